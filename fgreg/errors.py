@@ -1,0 +1,34 @@
+"""Errors that a user can cause and mend; everything else is a defect and keeps its traceback."""
+
+from __future__ import annotations
+
+
+class FgregError(Exception):
+    """Base of all known errors; the command line prints it as one line and exits with 2."""
+
+
+class InputError(FgregError):
+    """Bad input: names the place, what was found there and what was expected.
+
+    Args:
+        where: file and key or line, e.g. ``session.yaml: probe.radius_mm`` or ``events.jsonl: line 7: trus.x_mm``.
+        found: what was found, in a few words.
+        expected: what would have been right.
+    """
+
+    def __init__(self, where: str, found: str, expected: str) -> None:
+        self.where = where
+        self.found = found
+        self.expected = expected
+        super().__init__(f"{where}: found {found}, expected {expected}")
+
+
+class MissingExtraError(FgregError):
+    """An optional dependency is not installed; names the extra that brings it."""
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(f"{package} is not installed; install it with: pip install 'fgreg[{extra}]'")
+
+
+class EstimationError(FgregError):
+    """The estimate could not be formed from these measurements (not a defect of the file)."""
