@@ -157,7 +157,7 @@ class TagModel:
 
     @property
     def marker_p_corners_mm(self) -> FloatArray:
-        """(4, 3) corners in the marker frame, in the detector's order: top left, top right, bottom right, bottom left."""
+        """(4, 3) corners in the marker frame, in the detector order: top left, top right, bottom right, bottom left."""
         h = self.size_mm / 2.0
         tag_p = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
         return np.asarray(tag_p @ self.marker_T_tag[:3, :3].T + self.marker_T_tag[:3, 3])
