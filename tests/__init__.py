@@ -1,0 +1,1 @@
+"""Tests of fgreg; a package so that they can share helpers (``tests.forward``)."""
