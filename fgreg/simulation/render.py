@@ -1,7 +1,7 @@
 """Camera images of flat printed things: perspective, distortion, blur, fall-off of light and sensor noise.
 
 Each sheet is ray cast. Rays through the corners of the pixels are intersected with the sheet; a pixel whose four
-corners see one colour has that colour, all others are integrated over 16 samples of a low-discrepancy pattern that is
+corners see one colour has that colour, all others are integrated over 64 samples of a low-discrepancy pattern that is
 shifted from pixel to pixel, so that an edge has no preferred sub-pixel position. Pixel centres have integer
 coordinates, as in OpenCV. Nothing here is shared with the detectors.
 """
@@ -54,7 +54,7 @@ class Optics:
     vignetting: float = 0.35
     read_noise: float = 0.6
     shot_noise: float = 0.005
-    samples: int = 16
+    samples: int = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
