@@ -1,0 +1,100 @@
+"""Makes a ``gtsam.CustomFactor`` of a pure residual function, and refuses what GTSAM would take silently.
+
+GTSAM accepts a Jacobian of the wrong shape without a word, dies obscurely of one that is missing, and answers a NaN
+by returning the start. So every number passes here first: wrong shapes and numbers that are not finite raise
+:class:`FactorError`, which reaches the caller intact.
+
+Speed, since this runs once per factor and iteration: residual functions work on plain floats (for 3 x 6 blocks that
+beats numpy), the Jacobians go into one preallocated buffer in one copy, keys are read once by the builder. The factor
+is never referred to from its own callback: that cycle would never be freed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+
+Row = Sequence[float]
+Rows = Sequence[Row]
+"""A small matrix as rows of floats, e.g. ``pose.matrix().tolist()``."""
+
+Residual = tuple[Row, Sequence[Rows]]
+"""What a residual function returns: error (m,), and one (m, n) Jacobian per variable (none where not asked for)."""
+
+Evaluate = Callable[[gtsam.Values, bool], Residual]
+"""Reads the variables, calls the residual function; the flag says whether Jacobians are wanted."""
+
+
+class FactorError(ValueError):
+    """A residual function gave something that GTSAM must not see: a wrong shape, or a number that is not finite."""
+
+
+def custom_factor(
+    name: str,
+    noise_model: gtsam.noiseModel.Base,
+    keys: Sequence[int],
+    error_dim: int,
+    variable_dims: Sequence[int],
+    evaluate: Evaluate,
+) -> gtsam.CustomFactor:
+    """A factor whose error and Jacobians come from ``evaluate``.
+
+    Args:
+        name: for error messages.
+        noise_model: of dimension ``error_dim``.
+        keys: of the variables, in the order of the Jacobians.
+        error_dim: m.
+        variable_dims: tangent dimension n of each variable.
+        evaluate: ``(values, want_jacobians) -> (error (m,), [(m, n), ...])``.
+
+    Raises:
+        FactorError: here, if dimensions do not fit together; from the factor, when ``evaluate`` gives a wrong shape or
+            a number that is not finite, or fails in its arithmetic (infinite angle, division by zero).
+    """
+    if len(keys) != len(variable_dims):
+        raise FactorError(f"{name}: {len(keys)} keys but {len(variable_dims)} variable dimensions")
+    if noise_model.dim() != error_dim:
+        raise FactorError(f"{name}: noise model of dimension {noise_model.dim()}, expected {error_dim}")
+    dims = tuple(variable_dims)
+    count = len(dims)
+    buffer = np.empty(error_dim * sum(dims))
+    starts = np.cumsum([0, *(error_dim * n for n in dims)]).tolist()
+    blocks = tuple(buffer[starts[i] : starts[i + 1]].reshape(error_dim, dims[i]) for i in range(count))
+    error_out = np.empty(error_dim)
+    finite = math.isfinite
+
+    def callback(_: gtsam.CustomFactor, values: gtsam.Values, jacobians_out: gtsam.JacobianVector | None) -> np.ndarray:
+        want_jacobians = jacobians_out is not None
+        try:
+            error, jacobians = evaluate(values, want_jacobians)
+        except (ArithmeticError, ValueError) as failure:
+            raise FactorError(f"{name}: the residual cannot be computed here: {failure}") from failure
+        if len(error) != error_dim:
+            raise FactorError(f"{name}: error of length {len(error)}, expected {error_dim}")
+        # A sum is finite only if its terms are: one test for all of them.
+        if not finite(sum(error)):
+            raise FactorError(f"{name}: error {list(error)} is not finite")
+        error_out[:] = error
+        if jacobians_out is None:
+            return error_out
+        if len(jacobians) != count:
+            raise FactorError(f"{name}: {len(jacobians)} Jacobians, expected {count}")
+        flat: list[float] = []
+        for index, rows in enumerate(jacobians):
+            if len(rows) != error_dim:
+                raise FactorError(f"{name}: Jacobian {index} has {len(rows)} rows, expected {error_dim}")
+            for row in rows:
+                if len(row) != dims[index]:
+                    raise FactorError(f"{name}: Jacobian {index} has a row of {len(row)}, expected {dims[index]}")
+                flat.extend(row)
+        if not finite(sum(flat)):
+            raise FactorError(f"{name}: a Jacobian has an entry that is not finite")
+        buffer[:] = flat
+        for index in range(count):
+            jacobians_out[index] = blocks[index]  # copied by gtsam, so the buffer may serve again
+        return error_out
+
+    return gtsam.CustomFactor(noise_model, list(keys), callback)

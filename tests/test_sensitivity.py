@@ -1,0 +1,155 @@
+"""Rotation against arc angle, and what window and sweep say about a look."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fgreg.measurements import Look
+from fgreg.sensitivity import (
+    arc_of_rotation,
+    rotation_of_arc,
+    rotation_of_arc_derivatives,
+    sensitivity_prior,
+    sensitivity_priors,
+    window_priors,
+    wrap_angle,
+)
+from tests.forward import hear, make_measurements, make_session
+
+DEG = math.pi / 180.0
+
+
+def look(range_mm: float, sweep: int = 0, scan_sigma_deg: float = 0.1) -> Look:
+    return Look(0.0, scan_sigma_deg * DEG, 0.0, range_mm, np.eye(2), sweep)
+
+
+def test_six_degrees_of_rotation_are_eight_of_arc() -> None:
+    # By hand: sin 6 deg = 0.104528; times 10 / 30 is 0.034843, the sine of 1.9968 deg.
+    assert math.degrees(arc_of_rotation(6.0 * DEG, 30.0, 10.0)) == pytest.approx(7.9968, abs=1e-4)
+    assert math.degrees(rotation_of_arc(7.9968 * DEG, 30.0, 10.0)) == pytest.approx(6.0, abs=1e-4)
+
+
+def test_small_rotations_are_r_over_R_plus_r_of_the_arc() -> None:
+    assert float(rotation_of_arc(1e-5, 30.0, 10.0)) == pytest.approx(0.75e-5, rel=1e-8)
+
+
+def test_rotation_agrees_with_the_points_themselves() -> None:
+    rng = np.random.default_rng(41)
+    p = np.stack([np.zeros(200), rng.uniform(-20, 20, 200), rng.uniform(25, 60, 200)], axis=1)
+    scan = np.arctan2(p[:, 1], p[:, 2]) + rng.uniform(-0.5, 0.5, 200)
+    for point, t in zip(p, scan, strict=True):
+        distance, theta, rotation = hear(point, float(t), 10.0)
+        assert float(rotation_of_arc(theta - t, distance, 10.0)) == pytest.approx(rotation, abs=1e-12)
+
+
+def test_arc_of_rotation_is_the_inverse() -> None:
+    rng = np.random.default_rng(42)
+    r = rng.uniform(3.0, 80.0, 500)
+    delta = rng.uniform(-1.2, 1.2, 500)
+    rotation = rotation_of_arc(delta, r, 10.0)
+    back = arc_of_rotation(rotation, r, 10.0)
+    # Nearer than R two arc angles have the same rotation; the one on the branch through 0 comes back.
+    on_branch = np.abs(delta - rotation) < np.pi / 2
+    assert on_branch.mean() > 0.9
+    np.testing.assert_allclose(back[on_branch], delta[on_branch], atol=1e-9)
+    np.testing.assert_allclose(rotation_of_arc(back, r, 10.0), rotation, atol=1e-9)
+
+
+def test_rotation_out_of_reach_gives_the_arc_angle_that_comes_nearest() -> None:
+    delta = arc_of_rotation([0.5, -0.5], 2.0, 10.0)
+    reached = rotation_of_arc(delta, 2.0, 10.0)
+    every = rotation_of_arc(np.linspace(-np.pi, np.pi, 20001), 2.0, 10.0)
+    np.testing.assert_allclose(reached, [every.max(), every.min()], atol=1e-7)
+
+
+def test_derivatives_against_differences() -> None:
+    rng = np.random.default_rng(43)
+    delta, r = rng.uniform(-2.0, 2.0, 100), rng.uniform(12.0, 80.0, 100)
+    by_delta, by_range = rotation_of_arc_derivatives(delta, r, 10.0)
+    h = 1e-5
+    np.testing.assert_allclose(
+        by_delta, (rotation_of_arc(delta + h, r, 10.0) - rotation_of_arc(delta - h, r, 10.0)) / (2 * h), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        by_range, (rotation_of_arc(delta, r + h, 10.0) - rotation_of_arc(delta, r - h, 10.0)) / (2 * h), atol=1e-9
+    )
+
+
+def test_first_hit_is_five_degrees_ahead_not_zero() -> None:
+    # design.md: 6 deg and 2 deg steps, 5 +- 0.6 deg, not 0 +- 3.5.
+    probe = make_session().probe
+    for sweep in (1, -1):
+        prior = sensitivity_prior(look(30.0, sweep, 0.0), probe, 2.0 * DEG)
+        assert math.degrees(prior.centre_rad) == pytest.approx(5.0 * sweep)
+        assert math.degrees(prior.sigma_rad) == pytest.approx(2.0 / math.sqrt(12.0))
+        assert prior.edge_gain == sweep
+    window = sensitivity_prior(look(30.0, 0, 0.0), probe, 2.0 * DEG)
+    assert (window.centre_rad, window.edge_gain) == (0.0, 0.0)
+    assert math.degrees(window.sigma_rad) == pytest.approx(6.0 / math.sqrt(3.0))
+
+
+def test_stage_noise_adds_in_square() -> None:
+    prior = sensitivity_prior(look(30.0, 1, 0.3), make_session().probe, 2.0 * DEG)
+    assert math.degrees(prior.sigma_rad) == pytest.approx(math.hypot(2.0 / math.sqrt(12.0), 0.3))
+
+
+def test_half_width_is_taken_at_the_looks_depth() -> None:
+    probe = make_session(half_width_deg=(5.0, 6.0, 9.0)).probe
+    ranges = [10.0, 25.0, 30.0, 40.0, 90.0]
+    priors = sensitivity_priors([look(r, 1) for r in ranges], probe, 2.0 * DEG)
+    np.testing.assert_allclose(np.degrees(priors.centre_rad), [4.0, 4.5, 5.0, 7.0, 8.0])
+
+
+def test_a_step_wider_than_the_window_tells_no_more_than_the_window() -> None:
+    probe = make_session().probe
+    wide = sensitivity_prior(look(30.0, 1), probe, 15.0 * DEG)
+    window = sensitivity_prior(look(30.0, 0), probe, 15.0 * DEG)
+    assert wide == window
+
+
+def test_arrays_and_single_looks_agree() -> None:
+    session, measurements, _ = make_measurements(np.random.default_rng(44), aims=0, pairs=9)
+    looks = [pair.look for pair in measurements.pairs]
+    many = sensitivity_priors(looks, session.probe, session.stage.step_rad)
+    for index, one in enumerate(looks):
+        single = sensitivity_prior(one, session.probe, session.stage.step_rad)
+        assert single.centre_rad == many.centre_rad[index]
+        assert single.edge_gain == many.edge_gain[index]
+        assert single.sigma_rad == many.sigma_rad[index]
+
+
+@pytest.mark.parametrize("first_hit", [False, True])
+def test_centre_and_sigma_are_those_of_simulated_sweeps(first_hit: bool) -> None:
+    session = make_session(edge_sigma_deg=1.0)
+    offsets = []
+    for seed in range(30):
+        _, measurements, truth = make_measurements(
+            np.random.default_rng(1000 + seed), aims=0, pairs=100, first_hit=first_hit, session=session
+        )
+        looks = [pair.look for pair in measurements.pairs]
+        priors = window_priors(
+            [one.range_mm for one in looks],
+            [one.sweep for one in looks],
+            [one.scan_sigma_rad for one in looks],
+            session.probe.sensitivity,
+            session.stage.step_rad,
+        )
+        # Against the stage's reading, as the estimator has it.
+        rotation = np.array(truth.rotation_rad) + truth.scan_rad - [one.scan_rad for one in looks]
+        expected = priors.centre_rad + priors.edge_gain * truth.window_edge_rad
+        offsets.append((rotation - expected) / priors.sigma_rad)
+    z = np.concatenate(offsets)
+    assert abs(z.mean()) < 4.0 / math.sqrt(z.size)
+    # A window known to be wider by the edge is wider by as much for looks that know only the window: some 1 % here.
+    assert z.std() == pytest.approx(1.0, abs=0.05)
+
+
+def test_wrap_angle() -> None:
+    np.testing.assert_allclose(
+        wrap_angle([0.0, np.pi, -np.pi, 3 * np.pi, 2 * np.pi + 0.1, -4.0]),
+        [0.0, np.pi, np.pi, np.pi, 0.1, -4.0 + 2 * np.pi],
+        atol=1e-12,
+    )
