@@ -62,7 +62,7 @@ def _waveform(pulse: Pulse, time_us: FloatArray) -> FloatArray:
 def _envelope_peak_us(pulse: Pulse) -> float:
     """Where the Hilbert envelope of the raw waveform peaks: not quite at 0 where it is asymmetric or short."""
     step = pulse.sigma_us / 200.0
-    time = (np.arange(8192) - 3000) * step
+    time = np.asarray((np.arange(8192) - 3000) * step, dtype=np.float64)
     spectrum = np.fft.fft(_waveform(pulse, time))
     spectrum[4097:] = 0.0
     spectrum[1:4096] *= 2.0
@@ -74,9 +74,9 @@ def _envelope_peak_us(pulse: Pulse) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Elevation:
-    """How the amplitude falls as the stage turns away from the source: ``threshold ** (|rotation / half_width| ** power)``.
+    """How the amplitude falls as the stage turns away from the source.
 
-    At the half width of the window it reaches the threshold of hearing.
+    ``threshold ** (|rotation / half_width| ** power)``: at the half width it reaches the threshold of hearing.
     """
 
     threshold: float = 0.5
@@ -167,7 +167,7 @@ def simulate_channels(
         amplitude *= float(hearing.elevation.amplitude(offset, half_width_rad))
     distance_mm = np.linalg.norm(source - element_positions(probe, scan_rad), axis=1)
     centre = (distance_mm / speed_mm_us + channels.pulse_delay_us - channels.t0_us) * channels.sampling_mhz
-    reach = int(math.ceil(pulse.support_us * channels.sampling_mhz)) + 1
+    reach = math.ceil(pulse.support_us * channels.sampling_mhz) + 1
     index = np.rint(centre).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
     signal = amplitude[:, None] * pulse.waveform((index - centre[:, None]) / channels.sampling_mhz)
     row, column = np.nonzero((index >= 0) & (index < samples))
@@ -182,7 +182,7 @@ def noise_channels(probe: ProbeModel, rng: np.random.Generator, samples: int = 1
 
 def quantised(channels: ChannelArray, counts_per_unit: float = 12.0) -> npt.NDArray[np.int16]:
     """Channel data as int16, as a converter would deliver; ``counts_per_unit`` counts per noise standard deviation."""
-    return np.clip(np.rint(channels * counts_per_unit), -32768, 32767).astype(np.int16)
+    return np.asarray(np.clip(np.rint(channels * counts_per_unit), -32768, 32767).astype(np.int16))
 
 
 def simulate_envelope_image(
@@ -237,7 +237,8 @@ def simulate_envelope_image(
     axial = np.exp(-0.5 * ((z - range_mm) / along) ** 2)
     lateral = np.exp(-0.5 * ((x - source[0]) / lateral_mm) ** 2)
     noise = rng.standard_normal((2, *shape), dtype=np.float32)
-    return np.hypot((amplitude * np.outer(axial, lateral)).astype(np.float32) + noise[0], noise[1])
+    signal = (amplitude * np.outer(axial, lateral)).astype(np.float32)
+    return np.asarray(np.hypot(signal + noise[0], noise[1]))
 
 
 def _channels_of(probe: ProbeModel) -> ChannelModel:
