@@ -112,6 +112,14 @@ def transform_points(a_T_b: FloatArray, b_p: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("...ij,...j->...i", a_T_b[..., :3, :3], b_p) + a_T_b[..., :3, 3])
 
 
+def adjoint(a_T_b: FloatArray) -> FloatArray:
+    """(6, 6) map of tangents through a transform: ``a_T_b Exp(xi) = Exp(adjoint(a_T_b) xi) a_T_b``."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = a_T_b[:3, :3]
+    out[3:, :3] = hat(a_T_b[:3, 3]) @ a_T_b[:3, :3]
+    return out
+
+
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
     """The rotation closest to a (3, 3) matrix in the Frobenius norm."""
     u, _, vt = np.linalg.svd(matrix)

@@ -1,0 +1,40 @@
+"""What a user may set for a solve; raises on a value that cannot be, never repairs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class SolveConfig:
+    """Settings of the estimate and of its verdict.
+
+    Attributes:
+        limit_mm: predicted 95 % error at the worst target up to which a registration is ``ok``; beyond twice this it
+            is refused.
+        second_minimum_chi2: two minima whose costs differ by less cannot be told apart (99 % of chi square, 2 dof).
+        min_pairs: below, the registration counts as open unless the session gives an initial one.
+        refuse_beam_spread_rad, warn_beam_spread_rad: root mean square angle of the beams about their mean direction.
+        refuse_spot_spread_mm, warn_spot_spread_mm: root mean square distance of the PMs from their best line.
+        min_sweeps_per_side: below, a session that relies on first hits counts as one-way.
+        posterior_samples: draws behind the predicted target registration error.
+        seed: of those draws.
+    """
+
+    limit_mm: float = 3.0
+    second_minimum_chi2: float = 9.2
+    min_pairs: int = 6
+    refuse_beam_spread_rad: float = math.radians(2.0)
+    warn_beam_spread_rad: float = math.radians(5.0)
+    refuse_spot_spread_mm: float = 2.0
+    warn_spot_spread_mm: float = 4.0
+    min_sweeps_per_side: int = 3
+    posterior_samples: int = 400
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.limit_mm) and self.limit_mm > 0):
+            raise ValueError(f"limit_mm is {self.limit_mm}, expected a number > 0")
+        if self.posterior_samples < 100:
+            raise ValueError(f"posterior_samples is {self.posterior_samples}, expected at least 100")

@@ -1,0 +1,200 @@
+"""Measurements as flat arrays: what the reduced problem works on.
+
+A *beam* is one marker observation of one PM (looks of one PM that share an observation share the beam), a *look* one
+hearing of a PM. Marker covariances are turned to the camera's axes about the marker's origin, where the reduced
+problem perturbs them: rotation vector w and shift n, ``camera_R = Exp(w) observed_R``, ``camera_t = observed_t + n``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.frames import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
+from fgreg.measurements import EpochStart, MarkerObservation, Measurements, Pair
+from fgreg.models import SessionModel
+from fgreg.sensitivity import sensitivity_priors
+
+LINE_SIGMA_MM = 1e-3
+"""Width of the beam itself: point on line is an equality; this keeps its covariance invertible (as in the factors)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Where each shared variable sits in the vector of shared perturbations; an absent one is None.
+
+    Order: 6 per epoch (rotation rad, translation mm; right tangent), beam chart 4, window edge 1, then the optional
+    marker bias 3, sound speed ratio 1, probe radius 1.
+    """
+
+    epochs: int
+    bias: int | None
+    sound_speed: int | None
+    radius: int | None
+    size: int
+
+    @property
+    def beam(self) -> int:
+        return 6 * self.epochs
+
+    @property
+    def edge(self) -> int:
+        return 6 * self.epochs + 4
+
+
+def make_columns(epochs: int, *, bias: bool, sound_speed: bool, radius: bool) -> Columns:
+    """Lay out the shared variables."""
+    size = 6 * epochs + 5
+    bias_at = size if bias else None
+    size += 3 * bias
+    sound_at = size if sound_speed else None
+    size += sound_speed
+    radius_at = size if radius else None
+    return Columns(epochs, bias_at, sound_at, radius_at, size + radius)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamArrays:
+    """Marker observations: rotation (n, 3, 3), translation (n, 3) mm, covariance (n, 6, 6) along the camera's axes."""
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LookArrays:
+    """Looks: scan (L,) rad, x and range (L,) mm, weight (L, 3, 3) over (x, range, rotation), prior on the rotation.
+
+    The rotation offset's prior: ``rotation - centre - edge_gain * window_edge`` with sigma (in ``weight``).
+    """
+
+    scan_rad: FloatArray
+    x_mm: FloatArray
+    range_mm: FloatArray
+    weight: FloatArray
+    centre_rad: FloatArray
+    edge_gain: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochLink:
+    """Prior between epochs: ``trus_T_camera[k+1] = trus_T_camera[k] * old_T_new``, information over the tangent."""
+
+    index: int
+    old_T_new: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedProblem:
+    """All measurements of a session as arrays; indices say which PM and epoch each belongs to."""
+
+    columns: Columns
+    pms: tuple[int, ...]
+    beam_pm: IntArray
+    beam_epoch: IntArray
+    beams: BeamArrays
+    look_pm: IntArray
+    look_beam: IntArray
+    looks: LookArrays
+    aims: BeamArrays
+    aim_spot_mm: FloatArray
+    aim_spot_covariance: FloatArray
+    links: tuple[EpochLink, ...]
+    radius_mm: float
+    prior_information: FloatArray
+
+
+def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
+    if not markers:
+        return BeamArrays(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)))
+    transforms = np.stack([marker.camera_T_marker for marker in markers])
+    covariance = np.stack([marker.covariance for marker in markers])
+    rotation = np.ascontiguousarray(transforms[:, :3, :3])
+    return BeamArrays(rotation, transforms[:, :3, 3].copy(), parent_from_right_covariance(rotation, covariance))
+
+
+def _links(epochs: Sequence[EpochStart]) -> tuple[EpochLink, ...]:
+    links = []
+    for k, epoch in enumerate(epochs[1:]):
+        motion, covariance = epoch.camera_new_T_camera_old, epoch.covariance
+        if motion is not None and covariance is not None:
+            # new_T_old Exp(xi) inverted is old_T_new Exp(-Ad xi): the covariance moves to the other frame.
+            turn = adjoint(motion)
+            information = np.asarray(np.linalg.inv(turn @ covariance @ turn.T), dtype=np.float64)
+            links.append(EpochLink(k, inverse(motion), information))
+    return tuple(links)
+
+
+def pack(
+    measurements: Measurements,
+    model: SessionModel,
+    *,
+    sound_speed_sigma: float | None = None,
+    radius_sigma_mm: float | None = None,
+) -> PackedProblem:
+    """Lay measurements out as arrays.
+
+    Args:
+        measurements: aims, pairs and epochs.
+        model: the session's set-up.
+        sound_speed_sigma: prior sigma of the sound speed ratio (1 is the mean); None: not estimated.
+        radius_sigma_mm: prior sigma of the probe's radius; None: not estimated.
+    """
+    pairs = measurements.pairs
+    columns = make_columns(
+        len(measurements.epochs),
+        bias=model.noise.marker_bias_mm > 0,
+        sound_speed=sound_speed_sigma is not None,
+        radius=radius_sigma_mm is not None,
+    )
+    pms = tuple(dict.fromkeys(pair.pm for pair in pairs))
+    pm_index = {pm: index for index, pm in enumerate(pms)}
+    first_of_beam: dict[tuple[int, int], Pair] = {}
+    for pair in pairs:
+        first_of_beam.setdefault((pair.pm, pair.marker.id), pair)
+    beam_pairs = tuple(first_of_beam.values())
+    beam_index = {key: index for index, key in enumerate(first_of_beam)}
+    looks = [pair.look for pair in pairs]
+    priors = sensitivity_priors(looks, model.probe, model.stage.step_rad)
+    weight = np.zeros((len(looks), 3, 3))
+    if looks:
+        weight[:, :2, :2] = np.linalg.inv(np.stack([look.covariance for look in looks]))
+        weight[:, 2, 2] = priors.sigma_rad**-2
+
+    prior_information = np.zeros(columns.size)
+    prior_information[columns.edge] = max(model.probe.sensitivity.edge_sigma_rad, 1e-9) ** -2
+    if columns.bias is not None:
+        prior_information[columns.bias : columns.bias + 3] = model.noise.marker_bias_mm**-2
+    if columns.sound_speed is not None and sound_speed_sigma is not None:
+        prior_information[columns.sound_speed] = sound_speed_sigma**-2
+    if columns.radius is not None and radius_sigma_mm is not None:
+        prior_information[columns.radius] = radius_sigma_mm**-2
+
+    aims = measurements.aims
+    return PackedProblem(
+        columns=columns,
+        pms=pms,
+        beam_pm=np.array([pm_index[pair.pm] for pair in beam_pairs], dtype=np.int64),
+        beam_epoch=np.array([pair.epoch for pair in beam_pairs], dtype=np.int64),
+        beams=_beam_arrays([pair.marker for pair in beam_pairs]),
+        look_pm=np.array([pm_index[pair.pm] for pair in pairs], dtype=np.int64),
+        look_beam=np.array([beam_index[pair.pm, pair.marker.id] for pair in pairs], dtype=np.int64),
+        looks=LookArrays(
+            scan_rad=np.array([look.scan_rad for look in looks], dtype=np.float64),
+            x_mm=np.array([look.x_mm for look in looks], dtype=np.float64),
+            range_mm=np.array([look.range_mm for look in looks], dtype=np.float64),
+            weight=weight,
+            centre_rad=priors.centre_rad,
+            edge_gain=priors.edge_gain,
+        ),
+        aims=_beam_arrays([aim.marker for aim in aims]),
+        aim_spot_mm=np.array([aim.camera_p_spot_mm for aim in aims], dtype=np.float64).reshape(-1, 3),
+        aim_spot_covariance=np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3),
+        links=_links(measurements.epochs),
+        radius_mm=model.probe.radius_mm,
+        prior_information=prior_information,
+    )

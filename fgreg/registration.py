@@ -1,0 +1,152 @@
+"""Calibration and registration in the one graph, from no guess: all minima worth knowing, best first.
+
+1. Beam: lines through the aimed-at spots, refined on the aims alone (the graph without pairs).
+2. Registration starts of each epoch from the beams and the arc points (fgreg.initialization).
+3. Levenberg-Marquardt on the reduced graph from all of them at once; distinct minima are kept with their costs.
+4. The mirrored hypothesis (stage turning the other way, or elements counted from the other end) the same way.
+5. All epochs together from the best of each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.errors import EstimationError
+from fgreg.frames import FloatArray, inverse, transform_points
+from fgreg.initialization import beam_starts, registration_starts
+from fgreg.measurements import Measurements, Pair
+from fgreg.models import SessionModel
+from fgreg.packing import PackedProblem, pack
+from fgreg.reduced_blocks import arc_points
+from fgreg.reduced_solver import Optimum, optimize
+from fgreg.shared_state import SharedState, make_state, nominal_frame, stack_states
+
+SEARCH_PAIRS = 40
+"""The search for minima looks at no more pairs than this, spread over the session; all are used from there on."""
+SAME_MINIMUM_MM = 1.5
+"""Minima whose registrations move no target by more than this are one."""
+BEAM_CHI2 = 30.0
+"""Beams of calibrations worse than the best by more than this are not tried."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minimum:
+    """One local minimum: chi square, and the state (one hypothesis)."""
+
+    cost: float
+    state: SharedState
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochSearch:
+    """What the search of one epoch found: minima best first, and the best cost of the mirrored hypothesis."""
+
+    minima: tuple[Minimum, ...]
+    mirrored_cost: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """The joint optimum of a session (one hypothesis), the searches behind it, and its packed problem."""
+
+    problem: PackedProblem
+    optimum: Optimum
+    searches: tuple[EpochSearch, ...]
+    covariance: FloatArray
+
+
+def calibrate_beam(measurements: Measurements, model: SessionModel) -> list[FloatArray]:
+    """Candidate ``marker_T_nominal`` (z along the beam), best first: from the aims, and from ``initial``.
+
+    Raises:
+        EstimationError: no aims and no initial beam.
+    """
+    candidates = [nominal_frame(origin, direction) for origin, direction in beam_starts(measurements.aims)]
+    if model.initial_marker_T_laser is not None:
+        candidates.append(model.initial_marker_T_laser)
+    if not candidates:
+        raise EstimationError(
+            "no aims and no initial.marker_T_laser: the beam has nowhere to start; take at least 6 aim shots"
+        )
+    if not measurements.aims:
+        return candidates
+    alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model)
+    state = make_state(np.tile(np.eye(4), (len(candidates), 1, 1, 1)), np.array(candidates), model.probe.radius_mm)
+    found = optimize(alone, state)
+    cost = found.evaluation.cost
+    direction, origin = found.state.beam_direction(), found.state.beam_origin()
+    frames: list[FloatArray] = []
+    for index in np.argsort(cost):
+        if cost[index] > cost.min() + BEAM_CHI2:
+            break
+        lambdas = found.evaluation.aim_lambda_mm[index]
+        sign = 1.0 if np.median(lambdas) >= 0 else -1.0
+        frame = nominal_frame(origin[index], sign * direction[index])
+        if all(frame[:3, 2] @ other[:3, 2] < np.cos(0.02) for other in frames):
+            frames.append(frame)
+    return frames
+
+
+def _search_subset(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    if len(pairs) <= SEARCH_PAIRS:
+        return pairs
+    return tuple(pairs[i] for i in np.linspace(0, len(pairs) - 1, SEARCH_PAIRS).round().astype(int))
+
+
+def _mirrored(problem: PackedProblem) -> PackedProblem:
+    """The same data with lateral positions counted from the other end.
+
+    A stage that turns the other way gives this, too, but for half a turn of the TRUS frame about z: one hypothesis
+    stands for both.
+    """
+    return replace(problem, looks=replace(problem.looks, x_mm=-problem.looks.x_mm))
+
+
+def _starts(problem: PackedProblem, frames: list[FloatArray], model: SessionModel) -> SharedState:
+    """Starts of a one-epoch problem: for each beam the registrations that bring its lines to the arc points."""
+    arcs = arc_points(problem, np.zeros(1))[0]
+    states = []
+    for frame in frames:
+        beams = problem.beams
+        origin = (beams.rotation @ frame[:3, 3] + beams.translation_mm)[problem.look_beam]
+        direction = (beams.rotation @ frame[:3, 2])[problem.look_beam]
+        starts = registration_starts(origin, direction, arcs)
+        states.append(make_state(starts[:, None], frame, model.probe.radius_mm))
+    if model.initial_trus_T_camera is not None:
+        states.append(make_state(model.initial_trus_T_camera[None, None], frames[0], model.probe.radius_mm))
+    return stack_states(states)
+
+
+def targets_moved(first: FloatArray, second: FloatArray, targets_mm: FloatArray) -> float:
+    """Largest distance (mm) between where two registrations (4, 4) put the camera points under the targets."""
+    camera_p = transform_points(inverse(first), targets_mm)
+    return float(np.linalg.norm(transform_points(second, camera_p) - targets_mm, axis=1).max())
+
+
+def _distinct(found: Optimum, targets_mm: FloatArray, keep: int = 6) -> tuple[Minimum, ...]:
+    minima: list[Minimum] = []
+    for index in np.argsort(found.evaluation.cost):
+        state = found.state.take([index])
+        here = state.trus_T_camera()[0]
+        if all(targets_moved(other.state.trus_T_camera()[0], here, targets_mm) > SAME_MINIMUM_MM for other in minima):
+            minima.append(Minimum(float(found.evaluation.cost[index]), state))
+        if len(minima) == keep:
+            break
+    return tuple(minima)
+
+
+def search_epoch(
+    measurements: Measurements, model: SessionModel, frames: list[FloatArray], epoch: int, *, keep_within: float = 60.0
+) -> EpochSearch:
+    """All minima of one epoch's pairs with the aims; none where it has fewer than three pairs."""
+    pairs = tuple(replace(pair, epoch=0) for pair in measurements.pairs if pair.epoch == epoch)
+    if len({pair.pm for pair in pairs}) < 3:
+        return EpochSearch((), None)
+    subset = replace(measurements, pairs=_search_subset(pairs), epochs=measurements.epochs[:1])
+    problem = pack(subset, model)
+    found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
+    mirrored_problem = _mirrored(problem)
+    mirrored = optimize(mirrored_problem, _starts(mirrored_problem, frames, model), keep_within=keep_within)
+    return EpochSearch(_distinct(found, model.targets_mm), float(mirrored.evaluation.cost.min()))

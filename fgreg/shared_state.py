@@ -1,0 +1,110 @@
+"""Values of the shared variables, many hypotheses at once: leading dimension S everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fgreg.frames import FloatArray, exp_so3, log_so3, make_transform, rotation_to_direction
+from fgreg.packing import Columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedState:
+    """S hypotheses of all shared variables.
+
+    Attributes:
+        rotation, translation_mm: ``trus_T_camera`` of each epoch, (S, E, 3, 3) and (S, E, 3).
+        marker_T_nominal: (S, 4, 4) fixed frame of the beam chart.
+        beam: (S, 4) chart (x, y, a, b): origin R0 (x, y, 0) + p0, direction R0 normalise(a, b, 1).
+        edge_rad: (S,). bias_mm: (S, 3). sound_speed_ratio: (S,). radius_mm: (S,).
+    """
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+    marker_T_nominal: FloatArray
+    beam: FloatArray
+    edge_rad: FloatArray
+    bias_mm: FloatArray
+    sound_speed_ratio: FloatArray
+    radius_mm: FloatArray
+
+    @property
+    def count(self) -> int:
+        return len(self.beam)
+
+    def take(self, index: Any) -> SharedState:
+        """The hypotheses at ``index`` (anything that indexes an array's first dimension)."""
+        return SharedState(*(getattr(self, name)[index] for name in self.__slots__))
+
+    def retract(self, step: FloatArray, columns: Columns) -> SharedState:
+        """Move by ``step`` (S, D): ``rotation * Exp(omega)``, ``translation + rotation v``, additive otherwise."""
+        poses = step[:, : 6 * columns.epochs].reshape(-1, columns.epochs, 6)
+        moved = replace(
+            self,
+            rotation=self.rotation @ exp_so3(poses[..., :3]),
+            translation_mm=self.translation_mm + (self.rotation @ poses[..., 3:, None])[..., 0],
+            beam=self.beam + step[:, columns.beam : columns.beam + 4],
+            edge_rad=self.edge_rad + step[:, columns.edge],
+        )
+        if columns.bias is not None:
+            moved = replace(moved, bias_mm=self.bias_mm + step[:, columns.bias : columns.bias + 3])
+        if columns.sound_speed is not None:
+            moved = replace(moved, sound_speed_ratio=self.sound_speed_ratio + step[:, columns.sound_speed])
+        if columns.radius is not None:
+            moved = replace(moved, radius_mm=self.radius_mm + step[:, columns.radius])
+        return moved
+
+    def trus_T_camera(self, epoch: int = 0) -> FloatArray:
+        """(S, 4, 4) registrations of one epoch."""
+        return make_transform(self.rotation[:, epoch], self.translation_mm[:, epoch])
+
+    def beam_direction(self) -> FloatArray:
+        """(S, 3) unit direction of the beam in the marker frame."""
+        chart = np.concatenate([self.beam[:, 2:], np.ones((self.count, 1))], axis=1)
+        chart /= np.linalg.norm(chart, axis=1, keepdims=True)
+        return np.asarray((self.marker_T_nominal[:, :3, :3] @ chart[..., None])[..., 0])
+
+    def beam_origin(self) -> FloatArray:
+        """(S, 3) the chart's point on the beam (lambda = 0), marker frame, mm."""
+        r0 = self.marker_T_nominal[:, :3, :3]
+        return np.asarray(
+            r0[:, :, 0] * self.beam[:, :1] + r0[:, :, 1] * self.beam[:, 1:2] + self.marker_T_nominal[:, :3, 3]
+        )
+
+
+def stack_states(states: list[SharedState]) -> SharedState:
+    """All hypotheses of several states in one."""
+    return SharedState(*(np.concatenate([getattr(s, name) for s in states]) for name in SharedState.__slots__))
+
+
+def nominal_frame(origin_mm: FloatArray, direction: FloatArray) -> FloatArray:
+    """``marker_T_nominal`` with z along a direction (3,) and its origin at a point (3,) of the beam."""
+    return make_transform(rotation_to_direction(direction), origin_mm)
+
+
+def make_state(
+    trus_T_camera: FloatArray, marker_T_nominal: FloatArray, radius_mm: float, beam: FloatArray | None = None
+) -> SharedState:
+    """Hypotheses from registrations (S, E, 4, 4) and beams (S, 4, 4); the other variables at their prior means."""
+    count = len(trus_T_camera)
+    return SharedState(
+        rotation=np.array(trus_T_camera[..., :3, :3], dtype=np.float64),
+        translation_mm=np.array(trus_T_camera[..., :3, 3], dtype=np.float64),
+        marker_T_nominal=np.array(np.broadcast_to(marker_T_nominal, (count, 4, 4)), dtype=np.float64),
+        beam=np.zeros((count, 4)) if beam is None else np.array(beam, dtype=np.float64),
+        edge_rad=np.zeros(count),
+        bias_mm=np.zeros((count, 3)),
+        sound_speed_ratio=np.ones(count),
+        radius_mm=np.full(count, float(radius_mm)),
+    )
+
+
+def pose_difference(first: SharedState, second: SharedState, epoch: int = 0) -> FloatArray:
+    """(S, 6) right-tangent difference of two states' registrations: ``first * retract = second``."""
+    first_R_trus = np.swapaxes(first.rotation[:, epoch], -1, -2)
+    omega = log_so3(first_R_trus @ second.rotation[:, epoch])
+    shift = first_R_trus @ (second.translation_mm[:, epoch] - first.translation_mm[:, epoch])[..., None]
+    return np.concatenate([omega, shift[..., 0]], axis=1)
