@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 
+def one_line(text: str, limit: int | None = None) -> str:
+    """``text`` with line breaks, control characters and lone surrogates escaped, cut to ``limit`` characters."""
+    if limit is not None and len(text) > limit:
+        text = text[: limit - 3] + "..."
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 class FgregError(Exception):
     """Base of all known errors; the command line prints it as one line and exits with 2."""
 
 
 class InputError(FgregError):
-    """Bad input: names the place, what was found there and what was expected.
+    """Bad input: names the place, what was found there and what was expected. Its text is always one line.
 
     Args:
         where: file and key or line, e.g. ``session.yaml: probe.radius_mm`` or ``events.jsonl: line 7: trus.x_mm``.
@@ -17,10 +26,10 @@ class InputError(FgregError):
     """
 
     def __init__(self, where: str, found: str, expected: str) -> None:
-        self.where = where
-        self.found = found
-        self.expected = expected
-        super().__init__(f"{where}: found {found}, expected {expected}")
+        self.where = one_line(where)
+        self.found = one_line(found)
+        self.expected = one_line(expected)
+        super().__init__(f"{self.where}: found {self.found}, expected {self.expected}")
 
 
 class MissingExtraError(FgregError):

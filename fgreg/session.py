@@ -1,0 +1,147 @@
+"""A session's folder, read and checked: ``session.yaml``, ``events.jsonl``, ``ground_truth.yaml``, frames.
+
+Every problem becomes an :class:`InputError` that names the file, the key or line, what was found and what was
+expected. :func:`read_session` raises the first, :func:`check_session` returns all of them.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.events import Event
+from fgreg.ground_truth import GroundTruth, TrackTruth
+from fgreg.models import SessionModel
+from fgreg.safe_yaml import load_yaml
+from fgreg.schema import Bounds, Fields, Place, read_numbers, read_transform, shown
+from fgreg.session_events import EventLog, read_events
+from fgreg.session_frames import check_frames
+from fgreg.session_setup import COORDINATE_MM, SCAN_DEG, Setup, read_setup
+
+SETUP_FILE = "session.yaml"
+EVENTS_FILE = "events.jsonl"
+TRUTH_FILE = "ground_truth.yaml"
+
+_PM = re.compile(r"0|[1-9][0-9]{0,9}")
+_TRUTH_BYTES = 64_000_000
+_TRUTH_NODES = 2_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A session as recorded.
+
+    Attributes:
+        folder: as given.
+        model: how things were set up.
+        events: what happened, in order.
+        warnings: plain sentences on what is allowed but hardly meant, and on a last line that was cut short.
+    """
+
+    folder: Path
+    model: SessionModel
+    events: tuple[Event, ...]
+    warnings: tuple[str, ...]
+
+
+def read_session(folder: Path) -> Session:
+    """Reads a session. Frames that events name lie inside the folder, but whether they exist shows when they are used.
+
+    Raises:
+        InputError: the first problem of the folder, of ``session.yaml`` or of ``events.jsonl``.
+    """
+    problems: list[InputError] = []
+    setup, log = _read(folder, problems)
+    if problems:
+        raise problems[0]
+    if setup is None or setup.model is None:
+        raise AssertionError("no model and no problem")
+    return Session(folder, setup.model, tuple(log.events), (*setup.warnings, *log.warnings))
+
+
+def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
+    """Checks a session, its ground truth where there is one, and the headers of all frames that events name.
+
+    Returns:
+        All problems and all warnings; both empty where all is well.
+    """
+    problems: list[InputError] = []
+    setup, log = _read(folder, problems)
+    try:
+        _read_truth(folder, problems)
+    except InputError as error:
+        problems.append(error)
+    camera = None if setup is None else setup.camera
+    probe = None if setup is None else setup.probe
+    problems.extend(check_frames(log.frames, probe, None if camera is None else camera.left.image_size))
+    return problems, [*(() if setup is None else setup.warnings), *log.warnings]
+
+
+def read_ground_truth(folder: Path) -> GroundTruth | None:
+    """The truth about a session, or None where there is no ``ground_truth.yaml``.
+
+    Raises:
+        InputError: the first problem of the file.
+    """
+    problems: list[InputError] = []
+    truth = _read_truth(folder, problems)
+    if problems:
+        raise problems[0]
+    return truth
+
+
+def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, EventLog]:
+    """Both files of a session; what is wrong is appended to ``problems``, and the rest still read."""
+    try:
+        resolved = folder.resolve(strict=True)
+        if not resolved.is_dir():
+            problems.append(InputError(str(folder), "a file", "a session's folder"))
+            return None, EventLog()
+    except (OSError, RuntimeError, ValueError) as error:
+        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
+        found = "nothing" if absent else f"no access ({getattr(error, 'strerror', None) or error})"
+        problems.append(InputError(str(folder), found, "a session's folder"))
+        return None, EventLog()
+    setup: Setup | None = None
+    try:
+        data = load_yaml(folder / SETUP_FILE, SETUP_FILE)
+        setup = read_setup(data, SETUP_FILE, resolved.name or "session", problems)
+    except InputError as error:
+        problems.append(error)
+    return setup, read_events(folder / EVENTS_FILE, EVENTS_FILE, resolved, setup, problems)
+
+
+def _read_truth(folder: Path, problems: list[InputError]) -> GroundTruth | None:
+    path = folder / TRUTH_FILE
+    if not os.path.lexists(path):
+        return None
+    data = load_yaml(path, TRUTH_FILE, max_bytes=_TRUTH_BYTES, max_nodes=_TRUTH_NODES)
+    top = Fields(data, ("trus_T_camera", "marker_T_laser", "pms", "tracks"), Place(TRUTH_FILE), problems)
+    trus_T_camera = []
+    if top.has("trus_T_camera"):
+        entries = top.items("trus_T_camera", "a list of 4x4 transforms, one for each epoch")
+        trus_T_camera = [read_transform(entry, place, problems) for entry, place in entries]
+    marker_T_laser = top.transform("marker_T_laser") if top.has("marker_T_laser") else None
+    pms = {}
+    if top.has("pms") and (table := top.child("pms", _keys(top.raw("pms")))) is not None:
+        for key in _keys(top.raw("pms")):
+            if key.startswith("x_"):
+                continue
+            if not _PM.fullmatch(key):
+                table.fail(key, f"the PM {shown(key)}", "its number, an integer >= 0")
+                continue
+            pms[int(key)] = read_numbers(table.raw(key), table.at(key), problems, 3, COORDINATE_MM)
+    tracks = []
+    if top.has("tracks"):
+        for track in top.children("tracks", ("t", "stage_deg"), empty=True):
+            t = track.number("t", Bounds(unit="s"))
+            tracks.append(TrackTruth(t, math.radians(track.number("stage_deg", SCAN_DEG))))
+    return top.build(lambda: GroundTruth(tuple(trus_T_camera), marker_T_laser, pms, tuple(tracks)))
+
+
+def _keys(value: object) -> tuple[str, ...]:
+    return tuple(value) if isinstance(value, dict) else ()
