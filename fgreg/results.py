@@ -41,9 +41,7 @@ _SECONDS = Bounds(unit="s")
 _FIGURE = Bounds(0.0, FINITE.high)
 _ANY_LENGTH = math.inf  # a best estimate of a refused session may be anywhere
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-_NOT_FIGURE = Bounds(0.0, FINITE.high)
-_ANY_LENGTH = math.inf  # a best estimate of a refused session may be anywhere
-_PLAIN = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
+_NOT_PLAIN = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
 
 _TOP = ("format", "fgreg", "session", "verdict", "reasons", "laser", "epochs", "pairs", "tracks")
 _EPOCH = ("index", "start_s", "trus_T_camera", "covariance", "pairs", "verdict", "predicted_tre_mm")
