@@ -123,14 +123,9 @@ class GraphKeys:
 
     @property
     def private(self) -> tuple[int, ...]:
-        """All others, in the order in which they are eliminated: distances and angles, points, marker poses."""
-        return (
-            *self.lam,
-            *self.theta,
-            *(keys.camera_p_spot for keys in self.aims),
-            *self.trus_p_pm.values(),
-            *self.camera_T_marker,
-        )
+        """All others, in the order in which they are eliminated: points, distances and angles, marker poses."""
+        points = (*(aim.camera_p_spot for aim in self.aims), *self.trus_p_pm.values())
+        return (*points, *self.lam, *self.theta, *self.camera_T_marker)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,8 +136,8 @@ class GraphOptions:
         marker_T_nominal: (4, 4) fixed frame of the beam's chart; None: the session's initial ``marker_T_laser``, else
             the marker's own frame. The beam has to be within some 60 deg of its z axis.
         sound_speed_sigma: prior sigma of ``sound_speed_ratio`` about 1, None where it is not a variable.
-        unknown_motion_sigma: sigmas (rad, mm) of a camera motion of which nothing is known, about no motion: too wide to
-            matter where there are pairs, and keeps an epoch without any from being singular. None: no factor.
+        unknown_motion_sigma: sigmas (rad, mm) of a camera motion of which nothing is known, about no motion: too wide
+            to matter where there are pairs, and keeps an epoch without any from being singular. None: no factor.
     """
 
     marker_T_nominal: FloatArray | None = None

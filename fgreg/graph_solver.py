@@ -2,6 +2,11 @@
 
 The loop is our own, over ``graph.linearize(values)`` with values that Python holds: inside GTSAM's optimizers each
 callback of a Python factor copies all values, which makes one linearisation quadratic in the number of pairs.
+
+Elimination is by QR: GTSAM's Cholesky gives up as soon as two square roots on a diagonal differ by 4096 times, and
+with coincidences at 1e-3 mm beside noise of some mm or a hundredth of a radian that happens in sound problems. It takes
+1.6 times as long, and a solve less than twice as long as the linearisation it follows.
+
 Costs are GTSAM's, half the chi square.
 """
 
@@ -21,6 +26,9 @@ from fgreg.graph import ExplicitGraph, Variable, make_ordering
 from fgreg.graph_values import made_consistent
 
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-12, 1e12
+_LEAST_EIGENVALUE = 1e-12
+"""Of the information's correlation matrix: below, a combination of shared variables counts as undetermined."""
+
 _SCALE: dict[Variable, tuple[float, ...]] = {
     Variable.trus_T_camera: (0.1, 0.1, 0.1, 10.0, 10.0, 10.0),
     Variable.marker_laser: (10.0, 10.0, 0.1, 0.1),
@@ -70,7 +78,7 @@ def _damped_step(
         for key in own:
             damped.push_back(gtsam.JacobianFactor(key, block, zero, units[variable]))
     try:
-        step = damped.optimize(ordering)
+        step = damped.optimize(ordering, gtsam.EliminateQR)
     except RuntimeError:  # GTSAM's indeterminate linear system
         return None
     return step if math.isfinite(step.squaredNorm()) else None
@@ -139,26 +147,32 @@ class GraphCovariance:
     """
 
     def __init__(self, explicit: ExplicitGraph, values: gtsam.Values) -> None:
-        linear = explicit.graph.linearize(values)
-        try:
-            self._tree = linear.eliminateMultifrontal(explicit.ordering)
-            _, rest = linear.eliminatePartialMultifrontal(make_ordering(explicit.private))
-            information, _ = rest.hessian(make_ordering(explicit.shared))
-        except RuntimeError as failure:
-            raise EstimationError("these measurements do not determine all of the graph's variables") from failure
-        sigma = 1.0 / np.sqrt(np.diag(information))
-        correlation = information * np.outer(sigma, sigma)
-        # Units differ by orders of magnitude; what is undetermined shows once they are taken out.
-        if not np.isfinite(correlation).all() or np.linalg.eigvalsh(correlation)[0] < 1e-12:
-            raise EstimationError("these measurements do not determine all of the shared variables")
-        self._shared = np.asarray(np.linalg.inv(correlation) * np.outer(sigma, sigma))
+        self._linear = explicit.graph.linearize(values)
+        self._private = frozenset(explicit.private)
+        self._factors_of: dict[int, list[int]] = {}
+        for index in range(self._linear.size()):
+            for key in self._linear.at(index).keys():  # noqa: SIM118 - a method of the factor, not of a dict
+                self._factors_of.setdefault(key, []).append(index)
+        sizes = values.zeroVectors()
         self._columns: dict[int, slice] = {}
         start = 0
-        sizes = values.zeroVectors()
         for key in explicit.shared:
-            width = sizes.at(key).size
-            self._columns[key] = slice(start, start + width)
-            start += width
+            self._columns[key] = slice(start, start + sizes.at(key).size)
+            start = self._columns[key].stop
+        try:
+            _, rest = self._linear.eliminatePartialMultifrontal(make_ordering(explicit.private), gtsam.EliminateQR)
+        except RuntimeError as failure:
+            raise EstimationError("these measurements do not determine all private variables") from failure
+        information, _ = rest.hessian(make_ordering(explicit.shared))
+        diagonal = np.diag(information)
+        if not (np.isfinite(information).all() and (diagonal > 0.0).all()):
+            raise EstimationError("these measurements do not determine all shared variables")
+        # Units differ by orders of magnitude; what is undetermined shows once they are taken out.
+        sigma = 1.0 / np.sqrt(diagonal)
+        correlation = information * np.outer(sigma, sigma)
+        if np.linalg.eigvalsh(correlation)[0] < _LEAST_EIGENVALUE:
+            raise EstimationError("these measurements do not determine all shared variables")
+        self._shared = np.asarray(np.linalg.inv(correlation) * np.outer(sigma, sigma))
 
     def shared(self, keys: Sequence[int] | None = None) -> FloatArray:
         """Joint covariance of shared variables in the order of ``keys``; all of them, in the graph's, where absent."""
@@ -168,7 +182,39 @@ class GraphCovariance:
         return np.asarray(self._shared[np.ix_(index, index)])
 
     def of(self, key: int) -> FloatArray:
-        """Marginal covariance of one variable, private or shared: a PM (3, 3), a distance or angle (1, 1), ..."""
+        """Marginal covariance of one variable, private or shared: a PM (3, 3), a distance or angle (1, 1), ...
+
+        What is private to one PM or aim meets the rest at shared variables only. So those factors alone, with all
+        else that is private eliminated, give ``R x + S s = d``, and the covariance is R^-1 (I + S C S') R^-T with C
+        of the shared variables s.
+        """
         if key in self._columns:
             return self.shared([key])
-        return np.asarray(self._tree.marginalCovariance(key))
+        others, factors = self._component(key)
+        local = gtsam.GaussianFactorGraph()
+        for index in factors:
+            local.push_back(self._linear.at(index))
+        net, _ = local.eliminatePartialSequential(make_ordering((*others, key)), gtsam.EliminateQR)
+        conditional = net.back()
+        blocks, _ = conditional.jacobian()
+        width = blocks.shape[0]
+        root, by_shared = blocks[:, :width], blocks[:, width:]
+        covariance = np.eye(width)
+        parents = list(conditional.keys())[1:]
+        if parents:
+            covariance = covariance + by_shared @ self.shared(parents) @ by_shared.T
+        inverse = np.linalg.inv(root)
+        return np.asarray(inverse @ covariance @ inverse.T)
+
+    def _component(self, key: int) -> tuple[list[int], list[int]]:
+        """The other private variables and the factors that hang together with one without shared variables."""
+        found, factors, waiting = {key}, set[int](), [key]
+        while waiting:
+            for index in self._factors_of[waiting.pop()]:
+                if index in factors:
+                    continue
+                factors.add(index)
+                reached = self._private.intersection(self._linear.at(index).keys()) - found
+                found |= reached
+                waiting.extend(reached)
+        return sorted(found - {key}), sorted(factors)
