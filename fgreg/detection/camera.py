@@ -1,0 +1,107 @@
+"""The pinhole camera with OpenCV's five-parameter distortion: pixels to rays and back, with Jacobians.
+
+Pixel coordinates follow OpenCV: the centre of the top left pixel is (0, 0). *Normalised* coordinates are (X/Z, Y/Z).
+*Ideal* pixels are normalised coordinates times the focal lengths: pixels of the same camera without distortion,
+counted from the principal point. Straight lines in space are straight there, and a pixel keeps its size.
+
+Source of the model: OpenCV documentation, "Camera Calibration and 3D Reconstruction" (k1, k2, p1, p2, k3).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.models import CameraModel
+
+UNDISTORT_ITERATIONS = 20
+UNDISTORT_TOLERANCE = 1e-9
+
+
+def focal_px(camera: CameraModel) -> FloatArray:
+    """(2,) focal lengths along x and y."""
+    return np.array([camera.matrix[0, 0], camera.matrix[1, 1]])
+
+
+def _principal_px(camera: CameraModel) -> FloatArray:
+    return np.array([camera.matrix[0, 2], camera.matrix[1, 2]])
+
+
+def distort(camera: CameraModel, normalized: FloatArray) -> FloatArray:
+    """Where ideal normalised points (..., 2) really appear: normalised, distorted, (..., 2)."""
+    k1, k2, p1, p2, k3 = (float(v) for v in camera.distortion)
+    x, y = normalized[..., 0], normalized[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def distort_jacobian(camera: CameraModel, normalized: FloatArray) -> FloatArray:
+    """Derivative of :func:`distort` by its argument: (..., 2, 2)."""
+    k1, k2, p1, p2, k3 = (float(v) for v in camera.distortion)
+    x, y = normalized[..., 0], normalized[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # d radial / dx = slope * x
+    out = np.empty((*np.shape(x), 2, 2))
+    out[..., 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    out[..., 0, 1] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+    out[..., 1, 0] = out[..., 0, 1]
+    out[..., 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    return out
+
+
+def pixels_from_normalized(camera: CameraModel, normalized: FloatArray) -> FloatArray:
+    """Pixels (..., 2) at which ideal normalised points (..., 2) are seen."""
+    return distort(camera, normalized) * focal_px(camera) + _principal_px(camera)
+
+
+def project(camera: CameraModel, camera_p_mm: FloatArray) -> FloatArray:
+    """Pixels (..., 2) of points (..., 3) in this camera's frame (z > 0)."""
+    return pixels_from_normalized(camera, camera_p_mm[..., :2] / camera_p_mm[..., 2:3])
+
+
+def normalized_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArray:
+    """Ideal normalised points (..., 2) of pixels (..., 2), by Newton's method.
+
+    NaN where the distortion model cannot be inverted: no root near, or one past the fold of the radial polynomial.
+    """
+    observed = (np.asarray(pixels, dtype=np.float64) - _principal_px(camera)) / focal_px(camera)
+    if not camera.distortion.any():
+        return observed
+    point = observed.copy()
+    for _ in range(UNDISTORT_ITERATIONS):
+        error = distort(camera, point) - observed
+        if np.abs(error).max(initial=0.0) < UNDISTORT_TOLERANCE:
+            break
+        j = distort_jacobian(camera, point)
+        det = j[..., 0, 0] * j[..., 1, 1] - j[..., 0, 1] * j[..., 1, 0]
+        det = np.where(np.abs(det) < 1e-3, 1e-3, det)
+        point[..., 0] -= (j[..., 1, 1] * error[..., 0] - j[..., 0, 1] * error[..., 1]) / det
+        point[..., 1] -= (j[..., 0, 0] * error[..., 1] - j[..., 1, 0] * error[..., 0]) / det
+        np.clip(point, -10.0, 10.0, out=point)
+    error = np.abs(distort(camera, point) - observed).max(axis=-1)
+    good = (error < 1e-7) & (np.linalg.det(distort_jacobian(camera, point)) > 0.0)
+    return np.where(good[..., None], point, np.nan)
+
+
+def ideal_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArray:
+    """Ideal pixels (..., 2) of pixels (..., 2); NaN where the distortion cannot be inverted."""
+    return normalized_from_pixels(camera, pixels) * focal_px(camera)
+
+
+def pixels_from_ideal(camera: CameraModel, ideal: FloatArray) -> FloatArray:
+    """Pixels (..., 2) of ideal pixels (..., 2)."""
+    return pixels_from_normalized(camera, ideal / focal_px(camera))
+
+
+def pixel_by_ideal_jacobian(camera: CameraModel, ideal: FloatArray) -> FloatArray:
+    """Derivative of :func:`pixels_from_ideal`: (..., 2, 2)."""
+    f = focal_px(camera)
+    return f[:, None] * distort_jacobian(camera, ideal / f) / f

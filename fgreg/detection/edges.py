@@ -1,0 +1,307 @@
+"""Straight edges in an image to a small part of a pixel, with covariance.
+
+An edge between a dark and a light surface is fitted to the pixels about it as a blurred step,
+
+    I = (1 + g e) (B + (W - B) Phi(e / s)) + g s (W - B) phi(e / s),   e = d - o - m u,  B = b0 + b1 u,  W = w0 + w1 u,
+
+with Phi, phi the normal distribution and density, d the distance of a pixel from the starting line (towards the light
+side), u in [-1, 1] the place along it, and g the fall-off of light across the edge: the Gaussian blur of a step in
+albedo under light that varies linearly. o, m, s, the levels and g are found by damped Gauss-Newton for all edges at
+once. Any symmetric blur leaves o and m unbiased, and so does light that falls off along or across the edge (without
+g: 0.005 px, and the same in both views). The pixels are used where they are (nothing is interpolated), so their noise
+is independent and the normal equations give the covariance.
+
+Lengths are *ideal* pixels (camera.py): the edges of a square are straight in them whatever the lens does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from fgreg.detection.camera import (
+    distort_jacobian,
+    focal_px,
+    pixels_from_ideal,
+)
+from fgreg.frames import BoolArray, FloatArray
+from fgreg.models import CameraModel
+
+Image = npt.NDArray[np.uint8]
+
+MAX_ROWS = 112
+"""Pixel rows across an edge that are used; longer edges are sampled evenly."""
+CURVE_NODES = 17
+MIN_ROWS = 6
+MIN_CONTRAST = 12.0
+"""Grey levels between the dark and the light side below which an edge is not trusted."""
+MAX_BLUR_PX = 5.0
+LEVEL_SLOPE_SIGMA = 0.3
+"""Prior on b1 and w1 as a share of the contrast: short edges cannot tell them."""
+LOG_BLUR_SIGMA = 0.7
+"""Prior on log s about log of the starting blur: so does a step as sharp as a pixel."""
+FALL_OFF_SIGMA = 0.004
+"""Prior on g, per px: light that changes by half over a hundred pixels."""
+PARAMETERS = 8
+REWEIGH_AT = 2
+"""Iteration from which on pixels that do not belong weigh less."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeFit:
+    """Edges found about starting segments (n of them).
+
+    Attributes:
+        line: (n, 2) offset o at the middle and m at the end of the segment (u = 1), ideal px, along ``normal``.
+        covariance: (n, 2, 2) of ``line``, px^2, at the pixel noise that the fit leaves.
+        blur_px: (n,) standard deviation s of the step.
+        good: (n,) whether there is an edge that can be trusted.
+    """
+
+    line: FloatArray
+    covariance: FloatArray
+    blur_px: FloatArray
+    good: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Band:
+    """Pixels about n edges, p each: distance d, place u, grey level, and which of them count."""
+
+    d: FloatArray
+    u: FloatArray
+    grey: FloatArray
+    used: BoolArray
+
+
+def segment_frames(start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """(middle, direction, normal, half length) of segments (n, 2) -> (n, 2).
+
+    The normal points to the left hand of the direction as drawn (y down), which is outside a tag whose corners run
+    clockwise as seen.
+    """
+    half = 0.5 * (end - start)
+    length = np.linalg.norm(half, axis=-1)
+    direction = half / length[..., None]
+    normal = np.stack([direction[..., 1], -direction[..., 0]], axis=-1)
+    return 0.5 * (start + end), direction, normal, length
+
+
+def _band(
+    camera: CameraModel,
+    image: Image,
+    start: FloatArray,
+    end: FloatArray,
+    half_width: FloatArray,
+    trim: FloatArray,
+    rows: int,
+) -> _Band:
+    """Gather pixels: one row per pixel step along the edge's major axis, across it the pixels within half_width."""
+    middle, direction, normal, half_length = segment_frames(start, end)
+    n = len(start)
+    # The ideal segment, trimmed at its ends, as the lens draws it.
+    s_nodes = np.linspace(-1.0, 1.0, CURVE_NODES) * (half_length - trim)[:, None]
+    nodes = pixels_from_ideal(camera, middle[:, None] + s_nodes[..., None] * direction[:, None])
+    chord = np.abs(nodes[:, -1] - nodes[:, 0])
+    major = (chord[:, 1] > chord[:, 0]).astype(np.intp)
+    along_nodes = np.take_along_axis(nodes, major[:, None, None], axis=2)[..., 0]
+    count = min(rows, int(chord.max()) + 1)
+    steps = np.linspace(0.0, 1.0, count)
+    along = np.rint(along_nodes[:, :1] + steps * (along_nodes[:, -1:] - along_nodes[:, :1]))
+    fresh = np.ones(along.shape, dtype=bool)
+    fresh[:, 1:] = along[:, 1:] != along[:, :-1]
+    s = np.empty(along.shape)
+    for k in range(n):
+        forward = along_nodes[k, -1] > along_nodes[k, 0]
+        order = slice(None) if forward else slice(None, None, -1)
+        s[k] = np.interp(along[k], along_nodes[k, order], s_nodes[k, order])
+    ideal = middle[:, None] + s[..., None] * direction[:, None]
+    centre = pixels_from_ideal(camera, ideal)
+    # Across: pixels along the minor axis; a slanted edge needs up to sqrt(2) more of them.
+    reach = int(np.ceil(half_width.max() * np.sqrt(2.0))) + 1
+    offsets = np.arange(-reach, reach + 1)
+    px = np.rint(centre)[:, :, None, :] + np.zeros((1, 1, offsets.size, 1))
+    sideways = np.where(major[:, None, None, None] == 1, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    px = px + offsets[None, None, :, None] * sideways
+    # Ideal distance of a pixel by first order about its row's centre: the band is narrow.
+    f = focal_px(camera)
+    inverse_jacobian = np.linalg.inv(f[:, None] * distort_jacobian(camera, ideal / f) / f)
+    step = np.einsum("ekij,ekpj->ekpi", inverse_jacobian, px - centre[:, :, None, :])
+    d = np.einsum("ekpi,ei->ekp", step, normal)
+    u = (s[:, :, None] + np.einsum("ekpi,ei->ekp", step, direction)) / half_length[:, None, None]
+    height, width = image.shape
+    inside = (px[..., 0] >= 0) & (px[..., 0] < width) & (px[..., 1] >= 0) & (px[..., 1] < height)
+    ix = np.clip(px[..., 0], 0, width - 1).astype(np.intp)
+    iy = np.clip(px[..., 1], 0, height - 1).astype(np.intp)
+    used = inside & fresh[:, :, None] & (np.abs(d) <= half_width[:, None, None])
+    return _compact(_Band(d.reshape(n, -1), u.reshape(n, -1), image[iy, ix].reshape(n, -1), used.reshape(n, -1)))
+
+
+def _compact(band: _Band) -> _Band:
+    """The same band with as few unused pixels as the edge with the most allows."""
+    most = max(int(band.used.sum(axis=1).max()), 1)
+    order = np.argsort(~band.used, axis=1, kind="stable")[:, :most]
+    d, u, grey, used = (np.take_along_axis(a, order, axis=1) for a in (band.d, band.u, band.grey, band.used))
+    return _Band(d, u, grey.astype(np.float64), used)
+
+
+def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Grey levels (n, p) of parameters (n, 8) = (o, m, log s, b0, b1, w0, w1, g), and their Jacobian (n, p, 8)."""
+    u = band.u
+    blur = np.exp(x[:, 2])[:, None]
+    fall = x[:, 7:8]
+    e = band.d - x[:, :1] - x[:, 1:2] * u
+    t = e / blur
+    phi = np.exp(-0.5 * t * t) * (1.0 / np.sqrt(2.0 * np.pi))
+    big_phi = ndtr(t)
+    light = 1.0 + fall * e
+    # Shares of the two levels: they add up to the light that falls on the pixel.
+    high = light * big_phi + fall * blur * phi
+    low = light - high
+    dark = x[:, 3:4] + x[:, 4:5] * u
+    step = x[:, 5:6] + x[:, 6:7] * u - dark
+    jacobian = np.empty((*u.shape, PARAMETERS))
+    # d high / d e = fall Phi + light phi / s - fall t phi;  d high / d log s = -phi t light + fall s phi (1 + t^2)
+    by_e = fall * dark + step * (fall * big_phi + phi * (light / blur - fall * t))
+    jacobian[..., 0] = -by_e
+    jacobian[..., 1] = -by_e * u
+    jacobian[..., 2] = step * phi * (fall * blur * (1.0 + t * t) - light * t)
+    jacobian[..., 3] = low
+    jacobian[..., 4] = low * u
+    jacobian[..., 5] = high
+    jacobian[..., 6] = high * u
+    jacobian[..., 7] = e * dark + step * (e * big_phi + blur * phi)
+    return dark * light + step * high, jacobian
+
+
+def _fit_band(
+    band: _Band, start: FloatArray, iterations: int, tolerance_px: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(parameters (n, 8), inverse normal matrix (n, 8, 8), pixel noise sigma (n,)), by Levenberg-Marquardt."""
+    x = start.copy()
+    contrast = np.maximum(np.abs(x[:, 5] - x[:, 3]), MIN_CONTRAST)
+    # Priors: inverse variances about the start.
+    prior = np.zeros_like(x)
+    prior[:, 2] = LOG_BLUR_SIGMA**-2
+    prior[:, 4] = prior[:, 6] = (LEVEL_SLOPE_SIGMA * contrast) ** -2.0
+    prior[:, 7] = FALL_OFF_SIGMA**-2
+    centre = np.where(np.arange(PARAMETERS) == 2, x, 0.0)
+    diagonal = np.arange(PARAMETERS)
+
+    weight = band.used.astype(np.float64)
+    sigma = 0.1 * contrast
+    damping = np.full(len(x), 1e-3)
+    grey, jacobian = _step_model(band, x)
+    residual = band.grey - grey
+    cost = np.full(len(x), np.inf)
+    for iteration in range(iterations):
+        if iteration in (0, REWEIGH_AT, iterations - 2):
+            if iteration > 0:
+                # Pixels that do not belong (a speck, a glint) lose their say.
+                sigma = _spread(residual, np.minimum(weight, 9.0 * sigma[:, None] ** 2 / (residual**2 + 1e-12)), weight)
+                weight = band.used / (1.0 + (residual / (4.0 * sigma[:, None])) ** 4)
+            cost = np.sum(weight * residual**2, axis=1) / sigma**2 + np.sum(prior * (x - centre) ** 2, axis=1)
+        jw = jacobian * (weight / sigma[:, None] ** 2)[..., None]
+        normal = np.swapaxes(jw, 1, 2) @ jacobian
+        normal[:, diagonal, diagonal] += prior
+        gradient = (residual[:, None, :] @ jw)[:, 0] - prior * (x - centre)
+        damped = normal.copy()
+        damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        damped[:, diagonal, diagonal] += 1e-9
+        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        step[:, 2] = np.clip(step[:, 2], -0.5, 0.5)
+        y = x + step
+        y[:, 2] = np.clip(y[:, 2], np.log(0.2), np.log(2.0 * MAX_BLUR_PX))
+        new_grey, new_jacobian = _step_model(band, y)
+        new_residual = band.grey - new_grey
+        new_cost = np.sum(weight * new_residual**2, axis=1) / sigma**2 + np.sum(prior * (y - centre) ** 2, axis=1)
+        better = new_cost <= cost
+        damping = np.where(better, damping * 0.1, damping * 10.0)
+        x = np.where(better[:, None], y, x)
+        cost = np.where(better, new_cost, cost)
+        residual = np.where(better[:, None], new_residual, residual)
+        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
+        if iteration > REWEIGH_AT and np.abs(step[:, :2]).max() < tolerance_px:
+            break
+    sigma = _spread(residual, weight, weight)
+    jw = jacobian * (weight / sigma[:, None] ** 2)[..., None]
+    normal = np.swapaxes(jw, 1, 2) @ jacobian
+    normal[:, diagonal, diagonal] += prior + 1e-9
+    return x, np.linalg.inv(normal), sigma
+
+
+def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> FloatArray:
+    """Standard deviation of the pixels about their model, at least that of rounding to whole grey levels."""
+    dof = np.maximum(counted.sum(axis=1) - PARAMETERS, 1.0)
+    return np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3)
+
+
+def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> FloatArray:
+    """Levels from the outer thirds of the band, no offset, a wide blur."""
+    x = np.zeros((len(band.d), PARAMETERS))
+    x[:, 2] = np.log(blur_px)
+    for k, side in ((3, -1.0), (5, 1.0)):
+        share = band.used & (side * band.d > 0.5 * half_width[:, None])
+        x[:, k] = np.sum(share * band.grey, axis=1) / np.maximum(share.sum(axis=1), 1)
+    return x
+
+
+def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray) -> EdgeFit:
+    """Find the edges near starting segments, dark on the right hand of their direction as drawn (y down).
+
+    Args:
+        image: (h, w) uint8.
+        start, end: (n, 2) ideal px, within about a third of ``cell_px`` (and some 4 px) of the true corners.
+        cell_px: (n,) width of the dark band beside the edge: what may be looked at on either side.
+    """
+    # First pass: a wide look, to get onto the edge.
+    half_width = np.clip(0.55 * cell_px, 2.0, 8.0)
+    length = np.linalg.norm(end - start, axis=1)
+    trim = np.clip(0.12 * length, 2.0, 12.0)
+    band = _band(camera, image, start, end, half_width, trim, 40)
+    guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 2.5))
+    x, _, _ = _fit_band(band, guess, 10, 0.02)
+    near = (np.abs(x[:, 0]) + np.abs(x[:, 1]) < 1.2 * half_width) & (x[:, 5] - x[:, 3] > MIN_CONTRAST)
+    x[~near, :3] = guess[~near, :3]
+
+    # Second pass: about the line found, as wide as its blur asks for.
+    _, _, normal, _ = segment_frames(start, end)
+    start2 = start + (x[:, 0] - x[:, 1])[:, None] * normal
+    end2 = end + (x[:, 0] + x[:, 1])[:, None] * normal
+    blur = np.exp(x[:, 2])
+    half_width2 = np.clip(3.5 * blur + 1.5, 2.0, np.maximum(np.minimum(0.7 * cell_px, 14.0), 2.0))
+    trim2 = np.clip(3.0 * blur + 1.0, 2.0, 0.25 * length)
+    band = _band(camera, image, start2, end2, half_width2, trim2, MAX_ROWS)
+    x[:, [0, 1, 7]] = 0.0
+    x[:, 2] = np.log(np.clip(blur, 0.4, MAX_BLUR_PX))
+    x, inverse_normal, sigma = _fit_band(band, x, 8, 1e-3)
+
+    # Back to the starting segments' frame: both frames differ by the small turn of the first pass.
+    middle, direction, _, half_length = segment_frames(start, end)
+    _, _, normal2, _ = segment_frames(start2, end2)
+    ends = np.stack([start2 + (x[:, 0] - x[:, 1])[:, None] * normal2, end2 + (x[:, 0] + x[:, 1])[:, None] * normal2], 1)
+    relative = ends - middle[:, None]
+    place = np.einsum("eki,ei->ek", relative, direction) / half_length[:, None]
+    height = np.einsum("eki,ei->ek", relative, normal)
+    slope = (height[:, 1] - height[:, 0]) / (place[:, 1] - place[:, 0])
+    line = np.stack([height[:, 0] - slope * place[:, 0], slope], axis=1)
+
+    blur = np.exp(x[:, 2])
+    contrast = x[:, 5] - x[:, 3]
+    light = np.sum(band.used & (band.d > 0.5 * blur[:, None]), axis=1)
+    dark = np.sum(band.used & (band.d < -0.5 * blur[:, None]), axis=1)
+    first_u = np.min(np.where(band.used, band.u, 1.0), axis=1)
+    last_u = np.max(np.where(band.used, band.u, -1.0), axis=1)
+    good = (
+        near
+        & (contrast > np.maximum(MIN_CONTRAST, 4.0 * sigma))
+        & (blur < MAX_BLUR_PX)
+        & (np.minimum(light, dark) >= MIN_ROWS)
+        & (last_u - first_u > 0.5)
+        & (np.abs(x[:, 0]) + np.abs(x[:, 1]) < 1.5)
+    )
+    covariance = inverse_normal[:, :2, :2]
+    return EdgeFit(line=line, covariance=covariance, blur_px=blur, good=good)

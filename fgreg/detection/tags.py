@@ -1,0 +1,67 @@
+"""Tags of one dictionary in one image: OpenCV's ArUco detector, also at the image's border.
+
+Corner order is top left, top right, bottom right, bottom left *as OpenCV's generateImageMarker draws the tag*. For
+the AprilTag dictionaries OpenCV (4.x and 5.0) draws the official pictures turned by half a turn: with a tag printed
+from those pictures, ``marker_T_tag`` has to hold that half turn about z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fgreg.detection.corners import Image
+from fgreg.frames import FloatArray
+
+BORDER_PX = 12
+"""White frame put around the image, so that a tag whose quiet zone the image's edge cuts off is still a closed square."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundTag:
+    """A tag as the detector reports it: id and corners (4, 2) in pixels, good to a pixel or two."""
+
+    id: int
+    corners_px: FloatArray
+
+
+def dictionary_named(name: str) -> cv2.aruco.Dictionary:
+    """The OpenCV dictionary of that name, e.g. ``DICT_4X4_50`` or ``DICT_APRILTAG_36h11``.
+
+    Raises:
+        ValueError: no such dictionary.
+    """
+    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if not isinstance(number, int):
+        raise ValueError(f"{name} is not an OpenCV dictionary, expected e.g. DICT_4X4_50 or DICT_APRILTAG_36h11")
+    return cv2.aruco.getPredefinedDictionary(number)
+
+
+def tag_cells(name: str) -> int:
+    """Cells along a tag's side, black border of one cell included."""
+    return int(dictionary_named(name).markerSize) + 2
+
+
+def detector_parameters() -> cv2.aruco.DetectorParameters:
+    """Tuned for tags from about 15 px to most of the image, in light or dark surroundings."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minDistanceToBorder = 0
+    parameters.minMarkerPerimeterRate = 0.02
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    return parameters
+
+
+def find_tags(image: Image, dictionary: str) -> list[FoundTag]:
+    """All tags of a dictionary in a grey image (h, w); one id may come several times."""
+    padded = cv2.copyMakeBorder(image, BORDER_PX, BORDER_PX, BORDER_PX, BORDER_PX, cv2.BORDER_CONSTANT, value=255)
+    detector = cv2.aruco.ArucoDetector(dictionary_named(dictionary), detector_parameters())
+    corners, ids, _ = detector.detectMarkers(padded)
+    if ids is None:
+        return []
+    # ids: (n,) in OpenCV 5, (n, 1) in 4.
+    return [
+        FoundTag(int(tag_id), np.asarray(c, dtype=np.float64).reshape(4, 2) - BORDER_PX)
+        for tag_id, c in zip(np.asarray(ids).ravel(), corners, strict=True)
+    ]
