@@ -1,0 +1,177 @@
+"""What to simulate: everything that shapes a simulated session, in one frozen record."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from fgreg.frames import FloatArray, as_float_array
+from fgreg.models import (
+    BoardModel,
+    CameraModel,
+    ChannelModel,
+    CharucoModel,
+    MarkerModel,
+    NoiseModel,
+    ProbeModel,
+    SensitivityModel,
+    StageModel,
+    StereoRig,
+    TagModel,
+)
+from fgreg.simulation.acoustics import Elevation, Pulse
+from fgreg.simulation.render import Optics
+
+
+class Sweep(StrEnum):
+    """How the stage finds a PM.
+
+    ``window``: anywhere the PM is heard, uniformly, direction unknown (``sweep`` 0). ``alternating``: stepped from one
+    limit to the first angle that hears it, every other PM from the other limit. ``one_way``: always from the lower.
+    """
+
+    WINDOW = "window"
+    ALTERNATING = "alternating"
+    ONE_WAY = "one-way"
+
+
+def default_probe(channels: ChannelModel | None = None) -> ProbeModel:
+    """128 elements at 0.43 mm on a radius of 10 mm, window +-6 deg at every depth, known to 0.3 deg."""
+    sensitivity = SensitivityModel(
+        as_float_array([20.0, 30.0, 45.0]), as_float_array(np.radians([6.0, 6.0, 6.0])), math.radians(0.3)
+    )
+    return ProbeModel(128, 0.43, False, 10.0, 1540.0, sensitivity, channels)
+
+
+def default_stage() -> StageModel:
+    """Steps of 2 deg between -60 and 60 deg."""
+    return StageModel(math.radians(2.0), (math.radians(-60.0), math.radians(60.0)))
+
+
+def default_rig(width_px: int = 1280) -> StereoRig:
+    """A 16:9 stereo endoscope of 74 deg across with 5.2 mm between the lenses, which converge by 2.5 deg."""
+    s = width_px / 1280.0
+    height_px = round(width_px * 9 / 16)
+
+    def camera(f: float, cx: float, cy: float, distortion: list[float]) -> CameraModel:
+        matrix = [[f * s, 0.0, cx * s], [0.0, (f + 1.2) * s, cy * s], [0.0, 0.0, 1.0]]
+        return CameraModel((width_px, height_px), as_float_array(matrix), as_float_array(distortion))
+
+    turn = math.radians(2.5)
+    c, n = math.cos(turn), math.sin(turn)
+    right_T_left = [[c, 0.0, n, -5.19], [0.0, 1.0, 0.0, 0.06], [-n, 0.0, c, 0.11], [0.0, 0.0, 0.0, 1.0]]
+    return StereoRig(
+        camera(850.0, 645.3, 356.8, [-0.112, 0.064, 0.0006, -0.0004, 0.0]),
+        camera(853.5, 631.9, 361.4, [-0.118, 0.071, -0.0003, 0.0005, 0.0]),
+        as_float_array(right_T_left),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SimulationConfig:
+    """Everything that shapes a simulated session; angles rad, lengths mm. ``dataclasses.replace`` makes variants.
+
+    Recorded:
+        name: of the session.
+        frames: raw frames (images and channel data) instead of poses and (x, range).
+        aims, pairs: calibration shots and PMs of the registration, over all epochs.
+        looks_per_pm: looks at each PM, at different stage angles where it is heard; one ``pair`` event each.
+        amplitudes: record the amplitude of each look, and the curve in the session.
+        tracks_heard, tracks_silent: track events with one look at their PM, and without (``scan_deg`` only).
+        track_looks: looks of a track event that is heard.
+        sweep: how the stage finds PMs.
+        epochs: camera epochs; the camera moves between them.
+        camera_move_known: the move is recorded, with errors of the two sigmas (rotation, translation) and covariance.
+        initial_laser: record a rough ``initial.marker_T_laser`` (3 deg, 2 mm off per axis).
+
+    Errors that the session does not declare:
+        junk_pairs: PMs whose looks are of something else, anywhere in the image.
+        reversed_stage, reversed_elements: wired the other way round than the session says.
+        sound_speed_true_m_s: the tissue's; the probe's where None.
+        window_edge_rad: error of the known half width; drawn from ``edge_sigma`` where None.
+        edge_jitter_rad: a soft edge: the half width varies by this (sigma) from look to look.
+        marker_bias_mm: the constant offset of marker poses; drawn from ``noise.marker_bias_mm`` where None.
+        declared_noise: the session's ``noise`` block; the true one (``noise``) where None.
+
+    Geometry:
+        pm_x_mm, pm_angle_rad, pm_depth_mm: half extent along the axis and in stage angle, span of depths from the
+            element face of the tissue surface.
+        collinear: all PMs on one line, 0: along the probe's axis.
+        lambda_mm, aim_lambda_mm: span of distances from the fibre's tip to the spot.
+        beam_tilt_rad: beams spread by this to either side, about two axes (0: parallel beams).
+        beam_roll_rad, aim_roll_rad: the marker is rolled about the beam by this to either side.
+        laser_offset_mm, laser_tilt_rad: spans of the beam's distance from the marker's origin and of its angle to the
+            marker's -z (the printed face looks back at the camera).
+        marker_T_laser: fixes the calibration, else drawn.
+        camera_distance_mm: span, to the middle of the tissue. board_distance_mm: span of the boards' distances.
+        marker_distance_mm, tag_tilt_rad: shots outside this span, or with the tag's face turned farther away than
+            this, or with the tag not wholly in both images, are not taken.
+    """
+
+    name: str = "simulated"
+    frames: bool = False
+    aims: int = 12
+    pairs: int = 10
+    looks_per_pm: int = 1
+    amplitudes: bool = False
+    amplitude_noise: float = 0.05
+    tracks_heard: int = 0
+    tracks_silent: int = 0
+    track_looks: int = 1
+    sweep: Sweep = Sweep.ALTERNATING
+    epochs: int = 1
+    camera_move_known: bool = False
+    camera_move_sigma: tuple[float, float] = (math.radians(0.3), 0.5)
+    initial_laser: bool = False
+
+    junk_pairs: int = 0
+    reversed_stage: bool = False
+    reversed_elements: bool = False
+    sound_speed_true_m_s: float | None = None
+    window_edge_rad: float | None = None
+    edge_jitter_rad: float = 0.0
+    marker_bias_mm: tuple[float, float, float] | None = None
+    noise: NoiseModel = field(default_factory=NoiseModel)
+    declared_noise: NoiseModel | None = None
+
+    pm_x_mm: float = 20.0
+    pm_angle_rad: float = math.radians(35.0)
+    pm_depth_mm: tuple[float, float] = (22.0, 42.0)
+    collinear: bool = False
+    lambda_mm: tuple[float, float] = (20.0, 60.0)
+    aim_lambda_mm: tuple[float, float] = (20.0, 60.0)
+    beam_tilt_rad: float = math.radians(20.0)
+    beam_roll_rad: float = math.radians(40.0)
+    aim_roll_rad: float = math.radians(60.0)
+    laser_offset_mm: tuple[float, float] = (5.0, 15.0)
+    laser_tilt_rad: tuple[float, float] = (math.radians(10.0), math.radians(25.0))
+    marker_T_laser: FloatArray | None = None
+    camera_distance_mm: tuple[float, float] = (110.0, 135.0)
+    board_distance_mm: tuple[float, float] = (105.0, 150.0)
+    marker_distance_mm: tuple[float, float] = (75.0, 160.0)
+    tag_tilt_rad: float = math.radians(50.0)
+
+    probe: ProbeModel = field(default_factory=default_probe)
+    stage: StageModel = field(default_factory=default_stage)
+    camera: StereoRig = field(default_factory=default_rig)
+    marker: MarkerModel = field(default_factory=lambda: MarkerModel("DICT_4X4_50", (TagModel(0, 25.0),)))
+    board: BoardModel = field(default_factory=lambda: BoardModel(9, 6, 9.0, CharucoModel("DICT_5X5_100", 6.5)))
+    optics: Optics = field(default_factory=Optics)
+    pulse: Pulse = field(default_factory=Pulse)
+    elevation: Elevation = field(default_factory=Elevation)
+    snr_db: float = 15.0
+    samples: int = 1200
+    targets_mm: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1 or self.looks_per_pm < 1 or self.track_looks < 1:
+            raise ValueError("epochs, looks_per_pm and track_looks have to be at least 1")
+        if min(self.aims, self.pairs, self.tracks_heard, self.tracks_silent) < 0:
+            raise ValueError("aims, pairs and tracks have to be 0 or more")
+        if not 0 <= self.junk_pairs <= self.pairs:
+            raise ValueError(f"junk_pairs is {self.junk_pairs}, expected 0 to {self.pairs}")
+        if self.frames and self.probe.channels is None:
+            raise ValueError("raw frames need probe.channels")

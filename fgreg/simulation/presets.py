@@ -1,0 +1,56 @@
+"""Ready-made configurations, by the name that the command line takes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fgreg.models import BoardModel, ChannelModel, CharucoModel, NoiseModel
+from fgreg.simulation.config import SimulationConfig, Sweep, default_probe, default_rig
+
+_CHANNELS = ChannelModel(sampling_mhz=40.0, t0_us=13.0, pulse_delay_us=0.4)
+
+PHANTOM = SimulationConfig(
+    name="phantom",
+    frames=True,
+    aims=14,
+    pairs=15,
+    tracks_heard=2,
+    tracks_silent=2,
+    noise=NoiseModel(aim_mm=(0.3, 0.3, 0.1)),
+    probe=default_probe(_CHANNELS),
+    samples=1160,
+)
+"""Raw frames: 14 aims at a ChArUco board, 15 PMs found by sweeps from either side, 4 tracks, 15 dB."""
+
+PAPER = SimulationConfig(
+    name="paper",
+    aims=12,
+    pairs=10,
+    tracks_heard=3,
+    tracks_silent=3,
+    sweep=Sweep.WINDOW,
+    noise=NoiseModel(marker_bias_mm=0.1),
+)
+"""Poses, with the published noise: marker bias 0.1 mm, sigmas 0.1, 0.1, 0.8 mm and 0.01 rad, aim 1 mm; window only."""
+
+FIRST_HIT = SimulationConfig(name="first-hit", aims=12, pairs=15, tracks_heard=2, tracks_silent=2)
+"""Poses; each PM found by stepping from alternating sides up to the first angle that hears it."""
+
+PRESETS: dict[str, SimulationConfig] = {
+    "phantom": PHANTOM,
+    "paper": PAPER,
+    "first-hit": FIRST_HIT,
+    "one-way": replace(FIRST_HIT, name="one-way", sweep=Sweep.ONE_WAY),
+    "camera-move": replace(FIRST_HIT, name="camera-move", pairs=24, epochs=2, tracks_heard=2, tracks_silent=2),
+    "many-looks": replace(PAPER, name="many-looks", looks_per_pm=4, amplitudes=True),
+    "raw-small": replace(
+        PHANTOM,
+        name="raw-small",
+        aims=5,
+        pairs=5,
+        tracks_heard=1,
+        tracks_silent=1,
+        camera=default_rig(800),
+        board=BoardModel(6, 4, 13.0, CharucoModel("DICT_4X4_100", 9.75)),
+    ),
+}

@@ -1,0 +1,301 @@
+"""A whole session from a configuration and a seed: what the files would hold, the truth, and frames on demand.
+
+Forward only: beams are drawn in space, PMs are where they end, the stage is turned until the probe hears them, and
+what is recorded is measured there, with noise as ``session.yaml``'s ``noise`` block describes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.frames import BoolArray, FloatArray, IntArray, exp_so3, inverse, make_transform
+from fgreg.simulation import sweeps
+from fgreg.simulation.config import SimulationConfig
+from fgreg.simulation.documents import degrees, rows, session_document
+from fgreg.simulation.pictures import LookPicture, ShotPicture
+from fgreg.simulation.scene import AimShots, Scene, Shots, draw_aim_shots, draw_pm_shots, draw_scene
+
+Frame = npt.NDArray[np.uint8] | npt.NDArray[np.int16]
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedSession:
+    """A session in memory.
+
+    Attributes:
+        config, seed: what it was made from.
+        session, events, truth: the contents of ``session.yaml``, ``events.jsonl`` and ``ground_truth.yaml``.
+        frames: by the name that events use; each is rendered when called, the same every time.
+        scene: the truth behind it.
+        true_camera_T_marker: true marker poses by index into ``events``.
+    """
+
+    config: SimulationConfig
+    seed: int
+    session: Document
+    events: list[Document]
+    truth: Document
+    frames: Mapping[str, Callable[[], Frame]]
+    scene: Scene
+    true_camera_T_marker: Mapping[int, FloatArray]
+
+
+def simulate(config: SimulationConfig, seed: int) -> SimulatedSession:
+    """One session. The same configuration and seed give the same session.
+
+    Geometry, observation noise, stage and frames draw from streams of their own: changing the noise leaves the
+    geometry as it was.
+
+    Raises:
+        ValueError: the configuration cannot be realised (no visible marker, a PM out of the stage's reach).
+    """
+    return _Recorder(config, seed).record()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Looks:
+    """What is recorded of looks at n PMs, all (n, looks); ``source_mm`` (n, looks, 3) is what was really heard."""
+
+    scan_deg: FloatArray
+    sweep: IntArray
+    x_mm: FloatArray
+    range_mm: FloatArray
+    amplitude: FloatArray
+    source_mm: FloatArray
+    scan_rad: FloatArray
+    half_width_rad: FloatArray
+
+
+class _Recorder:
+    """Collects the events of one session in the order in which they happen."""
+
+    def __init__(self, config: SimulationConfig, seed: int) -> None:
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(8)]
+        self.config, self.seed = config, seed
+        self.scene_rng, self.aim_rng, self.shot_rng, self.miss_rng = streams[:4]
+        self.marker_rng, self.stage_rng, self.look_rng, self.misc_rng = streams[4:]
+        self.events: list[Document] = []
+        self.frames: dict[str, Callable[[], Frame]] = {}
+        self.true_markers: dict[int, FloatArray] = {}
+        self.time_s = 0.0
+
+    def record(self) -> SimulatedSession:
+        config = self.config
+        self.scene = scene = draw_scene(config, self.scene_rng)
+        aims = draw_aim_shots(config, scene, self.aim_rng, self.miss_rng.standard_normal((config.aims, 3)))
+        kinds = _interleaved(config.tracks_heard, config.tracks_silent)
+        pair_epochs = np.arange(config.pairs) * config.epochs // max(config.pairs, 1)
+        track_epochs = np.arange(kinds.size) * config.epochs // max(kinds.size, 1)
+        shots = draw_pm_shots(config, scene, np.concatenate([pair_epochs, track_epochs]), self.shot_rng)
+        pms, tracks = _part(shots, slice(0, config.pairs)), _part(shots, slice(config.pairs, None))
+        junk = np.zeros(config.pairs, dtype=bool)
+        junk[self.misc_rng.permutation(config.pairs)[: config.junk_pairs]] = True
+        pm_looks = self._looks(pms.spot_mm, config.looks_per_pm, 1, junk)
+        track_looks = self._looks(tracks.spot_mm, config.track_looks, -1, np.zeros(kinds.size, dtype=bool))
+        idle_deg = np.degrees(self.misc_rng.uniform(-config.pm_angle_rad, config.pm_angle_rad, kinds.size))
+
+        self._aims(aims)
+        answers: list[Document] = []
+        pm_markers, track_markers = self._observed(pms), self._observed(tracks)
+        for epoch in range(config.epochs):
+            if epoch > 0:
+                self._camera_moved(scene.camera_moves[epoch - 1])
+            for i in np.flatnonzero(pair_epochs == epoch):
+                self._pair(int(i), epoch, pms, pm_markers, pm_looks)
+            for j in np.flatnonzero(track_epochs == epoch):
+                looks = track_looks if kinds[j] else None
+                self._track(int(j), epoch, tracks, track_markers, looks, float(idle_deg[j]))
+                angle = sweeps.true_stage(config).device_from_scan(float(sweeps.plane_angle_rad(tracks.spot_mm[j])))
+                answers.append({"t": self.events[-1]["t"], "stage_deg": degrees(angle)})
+        return SimulatedSession(
+            config,
+            self.seed,
+            session_document(config, self._rough_laser() if config.initial_laser else None),
+            self.events,
+            self._truth(pms, answers, junk),
+            self.frames,
+            scene,
+            self.true_markers,
+        )
+
+    def _truth(self, pms: Shots, answers: list[Document], junk: BoolArray) -> Document:
+        config, scene = self.config, self.scene
+        speed = config.probe.sound_speed_m_s
+        return {
+            "trus_T_camera": [rows(transform) for transform in scene.trus_T_camera],
+            "marker_T_laser": rows(scene.marker_T_laser),
+            "pms": {i: rows(spot) for i, spot in enumerate(pms.spot_mm)},
+            "tracks": answers,
+            "x_seed": self.seed,
+            "x_window_edge_deg": degrees(scene.window_edge_rad),
+            "x_marker_bias_mm": [0.0, 0.0, 0.0] if config.frames else rows(scene.marker_bias_mm),
+            "x_sound_speed_ratio": (config.sound_speed_true_m_s or speed) / speed,
+            "x_reversed_stage": config.reversed_stage,
+            "x_reversed_elements": config.reversed_elements,
+            "x_junk_pms": [int(i) for i in np.flatnonzero(junk)],
+            "x_lambda_mm": rows(pms.lambda_mm),
+        }
+
+    def _looks(self, trus_p_pm_mm: FloatArray, looks: int, first_sign: int, junk: BoolArray) -> _Looks:
+        config, rng, noise = self.config, self.look_rng, self.config.noise
+        n = trus_p_pm_mm.shape[0]
+        heard = sweeps.look(config, trus_p_pm_mm, looks, first_sign, self.scene.window_edge_rad, self.stage_rng)
+        device = heard.device_rad + noise.scan_rad * self.stage_rng.standard_normal((n, looks))
+        source = np.repeat(trus_p_pm_mm[:, None], looks, axis=1)
+        junk_x: FloatArray = rng.uniform(-config.pm_x_mm, config.pm_x_mm, (n, 1))
+        junk_rho: FloatArray = config.probe.radius_mm + rng.uniform(*config.pm_depth_mm, (n, 1))
+        strength = np.exp(rng.uniform(-0.7, 0.7, n))[:, None]
+        if junk.any():
+            scan = heard.scan_rad[junk]
+            rho = junk_rho[junk]
+            x = np.broadcast_to(junk_x[junk], scan.shape)
+            source[junk] = np.stack([x, rho * np.sin(scan), rho * np.cos(scan)], axis=-1)
+        speed = config.probe.sound_speed_m_s
+        slowness = speed / (config.sound_speed_true_m_s or speed)
+        distance = sweeps.range_mm(source, heard.scan_rad, config.probe.radius_mm)
+        mirror = -1.0 if config.reversed_elements else 1.0
+        offset = sweeps.plane_angle_rad(source) - heard.scan_rad
+        amplitude = strength * config.elevation.amplitude(offset, heard.half_width_rad)
+        return _Looks(
+            np.degrees(device),
+            heard.device_sweep,
+            mirror * source[..., 0] + noise.lateral_mm * rng.standard_normal((n, looks)),
+            distance * slowness + noise.range_mm * rng.standard_normal((n, looks)),
+            amplitude * np.exp(config.amplitude_noise * rng.standard_normal((n, looks))),
+            source,
+            heard.scan_rad,
+            heard.half_width_rad,
+        )
+
+    def _observed(self, shots: Shots) -> list[Document]:
+        """Marker entries with a pose each: [Exp(w) R, t + n + bias], w and n along the camera's axes."""
+        if self.config.frames:
+            return [{} for _ in shots.lambda_mm]
+        noise, n = self.config.noise, shots.lambda_mm.size
+        w = self.marker_rng.standard_normal((n, 3)) * noise.marker_rotation_rad
+        shift = self.marker_rng.standard_normal((n, 3)) * noise.marker_translation_mm + self.scene.marker_bias_mm
+        turned = exp_so3(w) @ shots.camera_T_marker[:, :3, :3]
+        poses = make_transform(turned, shots.camera_T_marker[:, :3, 3] + shift)
+        return [{"camera_T_marker": matrix} for matrix in rows(poses)]
+
+    def _aims(self, aims: AimShots) -> None:
+        markers = self._observed(aims.shots)
+        spots = rows(aims.camera_p_spot_mm)
+        for i, marker in enumerate(markers):
+            if self.config.frames:
+                pose = aims.shots.camera_T_marker[i]
+                marker = self._pictures(f"aim-{i:02d}", pose, aims.shots.spot_mm[i], aims.camera_T_board[i], None)
+                event = {"type": "aim", "t": self._now(), "marker": marker, "corner": aims.corner[i].tolist()}
+            else:
+                event = {"type": "aim", "t": self._now(), "marker": marker, "camera_p_spot_mm": spots[i]}
+            self._add(event, aims.shots.camera_T_marker[i])
+
+    def _pair(self, i: int, epoch: int, pms: Shots, markers: list[Document], looks: _Looks) -> None:
+        name = f"pm-{i:02d}"
+        marker = self._pm_marker(name, i, epoch, pms, markers)
+        for k in range(looks.scan_deg.shape[1]):
+            trus = self._look(name if k == 0 else f"{name}-look-{k}", looks, i, k)
+            event = {"type": "pair", "t": self._now(), "pm": i, "marker": marker, "trus": trus}
+            self._add(event, pms.camera_T_marker[i])
+
+    def _track(
+        self, j: int, epoch: int, tracks: Shots, markers: list[Document], looks: _Looks | None, idle_deg: float
+    ) -> None:
+        name = f"track-{j:02d}"
+        event = {"type": "track", "t": self._now(), "marker": self._pm_marker(name, j, epoch, tracks, markers)}
+        if looks is None:
+            event["scan_deg"] = round(idle_deg, 4)
+        else:
+            heard = [self._look(f"{name}-look-{k}", looks, j, k) for k in range(looks.scan_deg.shape[1])]
+            event |= {"trus": heard[0]} if len(heard) == 1 else {"looks": heard}
+        self._add(event, tracks.camera_T_marker[j])
+
+    def _pm_marker(self, name: str, i: int, epoch: int, shots: Shots, markers: list[Document]) -> Document:
+        if not self.config.frames:
+            return markers[i]
+        camera_T_trus = inverse(self.scene.trus_T_camera[epoch])
+        spot = camera_T_trus[:3, :3] @ shots.spot_mm[i] + camera_T_trus[:3, 3]
+        return self._pictures(name, shots.camera_T_marker[i], spot, None, camera_T_trus)
+
+    def _pictures(
+        self,
+        name: str,
+        camera_T_marker: FloatArray,
+        camera_p_spot_mm: FloatArray,
+        camera_T_board: FloatArray | None,
+        camera_T_trus: FloatArray | None,
+    ) -> Document:
+        picture = ShotPicture(
+            camera_T_marker,
+            camera_T_marker @ self.scene.marker_T_laser,
+            camera_p_spot_mm,
+            self.seed,
+            (self.seed, len(self.frames)),
+            camera_T_board,
+            camera_T_trus,
+        )
+        sides = ["left"] if self.config.camera.right is None else ["left", "right"]
+        marker = {side: f"frames/{name}-{side}.png" for side in sides}
+        for side, frame in marker.items():
+            self.frames[frame] = partial(picture.render, self.config, side == "right")
+        return marker
+
+    def _look(self, name: str, looks: _Looks, i: int, k: int) -> Document:
+        trus: Document = {"scan_deg": round(float(looks.scan_deg[i, k]), 4)}
+        if self.config.frames:
+            picture = LookPicture(
+                looks.source_mm[i, k],
+                float(looks.scan_rad[i, k]),
+                float(looks.half_width_rad[i, k]),
+                (self.seed, len(self.frames), 2),
+            )
+            trus["frame"] = f"frames/{name}.npy"
+            self.frames[trus["frame"]] = partial(picture.record, self.config)
+        else:
+            trus["x_mm"] = round(float(looks.x_mm[i, k]), 5)
+            trus["range_mm"] = round(float(looks.range_mm[i, k]), 5)
+            if self.config.amplitudes:
+                trus["amplitude"] = round(float(looks.amplitude[i, k]), 5)
+        if looks.sweep[i, k] != 0:
+            trus["sweep"] = int(looks.sweep[i, k])
+        return trus
+
+    def _camera_moved(self, move: FloatArray) -> None:
+        event: Document = {"type": "camera_moved", "t": self._now()}
+        if self.config.camera_move_known:
+            sigma = np.repeat(self.config.camera_move_sigma, 3)
+            xi = sigma * self.misc_rng.standard_normal(6)
+            # Right perturbation; for errors this small Expmap's translation is xi's to second order.
+            event["camera_new_T_camera_old"] = rows(move @ make_transform(exp_so3(xi[:3]), xi[3:]))
+            event["covariance"] = np.diag(sigma**2).tolist()
+        self._add(event, None)
+
+    def _rough_laser(self) -> FloatArray:
+        error = self.misc_rng.standard_normal(6) * np.repeat([np.radians(3.0), 2.0], 3)
+        return self.scene.marker_T_laser @ make_transform(exp_so3(error[:3]), error[3:])
+
+    def _now(self) -> float:
+        self.time_s += 2.0 + 3.0 * float(self.misc_rng.random())
+        return round(self.time_s, 2)
+
+    def _add(self, event: Document, camera_T_marker: FloatArray | None) -> None:
+        if camera_T_marker is not None:
+            self.true_markers[len(self.events)] = camera_T_marker
+        self.events.append(event)
+
+
+def _part(shots: Shots, which: slice) -> Shots:
+    return Shots(shots.camera_T_marker[which], shots.lambda_mm[which], shots.spot_mm[which])
+
+
+def _interleaved(heard: int, silent: int) -> BoolArray:
+    """``heard`` times True and ``silent`` times False, evenly mixed."""
+    order = [((i + 0.5) / heard, True) for i in range(heard)] + [((i + 0.6) / silent, False) for i in range(silent)]
+    return np.array([kind for _, kind in sorted(order)], dtype=bool)

@@ -1,0 +1,97 @@
+"""Writes a simulated session as the folder that the format's text describes."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from fgreg.errors import InputError
+from fgreg.simulation.simulate import Frame, SimulatedSession
+
+Progress = Callable[[int, int], None]
+"""Called with the number of frames written so far and in all."""
+
+
+def write_session(
+    simulated: SimulatedSession, folder: Path, overwrite: bool = False, progress: Progress | None = None
+) -> None:
+    """Writes ``session.yaml``, ``events.jsonl``, ``frames/`` and ``ground_truth.yaml``.
+
+    The folder is complete or not there: all is written beside it under another name first. The bytes depend on the
+    configuration and the seed only.
+
+    Args:
+        folder: made where it does not exist.
+        overwrite: replace a folder that holds a session; without, only an empty folder will do.
+        progress: called after each frame.
+
+    Raises:
+        InputError: the folder is not empty and ``overwrite`` is not set, or it holds something else than a session.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not overwrite:
+            raise InputError(str(folder), "a folder that is not empty", "a new or empty folder, or --overwrite")
+        if not (folder / "session.yaml").is_file():
+            raise InputError(str(folder), "no session to overwrite", "a folder with a session.yaml")
+    partial = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        (partial / "session.yaml").write_text(_yaml(simulated.session), encoding="utf-8")
+        lines = [json.dumps(event, separators=(", ", ": ")) + "\n" for event in simulated.events]
+        (partial / "events.jsonl").write_text("".join(lines), encoding="utf-8")
+        (partial / "ground_truth.yaml").write_text(_yaml(simulated.truth), encoding="utf-8")
+        for done, (name, frame) in enumerate(simulated.frames.items(), start=1):
+            path = partial / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(encoded(name, frame()))
+            if progress is not None:
+                progress(done, len(simulated.frames))
+        if folder.exists():
+            shutil.rmtree(folder)
+        partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def encoded(name: str, frame: Frame) -> bytes:
+    """The bytes of a frame's file: PNG for images, NPY for channel data.
+
+    Raises:
+        ValueError: neither by its name.
+    """
+    if name.endswith(".png"):
+        done, data = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 7])
+        if not done:
+            raise ValueError(f"{name} could not be encoded")
+        return data.tobytes()
+    if name.endswith(".npy"):
+        buffer = io.BytesIO()
+        np.save(buffer, np.ascontiguousarray(frame), allow_pickle=False)
+        return buffer.getvalue()
+    raise ValueError(f"{name} is neither .png nor .npy")
+
+
+class _Dumper(yaml.SafeDumper):
+    """Mappings in blocks, lists of numbers on one line."""
+
+
+def _list(dumper: yaml.SafeDumper, values: list[Any]) -> yaml.nodes.Node:
+    flat = not any(isinstance(value, dict) for value in values)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=flat)
+
+
+_Dumper.add_representer(list, _list)
+
+
+def _yaml(document: dict[str, Any]) -> str:
+    return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=120))
