@@ -2,7 +2,7 @@
 
 A *beam* is one marker observation of one PM (looks of one PM that share an observation share the beam), a *look* one
 hearing of a PM. Marker covariances are turned to the camera's axes about the marker's origin, where the reduced
-problem perturbs them: rotation vector w and shift n, ``camera_R = Exp(w) observed_R``, ``camera_t = observed_t + n``.
+problem perturbs the pose by a twist (w, n): the right tangent of GTSAM's Pose3, in other axes.
 """
 
 from __future__ import annotations

@@ -8,17 +8,16 @@ sampling, Cappe et al., 2004). Deterministic by seed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgreg.estimate import PredictedTre
-from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, transform_points
-from fgreg.packing import PackedProblem
+from fgreg.frames import FloatArray, exp_so3, inverse, transform_points
+from fgreg.packing import Columns, PackedProblem
 from fgreg.reduced import log_marginal, refine
-from fgreg.reduced_blocks import PrivateState
 from fgreg.reduced_solver import Optimum
-from fgreg.shared_state import SharedState, pose_difference
+from fgreg.shared_state import SharedState
 
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposal: heavier tails than the posterior's, or rare samples would carry all the weight."""
@@ -30,6 +29,7 @@ class Posterior:
     """Weighted samples of the shared variables.
 
     Attributes:
+        columns: where each shared variable sits in ``step``.
         mean: the estimate they are centred on (one hypothesis).
         step: (S, D) right-tangent deviations of the samples from it.
         weight: (S,) sums to 1.
@@ -37,6 +37,7 @@ class Posterior:
         covariance: (D, D) second moment about the estimate.
     """
 
+    columns: Columns
     mean: SharedState
     step: FloatArray
     weight: FloatArray
@@ -53,19 +54,13 @@ def _log_density(problem: PackedProblem, optimum: Optimum, step: FloatArray) -> 
     state = _repeat(optimum.state, len(step)).retract(step, problem.columns)
     at = optimum.evaluation
     points = at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0]
-    private = PrivateState(
-        points,
-        np.broadcast_to(at.private.beam_error, (len(step), *at.private.beam_error.shape[1:])),
-        np.broadcast_to(at.private.aim_error, (len(step), *at.private.aim_error.shape[1:])),
-    )
+    private = replace(at.private.take(np.zeros(len(step), dtype=np.int64)), trus_p_pm=points)
     _, private = refine(problem, state, private)
     log_density = log_marginal(problem, state, private)
     return np.where(np.isfinite(log_density), log_density, -np.inf)
 
 
-def _student(
-    rng: np.random.Generator, mean: FloatArray, root: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
+def _student(rng: np.random.Generator, mean: FloatArray, root: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Samples (S, D) of a multivariate Student density, and their log density up to a constant."""
     size = len(mean)
     normal = rng.standard_normal((count, size))
@@ -76,7 +71,9 @@ def _student(
     return mean + standard @ root.T, log_density - np.log(np.diag(root)).sum()
 
 
-def sample_posterior(problem: PackedProblem, optimum: Optimum, covariance: FloatArray, count: int, seed: int) -> Posterior:
+def sample_posterior(
+    problem: PackedProblem, optimum: Optimum, covariance: FloatArray, count: int, seed: int
+) -> Posterior:
     """Weighted samples of the posterior around an optimum of one hypothesis.
 
     Args:
@@ -88,7 +85,7 @@ def sample_posterior(problem: PackedProblem, optimum: Optimum, covariance: Float
     """
     rng = np.random.default_rng(seed)
     mean = np.zeros(len(covariance))
-    root = np.linalg.cholesky(covariance)
+    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     for draws in (count // 2, count):
         step, log_proposal = _student(rng, mean, root, draws)
         log_weight = _log_density(problem, optimum, step) - log_proposal
@@ -101,11 +98,41 @@ def sample_posterior(problem: PackedProblem, optimum: Optimum, covariance: Float
         trust = effective / (effective + 2.0 * len(mean))
         mean = trust * centre
         moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * covariance
-        root = np.linalg.cholesky(moment)
+        root = np.asarray(np.linalg.cholesky(moment), dtype=np.float64)
     return Posterior(
+        columns=problem.columns,
         mean=optimum.state,
         step=step,
         weight=weight,
         effective=effective,
         covariance=np.asarray((step * weight[:, None]).T @ step),
+    )
+
+
+def weighted_quantile(values: FloatArray, weight: FloatArray, quantile: float) -> FloatArray:
+    """Quantile along the first axis of (S, n) values with weights (S,): (n,)."""
+    order = np.argsort(values, axis=0)
+    cumulative = np.cumsum(weight[order], axis=0)
+    row = np.minimum((cumulative < quantile).sum(axis=0), len(values) - 1)
+    return np.asarray(np.take_along_axis(np.take_along_axis(values, order, axis=0), row[None], axis=0)[0])
+
+
+def target_errors(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> FloatArray:
+    """(S, n) distances (mm) by which each sample moves the camera points that the estimate puts at the targets."""
+    estimate = posterior.mean.trus_T_camera(epoch)[0]
+    camera_p = transform_points(inverse(estimate), targets_mm)
+    twist = posterior.step[:, 6 * epoch : 6 * epoch + 6]
+    # A sample is estimate * (Exp(omega), v): in camera axes it moves p to Exp(omega) p + v.
+    moved = np.einsum("sij,nj->sni", exp_so3(twist[:, :3]), camera_p) + twist[:, None, 3:] - camera_p
+    return np.asarray(np.linalg.norm(moved, axis=-1))
+
+
+def predicted_tre(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> PredictedTre:
+    """Predicted target registration error of one epoch (definitions: :class:`fgreg.estimate.PredictedTre`)."""
+    error = target_errors(posterior, epoch, targets_mm)
+    quantiles = weighted_quantile(error, posterior.weight, QUANTILE)
+    return PredictedTre(
+        mean_mm=float(np.sqrt(posterior.weight @ error**2).mean()),
+        p95_mm=float(quantiles.mean()),
+        worst_mm=float(quantiles.max()),
     )

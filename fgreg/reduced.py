@@ -17,7 +17,7 @@ chi squares (twice the negative log of the density). Same optimum as fgreg.graph
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -112,8 +112,10 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
     point_covariance = inverse3(h_pp)
     point_step = -times(point_covariance, b_p)
 
-    aim = line_block(problem.aims, private.aim_error, state, problem.aim_spot_mm[None], None, None)
-    aim_covariance = aim.covariance + transposed(aim.across) @ problem.aim_spot_covariance @ aim.across
+    aim = line_block(problem.aims, private.aim_error, state, problem.aim_spot_mm + private.aim_shift, None, None)
+    aim = replace(aim, residual=aim.residual - times(transposed(aim.across), private.aim_shift))
+    aim_spread = problem.aim_spot_covariance @ aim.across
+    aim_covariance = aim.covariance + transposed(aim.across) @ aim_spread
     aim_weight = inverse2(aim_covariance)
     aim_weighted = times(aim_weight, aim.residual)
 
@@ -125,6 +127,7 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
     line_update = line.residual + times(transposed(line.across), point_step[:, problem.beam_pm])
     beam_error = -times(problem.beams.covariance @ transposed(line.marker_jacobian), times(line_weight, line_update))
     aim_error = -times(problem.aims.covariance @ transposed(aim.marker_jacobian), aim_weighted)
+    aim_shift = -times(aim_spread, aim_weighted)
     return _System(
         line=line,
         line_weight=line_weight,
@@ -137,7 +140,7 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
         point_covariance=point_covariance,
         point_step=point_step,
         cost=cost,
-        private=PrivateState(private.trus_p_pm + point_step, beam_error, aim_error),
+        private=PrivateState(private.trus_p_pm + point_step, beam_error, aim_error, aim_shift),
     )
 
 
@@ -162,6 +165,62 @@ def log_marginal(problem: PackedProblem, state: SharedState, private: PrivateSta
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _SharedDerivatives:
+    """Derivatives of all residuals by the shared variables (.., D), and how the PMs move with them (S, J, 3, D)."""
+
+    line: FloatArray
+    aim: FloatArray
+    h_ps: FloatArray
+    point_gain: FloatArray
+
+
+def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _System) -> _SharedDerivatives:
+    columns, size = problem.columns, problem.columns.size
+    count, pms = state.count, len(problem.pms)
+    line, look = system.line, system.look
+    by_shared = np.zeros((count, len(problem.beam_pm), 2, size))
+    pose = np.concatenate([line.to_camera @ hat(line.point_on_beam), -line.to_camera], axis=-1)
+    for epoch in range(columns.epochs):
+        mine = problem.beam_epoch == epoch
+        by_shared[:, mine, :, 6 * epoch : 6 * epoch + 6] = pose[:, mine]
+    aim_by_shared = np.zeros((count, len(problem.aims.rotation), 2, size))
+    for block, columns_of in ((line, by_shared), (system.aim, aim_by_shared)):
+        columns_of[..., columns.beam : columns.beam + 4] = beam_columns(block, state)
+        if columns.bias is not None:
+            columns_of[..., columns.bias : columns.bias + 3] = block.to_camera
+    h_ps = sum_by(line.across @ (system.line_weight @ by_shared), problem.beam_pm, pms)
+    h_ps = h_ps + sum_by(transposed(look.by_point) @ (problem.looks.weight @ look.by_shared), problem.look_pm, pms)
+    return _SharedDerivatives(by_shared, aim_by_shared, h_ps, -system.point_covariance @ h_ps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contributions:
+    """What each PM adds to the reduced problem at one hypothesis: cost (J,), gradient (J, D), hessian (J, D, D)."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+def pm_contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Contributions:
+    """The parts of :func:`evaluate` by PM, for a state of one hypothesis."""
+    pms = len(problem.pms)
+    system = _system(problem, state, private)
+    by = _shared_derivatives(problem, state, system)
+    line, look = system.line, system.look
+    line_t, look_t = transposed(system.line_weight @ by.line), transposed(problem.looks.weight @ look.by_shared)
+    hessian = sum_by(line_t @ by.line, problem.beam_pm, pms) + sum_by(look_t @ look.by_shared, problem.look_pm, pms)
+    hessian = hessian + transposed(by.h_ps) @ by.point_gain
+    gradient = sum_by(times(line_t, line.residual), problem.beam_pm, pms)
+    gradient = gradient + sum_by(times(look_t, look.residual), problem.look_pm, pms)
+    gradient = gradient + times(transposed(by.h_ps), system.point_step)
+    cost = sum_by(np.sum(line.residual * times(system.line_weight, line.residual), axis=-1), problem.beam_pm, pms)
+    look_cost = np.sum(look.residual * times(problem.looks.weight, look.residual), axis=-1)
+    cost = cost + sum_by(look_cost, problem.look_pm, pms) + np.sum(system.b_p * system.point_step, axis=-1)
+    return Contributions(cost[0], gradient[0], hessian[0])
+
+
 def evaluate(problem: PackedProblem, state: SharedState, private: PrivateState) -> Evaluation:
     """Cost, gradient and Gauss-Newton Hessian on the shared variables, private ones eliminated.
 
@@ -170,33 +229,17 @@ def evaluate(problem: PackedProblem, state: SharedState, private: PrivateState) 
         state: S hypotheses.
         private: where the private variables are linearised; refined once here (returned in ``private``).
     """
-    columns, size = problem.columns, problem.columns.size
-    count, pms = state.count, len(problem.pms)
     system = _system(problem, state, private)
+    by = _shared_derivatives(problem, state, system)
     line, look, aim = system.line, system.look, system.aim
-
-    by_shared = np.zeros((count, len(problem.beam_pm), 2, size))
-    pose = np.concatenate([line.to_camera @ hat(line.point_on_beam), -line.to_camera], axis=-1)
-    for epoch in range(columns.epochs):
-        mine = problem.beam_epoch == epoch
-        by_shared[:, mine, :, 6 * epoch : 6 * epoch + 6] = pose[:, mine]
-    aim_by_shared = np.zeros((count, len(problem.aims.rotation), 2, size))
-    for block, columns_of in ((line, by_shared), (aim, aim_by_shared)):
-        columns_of[..., columns.beam : columns.beam + 4] = beam_columns(block, state)
-        if columns.bias is not None:
-            columns_of[..., columns.bias : columns.bias + 3] = block.to_camera
-
-    weighted = system.line_weight @ by_shared
+    weighted = system.line_weight @ by.line
     look_weighted = problem.looks.weight @ look.by_shared
-    h_ps = sum_by(line.across @ weighted, problem.beam_pm, pms)
-    h_ps = h_ps + sum_by(transposed(look.by_point) @ look_weighted, problem.look_pm, pms)
-    point_gain = -system.point_covariance @ h_ps
-
-    hessian = _stacked(by_shared, weighted) + _stacked(look.by_shared, look_weighted) + _stacked(h_ps, point_gain)
-    hessian += _stacked(aim_by_shared, system.aim_weight @ aim_by_shared)
+    aim_weighted = system.aim_weight @ by.aim
+    hessian = _stacked(by.line, weighted) + _stacked(look.by_shared, look_weighted)
+    hessian += _stacked(by.h_ps, by.point_gain) + _stacked(by.aim, aim_weighted)
     gradient = _stacked(weighted, line.residual[..., None]) + _stacked(look_weighted, look.residual[..., None])
-    gradient += _stacked(h_ps, system.point_step[..., None])
-    gradient += _stacked(system.aim_weight @ aim_by_shared, aim.residual[..., None])
+    gradient += _stacked(by.h_ps, system.point_step[..., None])
+    gradient += _stacked(aim_weighted, aim.residual[..., None])
     gradient = gradient[..., 0]
     _add_priors(problem, state, gradient, hessian)
     return Evaluation(
@@ -204,7 +247,7 @@ def evaluate(problem: PackedProblem, state: SharedState, private: PrivateState) 
         gradient=gradient,
         hessian=hessian,
         private=system.private,
-        point_gain=point_gain,
+        point_gain=by.point_gain,
         point_covariance=system.point_covariance,
         line_residual=line.residual,
         line_covariance=line.covariance,

@@ -18,15 +18,20 @@ from fgreg.shared_state import SharedState
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrivateState:
-    """Estimates of the eliminated variables: PMs (S, J, 3) in TRUS mm, marker errors (w, n) of beams and of aims."""
+    """Estimates of the eliminated variables.
+
+    PMs (S, J, 3) in TRUS mm; marker errors (w, n) of beams (S, B, 6) and of aims (S, A, 6); what the aimed-at spots are
+    off their measured places, (S, A, 3) camera axes.
+    """
 
     trus_p_pm: FloatArray
     beam_error: FloatArray
     aim_error: FloatArray
+    aim_shift: FloatArray
 
     def take(self, index: Any) -> PrivateState:
         """The hypotheses at ``index`` (anything that indexes an array's first dimension)."""
-        return PrivateState(self.trus_p_pm[index], self.beam_error[index], self.aim_error[index])
+        return PrivateState(*(getattr(self, name)[index] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,10 +112,12 @@ def line_block(
     translation_mm: FloatArray | None,
 ) -> LineBlock:
     """Two residuals across the beam for points (S, n, 3), in TRUS (with rotation, translation) or camera axes."""
+    # The marker moves by Exp of a twist (w, n) about its observed origin: t + n + w x n / 2 to second order.
+    half_turn = 0.5 * hat(error[..., :3])
     marker_rotation = exp_so3(error[..., :3]) @ beams.rotation
     origin = times(marker_rotation, state.beam_origin()[:, None, :])
     direction = times(marker_rotation, state.beam_direction()[:, None, :])
-    marker_t = beams.translation_mm + error[..., 3:] - state.bias_mm[:, None, :]
+    marker_t = beams.translation_mm + error[..., 3:] + times(half_turn, error[..., 3:]) - state.bias_mm[:, None, :]
     if rotation is None or translation_mm is None:
         start, along = origin + marker_t, direction
     else:
@@ -123,8 +130,8 @@ def line_block(
     from_marker = origin + lambda_mm[..., None] * direction
     jacobian = np.empty((*residual.shape, 6))
     turn = hat(from_marker)
-    jacobian[..., :3] = to_camera @ (turn + 0.5 * turn @ hat(error[..., :3]))
-    jacobian[..., 3:] = -to_camera
+    jacobian[..., :3] = to_camera @ (turn + turn @ half_turn + 0.5 * hat(error[..., 3:]))
+    jacobian[..., 3:] = -to_camera @ (np.eye(3) + half_turn)
     covariance = jacobian @ beams.covariance @ transposed(jacobian)
     covariance[..., 0, 0] += LINE_SIGMA_MM**2
     covariance[..., 1, 1] += LINE_SIGMA_MM**2
@@ -210,6 +217,7 @@ def initial_private(problem: PackedProblem, state: SharedState) -> PrivateState:
         trus_p_pm=np.repeat(trus_p[first][None], count, axis=0),
         beam_error=np.zeros((count, len(problem.beam_pm), 6)),
         aim_error=np.zeros((count, len(problem.aims.rotation), 6)),
+        aim_shift=np.zeros((count, len(problem.aims.rotation), 3)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,7 +66,7 @@ def optimize(
         moved = state.take(index).retract(step, problem.columns)
         before = current.private.take(index)
         points = before.trus_p_pm + (current.point_gain[index] @ step[:, None, :, None])[..., 0]
-        _, ahead = refine(problem, moved, PrivateState(points, before.beam_error, before.aim_error))
+        _, ahead = refine(problem, moved, replace(before, trus_p_pm=points))
         trial = evaluate(problem, moved, ahead)
         good = np.isfinite(trial.cost) & (trial.cost <= current.cost[index] + 1e-9 * (1.0 + current.cost[index]))
         state = _merge_state(state, moved, index, good)

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.frames import FloatArray, inverse, transform_points
 from fgreg.initialization import beam_starts, registration_starts
-from fgreg.measurements import Measurements, Pair
+from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.packing import PackedProblem, pack
 from fgreg.reduced_blocks import arc_points
@@ -49,11 +50,25 @@ class EpochSearch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """The joint optimum of a session (one hypothesis), the searches behind it, and its packed problem."""
+    """The joint optimum of a session (one hypothesis) and what led to it.
 
+    Attributes:
+        model: the session's set-up.
+        measurements: what entered: the pairs of ``epochs``, with their epochs renumbered 0, 1, ...
+        epochs: the session's numbers of the epochs solved.
+        problem, optimum: packed measurements and the optimum of the reduced graph.
+        searches: of every epoch of the session; no minima where it had too few pairs of its own.
+        ambiguous: the session's epochs in which two minima cannot be told apart.
+        covariance: (D, D) inverse Hessian of the shared variables (``problem.columns``).
+    """
+
+    model: SessionModel
+    measurements: Measurements
+    epochs: tuple[int, ...]
     problem: PackedProblem
     optimum: Optimum
     searches: tuple[EpochSearch, ...]
+    ambiguous: tuple[int, ...]
     covariance: FloatArray
 
 
@@ -150,3 +165,96 @@ def search_epoch(
     mirrored_problem = _mirrored(problem)
     mirrored = optimize(mirrored_problem, _starts(mirrored_problem, frames, model), keep_within=keep_within)
     return EpochSearch(_distinct(found, model.targets_mm), float(mirrored.evaluation.cost.min()))
+
+
+def choose_minimum(search: EpochSearch, model: SessionModel, config: SolveConfig) -> tuple[Minimum, bool]:
+    """The minimum to use, and whether the choice is open.
+
+    Open: another minimum's cost lies within ``second_minimum_chi2`` of the best and ``initial.trus_T_camera`` does not
+    clearly favour one of them (at most half as far from it, at the worst target, as the next).
+    """
+    rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
+    if len(rivals) == 1:
+        return rivals[0], False
+    if model.initial_trus_T_camera is None:
+        return rivals[0], True
+    initial = model.initial_trus_T_camera
+    far = [targets_moved(initial, m.state.trus_T_camera()[0], model.targets_mm) for m in rivals]
+    order = np.argsort(far)
+    return rivals[order[0]], bool(far[order[0]] > 0.5 * far[order[1]])
+
+
+def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
+    """Epochs with minima of their own or tied to such a one by measured camera motions."""
+    known = {k for k, search in enumerate(searches) if search.minima}
+    tied = {k for k, e in enumerate(measurements.epochs) if k and e.camera_new_T_camera_old is not None}
+    for _ in range(len(searches)):
+        known |= {k for k in tied if k - 1 in known} | {k - 1 for k in tied if k in known}
+    return sorted(known)
+
+
+def _joint_start(
+    measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
+) -> SharedState:
+    """All solvable epochs in one state: from their own minima, else carried over by the measured motions."""
+    transforms = {k: minimum.state.trus_T_camera()[0] for k, minimum in chosen.items()}
+    while len(transforms) < len(solvable):
+        for k in solvable:
+            motion = measurements.epochs[k].camera_new_T_camera_old
+            if k and motion is not None and k not in transforms and k - 1 in transforms:
+                transforms[k] = transforms[k - 1] @ inverse(motion)
+            if k and motion is not None and k in transforms and k - 1 in solvable and k - 1 not in transforms:
+                transforms[k - 1] = transforms[k] @ motion
+    most = max(chosen, key=lambda k: sum(pair.epoch == k for pair in measurements.pairs))
+    beam = chosen[most].state
+    # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
+    frame = nominal_frame(beam.beam_origin()[0], beam.beam_direction()[0])
+    stacked = np.stack([transforms[k] for k in solvable])[None]
+    return make_state(stacked, frame, model.probe.radius_mm)
+
+
+def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
+    """The measurements of some epochs only, renumbered in order; a motion is kept where both its sides are."""
+    place = {k: i for i, k in enumerate(epochs)}
+    starts = tuple(measurements.epochs[k] if k - 1 in place else EpochStart(measurements.epochs[k].t) for k in epochs)
+    pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
+    return Measurements(measurements.aims, pairs, starts)
+
+
+def register(measurements: Measurements, model: SessionModel, config: SolveConfig) -> Registration:
+    """Calibrate and register: the joint optimum over all epochs that can be solved.
+
+    Raises:
+        EstimationError: no beam to start from, or no epoch with three PMs.
+    """
+    frames = calibrate_beam(measurements, model)
+    searches = tuple(search_epoch(measurements, model, frames, k) for k in range(len(measurements.epochs)))
+    solvable = _solvable(measurements, searches)
+    if not solvable:
+        counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
+        raise EstimationError(
+            f"no camera epoch has the 3 photoacoustic markers that a first solution takes (found {counts}); "
+            "take at least 6 pairs without moving the camera"
+        )
+    choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
+    chosen = {k: minimum for k, (minimum, _) in choices.items()}
+    kept = restrict_epochs(measurements, solvable)
+    problem = pack(kept, model)
+    optimum = optimize(problem, _joint_start(measurements, chosen, solvable, model), tolerance=1e-9)
+    hessian = optimum.evaluation.hessian[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    try:
+        covariance = np.linalg.inv(hessian * scale * scale[:, None]) * scale * scale[:, None]
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError("these shots leave the registration undetermined; take more pairs") from error
+    return Registration(
+        model=model,
+        measurements=kept,
+        epochs=tuple(solvable),
+        problem=problem,
+        optimum=optimum,
+        searches=searches,
+        ambiguous=tuple(k for k, (_, is_open) in choices.items() if is_open),
+        covariance=np.asarray(covariance, dtype=np.float64),
+    )

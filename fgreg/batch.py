@@ -1,0 +1,287 @@
+"""Solve a session's measurements as a whole: registration, beam, tracks, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.errors import EstimationError
+from fgreg.estimate import (
+    AimEstimate,
+    EpochEstimate,
+    LaserEstimate,
+    PairEstimate,
+    SessionEstimate,
+    TrackEstimate,
+    Verdict,
+)
+from fgreg.frames import FloatArray
+from fgreg.graph import GraphOptions, build_graph
+from fgreg.graph_solver import optimize as optimize_graph
+from fgreg.graph_values import SharedValues, initial_values, read_shared
+from fgreg.measurements import Measurements, Track
+from fgreg.models import SessionModel
+from fgreg.posterior import Posterior, predicted_tre, sample_posterior
+from fgreg.readout import read_aims, read_laser, read_pairs
+from fgreg.registration import Registration, register
+from fgreg.shared_state import SharedState, make_state, pose_difference
+from fgreg.surface import fit_surface
+from fgreg.tracking import TrackContext, track
+from fgreg.verdict import (
+    Condition,
+    accuracy,
+    ambiguity,
+    beam_sides,
+    consistency,
+    spread,
+    sweeps,
+    verdict_of,
+)
+
+GRAPH_PAIRS = 200
+"""Up to so many pairs the explicit graph is solved as well, and has to agree."""
+AGREEMENT_SIGMA = 0.05
+"""Largest distance between the two optima, in units of the estimate's own standard deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The answer for a session's measurements: everything but the session's name.
+
+    ``pairs``, ``tracks`` and ``aims`` are in the order of what was given. ``registration``, ``posterior`` and
+    ``context`` are None where nothing could be computed.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    laser: LaserEstimate | None
+    epochs: tuple[EpochEstimate, ...]
+    pairs: tuple[PairEstimate, ...]
+    tracks: tuple[TrackEstimate, ...]
+    aims: tuple[AimEstimate, ...]
+    registration: Registration | None = None
+    posterior: Posterior | None = None
+    context: TrackContext | None = None
+
+    def as_session(self, name: str) -> SessionEstimate:
+        """The estimate as files and reports have it."""
+        return SessionEstimate(
+            name, self.verdict, self.reasons, self.laser, self.epochs, self.pairs, self.tracks, self.aims
+        )
+
+
+def solve(
+    measurements: Measurements,
+    tracks: Sequence[Track],
+    model: SessionModel,
+    config: SolveConfig,
+    conditions: Sequence[Condition] = (),
+) -> Solution:
+    """Calibrate, register, judge, and answer the tracking queries from all of it.
+
+    Args:
+        measurements: aims, pairs, epochs.
+        tracks: queries; they never enter the estimate.
+        model: the session's set-up.
+        config: limits of the verdict.
+        conditions: found before (detection), to be weighed with those found here.
+    """
+    try:
+        registration = register(measurements, model, config)
+    except EstimationError as error:
+        return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
+    posterior = sample_posterior(
+        registration.problem, registration.optimum, registration.covariance, config.posterior_samples, config.seed
+    )
+    readout = read_laser(registration, model)
+    pairs = read_pairs(measurements, registration, model, readout.origin_shift_mm)
+    aims = read_aims(registration, readout.origin_shift_mm)
+    common = [*conditions, *_common_conditions(registration, pairs, aims)]
+    epochs, found = _judge_epochs(measurements, registration, posterior, pairs, model, config, common)
+    context = _track_context(registration, posterior, model, readout.origin_shift_mm)
+    refused = {epoch.index for epoch in epochs if epoch.verdict is Verdict.REFUSED}
+    answers = tuple(
+        TrackEstimate(query.t, None, None, None, False, f"the registration of camera epoch {query.epoch} is refused")
+        if query.epoch in refused
+        else track(query, context)
+        for query in tracks
+    )
+    # The last epoch is where the camera stands; an earlier one that failed is told, and no more than a warning.
+    verdict = max(epochs[-1].verdict, verdict_of(common), key=lambda v: v.severity)
+    if verdict is Verdict.OK and any(epoch.verdict is not Verdict.OK for epoch in epochs):
+        verdict = Verdict.WARNING
+    return Solution(
+        verdict=verdict,
+        reasons=tuple(condition.text for condition in [*common, *found]),
+        laser=readout.laser,
+        epochs=epochs,
+        pairs=pairs,
+        tracks=answers,
+        aims=aims,
+        registration=registration,
+        posterior=posterior,
+        context=context,
+    )
+
+
+def _nothing(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:
+    """A refusal where nothing could be computed."""
+    reasons = tuple(condition.text for condition in conditions)
+    why = reasons[-1]
+    return Solution(
+        verdict=Verdict.REFUSED,
+        reasons=reasons,
+        laser=None,
+        epochs=tuple(
+            EpochEstimate(k, epoch.t, None, None, sum(p.epoch == k for p in measurements.pairs), Verdict.REFUSED, None)
+            for k, epoch in enumerate(measurements.epochs)
+        ),
+        pairs=tuple(PairEstimate(p.t, p.pm, p.epoch, used=False, reason=why) for p in measurements.pairs),
+        tracks=tuple(TrackEstimate(q.t, None, None, None, False, f"no registration: {why}") for q in tracks),
+        aims=tuple(AimEstimate(a.t, used=False, reason=why) for a in measurements.aims),
+    )
+
+
+def _common_conditions(
+    registration: Registration, pairs: Sequence[PairEstimate], aims: Sequence[AimEstimate]
+) -> list[Condition]:
+    """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
+    problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
+    equations = 2 * len(aims) + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
+    unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
+    lambdas = [pair.lambda_mm for pair in pairs if pair.lambda_mm is not None]
+    lambdas += [aim.lambda_mm for aim in aims if aim.lambda_mm is not None]
+    found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
+    if len(pairs) <= GRAPH_PAIRS:
+        found.extend(_agreement(registration))
+    return found
+
+
+def _agreement(registration: Registration) -> list[Condition]:
+    """The explicit graph, solved from the reduced optimum, has to stay there: two derivations of one answer."""
+    apart = distance_to_explicit(registration)
+    if apart <= AGREEMENT_SIGMA:
+        return []
+    text = f"the two forms of the graph disagree by {apart:.2f} standard deviations: please report this session"
+    return [Condition(Verdict.REFUSED, text)]
+
+
+def distance_to_explicit(registration: Registration) -> float:
+    """Mahalanobis distance between the reduced optimum's registrations and the explicit graph's (reference)."""
+    state, problem = registration.optimum.state, registration.problem
+    epochs = problem.columns.epochs
+    options = GraphOptions(marker_T_nominal=state.marker_T_nominal[0], unknown_motion_sigma=None)
+    explicit = build_graph(registration.measurements, registration.model, options)
+    shared = SharedValues(
+        trus_T_camera=tuple(state.trus_T_camera(k)[0] for k in range(epochs)),
+        marker_laser=state.beam[0],
+        window_edge_rad=float(state.edge_rad[0]),
+        marker_bias_mm=state.bias_mm[0],
+        sound_speed_ratio=float(state.sound_speed_ratio[0]),
+    )
+    found = optimize_graph(explicit, initial_values(explicit, shared))
+    there = read_shared(explicit, found.values, shared)
+    other = make_state(np.stack(there.trus_T_camera)[None], state.marker_T_nominal, problem.radius_mm)
+    step = np.concatenate([pose_difference(state, other, k)[0] for k in range(epochs)])
+    poses = registration.covariance[: 6 * epochs, : 6 * epochs]
+    return float(np.sqrt(step @ np.linalg.solve(poses, step)))
+
+
+def _judge_epochs(
+    measurements: Measurements,
+    registration: Registration,
+    posterior: Posterior,
+    pairs: Sequence[PairEstimate],
+    model: SessionModel,
+    config: SolveConfig,
+    common: Sequence[Condition],
+) -> tuple[tuple[EpochEstimate, ...], list[Condition]]:
+    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several)."""
+    several = len(measurements.epochs) > 1
+    out: list[EpochEstimate] = []
+    reasons: list[Condition] = []
+    state = registration.optimum.state
+    for k, start in enumerate(measurements.epochs):
+        count = sum(pair.epoch == k for pair in measurements.pairs)
+        pms = len({pair.pm for pair in measurements.pairs if pair.epoch == k})
+        if k not in registration.epochs:
+            text = f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
+            found = [Condition(Verdict.REFUSED, text)]
+            out.append(EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None))
+        else:
+            place = registration.epochs.index(k)
+            found = _epoch_conditions(measurements, registration, pairs, k, model, config)
+            tre = predicted_tre(posterior, place, model.targets_mm)
+            found.extend(accuracy(tre, config))
+            block = slice(6 * place, 6 * place + 6)
+            out.append(
+                EpochEstimate(
+                    index=k,
+                    start_s=start.t,
+                    trus_T_camera=state.trus_T_camera(place)[0],
+                    covariance=posterior.covariance[block, block],
+                    pairs=count,
+                    verdict=verdict_of([*common, *found]),
+                    predicted_tre=tre,
+                )
+            )
+        name = f"epoch {k}: " if several else ""
+        reasons.extend(Condition(condition.verdict, name + condition.text) for condition in found)
+    return tuple(out), reasons
+
+
+def _epoch_conditions(
+    measurements: Measurements,
+    registration: Registration,
+    pairs: Sequence[PairEstimate],
+    epoch: int,
+    model: SessionModel,
+    config: SolveConfig,
+) -> list[Condition]:
+    place, state = registration.epochs.index(epoch), registration.optimum.state
+    mine = [pair for pair in measurements.pairs if pair.epoch == epoch]
+    search = registration.searches[epoch]
+    linked = any(link.index in (place - 1, place) for link in registration.problem.links)
+    found = ambiguity(
+        search,
+        len({pair.pm for pair in mine}),
+        is_open=epoch in registration.ambiguous,
+        has_initial=model.initial_trus_T_camera is not None or linked,
+        config=config,
+    )
+    if mine:
+        directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
+        points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.trus_p_pm_mm is not None])
+        if not linked or len(mine) >= config.min_pairs:
+            found.extend(spread(directions, points, config))
+        found.extend(sweeps(mine, config))
+    return found
+
+
+def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:
+    camera_d = camera_T_marker[:, :3, :3] @ state.beam_direction()[0]
+    return np.asarray(camera_d @ state.rotation[0, epoch].T)
+
+
+def _track_context(
+    registration: Registration, posterior: Posterior, model: SessionModel, origin_shift_mm: float
+) -> TrackContext:
+    problem, at = registration.problem, registration.optimum.evaluation
+    gain = at.point_gain[0]
+    covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
+    state = registration.optimum.state
+    camera_d = problem.beams.rotation @ state.beam_direction()[0]
+    trus_d = np.einsum("bij,bj->bi", state.rotation[0, problem.beam_epoch], camera_d)
+    surface = fit_surface(at.private.trus_p_pm[0], covariance, trus_d)
+    return TrackContext(
+        model=model,
+        epochs=registration.epochs,
+        state=state,
+        covariance=registration.covariance,
+        posterior=posterior,
+        surface=surface,
+        origin_shift_mm=origin_shift_mm,
+    )

@@ -1,0 +1,139 @@
+"""From the optimum to what is reported: the laser line, each pair, each aim."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate
+from fgreg.frames import FloatArray, exp_so3, make_transform, rotation_to_direction
+from fgreg.measurements import Measurements
+from fgreg.models import SessionModel
+from fgreg.reduced import pm_contributions
+from fgreg.registration import Registration
+from fgreg.sensitivity import rotation_of_arc, wrap_angle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserReadout:
+    """The laser line, and lambda of its origin in the beam chart (mm)."""
+
+    laser: LaserEstimate
+    origin_shift_mm: float
+
+
+def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
+    """``marker_T_laser`` with +z along the beam; origin at the nominal tip's foot, else nearest the marker's origin.
+
+    Roll about the beam and shift along it are gauge: their variances are zero.
+    """
+    state, columns = registration.optimum.state, registration.problem.columns
+    direction, start = state.beam_direction()[0], state.beam_origin()[0]
+    initial = model.initial_marker_T_laser
+    if initial is None:
+        rotation, shift = rotation_to_direction(direction), float(-start @ direction)
+    else:
+        # The nominal frame turned by the least that brings its z onto the beam: its roll stays.
+        axis = np.cross(initial[:3, 2], direction)
+        sine, cosine = float(np.linalg.norm(axis)), float(initial[:3, 2] @ direction)
+        turn = axis / max(sine, 1e-12) * np.arctan2(sine, cosine)
+        rotation, shift = exp_so3(turn) @ initial[:3, :3], float((initial[:3, 3] - start) @ direction)
+    r0 = state.marker_T_nominal[0, :3, :3]
+    chart = np.array([*state.beam[0, 2:], 1.0])
+    length = float(np.linalg.norm(chart))
+    unit = chart / length
+    by_direction = np.zeros((3, 4))
+    by_direction[:, 2:] = r0 @ ((np.eye(3) - np.outer(unit, unit)) / length)[:, :2]
+    by_origin = shift * by_direction
+    by_origin[:, :2] += r0[:, :2]
+    along = rotation.T @ by_direction
+    jacobian = np.zeros((6, 4))
+    jacobian[0], jacobian[1] = -along[1], along[0]  # omega x z = (omega_y, -omega_x, 0)
+    jacobian[3:5] = (rotation.T @ by_origin)[:2]
+    beam = slice(columns.beam, columns.beam + 4)
+    covariance = jacobian @ registration.covariance[beam, beam] @ jacobian.T
+    transform = make_transform(rotation, start + shift * direction)
+    return LaserReadout(LaserEstimate(transform, covariance), shift)
+
+
+def read_pairs(
+    measurements: Measurements, registration: Registration, model: SessionModel, origin_shift_mm: float
+) -> tuple[PairEstimate, ...]:
+    """One estimate per pair of ``measurements``, in order; those of unsolved epochs are listed as not used."""
+    problem, at = registration.problem, registration.optimum.evaluation
+    state = registration.optimum.state
+    gain, points = at.point_gain[0], at.private.trus_p_pm[0]
+    covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
+    nis = _innovations(registration)
+    looks = problem.looks
+    radius, ratio = float(state.radius_mm[0]), float(state.sound_speed_ratio[0])
+    out: list[PairEstimate] = []
+    look = 0
+    for pair in measurements.pairs:
+        if pair.epoch not in registration.epochs:
+            reason = f"camera epoch {pair.epoch} has too few pairs for a registration"
+            out.append(PairEstimate(pair.t, pair.pm, pair.epoch, used=False, reason=reason))
+            continue
+        pm, scan = int(problem.look_pm[look]), float(looks.scan_rad[look])
+        dy = float(points[pm, 1]) - radius * np.sin(scan)
+        dz = float(points[pm, 2]) - radius * np.cos(scan)
+        delta = float(wrap_angle(np.arctan2(dy, dz) - scan))
+        rotation = float(rotation_of_arc(delta, ratio * float(looks.range_mm[look]), radius))
+        out.append(
+            PairEstimate(
+                t=pair.t,
+                pm=pair.pm,
+                epoch=pair.epoch,
+                used=True,
+                lambda_mm=float(at.lambda_mm[0, problem.look_beam[look]]) - origin_shift_mm,
+                theta_rad=scan + delta,
+                rotation_rad=model.stage.direction * rotation,
+                trus_p_pm_mm=points[pm],
+                covariance=covariance[pm],
+                residual_mm=float(np.hypot(*at.look_residual[0, look, :2])),
+                nis=float(nis[pm]),
+            )
+        )
+        look += 1
+    return tuple(out)
+
+
+def _innovations(registration: Registration) -> FloatArray:
+    """(J,) normalised innovation squared of each PM against the estimate without it.
+
+    In closed form: leaving a PM with cost c, gradient g and Hessian A out of the total H moves the optimum to where the
+    rest costs g' (H - A)^-1 g less, so NIS = c + g' (H - A)^-1 g, chi square of two degrees of freedom for one look.
+    Infinite where the rest does not determine the estimate.
+    """
+    optimum = registration.optimum
+    parts = pm_contributions(registration.problem, optimum.state, optimum.evaluation.private)
+    rest = optimum.evaluation.hessian[0] - parts.hessian
+    scale = np.sqrt(np.diagonal(rest, axis1=1, axis2=2))
+    out = np.full(len(parts.cost), np.inf)
+    good = (scale > 1e-9).all(axis=1)
+    scale = scale[good]
+    correlation = rest[good] / scale[:, :, None] / scale[:, None, :]
+    eigenvalue, vector = np.linalg.eigh(correlation)
+    along = np.einsum("jab,ja->jb", vector, parts.gradient[good] / scale)
+    moved = np.sum(along**2 / np.maximum(eigenvalue, 1e-12), axis=1)
+    out[good] = np.where(eigenvalue[:, 0] > 1e-9, parts.cost[good] + moved, np.inf)
+    return out
+
+
+def read_aims(registration: Registration, origin_shift_mm: float) -> tuple[AimEstimate, ...]:
+    """One estimate per aim, in order."""
+    at = registration.optimum.evaluation
+    out = []
+    for index, aim in enumerate(registration.measurements.aims):
+        residual = at.aim_residual[0, index]
+        out.append(
+            AimEstimate(
+                t=aim.t,
+                used=True,
+                lambda_mm=float(at.aim_lambda_mm[0, index]) - origin_shift_mm,
+                residual_mm=float(np.linalg.norm(residual)),
+                nis=float(residual @ np.linalg.solve(at.aim_covariance[0, index], residual)),
+            )
+        )
+    return tuple(out)

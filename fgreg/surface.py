@@ -1,0 +1,130 @@
+"""The tissue surface that the PMs trace: where a beam with no PM heard will end.
+
+Heights along the beams' mean direction over the plane across it: a plane plus a Gaussian process (kriging with a
+linear trend), its amplitude from the data, its predictive sigma widened where leaving out a PM shows it too small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.frames import FloatArray, rotation_to_direction
+
+LENGTH_MM = 15.0
+"""Distance over which the surface's deviations from its plane stay alike."""
+MIN_RELIEF_MM = 0.5
+"""Least sigma of those deviations: no tissue is flatter."""
+MIN_POINTS = 5
+GRAZING = 0.2
+"""Least cosine-like of beam against normal: at less, the distance is not to be had."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """A ray's end: distance along it (mm), point (3,) in TRUS, normal (3,), sigma of ``normal @ point`` (mm)."""
+
+    distance_mm: float
+    trus_p: FloatArray
+    normal: FloatArray
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TissueSurface:
+    """Heights over a plane in TRUS: ``axes`` (3, 3) columns u, v, height; all mm.
+
+    Attributes:
+        axes: ``trus_R_surface``, third column along the beams.
+        centre: (3,) TRUS origin of the surface's coordinates.
+        place: (n, 2) of the PMs.
+        covariance_inverse: (n, n). trend: (3,) coefficients over (1, u, v). trend_covariance: (3, 3).
+        residual: (n,) heights less trend. relief_mm: sigma of the Gaussian process. inflation: of the sigma.
+    """
+
+    axes: FloatArray
+    centre: FloatArray
+    place: FloatArray
+    covariance_inverse: FloatArray
+    trend: FloatArray
+    trend_covariance: FloatArray
+    residual: FloatArray
+    relief_mm: float
+    inflation: float
+
+    def height(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Height and its sigma (m,) at places (m, 2), mm."""
+        near = _kernel(place, self.place, self.relief_mm)
+        design = _design(place)
+        weights = near @ self.covariance_inverse
+        mean = design @ self.trend + weights @ self.residual
+        left = design - weights @ _design(self.place)
+        variance = self.relief_mm**2 - np.sum(weights * near, axis=1)
+        variance = np.maximum(variance, 0.0) + np.sum((left @ self.trend_covariance) * left, axis=1)
+        return mean, self.inflation * np.sqrt(variance)
+
+    def meet(self, trus_p: FloatArray, trus_d: FloatArray) -> Meeting | None:
+        """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where it misses it."""
+        along = np.linspace(1.0, 200.0, 400)
+        points = (trus_p + along[:, None] * trus_d - self.centre) @ self.axes
+        gap = points[:, 2] - self.height(points[:, :2])[0]
+        crossing = np.flatnonzero((gap[:-1] < 0) & (gap[1:] >= 0))
+        if crossing.size == 0:
+            return None
+        i = int(crossing[0])
+        distance = float(along[i] - gap[i] * (along[i + 1] - along[i]) / (gap[i + 1] - gap[i]))
+        place = ((trus_p + distance * trus_d - self.centre) @ self.axes)[:2]
+        around = place + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])
+        height, sigma = self.height(around)
+        slope = np.array([height[1] - height[2], height[3] - height[4]]) / 0.2
+        normal = self.axes @ np.array([-slope[0], -slope[1], 1.0])
+        if normal @ trus_d < GRAZING:
+            return None
+        return Meeting(distance, trus_p + distance * trus_d, normal, float(sigma[0]))
+
+
+def _kernel(first: FloatArray, second: FloatArray, relief_mm: float) -> FloatArray:
+    square = np.sum((first[:, None] - second[None]) ** 2, axis=-1)
+    return np.asarray(relief_mm**2 * np.exp(-0.5 * square / LENGTH_MM**2))
+
+
+def _design(place: FloatArray) -> FloatArray:
+    return np.column_stack([np.ones(len(place)), place])
+
+
+def fit_surface(trus_p_pm: FloatArray, covariance: FloatArray, trus_d_beam: FloatArray) -> TissueSurface | None:
+    """The surface through PMs (n, 3) with covariances (n, 3, 3), seen along beams (n, 3); None below 5 PMs."""
+    if len(trus_p_pm) < MIN_POINTS:
+        return None
+    mean_direction = trus_d_beam.mean(axis=0)
+    length = float(np.linalg.norm(mean_direction))
+    if length < 0.5:
+        return None
+    axes = rotation_to_direction(mean_direction / length)
+    centre = trus_p_pm.mean(axis=0)
+    local = (trus_p_pm - centre) @ axes
+    place, height = local[:, :2], local[:, 2]
+    noise = np.einsum("i,nij,j->n", axes[:, 2], covariance, axes[:, 2])
+    design = _design(place)
+    if np.linalg.svd(place - place.mean(axis=0), compute_uv=False)[1] < 1.0:
+        return None  # PMs in a row: the slope across is anybody's guess
+
+    def solve(relief_mm: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+        total = _kernel(place, place, relief_mm) + np.diag(noise + 1e-6)
+        inverse = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        information = design.T @ inverse @ design
+        trend_covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        trend = trend_covariance @ (design.T @ inverse @ height)
+        residual = height - design @ trend
+        likelihood = residual @ inverse @ residual + np.linalg.slogdet(total)[1] + np.linalg.slogdet(information)[1]
+        return inverse, trend, trend_covariance, residual, float(likelihood)
+
+    reliefs = np.geomspace(MIN_RELIEF_MM, 10.0, 12)
+    relief = float(min(reliefs, key=lambda value: solve(float(value))[4]))
+    inverse, trend, trend_covariance, residual, _ = solve(relief)
+    # Leave-one-out errors in closed form: with the trend projected out, e_i = (P h)_i / P_ii, variance 1 / P_ii.
+    projected = inverse - inverse @ design @ trend_covariance @ design.T @ inverse
+    left_out = (projected @ height) ** 2 / np.diag(projected)
+    inflation = float(np.sqrt(max(1.0, left_out.mean())))
+    return TissueSurface(axes, centre, place, inverse, trend, trend_covariance, residual, relief, inflation)

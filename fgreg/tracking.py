@@ -1,0 +1,149 @@
+"""Where to turn the stage for a beam: absolute angle with its sigma.
+
+With the PM heard now (the paper's Eq. 11): lambda and theta' given the registration. Here the registration and the
+beam enter with their covariance, the marker and the look with theirs, so the answer is the posterior of the PM's angle
+given the session and the query; the session's estimate itself is not touched. With nothing heard, lambda comes from
+the tissue surface that the PMs so far trace.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.estimate import TrackEstimate
+from fgreg.frames import FloatArray, exp_so3
+from fgreg.measurements import EpochStart, Measurements, Pair, Track
+from fgreg.models import SessionModel
+from fgreg.packing import pack
+from fgreg.posterior import Posterior
+from fgreg.reduced import Evaluation, evaluate
+from fgreg.reduced_blocks import initial_private
+from fgreg.shared_state import SharedState
+from fgreg.surface import GRAZING, TissueSurface
+
+ITERATIONS = 6
+SAMPLES = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackContext:
+    """What a query is answered from.
+
+    Attributes:
+        model: the session's set-up.
+        epochs: the session's numbers of the solved epochs, in the order of ``state``.
+        state: the estimate (one hypothesis). covariance: (D, D) of its shared variables. posterior: their samples.
+        surface: the tissue surface, where the PMs trace one.
+        origin_shift_mm: lambda of the laser frame's origin in the beam chart.
+        causal: whether only what was known at the query's time entered.
+    """
+
+    model: SessionModel
+    epochs: tuple[int, ...]
+    state: SharedState
+    covariance: FloatArray
+    posterior: Posterior
+    surface: TissueSurface | None
+    origin_shift_mm: float
+    causal: bool = False
+
+
+def track(query: Track, context: TrackContext) -> TrackEstimate:
+    """Answer one query; ``stage_rad`` None with a reason where it cannot be answered."""
+    if query.epoch not in context.epochs:
+        return _refused(query, context, f"camera epoch {query.epoch} has no registration")
+    scan_rad: float
+    if query.looks:
+        scan_rad, sigma_rad, lambda_mm = _from_looks(query, context)
+    else:
+        answer = _from_surface(query, context)
+        if isinstance(answer, str):
+            return _refused(query, context, answer)
+        scan_rad, sigma_rad, lambda_mm = answer
+    device_rad = context.model.stage.device_from_scan(scan_rad)
+    low, high = context.model.stage.limits_device_rad
+    if not low <= device_rad <= high:
+        reason = f"the stage would have to turn to {math.degrees(device_rad):.1f} deg, outside its limits"
+        return _refused(query, context, f"{reason} {math.degrees(low):.0f} to {math.degrees(high):.0f} deg")
+    return TrackEstimate(query.t, device_rad, sigma_rad, lambda_mm - context.origin_shift_mm, context.causal)
+
+
+def _refused(query: Track, context: TrackContext, reason: str) -> TrackEstimate:
+    return TrackEstimate(query.t, None, None, None, context.causal, reason)
+
+
+def _angle(trus_p: FloatArray) -> tuple[float, FloatArray]:
+    """Plane angle of a TRUS point (rad) and its derivative (3,) by the point (rad / mm)."""
+    y, z = float(trus_p[1]), float(trus_p[2])
+    square = y * y + z * z
+    return math.atan2(y, z), np.array([0.0, z, -y]) / square
+
+
+def _from_looks(query: Track, context: TrackContext) -> tuple[float, float, float]:
+    """Gauss-Newton on the one PM with the session's estimate as prior: (scan angle, sigma, lambda in the chart)."""
+    epoch = context.epochs.index(query.epoch)
+    count = context.state.rotation.shape[1]
+    pairs = tuple(Pair(query.t, 0, epoch, query.marker, look) for look in query.looks)
+    problem = pack(Measurements((), pairs, tuple(EpochStart(0.0) for _ in range(count))), context.model)
+    # The priors on the shared variables are in the session's estimate already.
+    problem = replace(problem, prior_information=np.zeros(problem.columns.size))
+    information = np.linalg.inv(context.covariance)
+    deviation = np.zeros(problem.columns.size)
+    state, private = context.state, initial_private(problem, context.state)
+    at: Evaluation | None = None
+    for _ in range(ITERATIONS):
+        at = evaluate(problem, state, private)
+        hessian = information + at.hessian[0]
+        step = -np.linalg.solve(hessian, information @ deviation + at.gradient[0])
+        deviation = deviation + step
+        state = context.state.retract(deviation[None], problem.columns)
+        private = replace(
+            at.private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[None, None, :, None])[..., 0]
+        )
+        if float(step @ hessian @ step) < 1e-8:
+            break
+    at = evaluate(problem, state, private)
+    shared = np.linalg.inv(information + at.hessian[0])
+    gain = at.point_gain[0, 0]
+    covariance = at.point_covariance[0, 0] + gain @ shared @ gain.T
+    angle, by_point = _angle(at.private.trus_p_pm[0, 0])
+    return angle, math.sqrt(float(by_point @ covariance @ by_point)), float(at.lambda_mm[0, 0])
+
+
+def _from_surface(query: Track, context: TrackContext) -> tuple[float, float, float] | str:
+    """The beam's end on the tissue surface: (scan angle, sigma, lambda in the chart), or why not."""
+    if context.surface is None:
+        return "no PM is heard and the session's PMs trace no surface yet (at least 5, not in a row)"
+    epoch = context.epochs.index(query.epoch)
+    origin, direction = _beam_in_trus(query, context.state, epoch, np.zeros((1, 6)))
+    met = context.surface.meet(origin[0], direction[0])
+    if met is None:
+        return "no PM is heard and the beam does not meet the surface that the session's PMs trace"
+    angle, _ = _angle(met.trus_p)
+    # Spread of the angle over the posterior, the marker's noise and the surface's height: nonlinear enough to sample.
+    rng = np.random.default_rng(0)
+    pick = rng.choice(len(context.posterior.weight), SAMPLES, p=context.posterior.weight)
+    state = context.state.take(np.zeros(SAMPLES, dtype=np.int64))
+    state = state.retract(context.posterior.step[pick], context.posterior.columns)
+    turn = np.kron(np.eye(2), query.marker.camera_T_marker[:3, :3])
+    noise = rng.multivariate_normal(np.zeros(6), turn @ query.marker.covariance @ turn.T, SAMPLES)
+    origin, direction = _beam_in_trus(query, state, epoch, noise)
+    height = met.normal @ met.trus_p + met.sigma_mm * rng.standard_normal(SAMPLES)
+    towards = np.maximum(direction @ met.normal, 0.5 * GRAZING)
+    point = origin + ((height - origin @ met.normal) / towards)[:, None] * direction
+    spread = np.mod(np.arctan2(point[:, 1], point[:, 2]) - angle + np.pi, 2 * np.pi) - np.pi
+    return angle, float(np.sqrt(np.mean(spread**2))), met.distance_mm
+
+
+def _beam_in_trus(query: Track, state: SharedState, epoch: int, error: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Origin (S, 3) and direction (S, 3) of the query's beam for marker errors (S, 6) along the camera's axes."""
+    marker = query.marker.camera_T_marker
+    rotation = exp_so3(error[:, :3]) @ marker[:3, :3]
+    camera_p = np.einsum("sij,sj->si", rotation, state.beam_origin()) + marker[:3, 3] + error[:, 3:] - state.bias_mm
+    camera_d = np.einsum("sij,sj->si", rotation, state.beam_direction())
+    trus_R_camera = state.rotation[:, epoch]
+    origin = np.einsum("sij,sj->si", trus_R_camera, camera_p) + state.translation_mm[:, epoch]
+    return origin, np.einsum("sij,sj->si", trus_R_camera, camera_d)
