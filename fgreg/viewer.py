@@ -1,0 +1,308 @@
+"""The Rerun recording of a session, and its null twin that takes the same calls and does nothing.
+
+Entities, all in TRUS millimetres unless a parent's transform says otherwise:
+
+- ``world/probe``, ``world/trus``: the housing and the axes of TRUS.
+- ``world/stage``: turned to the shot's plane; ``plane`` (with the shot's frame on it), ``elements``, ``label`` below.
+- ``world/looks/{arc,beam,pm}``: one entry per look; the blueprint shows all up to the time cursor.
+- ``world/shot/{arc,beam,pm,sound}``: those of the shot at the cursor, bold, with labels.
+- ``world/camera``: ``trus_T_camera`` of the epoch; ``left`` and ``right`` are pinholes with the endoscope's images,
+  ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines below.
+- ``world/targets``: 95 % ellipsoids of the predicted error; ``world/truth``: PMs and camera where they are known.
+- ``pa``: the shot's photoacoustic frame with its detection; ``plots/*``; ``summary``; ``log``.
+
+Timelines: ``shot`` (number among all aims, pairs and tracks, from 0) and ``time`` (seconds, as in the events).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg import viewer_scene as scene
+from fgreg import viewer_shapes as shapes
+from fgreg.errors import InputError
+from fgreg.estimate import SessionEstimate
+from fgreg.frames import FloatArray, exp_so3
+from fgreg.measurements import Measurements, Track
+from fgreg.models import ProbeModel, SessionModel
+from fgreg.viewer_blueprint import Contents, make_blueprint
+from fgreg.viewer_pa import pa_picture, texture
+from fgreg.viewer_result import ResultPainter, Truth
+from fgreg.viewer_shapes import Image8
+
+ShotKind = Literal["aim", "pair", "track"]
+
+
+class NullViewer:
+    """Takes every call of :class:`Viewer` and does nothing, for runs without a recording."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to close."""
+
+    def session(self, model: SessionModel) -> None:
+        """Nothing is drawn."""
+
+    def shot_images(
+        self,
+        t: float,
+        kind: ShotKind,
+        index: int,
+        left: Image8 | None,
+        right: Image8 | None = None,
+        marker_outlines_px: Iterable[FloatArray] | None = None,
+        corner_px: FloatArray | None = None,
+    ) -> None:
+        """Nothing is drawn."""
+
+    def pa_frame(
+        self,
+        t: float,
+        index: int,
+        frame: npt.NDArray[np.generic],
+        x_mm: float | None,
+        range_mm: float | None,
+        covariance: FloatArray | None,
+        probe: ProbeModel,
+    ) -> None:
+        """Nothing is drawn."""
+
+    def result(
+        self,
+        model: SessionModel,
+        measurements: Measurements,
+        estimate: SessionEstimate,
+        truth: Truth | None = None,
+        tracks: Sequence[Track] = (),
+    ) -> None:
+        """Nothing is drawn."""
+
+
+class Viewer:
+    """Writes a recording while a session is worked on. Use as a context manager: the file appears at its end.
+
+    It is written under a temporary name beside its own and renamed when all is done; an exception leaves no file, and
+    an older one there as it was.
+
+    Args:
+        rrd: the file to write; its folder has to exist.
+        session_name: shown as the recording's name.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to, or ``rrd`` is a folder.
+    """
+
+    def __init__(self, rrd: Path, session_name: str) -> None:
+        if not rrd.parent.is_dir():
+            raise InputError(str(rrd), "a folder that does not exist", "an existing folder for the recording")
+        if rrd.is_dir():
+            raise InputError(str(rrd), "a folder", "the name of a file to write")
+        self._rrd = rrd
+        self._part = rrd.with_name(f".{rrd.name}.{os.getpid()}.part")
+        try:
+            self._part.touch()
+        except OSError as error:
+            raise InputError(str(rrd), f"a place that refuses files ({error.strerror})", "a writable one") from error
+        self._rec = shapes.Recorder(self._part, session_name)
+        self._shown: set[str] = set()
+        self._pa_size: tuple[int, int] | None = None
+        self._textured: set[int] = set()
+        self._finished = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finish the file and give it its name, or remove it after an exception."""
+        try:
+            if not self._finished:
+                self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
+            self._rec.close()
+            if kind is None:
+                self._part.replace(self._rrd)
+        finally:
+            self._part.unlink(missing_ok=True)
+
+    def session(self, model: SessionModel) -> None:
+        """Draw what does not change: probe, array, axes, cameras, the marker's outline, the plots' styles."""
+        import rerun as rr
+
+        rec, probe = self._rec, model.probe
+        length = scene.array_length_mm(probe)
+        rec.static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        reach = np.array([length / 2.0 + 4.0, 0.0, 0.0]) + probe.radius_mm + 14.0
+        rec.static("world/trus", shapes.axes(reach))
+        rec.static("world/trus/labels", shapes.axis_labels(reach, ("x: rotation axis", "y", "z")))
+        rec.static("world/probe", shapes.probe(length + 8.0, probe.radius_mm * 0.98))
+        face = np.array([[-length / 2.0, 0.0, probe.radius_mm], [length / 2.0, 0.0, probe.radius_mm]])
+        rec.static("world/stage/elements", shapes.strips([face], shapes.SOUND, 3.0))
+        shapes.draw_cameras(rec, model, shapes.CAMERA)
+        if model.marker is not None:
+            outlines = scene.marker_outlines_mm(model.marker)
+            rec.static("world/camera/marker/tags", shapes.strips(outlines, shapes.MARKER, 1.5))
+        rec.static("world/camera/marker/axes", shapes.axes(8.0))
+        rec.static("world/camera/marker/label", shapes.point([0.0, 0.0, 0.0], shapes.MARKER, 1.0, "marker"))
+        for plot in ("residual_mm", "nis", "rotation_deg", "lambda_mm"):
+            for name, color, shape in (
+                ("pair", shapes.PM, rr.components.MarkerShape.Circle),
+                ("pair_not_used", shapes.UNUSED, rr.components.MarkerShape.Cross),
+                ("aim", shapes.BEAM, rr.components.MarkerShape.Diamond),
+                ("track", shapes.SOUND, rr.components.MarkerShape.Up),
+            ):
+                name_shown = name.replace("_", " ")
+                style = rr.SeriesPoints(colors=[color], names=[name_shown], markers=[shape], marker_sizes=[4.0])
+                rec.static(f"plots/{plot}/{name}", style)
+
+    def shot_images(
+        self,
+        t: float,
+        kind: ShotKind,
+        index: int,
+        left: Image8 | None,
+        right: Image8 | None = None,
+        marker_outlines_px: Iterable[FloatArray] | None = None,
+        corner_px: FloatArray | None = None,
+    ) -> None:
+        """Show the endoscope's images of a shot.
+
+        Args:
+            t: seconds.
+            kind: of shot.
+            index: its number among all aims, pairs and tracks of the session, from 0.
+            left, right: (h, w) grey or (h, w, 3) BGR, uint8; None where there is none.
+            marker_outlines_px: the tags' (4, 2) corners found in the left image.
+            corner_px: (2,) the board corner aimed at, in the left image.
+        """
+        rec = self._rec
+        rec.at(t, index)
+        for side, image in (("left", left), ("right", right)):
+            if image is not None:
+                self._shown.add(side)
+                rec.log(f"world/camera/{side}", shapes.picture(image))
+        if left is None:
+            return
+        rec.clear("world/camera/left/marker", "world/camera/left/corner")
+        outlines = [np.vstack([corners, corners[:1]]) for corners in marker_outlines_px or ()]
+        if outlines:
+            rec.log("world/camera/left/marker/outline", shapes.strips_2d(outlines, shapes.BEAM, 1.5))
+        if corner_px is not None:
+            label = f"{kind}: laser on this corner"
+            corner = np.asarray(corner_px).reshape(1, 2)
+            rec.log("world/camera/left/corner/spot", shapes.points_2d(corner, shapes.PM, 4.0, [label]))
+
+    def pa_frame(
+        self,
+        t: float,
+        index: int,
+        frame: npt.NDArray[np.generic],
+        x_mm: float | None,
+        range_mm: float | None,
+        covariance: FloatArray | None,
+        probe: ProbeModel,
+    ) -> None:
+        """Show a photoacoustic frame with its detection, in the image view and on the image plane of the world.
+
+        Args:
+            t: seconds.
+            index: number of the shot, as in :meth:`shot_images`.
+            frame: (elements, samples) channel data or (depth, lateral) envelope.
+            x_mm, range_mm: where the PM was found; None where it was not.
+            covariance: (2, 2) over both, mm^2.
+            probe: how the frame is sampled; a frame it cannot be read with is left out.
+        """
+        picture = pa_picture(frame, probe)
+        if picture is None:
+            return
+        rec = self._rec
+        self._pa_size = picture.image.shape
+        self._textured.add(index)
+        rec.at(t, index)
+        rec.log("pa", shapes.picture(picture.image))
+        rec.log("pa/ruler", shapes.ruler(picture))
+        low_x, high_x, low_range, high_range = picture.extent_mm
+        near, far = probe.radius_mm + low_range, probe.radius_mm + high_range
+        corners = np.array([[low_x, 0.0, near], [high_x, 0.0, near], [high_x, 0.0, far], [low_x, 0.0, far]])
+        rec.log("world/stage/plane", shapes.plane_mesh(corners, texture(picture)))
+        # The number of the shot is part of the caption: at later shots without a frame this one stays.
+        found = "no source found" if x_mm is None or range_mm is None else f"x {x_mm:.1f} mm, range {range_mm:.1f} mm"
+        above = np.array([[0.5 * picture.image.shape[1], -0.1 * picture.image.shape[0]]])
+        rec.log("pa/caption", shapes.points_2d(above, shapes.PM, 0.5, [f"shot {index}: {found}"]))
+        rec.clear("pa/detection")
+        if x_mm is None or range_mm is None:
+            return
+        gap, arm = 0.5, 2.0
+        ticks = [
+            np.array([[gap, 0.0], [arm, 0.0]]) @ exp_so3(np.array([0.0, 0.0, k * np.pi / 2.0]))[:2, :2]
+            for k in range(4)
+        ]
+        cross = [picture.pixels(x_mm + tick[:, 0], range_mm + tick[:, 1]) for tick in ticks]
+        rec.log("pa/detection/spot", shapes.strips_2d(cross, shapes.PM, 1.2))
+        if covariance is not None:
+            outline = scene.ellipse_95(np.array([x_mm, range_mm]), covariance)
+            strip = picture.pixels(outline[:, 0], outline[:, 1])
+            rec.log("pa/detection/ellipse", shapes.strips_2d([strip], shapes.PM, 0.8))
+        if picture.wavefront:
+            # Dots, so that the wave itself can be seen between them.
+            x = np.sort(probe.element_x_mm)[::5]
+            front = picture.pixels(x, np.hypot(x - x_mm, range_mm))
+            front = front[front[:, 1] <= picture.image.shape[0]]
+            rec.log("pa/detection/wavefront", shapes.points_2d(front, shapes.PM, 1.3))
+
+    def result(
+        self,
+        model: SessionModel,
+        measurements: Measurements,
+        estimate: SessionEstimate,
+        truth: Truth | None = None,
+        tracks: Sequence[Track] = (),
+    ) -> None:
+        """Draw the answer: registration, beams, arcs, PMs, targets, tracks, plots and text.
+
+        Args:
+            model: the session's set-up.
+            measurements: what entered the estimate.
+            estimate: the answer; its looks are matched to the measured pairs by time and PM.
+            truth: where it is known.
+            tracks: the queries behind ``estimate.tracks``, in order; without them only the plane is shown.
+        """
+        painter = ResultPainter(
+            rec=self._rec,
+            model=model,
+            measurements=measurements,
+            estimate=estimate,
+            truth=truth,
+            tracks=tuple(tracks),
+            textured=frozenset(self._textured),
+        )
+        painter.paint()
+        eye = scene.best_eye(painter.eye_points())
+        self._rec.blueprint(make_blueprint(self._contents(result=True), estimate.verdict, eye))
+        self._finished = True
+
+    def _contents(self, *, result: bool) -> Contents:
+        return Contents("left" in self._shown, "right" in self._shown, self._pa_size, result)
+
+
+def open_viewer(rrd: Path | None, session_name: str) -> Viewer | NullViewer:
+    """A viewer that records to ``rrd``, or its null twin where that is None.
+
+    Raises:
+        InputError: the folder of ``rrd`` does not exist or cannot be written to, or ``rrd`` is a folder.
+    """
+    return NullViewer() if rrd is None else Viewer(rrd, session_name)
+
+
+__all__ = ["NullViewer", "ShotKind", "Truth", "Viewer", "open_viewer"]

@@ -1,0 +1,216 @@
+"""Geometry of what the recording shows, as plain arrays: no Rerun here, so that every number can be checked alone.
+
+TRUS millimetres and radians unless a name says otherwise. The stage's frame ``plane`` turns with the image plane: it
+equals ``trus`` at stage angle 0, so a point (x, 0, z) of it lies in the image plane at z from the rotation axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.estimate import PairEstimate, SessionEstimate
+from fgreg.frames import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
+from fgreg.measurements import Look, Measurements, Pair
+from fgreg.models import CameraModel, MarkerModel, ProbeModel
+
+CHI2_95_3 = 7.814728
+"""95 % quantile of chi-square with three degrees of freedom."""
+CHI2_95_2 = 5.991465
+"""95 % quantile of chi-square with two degrees of freedom."""
+ARC_HALF_WIDTHS = 1.5
+"""How far an arc is drawn to either side, in half widths of the sensitivity window."""
+
+
+def trus_T_plane(scan_rad: float) -> FloatArray:
+    """(4, 4) from the turned image plane's frame to TRUS: +z goes to (0, sin t, cos t), a turn of -t about x."""
+    return make_transform(exp_so3(np.array([-scan_rad, 0.0, 0.0])), np.zeros(3))
+
+
+def arc_from_rotation(rotation_rad: FloatArray | float, range_mm: float, radius_mm: float) -> FloatArray:
+    """Arc angle delta about the element that a stage rotation from the look's plane corresponds to.
+
+    Inverse of ``rotation = atan2(r sin delta, R + r cos delta)``; by the sine rule
+    ``r sin(delta - rotation) = R sin(rotation)``.
+    """
+    sine = np.clip(radius_mm * np.sin(rotation_rad) / range_mm, -1.0, 1.0)
+    return np.asarray(rotation_rad + np.arcsin(sine))
+
+
+def element_centre_mm(look: Look, probe: ProbeModel) -> FloatArray:
+    """(3,) the point of the array that the look's range is measured from."""
+    t = look.scan_rad
+    return np.array([look.x_mm, probe.radius_mm * math.sin(t), probe.radius_mm * math.cos(t)])
+
+
+def arc_point_mm(look: Look, probe: ProbeModel, theta_rad: FloatArray | float) -> FloatArray:
+    """(..., 3) the points of a look's arc at arc angles theta'."""
+    theta = np.asarray(theta_rad, dtype=np.float64)
+    direction = np.stack([np.zeros_like(theta), np.sin(theta), np.cos(theta)], axis=-1)
+    return np.asarray(element_centre_mm(look, probe) + look.range_mm * direction)
+
+
+def arc_strip_mm(look: Look, probe: ProbeModel, points: int = 25) -> FloatArray:
+    """(points, 3) the arc of a look over 1.5 half widths of the window to either side of its plane."""
+    half = ARC_HALF_WIDTHS * float(probe.sensitivity.half_width_at(look.range_mm))
+    rotation = np.linspace(-half, half, points)
+    return arc_point_mm(look, probe, look.scan_rad + arc_from_rotation(rotation, look.range_mm, probe.radius_mm))
+
+
+def array_length_mm(probe: ProbeModel) -> float:
+    """Length of the array along x."""
+    return probe.elements * probe.pitch_mm
+
+
+def plane_corners_mm(probe: ProbeModel, depth_mm: float) -> FloatArray:
+    """(4, 3) corners of the image plane in its own frame: from the array's face to ``depth_mm``, face first."""
+    half, near, far = array_length_mm(probe) / 2.0, probe.radius_mm, probe.radius_mm + depth_mm
+    return np.array([[-half, 0.0, near], [half, 0.0, near], [half, 0.0, far], [-half, 0.0, far]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipsoid:
+    """Half sizes (3,) mm along the columns of ``rotation`` (3, 3), a proper rotation."""
+
+    half_sizes_mm: FloatArray
+    rotation: FloatArray
+
+
+def ellipsoid_95(covariance: FloatArray) -> Ellipsoid:
+    """The 95 % ellipsoid of a (3, 3) covariance: principal sigmas times sqrt of chi-square's 0.95 quantile, 7.815."""
+    variance, axes = np.linalg.eigh(covariance)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    return Ellipsoid(np.sqrt(CHI2_95_3 * np.clip(variance, 0.0, None)), axes)
+
+
+def ellipse_95(centre: FloatArray, covariance: FloatArray, points: int = 49) -> FloatArray:
+    """(points, 2) closed outline of the 95 % ellipse of a (2, 2) covariance about ``centre``."""
+    variance, axes = np.linalg.eigh(covariance)
+    turn = np.linspace(0.0, 2.0 * math.pi, points)
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return np.asarray(centre + circle * np.sqrt(CHI2_95_2 * np.clip(variance, 0.0, None)) @ axes.T)
+
+
+def quaternion_xyzw(rotation: FloatArray) -> FloatArray:
+    """(4,) unit quaternion, scalar last, of a (3, 3) rotation."""
+    vector = log_so3(rotation)
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 0 else vector
+    return np.array([*(math.sin(angle / 2.0) * axis), math.cos(angle / 2.0)])
+
+
+def target_covariances(trus_T_camera: FloatArray, covariance: FloatArray, targets_mm: FloatArray) -> FloatArray:
+    """(n, 3, 3) covariances of targets (n, 3) in TRUS axes, mm^2, from the registration's (right tangent).
+
+    A camera point moves by ``R (rotation x p + translation)`` with the tangent, so ``J = R [-hat(p), I]``.
+    """
+    rotation = trus_T_camera[:3, :3]
+    camera_p = (targets_mm - trus_T_camera[:3, 3]) @ rotation
+    jacobian = np.concatenate([-hat(camera_p), np.broadcast_to(np.eye(3), (len(targets_mm), 3, 3))], axis=2)
+    jacobian = rotation @ jacobian
+    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
+
+
+def laser_origin_and_tip(a_T_laser: FloatArray, lambda_mm: float) -> tuple[FloatArray, FloatArray]:
+    """The beam's origin (3,) and its point (3,) at ``lambda_mm``, in frame a."""
+    ends = transform_points(a_T_laser, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, lambda_mm]]))
+    return ends[0], ends[1]
+
+
+def marker_outlines_mm(marker: MarkerModel) -> list[FloatArray]:
+    """One closed (5, 3) outline per tag, marker frame."""
+    return [np.vstack([corners, corners[:1]]) for corners in (tag.marker_p_corners_mm for tag in marker.tags)]
+
+
+def frustum_strips_mm(camera: CameraModel | None, depth_mm: float) -> list[FloatArray]:
+    """Outline of a camera in its own frame: the picture's rectangle at ``depth_mm`` and a line to each corner.
+
+    Distortion is left out. Where the camera is not known, a square of 50 degrees stands for it.
+    """
+    if camera is None:
+        half = depth_mm * math.tan(math.radians(25.0))
+        corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    else:
+        width, height = camera.image_size
+        pixels = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+        corners = depth_mm * (pixels - camera.matrix[:2, 2]) / np.array([camera.matrix[0, 0], camera.matrix[1, 1]])
+    rectangle = np.column_stack([corners, np.full(4, depth_mm)])
+    return [np.vstack([rectangle, rectangle[:1]]), *(np.vstack([np.zeros(3), corner]) for corner in rectangle)]
+
+
+def looks_of_estimates(pairs: Sequence[PairEstimate], measurements: Measurements) -> list[Pair | None]:
+    """The measured pair behind each estimated look, None where nothing was measured (no marker, no sound).
+
+    Estimates list every look of the session, measurements only those that were detected; both are in event order, and
+    ``t`` and ``pm`` tell them apart. Where several looks share both, those in use are served first.
+    """
+    waiting: dict[tuple[float, int], list[Pair]] = {}
+    for pair in measurements.pairs:
+        waiting.setdefault((pair.t, pair.pm), []).append(pair)
+    found: list[Pair | None] = [None] * len(pairs)
+    for position in sorted(range(len(pairs)), key=lambda i: not pairs[i].used):
+        queue = waiting.get((pairs[position].t, pairs[position].pm))
+        if queue:
+            found[position] = queue.pop(0)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One aim, pair or track: its number in the session, and its position within its own kind."""
+
+    number: int
+    t: float
+    kind: str
+    position: int
+
+
+def shots_of(estimate: SessionEstimate) -> list[Shot]:
+    """All shots of a session in time order, numbered from 0; at equal times aims, then pairs, then tracks."""
+    listed = [(aim.t, 0, position) for position, aim in enumerate(estimate.aims)]
+    listed += [(pair.t, 1, position) for position, pair in enumerate(estimate.pairs)]
+    listed += [(track.t, 2, position) for position, track in enumerate(estimate.tracks)]
+    kinds = ("aim", "pair", "track")
+    return [Shot(number, t, kinds[kind], position) for number, (t, kind, position) in enumerate(sorted(listed))]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eye:
+    """Where to look from: position and what to look at, (3,) TRUS mm; up is TRUS +z."""
+
+    position_mm: FloatArray
+    target_mm: FloatArray
+
+
+def best_eye(points_mm: FloatArray, half_height: float = 0.47, half_width: float = 0.42) -> Eye:
+    """The eye from which points (n, 3) fill the view, seen from above and obliquely to the probe's axis.
+
+    Straight along the axis the probe is a disc, straight across it the arcs are lines: the eye stands 40 to 60 degrees
+    off the axis and 20 to 35 degrees up, in the one of the four quarters where the points are spread out most.
+
+    Args:
+        points_mm: what has to be in view.
+        half_height, half_width: of the view, at distance 1 (tangents of half its angles, less a margin).
+    """
+    best, best_spread = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])), -1.0
+    offsets = points_mm - points_mm.mean(axis=0)
+    for elevation in np.radians([20.0, 27.0, 35.0]):
+        for azimuth in np.radians([40.0, 50.0, 60.0, 120.0, 130.0, 140.0, 220.0, 230.0, 240.0, 300.0, 310.0, 320.0]):
+            flat = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+            away = np.array([*(math.cos(elevation) * flat[:2]), math.sin(elevation)])
+            right = np.array([-flat[1], flat[0], 0.0])
+            up = np.cross(away, right)
+            spread = float(np.linalg.svd(offsets @ np.column_stack([right, up]), compute_uv=False)[1])
+            if spread > best_spread:
+                best, best_spread = (away, right, up), spread
+    away, right, up = best
+    seen = points_mm @ np.column_stack([right, up, away])
+    middle = (seen.min(axis=0) + seen.max(axis=0)) / 2.0
+    seen = seen - middle
+    distance = float((np.maximum(np.abs(seen[:, 0]) / half_width, np.abs(seen[:, 1]) / half_height) + seen[:, 2]).max())
+    target = np.column_stack([right, up, away]) @ middle
+    return Eye(target + max(distance, 1.0) * away, target)

@@ -1,0 +1,253 @@
+"""Small pieces a recording is made of: colours, a stream with two timelines, Rerun archetypes from arrays.
+
+``rerun`` is imported when a piece is made, not when this module is: its import takes more than half a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.frames import FloatArray, inverse
+from fgreg.models import CameraModel, SessionModel
+from fgreg.viewer_pa import PaPicture
+from fgreg.viewer_scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+Color = tuple[int, int, int]
+Image8 = npt.NDArray[np.uint8]
+
+PROBE: Color = (150, 155, 165)
+PLANE: Color = (60, 150, 190)
+SOUND: Color = (70, 190, 250)
+BEAM: Color = (70, 240, 110)
+PM: Color = (255, 175, 50)
+CAMERA: Color = (120, 150, 255)
+REFUSED: Color = (255, 60, 60)
+UNUSED: Color = (130, 130, 130)
+MARKER: Color = (245, 245, 245)
+TARGET: Color = (120, 112, 165)
+TRUTH: Color = (255, 80, 210)
+AXES: tuple[Color, ...] = ((235, 90, 90), (90, 210, 100), (100, 140, 255))
+IMAGE_DISTANCE_MM = 35.0
+"""From the camera to where its image is drawn."""
+JPEG_QUALITY = 80
+
+
+class Recorder:
+    """A recording stream into a file, with the timelines ``shot`` and ``time``."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        import rerun as rr
+
+        self._stream = rr.RecordingStream("fgreg")
+        self._stream.save(path)
+        self._stream.send_recording_name(name)
+
+    def at(self, t: float, shot: int) -> None:
+        """What is logged next belongs to shot number ``shot``, at ``t`` seconds."""
+        self._stream.set_time("shot", sequence=shot)
+        self._stream.set_time("time", duration=t)
+
+    def log(self, path: str, *what: rr.AsComponents) -> None:
+        """Log at the present moment."""
+        self._stream.log(path, *what)
+
+    def static(self, path: str, *what: rr.AsComponents) -> None:
+        """Log for all times."""
+        self._stream.log(path, *what, static=True)
+
+    def clear(self, *paths: str) -> None:
+        """From the present moment on, nothing is at or below these paths."""
+        import rerun as rr
+
+        for path in paths:
+            self._stream.log(path, rr.Clear(recursive=True))
+
+    def series(self, path: str, shots: Sequence[int], seconds: Sequence[float], values: Sequence[float]) -> None:
+        """A whole plot at once."""
+        import rerun as rr
+
+        indexes = [rr.TimeColumn("shot", sequence=shots), rr.TimeColumn("time", duration=seconds)]
+        self._stream.send_columns(path, indexes=indexes, columns=rr.Scalars.columns(scalars=values))
+
+    def blueprint(self, blueprint: rrb.Blueprint) -> None:
+        """How the recording opens."""
+        self._stream.send_blueprint(blueprint)
+
+    def close(self) -> None:
+        """Write out what is left and end the file."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+
+def ui(points: float) -> float:
+    """A radius in screen points, the same at every zoom: Rerun takes negative radii so."""
+    return -points
+
+
+def transform(a_T_b: FloatArray | None) -> rr.Transform3D:
+    """A transform; where there is none, scale 0, at which Rerun does not show what is below."""
+    import rerun as rr
+
+    if a_T_b is None:
+        return rr.Transform3D(scale=0.0)
+    return rr.Transform3D(translation=a_T_b[:3, 3], mat3x3=a_T_b[:3, :3])
+
+
+def axes(lengths_mm: FloatArray | float) -> rr.Arrows3D:
+    """Red, green, blue arrows along x, y, z; one length, or (3,)."""
+    import rerun as rr
+
+    vectors = np.diag(np.broadcast_to(lengths_mm, 3))
+    return rr.Arrows3D(origins=np.zeros((3, 3)), vectors=vectors, colors=AXES, radii=[ui(1.5)])
+
+
+def axis_labels(lengths_mm: FloatArray, labels: Sequence[str]) -> rr.Points3D:
+    """Names at the ends of :func:`axes`."""
+    import rerun as rr
+
+    return rr.Points3D(np.diag(lengths_mm), colors=AXES, radii=[ui(0.5)], labels=labels)
+
+
+def point(p_mm: FloatArray | Sequence[float], color: Color, size: float, label: str | None = None) -> rr.Points3D:
+    """One point, ``size`` screen points in radius, with its label shown."""
+    import rerun as rr
+
+    return rr.Points3D([p_mm], colors=[color], radii=[ui(size)], labels=None if label is None else [label])
+
+
+def strips(strips_mm: Sequence[FloatArray], color: Color, size: float, label: str | None = None) -> rr.LineStrips3D:
+    """Lines through (n, 3) points each, ``size`` screen points in radius."""
+    import rerun as rr
+
+    return rr.LineStrips3D(strips_mm, colors=[color], radii=[ui(size)], labels=None if label is None else [label])
+
+
+def arrow(
+    origin_mm: FloatArray, tip_mm: FloatArray, color: Color, size: float, label: str | None = None
+) -> rr.Arrows3D:
+    """One arrow, ``size`` screen points in radius."""
+    import rerun as rr
+
+    labels = None if label is None else [label]
+    return rr.Arrows3D(
+        origins=[origin_mm], vectors=[tip_mm - origin_mm], colors=[color], radii=[ui(size)], labels=labels
+    )
+
+
+def ellipsoids(centres_mm: FloatArray, covariances: FloatArray, color: Color) -> rr.Ellipsoids3D:
+    """95 % ellipsoids of (n, 3, 3) covariances about (n, 3) points."""
+    import rerun as rr
+
+    shapes = [ellipsoid_95(covariance) for covariance in covariances]
+    return rr.Ellipsoids3D(
+        centers=centres_mm,
+        half_sizes=[shape.half_sizes_mm for shape in shapes],
+        quaternions=[rr.Quaternion(xyzw=quaternion_xyzw(shape.rotation)) for shape in shapes],
+        colors=[color],
+        line_radii=[ui(0.5)],
+    )
+
+
+def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) -> rr.Mesh3D:
+    """The image plane: see-through, with a picture (rows, columns, 3) on it where there is one.
+
+    Args:
+        corners_mm: (4, 3), the picture's first row first, each row from its first column; then back along the last.
+        picture: RGB.
+    """
+    import rerun as rr
+
+    triangles = [[0, 1, 2], [0, 2, 3]]
+    if picture is None:
+        return rr.Mesh3D(vertex_positions=corners_mm, triangle_indices=triangles, albedo_factor=(*PLANE, 80))
+    return rr.Mesh3D(
+        vertex_positions=corners_mm,
+        triangle_indices=triangles,
+        vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
+        albedo_texture=picture,
+        albedo_factor=(255, 255, 255, 190),
+    )
+
+
+def probe(length_mm: float, radius_mm: float) -> rr.Capsules3D:
+    """The housing: a cylinder about the x axis with round ends, just inside the array's face."""
+    import rerun as rr
+
+    return rr.Capsules3D(
+        lengths=[length_mm],
+        radii=[radius_mm],
+        translations=[[-length_mm / 2.0, 0.0, 0.0]],
+        rotation_axis_angles=[rr.RotationAxisAngle([0.0, 1.0, 0.0], degrees=90.0)],
+        colors=[PROBE],
+        fill_mode="solid",
+        labels=["TRUS probe"],
+        show_labels=True,
+    )
+
+
+def pinhole(camera: CameraModel, color: Color) -> rr.Pinhole:
+    """A camera's frustum, without its distortion."""
+    import rerun as rr
+
+    return rr.Pinhole(
+        image_from_camera=camera.matrix,
+        resolution=camera.image_size,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=IMAGE_DISTANCE_MM,
+        color=color,
+        line_width=ui(2.0),
+    )
+
+
+def draw_cameras(rec: Recorder, model: SessionModel, color: Color) -> None:
+    """The endoscope under ``world/camera``, in a colour; drawing again changes the colour."""
+    rec.static("world/camera/label", point([0.0, 0.0, 0.0], color, 4.0, "camera"))
+    rec.static("world/camera/axes", axes(10.0))
+    if model.camera is None:
+        rec.static("world/camera/outline", strips(frustum_strips_mm(None, IMAGE_DISTANCE_MM / 2.0), color, 1.5))
+        return
+    rec.static("world/camera/left", pinhole(model.camera.left, color))
+    if model.camera.right is not None and model.camera.right_T_left is not None:
+        left_T_right = transform(inverse(model.camera.right_T_left))
+        rec.static("world/camera/right", left_T_right, pinhole(model.camera.right, color))
+
+
+def picture(image: Image8) -> rr.EncodedImage | rr.Image:
+    """A (h, w) grey or (h, w, 3) BGR image as JPEG."""
+    import rerun as rr
+
+    image = np.ascontiguousarray(image)
+    return rr.Image(image, color_model="BGR" if image.ndim == 3 else "L").compress(jpeg_quality=JPEG_QUALITY)
+
+
+def points_2d(pixels: FloatArray, color: Color, size: float, labels: Sequence[str] | None = None) -> rr.Points2D:
+    """Points (n, 2) on an image, with their labels shown."""
+    import rerun as rr
+
+    return rr.Points2D(pixels, colors=[color], radii=[ui(size)], labels=labels, show_labels=labels is not None)
+
+
+def strips_2d(strips_px: Sequence[FloatArray], color: Color, size: float) -> rr.LineStrips2D:
+    """Lines on an image."""
+    import rerun as rr
+
+    return rr.LineStrips2D(strips_px, colors=[color], radii=[ui(size)])
+
+
+def ruler(frame: PaPicture) -> rr.Points2D:
+    """Labelled marks every 10 mm along the left (range) and upper (x) edges of a photoacoustic picture."""
+    low_x, high_x, low_range, high_range = frame.extent_mm
+    ranges = np.arange(math.ceil(low_range / 10.0) * 10.0, high_range, 10.0)
+    across = np.arange(math.ceil(low_x / 10.0) * 10.0, high_x, 10.0)
+    marks = np.vstack([frame.pixels(low_x, ranges), frame.pixels(across, low_range)])
+    return points_2d(marks, UNUSED, 1.5, [f"{value:.0f}" for value in (*ranges, *across)])
