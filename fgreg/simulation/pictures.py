@@ -66,9 +66,9 @@ class ShotPicture:
             TagSurface(config.marker.dictionary, tag.id, tag.size_mm, self.camera_T_marker @ tag.marker_T_tag)
             for tag in config.marker.tags
         ]
-        # The bare fibre, from the marker's body to a little beyond the laser frame's origin, its tip.
-        fibre = transform_points(self.camera_T_laser, np.array([[0.0, 0.0, -3.0], [0.0, 0.0, 0.0]]))
-        surfaces.append(_strip(fibre[0], fibre[1], 0.9, 0.8))
+        # The bare fibre about the laser frame's origin. It is behind the marker's printed face: never over it.
+        fibre = transform_points(self.camera_T_laser, np.array([[0.0, 0.0, -4.0], [0.0, 0.0, 8.0]]))
+        surfaces.append(_strip(fibre[0], fibre[1], 0.9, 0.7, depth_bias_mm=25.0))
         if self.camera_T_board is not None:
             surfaces.append(BoardSurface(config.board, self.camera_T_board))
             away = make_transform(np.eye(3), np.array([0.0, 0.0, DRAPE_MM]))
@@ -105,7 +105,9 @@ def _tissue(config: SimulationConfig, camera_T_trus: FloatArray, seed: int) -> t
     return Background(camera_T_plane, 0.2, 0.4, seed), clutter
 
 
-def _strip(camera_p0_mm: FloatArray, camera_p1_mm: FloatArray, width_mm: float, albedo: float) -> PatchSurface:
+def _strip(
+    camera_p0_mm: FloatArray, camera_p1_mm: FloatArray, width_mm: float, albedo: float, depth_bias_mm: float = 0.0
+) -> PatchSurface:
     """A strip from one point to another that shows its full width to the camera."""
     along = camera_p1_mm - camera_p0_mm
     length = float(np.linalg.norm(along))
@@ -113,7 +115,9 @@ def _strip(camera_p0_mm: FloatArray, camera_p1_mm: FloatArray, width_mm: float, 
     middle = 0.5 * (camera_p0_mm + camera_p1_mm)
     x = np.cross(y, middle)
     x /= np.linalg.norm(x)
-    return PatchSurface(make_transform(np.stack([x, y, np.cross(x, y)], axis=-1), middle), width_mm, length, albedo)
+    return PatchSurface(
+        make_transform(np.stack([x, y, np.cross(x, y)], axis=-1), middle), width_mm, length, albedo, depth_bias_mm
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

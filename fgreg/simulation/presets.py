@@ -51,6 +51,6 @@ PRESETS: dict[str, SimulationConfig] = {
         tracks_heard=1,
         tracks_silent=1,
         camera=default_rig(800),
-        board=BoardModel(6, 4, 13.0, CharucoModel("DICT_4X4_100", 9.75)),
+        board=BoardModel(6, 4, 13.0, CharucoModel("DICT_5X5_100", 9.75)),
     ),
 }

@@ -67,6 +67,7 @@ class Sheet:
     albedo: tuple[float, float, float]
     faces_camera: bool
     outline_mm: FloatArray
+    depth_bias_mm: float = 0.0
 
 
 class Surface(Protocol):
@@ -149,12 +150,16 @@ class BoardSurface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchSurface:
-    """A rectangle of one colour, seen from both sides: fibre, instrument shaft, clutter. Origin at its centre."""
+    """A rectangle of one colour, seen from both sides: fibre, instrument shaft, clutter. Origin at its centre.
+
+    ``depth_bias_mm`` counts as additional distance when it is decided what hides what.
+    """
 
     camera_T_patch: FloatArray
     width_mm: float
     height_mm: float
     albedo: float
+    depth_bias_mm: float = 0.0
 
     def sheet(self) -> Sheet:
         w, h = self.width_mm / 2.0, self.height_mm / 2.0
@@ -165,6 +170,7 @@ class PatchSurface:
             (0.0, self.albedo, self.albedo),
             True,
             np.array([[-w, -h], [w, -h], [w, h], [-w, h]]),
+            self.depth_bias_mm,
         )
 
     def seen_from(self, other_T_camera: FloatArray) -> PatchSurface:
@@ -275,7 +281,7 @@ def render_frame(
     if background is not None:
         image += _spread(_background_radiance(background, rays, optics), rays, (0, height), (0, width))
     sheets = [surface.sheet() for surface in surfaces]
-    sheets.sort(key=lambda sheet: -float(np.linalg.norm(_outline_in_camera(sheet).mean(axis=0))))
+    sheets.sort(key=_distance, reverse=True)
     for sheet in sheets:
         _paint(image, sheet, camera, rays, optics)
     image = _blurred(image, optics.blur_px)
@@ -378,6 +384,10 @@ def _outline_in_camera(sheet: Sheet) -> FloatArray:
     """(4, 3) corners of the sheet in the camera frame."""
     surface_p = np.column_stack([sheet.outline_mm, np.zeros(4)])
     return np.asarray(surface_p @ sheet.camera_T_surface[:3, :3].T + sheet.camera_T_surface[:3, 3])
+
+
+def _distance(sheet: Sheet) -> float:
+    return float(np.linalg.norm(_outline_in_camera(sheet).mean(axis=0))) + sheet.depth_bias_mm
 
 
 def _region(sheet: Sheet, camera: CameraModel, rays: _Rays) -> tuple[int, int, int, int] | None:

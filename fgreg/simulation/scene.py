@@ -336,22 +336,25 @@ def _inside(camera: CameraModel, camera_p_mm: FloatArray, margin_px: float) -> B
 def _corner_visible(
     config: SimulationConfig, camera_T_marker: FloatArray, camera_T_board: FloatArray, corner: IntArray
 ) -> BoolArray:
-    """Whether the corner aimed at, and enough of the board, is in all images and not behind the tag; (n,)."""
-    board = config.board
-    rows, columns = np.divmod(np.arange(board.rows * board.columns), board.columns)
-    board_p = np.stack([columns, rows, 0 * rows], axis=-1) * board.square_mm
+    """Whether the four squares about the corner aimed at, and enough of the board, are in all images and not behind
+    the tag; (n,)."""
+    board, n = config.board, corner.shape[0]
+    # All corners of squares, the outer ones too: index [row + 1, column + 1] of the inner corner [column, row].
+    rows, columns = np.divmod(np.arange((board.rows + 2) * (board.columns + 2)), board.columns + 2)
+    board_p = np.stack([columns - 1, rows - 1, 0 * rows], axis=-1) * board.square_mm
     left_p = transform_points(camera_T_board[:, None], board_p)
     tag = config.marker.tags[0]
-    outline = _outline(camera_T_marker @ tag.marker_T_tag, tag, config.marker.dictionary, grow=1.15)
-    aimed = corner[:, 1] * board.columns + corner[:, 0]
+    outline = _outline(camera_T_marker @ tag.marker_T_tag, tag, config.marker.dictionary, grow=1.1)
     # A plain chessboard is found only as a whole; of a ChArUco board a part will do.
-    enough = board.rows * board.columns if board.charuco is None else min(12, board.rows * board.columns)
-    good = np.ones(aimed.shape, dtype=bool)
+    enough = rows.size if board.charuco is None else min(20, rows.size)
+    good = np.ones(n, dtype=bool)
     for camera, camera_T_left in _views(config.camera):
         camera_p = transform_points(camera_T_left, left_p)
         quad = project_points(camera, transform_points(camera_T_left, outline))
         seen = _inside(camera, camera_p, EDGE_PX) & ~_within(project_points(camera, camera_p), quad)
-        good &= (seen.sum(axis=-1) >= enough) & seen[np.arange(aimed.size), aimed]
+        grid = seen.reshape(n, board.rows + 2, board.columns + 2)
+        about = [grid[np.arange(n), corner[:, 1] + i, corner[:, 0] + j] for i in range(3) for j in range(3)]
+        good &= (seen.sum(axis=-1) >= enough) & np.all(about, axis=0)
     return np.asarray(good)
 
 

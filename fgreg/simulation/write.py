@@ -94,4 +94,4 @@ _Dumper.add_representer(list, _list)
 
 
 def _yaml(document: dict[str, Any]) -> str:
-    return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=120))
+    return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=400))
