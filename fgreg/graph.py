@@ -142,7 +142,7 @@ class GraphOptions:
 
     marker_T_nominal: FloatArray | None = None
     sound_speed_sigma: float | None = None
-    unknown_motion_sigma: tuple[float, float] | None = (1.0, 300.0)
+    unknown_motion_sigma: tuple[float, float] | None = (3.0, 1000.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
