@@ -66,10 +66,11 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
         image = (image.astype(np.float32) * (255.0 / max(int(image.max()), 1))).astype(np.uint8)
     if image.dtype != np.uint8:
         raise ValueError(f"image of type {image.dtype}, expected uint8 or uint16")
-    if image.ndim == 3:
-        code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-        return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
-    return np.ascontiguousarray(image, dtype=np.uint8)
+    picture = np.ascontiguousarray(image, dtype=np.uint8)
+    if picture.ndim == 3:
+        code = cv2.COLOR_BGR2GRAY if picture.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
+        picture = np.asarray(cv2.cvtColor(picture, code), dtype=np.uint8)
+    return picture
 
 
 def refine_subpixel(image: Image, corners_px: FloatArray, half_window_px: int) -> FloatArray:
@@ -146,7 +147,7 @@ def square_corners(
         sigma = np.where(np.repeat(from_edges[k], 2), CORNER_FLOOR_PX, FALLBACK_SIGMA_PX)
         covariance[k] = from_lines + np.diag(sigma**2)
     # A fallback corner's sigma is in image pixels: bring it to ideal ones.
-    for k, c in zip(*np.nonzero(found & ~from_edges), strict=True):
+    for k, c in np.argwhere(found & ~from_edges):
         inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal[k, c]))
         covariance[k, 2 * c : 2 * c + 2, 2 * c : 2 * c + 2] = FALLBACK_SIGMA_PX**2 * inverse @ inverse.T
     return SquareCorners(ideal, covariance, found, from_edges)

@@ -73,7 +73,7 @@ class _Band:
 
     d: FloatArray
     u: FloatArray
-    grey: FloatArray
+    grey: npt.NDArray[np.float64] | Image
     used: BoolArray
 
 
@@ -144,8 +144,9 @@ def _compact(band: _Band) -> _Band:
     """The same band with as few unused pixels as the edge with the most allows."""
     most = max(int(band.used.sum(axis=1).max()), 1)
     order = np.argsort(~band.used, axis=1, kind="stable")[:, :most]
-    d, u, grey, used = (np.take_along_axis(a, order, axis=1) for a in (band.d, band.u, band.grey, band.used))
-    return _Band(d, u, grey.astype(np.float64), used)
+    d, u = np.take_along_axis(band.d, order, axis=1), np.take_along_axis(band.u, order, axis=1)
+    grey = np.take_along_axis(band.grey, order, axis=1).astype(np.float64)
+    return _Band(d, u, grey, np.take_along_axis(band.used, order, axis=1))
 
 
 def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -230,13 +231,13 @@ def _fit_band(
     jw = jacobian * (weight / sigma[:, None] ** 2)[..., None]
     normal = np.swapaxes(jw, 1, 2) @ jacobian
     normal[:, diagonal, diagonal] += prior + 1e-9
-    return x, np.linalg.inv(normal), sigma
+    return x, np.asarray(np.linalg.inv(normal), dtype=np.float64), sigma
 
 
 def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> FloatArray:
     """Standard deviation of the pixels about their model, at least that of rounding to whole grey levels."""
     dof = np.maximum(counted.sum(axis=1) - PARAMETERS, 1.0)
-    return np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3)
+    return np.asarray(np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3))
 
 
 def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> FloatArray:

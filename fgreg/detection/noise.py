@@ -23,7 +23,7 @@ SHARED_DOF = 30.0
 
 
 class Residuals(Protocol):
-    """A fit: whitened sum of squares, its degrees of freedom, information at unit scale, covariance of common errors."""
+    """What a fit leaves: whitened sum of squares, its degrees of freedom, information, common errors."""
 
     @property
     def cost(self) -> float: ...

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from fgreg.frames import BoolArray, FloatArray, IntArray, exp_so3, hat, make_transform, nearest_rotation
+from fgreg.frames import BoolArray, FloatArray, IntArray, exp_so3, hat, inverse, make_transform, nearest_rotation
 
 ITERATIONS = 25
 
@@ -158,7 +158,8 @@ def fit_pose(corners: CornerSet, start: FloatArray, *, huber: float | None = Non
         normal, gradient = j.T @ j, j.T @ r
         accepted = False
         for _ in range(8):
-            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            damped = normal + damping * np.diag(np.diag(normal))
+            step = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
             trial = pose @ make_transform(exp_so3(step[:3]), step[3:])
             new_residual, new_jacobian, in_front = corner_residuals(corners, trial)
             new_root, new_cost = weigh(new_residual)
@@ -257,6 +258,7 @@ def pose_hypotheses(corners: CornerSet) -> list[FloatArray]:
         except cv2.error:  # degenerate corners: no pose from this set
             continue
         for rotation_vector, translation in zip(rotations, translations, strict=True):
-            if np.isfinite(rotation_vector).all() and np.isfinite(translation).all():
-                out.append(np.linalg.inv(view_T_camera) @ _rigid(rotation_vector, translation))
+            view_T_body = _rigid(np.asarray(rotation_vector, np.float64), np.asarray(translation, np.float64))
+            if np.isfinite(view_T_body).all():
+                out.append(inverse(view_T_camera) @ view_T_body)
     return out

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgreg.detection.corners import Image
+from fgreg.detection.edges import Image
 from fgreg.frames import FloatArray
 
 BORDER_PX = 12
-"""White frame put around the image, so that a tag whose quiet zone the image's edge cuts off is still a closed square."""
+"""White frame put around the image: a tag whose quiet zone the image's edge cuts off is still a closed square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

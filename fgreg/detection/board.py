@@ -1,0 +1,277 @@
+"""The calibration board in one or two frames: its pose and its corners, each with covariance.
+
+Corner [column, row] of a plain chessboard: [0, 0] is the inner corner at a black corner square such that, seen from
+the front with that square at the top left, columns run right and rows run down. On a board whose columns + rows is
+even half a turn gives the same picture, so it is refused. A ChArUco board names its corners itself
+(row * columns + column, OpenCV's pattern since 4.6).
+
+Board frame: origin at corner [0, 0], x along the columns, y down the rows, z away from the viewer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.detection.camera import focal_px, ideal_from_pixels, pixel_by_ideal_jacobian
+from fgreg.detection.corners import grey, refine_subpixel
+from fgreg.detection.edges import Image
+from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, best_poses, choose_pose
+from fgreg.detection.noise import CornerNoise, fit_covariance
+from fgreg.detection.pose import CornerSet, join
+from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named
+from fgreg.frames import BoolArray, FloatArray, IntArray, hat
+from fgreg.models import BoardModel, CameraModel, StereoRig
+
+CORNER_SIGMA_PX = 0.03
+"""Of a refined inner corner. Four squares meet there: the picture is symmetric, so blur does not bias it."""
+COMMON_PX = 0.01
+"""Error of a corner that is the same in both views (grid of pixels, print)."""
+MIN_CORNERS = 6
+SMALL_WIDTH_PX = 640
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardFit:
+    """A board found: its pose with all that goes with it."""
+
+    pose: RigidFit
+    board: BoardModel
+
+    @property
+    def camera_T_board(self) -> FloatArray:
+        """(4, 4)."""
+        return self.pose.camera_T_body
+
+
+def board_covariance(fit: BoardFit, noise: CornerNoise) -> FloatArray:
+    """(6, 6) covariance of ``camera_T_board`` over the right tangent (rotation rad, translation mm)."""
+    return fit_covariance(fit.pose, noise)
+
+
+def board_corner(fit: BoardFit, column: int, row: int, noise: CornerNoise) -> tuple[FloatArray, FloatArray]:
+    """Where a corner is: (camera_p_mm (3,), covariance (3, 3) along the camera's axes).
+
+    From the pose fitted to all corners, so it is as good as the board is flat, and need not itself be in view.
+
+    Raises:
+        ValueError: the board has no such corner.
+    """
+    board = fit.board
+    if not (0 <= column < board.columns and 0 <= row < board.rows):
+        raise ValueError(f"corner [{column}, {row}], expected [0..{board.columns - 1}, 0..{board.rows - 1}]")
+    board_p = np.array([column, row, 0.0]) * board.square_mm
+    rotation = fit.camera_T_board[:3, :3]
+    jacobian = rotation @ np.hstack([-hat(board_p), np.eye(3)])
+    covariance = jacobian @ board_covariance(fit, noise) @ jacobian.T
+    return rotation @ board_p + fit.camera_T_board[:3, 3], covariance
+
+
+def board_refusal(board: BoardModel) -> str | None:
+    """Why this board cannot be used; None where it can.
+
+    On a plain board the square at the far end from a black corner square is columns + rows squares away, so black
+    where that is even: then half a turn looks the same.
+    """
+    if board.charuco is None and min(board.columns, board.rows) < 3:
+        return f"a plain board of {board.columns} x {board.rows} inner corners is too small to be found, at least 3 x 4"
+    if board.charuco is None and (board.columns + board.rows) % 2 == 0:
+        return (
+            f"a plain board of {board.columns} x {board.rows} inner corners looks the same after half a turn; "
+            "one of columns and rows has to be odd and the other even, or use ChArUco"
+        )
+    return None
+
+
+def _find_chessboard(image: Image, board: BoardModel) -> FloatArray | None:
+    """Inner corners (rows * columns, 2), in rows, from any of the ends; None where the board is not all in view."""
+    size = (board.columns, board.rows)
+    pad = BORDER_PX
+    whole = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=255)
+    scale = min(1.0, SMALL_WIDTH_PX / whole.shape[1])
+    small = cv2.resize(whole, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else whole
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for picture, factor in ((whole, 1.0), (small, scale)):
+        found, corners = cv2.findChessboardCorners(picture, size, flags=flags)
+        if found:
+            return _unscaled(corners, factor)
+    found, corners = cv2.findChessboardCornersSB(small, size)
+    if found:
+        return _unscaled(corners, scale)
+    return None
+
+
+def _unscaled(corners: npt.NDArray[np.generic], scale: float) -> FloatArray:
+    """Corners (n, 2) in the image, of those found in its padded copy of ``scale`` times the size."""
+    px = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+    return np.asarray((px + 0.5) / scale - 0.5 - BORDER_PX)
+
+
+def order_corners(image: Image, corners_px: FloatArray, board: BoardModel) -> FloatArray | None:
+    """Corners (rows * columns, 2) put in the order row * columns + column; None where the squares are not told apart.
+
+    Args:
+        corners_px: in rows, from any end, in either sense.
+    """
+    grid = corners_px.reshape(board.rows, board.columns, 2)
+    right = (grid[:, 1:] - grid[:, :-1]).mean(axis=(0, 1))
+    down = (grid[1:] - grid[:-1]).mean(axis=(0, 1))
+    if right[0] * down[1] - right[1] * down[0] < 0.0:
+        grid = grid[:, ::-1]  # seen from the front, rows run down where columns run right
+    # The square inside corners [c, r] and [c + 1, r + 1] is black where c + r is even.
+    centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    height, width = image.shape
+    blurred = cv2.blur(image, (3, 3))
+    x = np.clip(np.rint(centres[..., 0]).astype(int), 0, width - 1)
+    y = np.clip(np.rint(centres[..., 1]).astype(int), 0, height - 1)
+    level = blurred[y, x].astype(np.float64)
+    even = (np.add.outer(np.arange(level.shape[0]), np.arange(level.shape[1])) % 2) == 0
+    if even.all():  # a 2 x 2 board has one inner square only; it is refused elsewhere
+        return None
+    # Neighbours are compared, so that light falling off over the board does not matter.
+    sign = np.where(even, -1.0, 1.0)
+    across = (level[:, 1:] - level[:, :-1]) * sign[:, 1:]
+    along = (level[1:] - level[:-1]) * sign[1:]
+    vote = np.concatenate([across.ravel(), along.ravel()])
+    if abs(vote.mean()) < 0.5 * np.abs(vote).mean():
+        return None
+    if vote.mean() < 0.0:
+        grid = grid[::-1, ::-1]
+    return grid.reshape(-1, 2)
+
+
+def _spacing_px(corners_px: FloatArray, ids: IntArray, board: BoardModel) -> float:
+    """Smallest distance between neighbouring corners that were found."""
+    grid = np.full((board.rows, board.columns, 2), np.nan)
+    grid[ids // board.columns, ids % board.columns] = corners_px
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)]
+    gaps = np.concatenate(steps)
+    gaps = gaps[np.isfinite(gaps)]
+    return float(gaps.min()) if gaps.size else 0.0
+
+
+def _find_charuco(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray] | None:
+    """Corners (n, 2) and their ids."""
+    assert board.charuco is not None
+    pattern = cv2.aruco.CharucoBoard(
+        (board.columns + 1, board.rows + 1),
+        board.square_mm,
+        board.charuco.marker_mm,
+        dictionary_named(board.charuco.dictionary),
+    )
+    pattern.setLegacyPattern(False)
+    detector = cv2.aruco.CharucoDetector(pattern, cv2.aruco.CharucoParameters(), detector_parameters())
+    pad = BORDER_PX
+    padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=255)
+    corners, ids, _, _ = detector.detectBoard(padded)
+    if ids is None or len(ids) == 0:
+        return None
+    return np.asarray(corners, dtype=np.float64).reshape(-1, 2) - pad, np.asarray(ids, dtype=np.int64).ravel()
+
+
+def find_board_corners(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray] | None:
+    """Refined corners (n, 2) px and their ids (row * columns + column); None where the board is not found."""
+    ids: IntArray
+    if board.charuco is None:
+        grid = _find_chessboard(image, board)
+        corners = None if grid is None else order_corners(image, grid, board)
+        if corners is None:
+            return None
+        ids = np.arange(board.rows * board.columns, dtype=np.int64)
+        reach = 0.4 * _spacing_px(corners, ids, board)
+    else:
+        found = _find_charuco(image, board)
+        if found is None:
+            return None
+        corners, ids = found
+        # Not so far that the markers in the white squares come into the window.
+        gap = 0.5 * (1.0 - board.charuco.marker_mm / board.square_mm)
+        reach = gap * _spacing_px(corners, ids, board) - 1.0
+    corners = refine_subpixel(image, corners, int(np.clip(reach, 2, 9)))
+    height, width = image.shape
+    inside = (np.minimum(corners, np.array([width, height]) - 1.0 - corners) > 3.0).all(axis=1)
+    return corners[inside], ids[inside]
+
+
+def _view_corners(
+    image: npt.NDArray[np.generic], camera: CameraModel, view: int, view_T_camera: FloatArray, board: BoardModel
+) -> CornerSet | None:
+    found = find_board_corners(grey(image), board)
+    if found is None:
+        return None
+    pixels, ids = found
+    ideal = ideal_from_pixels(camera, pixels)
+    good = np.isfinite(ideal).all(axis=1)
+    ideal, ids = ideal[good], ids[good]
+    n = len(ids)
+    if n == 0:
+        return None
+    inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal))
+    covariance = np.zeros((n, 2, n, 2))
+    covariance[np.arange(n), :, np.arange(n), :] = CORNER_SIGMA_PX**2 * inverse @ np.swapaxes(inverse, 1, 2)
+    board_p = np.column_stack([ids % board.columns, ids // board.columns, np.zeros(n)]) * board.square_mm
+    return CornerSet(
+        body_p_mm=board_p,
+        ideal_px=ideal,
+        view=np.full(n, view, dtype=np.int64),
+        group=np.zeros(n, dtype=np.int64),
+        covariance=covariance.reshape(2 * n, 2 * n),
+        common_px=np.full(n, COMMON_PX),
+        outward_px=np.zeros((n, 2)),
+        focal_px=np.tile(focal_px(camera), (n, 1)),
+        view_T_camera=np.tile(view_T_camera, (n, 1, 1)),
+    )
+
+
+def _strays(corners: CornerSet) -> BoolArray:
+    """(n,) corners far off the pose that most of them agree on: a glint, a finger, a marker read wrongly."""
+    fits = best_poses(corners, huber=3.0)
+    if not fits:
+        return np.zeros(len(corners.view), dtype=bool)
+    size = np.linalg.norm(fits[0].residual_px, axis=1)
+    return np.asarray(size > max(6.0 * float(np.median(size)), 0.5))
+
+
+def detect_board(
+    left: npt.NDArray[np.generic] | None,
+    right: npt.NDArray[np.generic] | None,
+    rig: StereoRig,
+    board: BoardModel,
+) -> BoardFit | NotFound:
+    """Find the board in one or both frames of a shot.
+
+    Args:
+        left, right: (h, w) grey or (h, w, 3) BGR images, uint8 or uint16, of the rig's image size; None where absent.
+
+    Raises:
+        ValueError: a right frame without a right camera, no frame at all, an unknown dictionary, or not an image.
+    """
+    if left is None and right is None:
+        raise ValueError("no frame to detect in")
+    refused = board_refusal(board)
+    if refused:
+        return NotFound(f"board: {refused}")
+    parts: list[CornerSet] = []
+    if left is not None:
+        corners = _view_corners(left, rig.left, 0, np.eye(4), board)
+        parts += [] if corners is None else [corners]
+    if right is not None:
+        if rig.right is None or rig.right_T_left is None:
+            raise ValueError("a right frame, but the rig has no right camera")
+        corners = _view_corners(right, rig.right, 1, rig.right_T_left, board)
+        parts += [] if corners is None else [corners]
+    where = " or ".join(name for name, image in zip(VIEW_NAMES, (left, right), strict=True) if image is not None)
+    if not parts:
+        return NotFound(f"board: not found in the {where} view")
+    everything = join(parts)
+    if len(everything.view) < MIN_CORNERS:
+        return NotFound(f"board: only {len(everything.view)} corners seen in the {where} view")
+    stray = _strays(everything)
+    left_out = [f"{int(stray.sum())} corners off the board"] if stray.any() else []
+    if 3 * int(stray.sum()) > len(stray):
+        return NotFound(f"board: {int(stray.sum())} of {len(stray)} corners do not fit the board")
+    pose = choose_pose(everything.subset(~stray), "board", left_out)
+    return pose if isinstance(pose, NotFound) else BoardFit(pose, board)

@@ -1,0 +1,186 @@
+"""One pose from all corners of a body: hypotheses, strays, the choice between two planar poses, or why not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.detection.pose import (
+    CornerSet,
+    PoseFit,
+    common_covariance,
+    corner_residuals,
+    fit_pose,
+    fit_with_excess,
+    pose_hypotheses,
+    whitener,
+)
+from fgreg.frames import FloatArray, log_so3
+
+VIEW_NAMES = ("left", "right")
+MAX_RMS_PX = 4.0
+"""Residual beyond which the corners do not belong to one body as modelled."""
+OTHER_POSE_RAD = 0.02
+"""Minima closer than this are one pose."""
+AMBIGUITY_SIGMA_PX = 0.15
+"""Corner noise against which two hypotheses are told apart: more than what is measured, for what is not modelled (a
+tag that is not quite flat, a lens not quite as calibrated)."""
+AMBIGUITY_CHI2 = 25.0
+"""Difference in chi-square at that noise (or at the residuals', where they are larger) below which a pose is ambiguous:
+odds of 2.7e5 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class NotFound:
+    """Nothing that can be used; the reason as a plain sentence part."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidFit:
+    """A rigid body found in one or two views.
+
+    Attributes:
+        camera_T_body: (4, 4).
+        information: (6, 6) over the right tangent (rotation rad, translation mm), at corner noise scale 1.
+        common_covariance: (6, 6) of the errors that residuals cannot show (method bias, errors common to both views).
+        cost: whitened sum of squared residuals, chi-square of ``dof`` at scale 1.
+        dof: residuals less 6.
+        corners: how many, over all views.
+        views: names of the views used.
+        rms_px: root mean square distance of predicted from observed corners, undistorted pixels.
+        residual_sum_px2: sum of those squared distances.
+        second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
+        left_out: what was seen but not used, with the reason.
+    """
+
+    camera_T_body: FloatArray
+    information: FloatArray
+    common_covariance: FloatArray
+    cost: float
+    dof: int
+    corners: int
+    views: tuple[str, ...]
+    rms_px: float
+    residual_sum_px2: float
+    second_ratio: float
+    left_out: tuple[str, ...]
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> float:
+    """Angle (rad) between the rotations of two poses (4, 4)."""
+    return float(np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3])))
+
+
+def rms_px(residual_px: FloatArray) -> float:
+    """Root mean square length of residuals (n, 2)."""
+    return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1))))
+
+
+def best_poses(corners: CornerSet, *, huber: float | None = None) -> list[PoseFit]:
+    """Up to two distinct minima of the joint fit, best first, from all planar hypotheses."""
+    white = whitener(corners.covariance)
+    ranked: list[tuple[float, FloatArray]] = []
+    for pose in pose_hypotheses(corners):
+        residual, _, in_front = corner_residuals(corners, pose)
+        if in_front:
+            # Capped, so that one bad tag does not decide which hypothesis is tried first.
+            size = np.sum((white @ residual.ravel()).reshape(-1, 2) ** 2, axis=1)
+            ranked.append((float(np.minimum(size, 4.0 * np.median(size) + 1e-12).sum()), pose))
+    ranked.sort(key=lambda item: item[0])
+    fits: list[PoseFit] = []
+    tried: list[FloatArray] = []
+    for _, pose in ranked:
+        if any(angle_between(pose, other) < 0.1 for other in tried):
+            continue
+        tried.append(pose)
+        fit = fit_pose(corners, pose, huber=huber)
+        if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
+            fits.append(fit)
+        if len(tried) >= 6:
+            break
+    if fits:
+        # Where the perspective is weak the other hypothesis mirrors the tilt; a solver may have given only one.
+        fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body), huber=huber)
+        if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
+            fits.append(fit)
+    return sorted(fits, key=lambda fit: fit.cost)[:2]
+
+
+def _mirrored(corners: CornerSet, camera_T_body: FloatArray) -> FloatArray:
+    """The same place with the body plane's normal mirrored at the line of sight."""
+    points = corners.body_p_mm - corners.body_p_mm.mean(axis=0)
+    normal = np.linalg.svd(points)[2][2]
+    centre = camera_T_body[:3, :3] @ corners.body_p_mm.mean(axis=0) + camera_T_body[:3, 3]
+    sight = centre / np.linalg.norm(centre)
+    out = camera_T_body.copy()
+    # Half a turn about the sight mirrors the tilt and turns the body round; half a turn about its normal undoes that.
+    out[:3, :3] = _half_turn(sight) @ camera_T_body[:3, :3] @ _half_turn(normal)
+    out[:3, 3] = centre - out[:3, :3] @ corners.body_p_mm.mean(axis=0)
+    return out
+
+
+def _half_turn(axis: FloatArray) -> FloatArray:
+    return 2.0 * np.outer(axis, axis) - np.eye(3)
+
+
+def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, list[str]]:
+    """Drop tags that do not fit the body where most of them do (a tag read wrongly, or one that came off)."""
+    groups = np.unique(corners.group)
+    if len(groups) < 3:
+        return corners, []
+    fits = best_poses(corners, huber=3.0)
+    if not fits:
+        return corners, []
+    rms = np.array([rms_px(fits[0].residual_px[corners.group == g]) for g in groups])
+    stray = rms > max(5.0 * float(np.median(rms)), 2.0)
+    if not stray.any() or (~stray).sum() < 2:
+        return corners, []
+    kept = corners.subset(~np.isin(corners.group, groups[stray]))
+    return kept, [f"{names[int(g)]} is {r:.1f} px off the body" for g, r in zip(groups[stray], rms[stray], strict=True)]
+
+
+def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit | NotFound:
+    """The pose of a body, from the better of its planar hypotheses where they can be told apart.
+
+    Args:
+        what: the body's name for the reasons, e.g. ``marker``.
+        left_out: passed on.
+    """
+    if len(corners.view) < 4:
+        return NotFound(f"{what}: only {len(corners.view)} corners seen, at least 4 are needed")
+    # Hypotheses are weighed at a noise that forgives what is not modelled; the chosen one is then fitted at its own.
+    hypotheses = best_poses(corners.with_excess(AMBIGUITY_SIGMA_PX**2))
+    chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
+    if chosen is None:
+        return NotFound(f"{what}: no pose fits the corners seen")
+    corners, best = chosen
+    rms = rms_px(best.residual_px)
+    views = tuple(VIEW_NAMES[v] for v in np.unique(corners.view))
+    if rms > MAX_RMS_PX:
+        cause = "the two views or the model" if len(views) == 2 else "the model"
+        return NotFound(f"{what}: corners {rms:.1f} px off the best pose; {cause} cannot be right")
+    dof = 2 * len(corners.view) - 6
+    ratio = np.inf
+    if len(hypotheses) == 2:
+        first, second = hypotheses
+        ratio = rms_px(second.residual_px) / max(rms_px(first.residual_px), 1e-9)
+        if second.cost - first.cost < AMBIGUITY_CHI2 * max(1.0, first.cost / max(dof, 1)):
+            kind = "ambiguous single view" if len(views) == 1 else "ambiguous"
+            apart = np.degrees(angle_between(first.camera_T_body, second.camera_T_body))
+            return NotFound(f"{what}: {kind}: a second pose {apart:.0f} deg away fits only {ratio:.1f} times worse")
+    return RigidFit(
+        camera_T_body=best.camera_T_body,
+        information=best.information,
+        common_covariance=common_covariance(corners, best),
+        cost=best.cost,
+        dof=dof,
+        corners=len(corners.view),
+        views=views,
+        rms_px=rms,
+        residual_sum_px2=float(np.sum(best.residual_px**2)),
+        second_ratio=float(ratio),
+        left_out=tuple(left_out),
+    )
