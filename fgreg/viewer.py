@@ -155,6 +155,8 @@ class Viewer:
             rec.static("world/camera/marker/tags", shapes.strips(outlines, shapes.MARKER, 1.5))
         rec.static("world/camera/marker/axes", shapes.axes(8.0))
         rec.static("world/camera/marker/label", shapes.point([0.0, 0.0, 0.0], shapes.MARKER, 1.0, "marker"))
+        limit = rr.SeriesLines(colors=[shapes.UNUSED], names=["95 % of good looks are below"], widths=[1.0])
+        rec.static("plots/nis/limit_95", limit)
         for plot in ("residual_mm", "nis", "rotation_deg", "lambda_mm"):
             for name, color, shape in (
                 ("pair", shapes.PM, rr.components.MarkerShape.Circle),

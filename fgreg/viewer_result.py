@@ -13,6 +13,7 @@ from fgreg import viewer_scene as scene
 from fgreg import viewer_shapes as shapes
 from fgreg.estimate import PairEstimate, SessionEstimate, Verdict
 from fgreg.frames import FloatArray, inverse, log_so3, transform_points
+from fgreg.matching import measured_pairs
 from fgreg.measurements import Look, MarkerObservation, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.viewer_text import summary_markdown
@@ -22,12 +23,12 @@ FAR_MM = 1000.0
 
 
 class Truth(Protocol):
-    """What is known of the truth: ``trus_T_camera`` per epoch, and the PMs (3,) in TRUS millimetres by number."""
+    """What is known of the truth: ``trus_T_camera`` per epoch, and the PMs (3,) by number."""
 
     @property
     def trus_T_camera(self) -> Sequence[FloatArray]: ...
     @property
-    def pms(self) -> Mapping[int, FloatArray]: ...
+    def trus_p_pm_mm(self) -> Mapping[int, FloatArray]: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +54,7 @@ class ResultPainter:
         """Draw everything."""
         if self.estimate.verdict is Verdict.REFUSED:
             shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
-        looks = scene.looks_of_estimates(self.estimate.pairs, self.measurements)
+        looks = measured_pairs(self.estimate.pairs, self.measurements)
         markers_of_aims = {aim.t: aim.marker for aim in self.measurements.aims}
         epoch, plane_is_plain = -1, False
         for shot in scene.shots_of(self.estimate):
@@ -216,17 +217,22 @@ class ResultPainter:
             else:
                 values = {"lambda_mm/track": self.estimate.tracks[shot.position].lambda_mm}
             for path, value in values.items():
-                if value is not None:
+                if value is not None and math.isfinite(value):
                     series.setdefault(path, []).append((shot.number, shot.t, value))
         for path, rows in series.items():
             numbers, seconds, scalars = zip(*rows, strict=True)
             self.rec.series(f"plots/{path}", numbers, seconds, scalars)
+        ends = [row for path, rows in series.items() if path.startswith("nis/") for row in rows]
+        if ends:
+            first, last = min(ends), max(ends)
+            limits = [scene.CHI2_95_2] * 2
+            self.rec.series("plots/nis/limit_95", (first[0], last[0]), (first[1], last[1]), limits)
 
     def _static(self) -> None:
         import rerun as rr
 
-        if self.truth is not None and self.truth.pms:
-            known = rr.Points3D(list(self.truth.pms.values()), colors=[shapes.TRUTH], radii=[shapes.ui(2.5)])
+        if self.truth is not None and self.truth.trus_p_pm_mm:
+            known = rr.Points3D(list(self.truth.trus_p_pm_mm.values()), colors=[shapes.TRUTH], radii=[shapes.ui(2.5)])
             self.rec.static("world/truth/pms", known)
         page = summary_markdown(self.model, self.estimate, self._camera_errors())
         if self.estimate.laser is not None:

@@ -7,14 +7,13 @@ equals ``trus`` at stage angle 0, so a point (x, 0, z) of it lies in the image p
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.estimate import PairEstimate, SessionEstimate
+from fgreg.estimate import SessionEstimate
 from fgreg.frames import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
-from fgreg.measurements import Look, Measurements, Pair
+from fgreg.measurements import Look
 from fgreg.models import CameraModel, MarkerModel, ProbeModel
 
 CHI2_95_3 = 7.814728
@@ -140,23 +139,6 @@ def frustum_strips_mm(camera: CameraModel | None, depth_mm: float) -> list[Float
         corners = depth_mm * (pixels - camera.matrix[:2, 2]) / np.array([camera.matrix[0, 0], camera.matrix[1, 1]])
     rectangle = np.column_stack([corners, np.full(4, depth_mm)])
     return [np.vstack([rectangle, rectangle[:1]]), *(np.vstack([np.zeros(3), corner]) for corner in rectangle)]
-
-
-def looks_of_estimates(pairs: Sequence[PairEstimate], measurements: Measurements) -> list[Pair | None]:
-    """The measured pair behind each estimated look, None where nothing was measured (no marker, no sound).
-
-    Estimates list every look of the session, measurements only those that were detected; both are in event order, and
-    ``t`` and ``pm`` tell them apart. Where several looks share both, those in use are served first.
-    """
-    waiting: dict[tuple[float, int], list[Pair]] = {}
-    for pair in measurements.pairs:
-        waiting.setdefault((pair.t, pair.pm), []).append(pair)
-    found: list[Pair | None] = [None] * len(pairs)
-    for position in sorted(range(len(pairs)), key=lambda i: not pairs[i].used):
-        queue = waiting.get((pairs[position].t, pairs[position].pm))
-        if queue:
-            found[position] = queue.pop(0)
-    return found
 
 
 @dataclass(frozen=True, slots=True)

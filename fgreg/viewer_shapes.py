@@ -39,6 +39,8 @@ TRUTH: Color = (255, 80, 210)
 AXES: tuple[Color, ...] = ((235, 90, 90), (90, 210, 100), (100, 140, 255))
 IMAGE_DISTANCE_MM = 35.0
 """From the camera to where its image is drawn."""
+LARGEST_ELLIPSOID_MM = 50.0
+"""Half size beyond which an ellipsoid is not drawn."""
 JPEG_QUALITY = 80
 
 
@@ -145,12 +147,17 @@ def arrow(
 
 
 def ellipsoids(centres_mm: FloatArray, covariances: FloatArray, color: Color) -> rr.Ellipsoids3D:
-    """95 % ellipsoids of (n, 3, 3) covariances about (n, 3) points."""
+    """95 % ellipsoids of (n, 3, 3) covariances about (n, 3) points.
+
+    Those longer than LARGEST_ELLIPSOID_MM are left out: they would hide the scene, and say no more than "unknown".
+    """
     import rerun as rr
 
     shapes = [ellipsoid_95(covariance) for covariance in covariances]
+    drawn = [i for i, shape in enumerate(shapes) if shape.half_sizes_mm.max() <= LARGEST_ELLIPSOID_MM]
+    shapes = [shapes[i] for i in drawn]
     return rr.Ellipsoids3D(
-        centers=centres_mm,
+        centers=centres_mm[drawn],
         half_sizes=[shape.half_sizes_mm for shape in shapes],
         quaternions=[rr.Quaternion(xyzw=quaternion_xyzw(shape.rotation)) for shape in shapes],
         colors=[color],
@@ -175,7 +182,7 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
         triangle_indices=triangles,
         vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
         albedo_texture=picture,
-        albedo_factor=(255, 255, 255, 190),
+        albedo_factor=(255, 255, 255, 160),
     )
 
 
