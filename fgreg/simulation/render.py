@@ -242,18 +242,19 @@ def undistorted_rays(camera: CameraModel, column_px: FloatArray, row_px: FloatAr
     yd = (row_px - k[1, 2]) / k[1, 1]
     xd = (column_px - k[0, 2] - k[0, 1] * yd) / k[0, 0]
     x, y = xd.copy(), yd.copy()
-    worst = 0.0
-    for _ in range(25):
-        fx, fy = _distort(x, y, camera.distortion)
-        ex, ey = fx - xd, fy - yd
-        worst = float(max(np.abs(ex).max(), np.abs(ey).max()))
-        if worst < 1e-12:
-            return x, y
-        jxx, jxy, jyy = _distortion_jacobian(x, y, camera.distortion)
-        determinant = jxx * jyy - jxy * jxy
-        x -= (jyy * ex - jxy * ey) / determinant
-        y -= (jxx * ey - jxy * ex) / determinant
-    if not worst < 1e-9:
+    with np.errstate(all="ignore"):  # a lens that folds diverges; that is told below
+        for _ in range(25):
+            fx, fy = _distort(x, y, camera.distortion)
+            ex, ey = fx - xd, fy - yd
+            jxx, jxy, jyy = _distortion_jacobian(x, y, camera.distortion)
+            determinant = jxx * jyy - jxy * jxy
+            if max(np.abs(ex).max(), np.abs(ey).max()) < 1e-12:
+                break
+            x -= (jyy * ex - jxy * ey) / determinant
+            y -= (jxx * ey - jxy * ex) / determinant
+    # A solution beyond the fold of the polynomial is on the other side of the axis, or turns the image over.
+    unfolded = (determinant > 0.0) & (x * xd + y * yd >= 0.0)
+    if not (np.abs(ex) < 1e-9).all() or not (np.abs(ey) < 1e-9).all() or not unfolded.all():
         raise ValueError(f"the lens distortion {camera.distortion.tolist()} cannot be inverted over the image")
     return x, y
 
