@@ -5,11 +5,11 @@ from __future__ import annotations
 
 def one_line(text: str, limit: int | None = None) -> str:
     """``text`` with line breaks, control characters and lone surrogates escaped, cut to ``limit`` characters."""
-    if limit is not None and len(text) > limit:
-        text = text[: limit - 3] + "..."
-    if text.isprintable():
-        return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    if limit is not None:
+        text = text[: limit + 1]
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return text if limit is None or len(text) <= limit else text[: limit - 3] + "..."
 
 
 class FgregError(Exception):

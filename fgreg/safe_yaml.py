@@ -27,6 +27,7 @@ MAX_DEPTH = 32
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 _LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
+_OLD_NUMBER = re.compile(r"([-+]?[0-9]+\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
 _SPECIAL = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _TRUTH = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _NULLS = frozenset({"", "~", "null", "Null", "NULL"})
@@ -37,13 +38,18 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class YamlMapping(dict[str, object]):
-    """A mapping that knows the 1-based line of each key."""
+    """A mapping that knows the 1-based line of each key.
 
-    __slots__ = ("lines",)
+    ``texts`` has the written form of numbers that YAML 1.1 takes for texts (``1e5``), so that a text is not lost where
+    one is expected: writers of 1.1 leave such texts without quotes.
+    """
+
+    __slots__ = ("lines", "texts")
 
     def __init__(self) -> None:
         super().__init__()
         self.lines: dict[str, int] = {}
+        self.texts: dict[str, str] = {}
 
 
 class YamlSequence(list[object]):
@@ -177,7 +183,7 @@ class _Builder:
         return InputError(f"{self._label}: line {line}", found, expected)
 
     def _refuse_tag(self, tag: str | None, line: int) -> None:
-        if tag is not None and tag != "!":
+        if tag is not None:
             raise self._error(line, f"the tag {one_line(tag, 60)}", "plain values without tags")
 
     def _count(self, nodes: int, line: int) -> None:
@@ -194,7 +200,14 @@ class _Builder:
         value = _plain_value(event.value) if event.implicit[0] else event.value
         if event.anchor is not None:
             self._anchors[event.anchor] = (value, 1, 0)
+        if isinstance(value, float) and not _OLD_NUMBER.fullmatch(event.value):
+            self._note_text(top, event.value)
         self._put(value, 1, line)
+
+    @staticmethod
+    def _note_text(top: _Open | None, text: str) -> None:
+        if top is not None and isinstance(top.node, YamlMapping) and top.key is not None:
+            top.node.texts[top.key] = text
 
     def _key(self, top: _Open, key: str, line: int) -> None:
         if key in top.node:

@@ -61,6 +61,8 @@ class Bounds:
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
+        if self == replace(ANY, unit=self.unit):
+            return f"a finite number{' in' if unit else ''}{unit}"
         if self.low == -self.high:
             return f"a number within +-{self.high:g}{unit}"
         return f"a number {'>' if self.above else '>='} {self.low:g} and <= {self.high:g}{unit}"
@@ -101,8 +103,9 @@ class Place:
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """The known word that a misspelt one was probably meant to be."""
-    matches = difflib.get_close_matches(word[:80].lower(), list(known), n=1, cutoff=0.7)
-    return matches[0] if matches else None
+    by_lower = {name.lower(): name for name in known}
+    matches = difflib.get_close_matches(word[:80].lower(), list(by_lower), n=1, cutoff=0.7)
+    return by_lower[matches[0]] if matches else None
 
 
 class Fields:
@@ -131,13 +134,18 @@ class Fields:
             meant = nearest(key, [name for name in known if name not in value])
             if meant is not None:
                 self._misspelt.add(meant)
-            hint = f"{meant} (did you mean that?)" if meant else f"one of {', '.join(known)} or a name with x_"
-            self.fail(key, "an unknown key", hint)
+            every = f"one of {', '.join(known)}, or a name that starts with x_"
+            self.fail(key, "an unknown key", f"a known one (did you mean {meant}?)" if meant else every)
 
     @property
     def ok(self) -> bool:
         """Whether nothing was wrong since this mapping was opened."""
         return len(self.problems) == self._start
+
+    @property
+    def misspelt(self) -> frozenset[str]:
+        """Known keys that are absent but resemble an unknown one."""
+        return frozenset(self._misspelt)
 
     def has(self, key: str) -> bool:
         return key in self._values
@@ -223,6 +231,8 @@ class Fields:
                 self._missing(key, expected)
             return default or ""
         value = self._values[key]
+        if isinstance(self._values, YamlMapping):
+            value = self._values.texts.get(key, value)
         if not isinstance(value, str) or not value:
             self.fail(key, shown(value), expected)
             return ""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgreg.errors import InputError
-from fgreg.events import Event
+from fgreg.events import Event, PairEvent, TrackEvent
 from fgreg.ground_truth import GroundTruth, TrackTruth
 from fgreg.models import SessionModel
 from fgreg.safe_yaml import load_yaml
@@ -60,7 +60,7 @@ def read_session(folder: Path) -> Session:
         raise problems[0]
     if setup is None or setup.model is None:
         raise AssertionError("no model and no problem")
-    return Session(folder, setup.model, tuple(log.events), (*setup.warnings, *log.warnings))
+    return Session(folder, setup.model, tuple(log.events), tuple(_warnings(setup, log)))
 
 
 def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
@@ -78,7 +78,7 @@ def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
     camera = None if setup is None else setup.camera
     probe = None if setup is None else setup.probe
     problems.extend(check_frames(log.frames, probe, None if camera is None else camera.left.image_size))
-    return problems, [*(() if setup is None else setup.warnings), *log.warnings]
+    return problems, _warnings(setup, log)
 
 
 def read_ground_truth(folder: Path) -> GroundTruth | None:
@@ -113,6 +113,26 @@ def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, Event
     except InputError as error:
         problems.append(error)
     return setup, read_events(folder / EVENTS_FILE, EVENTS_FILE, resolved, setup, problems)
+
+
+def _warnings(setup: Setup | None, log: EventLog) -> list[str]:
+    """What is allowed but hardly meant, of both files together."""
+    if setup is None:
+        return log.warnings
+    beyond = []
+    if setup.model is not None:
+        lower, upper = (math.degrees(limit) for limit in setup.model.stage.limits_device_rad)
+        for event in log.events:
+            looks = (
+                (event.trus,) if isinstance(event, PairEvent) else event.looks if isinstance(event, TrackEvent) else ()
+            )
+            if any(not lower - 1e-6 <= look.scan_deg <= upper + 1e-6 for look in looks):
+                beyond.append(event.line)
+    out = [*setup.warnings, *log.warnings]
+    if beyond:
+        where = f"{EVENTS_FILE}: line {beyond[0]}" + (f" and {len(beyond) - 1} more" if beyond[1:] else "")
+        out.append(f"{where}: scan_deg is outside stage.limits_deg, [{lower:g}, {upper:g}]")
+    return out
 
 
 def _read_truth(folder: Path, problems: list[InputError]) -> GroundTruth | None:

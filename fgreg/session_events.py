@@ -115,7 +115,7 @@ def _parse(line: bytes, place: Place, problems: list[InputError], log: EventLog)
     expected = "one JSON object"
     try:
         value = json.loads(
-            line.decode("utf-8"),
+            line.rstrip(b"\r\n").decode("utf-8"),
             object_pairs_hook=_object,
             parse_constant=_refuse_constant,
             parse_int=_integer,

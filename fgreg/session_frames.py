@@ -65,7 +65,7 @@ def locate_frame(folder: Path, name: str, where: str) -> Path:
     except (OSError, RuntimeError, ValueError):  # loops of links, names the file system cannot have
         inside = False
     if not inside:
-        raise InputError(where, f"{shown(name)}, which leads out of the folder,", _FRAME_NAME)
+        raise InputError(where, f"{shown(name)}, which leads out of the folder", _FRAME_NAME)
     return path
 
 
@@ -84,7 +84,7 @@ def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int,
     with _open_frame(path, name, where) as file:
         size = _png_size(file)
         if size is None:
-            raise InputError(where, f"{shown(name)}, which is no whole PNG image,", "a PNG image")
+            raise InputError(where, f"{shown(name)}, which is no whole PNG image", "a PNG image")
         if image_size is not None and size != image_size:
             expected = f"camera.image_size, {image_size[0]} x {image_size[1]}"
             raise InputError(where, f"{shown(name)} with {size[0]} x {size[1]} px", expected)
@@ -153,7 +153,7 @@ def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None
     with _open_frame(path, name, where) as file:
         header = _npy_header(file)
         if header is None:
-            raise InputError(where, f"{shown(name)}, which is no NPY array,", "an NPY array")
+            raise InputError(where, f"{shown(name)}, which is no NPY array", "an NPY array")
         shape, dtype = header
         if dtype.hasobject:
             raise InputError(where, f"{shown(name)} with Python objects", "an NPY array of numbers")

@@ -153,7 +153,7 @@ def read_setup(data: Mapping[str, object], file: str, default_name: str, problem
 
     return Setup(
         model=top.build(make),
-        present=_present(data),
+        present=_present(data) | top.misspelt,
         probe=probe,
         camera=camera,
         board=board,
@@ -167,6 +167,11 @@ def _present(data: Mapping[str, object]) -> frozenset[str]:
         inner = data.get(section)
         if isinstance(inner, Mapping):
             names |= {f"{section}.{key}" for key in inner}
+    # A section that is not there or no section is one problem, not one more for each event that needs a part of it.
+    if not isinstance(data.get("probe"), Mapping):
+        names.add("probe.channels")
+    if not isinstance(data.get("camera"), Mapping):
+        names.add("camera.right")
     return frozenset(names)
 
 
@@ -363,7 +368,7 @@ def _board(top: Fields) -> BoardModel | None:
     rows = fields.integer("rows", smallest, 200)
     square_mm = fields.number("square_mm", POSITIVE_MM)
     if fields.ok and not fields.has("charuco") and (columns + rows) % 2 == 0:
-        found = f"{columns} x {rows} inner corners, the same when turned by half a turn,"
+        found = f"{columns} x {rows} inner corners, the same when turned by half a turn"
         fields.fail("", found, "columns + rows odd, or a charuco board")
     charuco = None
     if fields.has("charuco"):
