@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.camera import ideal_from_pixels, pixel_by_ideal_jacobian
-from fgreg.detection.edges import Image, fit_edges, segment_frames
+from fgreg.detection.edges import MIN_CONTRAST, Image, fit_edges, segment_frames
 from fgreg.frames import BoolArray, FloatArray
 from fgreg.models import CameraModel
 
@@ -27,9 +27,14 @@ FALLBACK_SIGMA_PX = 0.3
 """Of a corner from sub-pixel refinement of a small or poor square."""
 COMMON_PX, COMMON_FALLBACK_PX = 0.0025, 0.1
 """Error of a corner that is the same in both views, so that their residuals do not show it: where the edges fall on
-the grid of pixels, how straight they were printed."""
+the grid of pixels, how straight they were printed. That from edges is for edges of COMMON_LENGTH_PX, see below."""
+COMMON_LENGTH_PX = 200.0
 OUTWARD_PX, OUTWARD_FALLBACK_PX = 0.002, 0.1
 """Error of all corners of all squares outwards together (the method's own bias): what makes depth too small."""
+BORDER_MARGIN_PX = 7.0
+"""Corners nearer to the image's border than this have to come from edges."""
+MAX_FALLBACK_EDGE_PX = 60.0
+"""Longer edges than this can be fitted: where they cannot, the square's outline is not what the detector took it for."""
 MIN_EDGE_PX = 12.0
 """Edges shorter than this are left to sub-pixel refinement."""
 
@@ -43,12 +48,16 @@ class SquareCorners:
         covariance: (n, 8, 8) px^2 over (x0, y0, x1, ...), at unit corner noise scale.
         found: (n, 4) which corners may be used.
         from_edges: (n, 4) whether a corner is an intersection of edges, else sub-pixel refinement.
+        common_px: (n, 4) sigma of the error that a corner has in common in both views.
+        outward_px: (n, 4, 2) one sigma of the outward error that all squares have in common.
     """
 
     ideal_px: FloatArray
     covariance: FloatArray
     found: BoolArray
     from_edges: BoolArray
+    common_px: FloatArray
+    outward_px: FloatArray
 
 
 def grey(image: npt.NDArray[np.generic]) -> Image:
@@ -75,8 +84,12 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
 
 def refine_subpixel(image: Image, corners_px: FloatArray, half_window_px: int) -> FloatArray:
     """OpenCV's sub-pixel refinement of corners (n, 2); a corner that ran away keeps its starting place."""
-    if len(corners_px) == 0:
-        return corners_px
+    height, width = image.shape
+    inside = ((corners_px >= 0.0) & (corners_px <= np.array([width, height]) - 1.0)).all(axis=1)
+    if not inside.all():
+        out = corners_px.copy()
+        out[inside] = refine_subpixel(image, corners_px[inside], half_window_px) if inside.any() else out[inside]
+        return out
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 40, 0.001)
     start = np.ascontiguousarray(corners_px, dtype=np.float32).reshape(-1, 1, 2)
     window = (half_window_px, half_window_px)
@@ -107,15 +120,17 @@ def square_corners(
         reach = int(np.clip(np.floor(0.6 * cell_px[k]), 2, 5))
         fallback[k] = refine_subpixel(image, corners_px[k], reach)
     ideal = ideal_from_pixels(camera, fallback)
-    margin = np.minimum(fallback, np.array([width, height]) - 1.0 - fallback).min(axis=2)
-    found = np.isfinite(ideal).all(axis=2) & (margin > 1.5)
+    # At the image's border the refinement sees too little, and the corner may not be the tag's at all but the place
+    # where the border cuts it: only edges that are seen on both sides count there.
+    margin = np.minimum(corners_px, np.array([width, height]) - 1.0 - corners_px).min(axis=2)
+    found = np.isfinite(ideal).all(axis=2) & (margin > BORDER_MARGIN_PX)
     from_edges = np.zeros((n, 4), dtype=bool)
     covariance = np.zeros((n, 8, 8))
     covariance[:, np.arange(8), np.arange(8)] = FALLBACK_SIGMA_PX**2
 
     usable = np.flatnonzero(np.isfinite(ideal).all(axis=(1, 2)) & (sides.min(axis=1) >= MIN_EDGE_PX))
     if not edges or usable.size == 0:
-        return SquareCorners(ideal, covariance, found, from_edges)
+        return _with_common(ideal, covariance, found, from_edges, sides)
 
     start = ideal[usable].reshape(-1, 2)
     end = np.roll(ideal[usable], -1, axis=1).reshape(-1, 2)
@@ -123,6 +138,9 @@ def square_corners(
     middle, direction, normal, half = (a.reshape(-1, 4, *a.shape[1:]) for a in segment_frames(start, end))
     line, good = fit.line.reshape(-1, 4, 2), fit.good.reshape(-1, 4)
     line_covariance = fit.covariance.reshape(-1, 4, 2, 2)
+    # Sub-pixel refinement of a corner counts only on small squares, whose outline lies between dark and light.
+    step = (fit.step > MIN_CONTRAST).reshape(-1, 4)
+    found[usable] &= step & np.roll(step, 1, axis=1) & (sides[usable].min(axis=1) < MAX_FALLBACK_EDGE_PX)[:, None]
     for row, k in enumerate(usable):
         jacobian = np.zeros((8, 8))
         for c in range(4):
@@ -134,6 +152,8 @@ def square_corners(
             right = np.array([rows[j] @ middle[row, i] + line[row, i, 0] for j, i in enumerate((e, g))])
             inverse = np.linalg.inv(rows)
             corner = inverse @ right
+            if np.linalg.norm(corner - start.reshape(-1, 4, 2)[row, c]) > max(4.0, 0.5 * cell_px[k]):
+                continue
             ideal[k, c] = corner
             from_edges[k, c] = found[k, c] = True
             for j, i in enumerate((e, g)):
@@ -147,7 +167,19 @@ def square_corners(
         sigma = np.where(np.repeat(from_edges[k], 2), CORNER_FLOOR_PX, FALLBACK_SIGMA_PX)
         covariance[k] = from_lines + np.diag(sigma**2)
     # A fallback corner's sigma is in image pixels: bring it to ideal ones.
-    for k, c in np.argwhere(found & ~from_edges):
+    for k, c in np.argwhere(found & ~from_edges).tolist():
         inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal[k, c]))
         covariance[k, 2 * c : 2 * c + 2, 2 * c : 2 * c + 2] = FALLBACK_SIGMA_PX**2 * inverse @ inverse.T
-    return SquareCorners(ideal, covariance, found, from_edges)
+    return _with_common(ideal, covariance, found, from_edges, sides)
+
+
+def _with_common(
+    ideal: FloatArray, covariance: FloatArray, found: BoolArray, from_edges: BoolArray, sides_px: FloatArray
+) -> SquareCorners:
+    """Add the common errors: short edges average less of theirs away."""
+    from_edge = COMMON_PX * np.sqrt(COMMON_LENGTH_PX / np.maximum(sides_px.min(axis=1), 1.0))
+    common = np.where(from_edges, from_edge[:, None], COMMON_FALLBACK_PX)
+    arm = ideal - ideal.mean(axis=1, keepdims=True)
+    arm /= np.maximum(np.linalg.norm(arm, axis=2, keepdims=True), 1e-9)
+    outward = arm * np.where(from_edges, OUTWARD_PX, OUTWARD_FALLBACK_PX)[..., None]
+    return SquareCorners(ideal, covariance, found, from_edges, common, outward)

@@ -27,7 +27,7 @@ from fgreg.detection.camera import (
     focal_px,
     pixels_from_ideal,
 )
-from fgreg.frames import BoolArray, FloatArray
+from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.models import CameraModel
 
 Image = npt.NDArray[np.uint8]
@@ -35,7 +35,8 @@ Image = npt.NDArray[np.uint8]
 MAX_ROWS = 112
 """Pixel rows across an edge that are used; longer edges are sampled evenly."""
 CURVE_NODES = 17
-MIN_ROWS = 6
+SECTIONS, MIN_SECTIONS = 8, 6
+"""Parts of an edge, and in how many of them both its sides have to be in the image."""
 MIN_CONTRAST = 12.0
 """Grey levels between the dark and the light side below which an edge is not trusted."""
 MAX_BLUR_PX = 5.0
@@ -58,12 +59,14 @@ class EdgeFit:
         line: (n, 2) offset o at the middle and m at the end of the segment (u = 1), ideal px, along ``normal``.
         covariance: (n, 2, 2) of ``line``, px^2, at the pixel noise that the fit leaves.
         blur_px: (n,) standard deviation s of the step.
+        step: (n,) grey levels by which the left hand of the starting segment is lighter than its right.
         good: (n,) whether there is an edge that can be trusted.
     """
 
     line: FloatArray
     covariance: FloatArray
     blur_px: FloatArray
+    step: FloatArray
     good: BoolArray
 
 
@@ -240,6 +243,20 @@ def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> Fl
     return np.asarray(np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3))
 
 
+def _sections_seen(band: _Band, x: FloatArray, reach: FloatArray, margin_px: FloatArray) -> IntArray:
+    """(n,) in how many sections of |u| < reach (n,) there are pixels beyond ``margin_px`` (n,) on both sides."""
+    e = band.d - x[:, :1] - x[:, 1:2] * band.u
+    section = np.floor((band.u / reach[:, None] + 1.0) * (SECTIONS / 2)).astype(np.intp)
+    seen = np.zeros((len(x), SECTIONS), dtype=np.int64)
+    edge = np.broadcast_to(np.arange(len(x))[:, None], e.shape)
+    for bit, side in ((1, e > margin_px[:, None]), (2, e < -margin_px[:, None])):
+        chosen = band.used & side & (section >= 0) & (section < SECTIONS)
+        present = np.zeros((len(x), SECTIONS), dtype=bool)
+        present[edge[chosen], section[chosen]] = True
+        seen += bit * present
+    return np.asarray((seen == 3).sum(axis=1))
+
+
 def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> FloatArray:
     """Levels from the outer thirds of the band, no offset, a wide blur."""
     x = np.zeros((len(band.d), PARAMETERS))
@@ -250,23 +267,34 @@ def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> Fl
     return x
 
 
+def _locate(
+    camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray, widest_px: float
+) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """A first look: (parameters (n, 8), whether an edge is near (n,), light less dark level about the start (n,))."""
+    half_width = np.clip(0.55 * cell_px, 2.0, widest_px)
+    trim = np.clip(0.12 * np.linalg.norm(end - start, axis=1), 2.0, 12.0)
+    band = _band(camera, image, start, end, half_width, trim, 40)
+    guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 0.3 * widest_px))
+    x, _, _ = _fit_band(band, guess, 10, 0.02)
+    near = (np.abs(x[:, 0]) + np.abs(x[:, 1]) < half_width) & (x[:, 5] - x[:, 3] > MIN_CONTRAST)
+    near &= np.exp(x[:, 2]) < MAX_BLUR_PX
+    return np.where(near[:, None], x, guess), near, guess[:, 5] - guess[:, 3]
+
+
 def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray) -> EdgeFit:
     """Find the edges near starting segments, dark on the right hand of their direction as drawn (y down).
 
     Args:
         image: (h, w) uint8.
-        start, end: (n, 2) ideal px, within about a third of ``cell_px`` (and some 4 px) of the true corners.
+        start, end: (n, 2) ideal px, within about half of ``cell_px`` (and 15 px) of the true corners.
         cell_px: (n,) width of the dark band beside the edge: what may be looked at on either side.
     """
-    # First pass: a wide look, to get onto the edge.
-    half_width = np.clip(0.55 * cell_px, 2.0, 8.0)
     length = np.linalg.norm(end - start, axis=1)
-    trim = np.clip(0.12 * length, 2.0, 12.0)
-    band = _band(camera, image, start, end, half_width, trim, 40)
-    guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 2.5))
-    x, _, _ = _fit_band(band, guess, 10, 0.02)
-    near = (np.abs(x[:, 0]) + np.abs(x[:, 1]) < 1.2 * half_width) & (x[:, 5] - x[:, 3] > MIN_CONTRAST)
-    x[~near, :3] = guess[~near, :3]
+    x, near, step = _locate(camera, image, start, end, cell_px, 8.0)
+    far = np.flatnonzero(~near & (cell_px > 15.0))
+    if far.size:
+        # The detector may have taken the inner outline of a thick border, some ten pixels off.
+        x[far], near[far], _ = _locate(camera, image, start[far], end[far], cell_px[far], 18.0)
 
     # Second pass: about the line found, as wide as its blur asks for.
     _, _, normal, _ = segment_frames(start, end)
@@ -292,17 +320,13 @@ def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatAr
 
     blur = np.exp(x[:, 2])
     contrast = x[:, 5] - x[:, 3]
-    light = np.sum(band.used & (band.d > 0.5 * blur[:, None]), axis=1)
-    dark = np.sum(band.used & (band.d < -0.5 * blur[:, None]), axis=1)
-    first_u = np.min(np.where(band.used, band.u, 1.0), axis=1)
-    last_u = np.max(np.where(band.used, band.u, -1.0), axis=1)
+    sections = _sections_seen(band, x, 1.0 - 2.0 * trim2 / length, np.minimum(blur, 0.4 * half_width2))
     good = (
         near
         & (contrast > np.maximum(MIN_CONTRAST, 4.0 * sigma))
         & (blur < MAX_BLUR_PX)
-        & (np.minimum(light, dark) >= MIN_ROWS)
-        & (last_u - first_u > 0.5)
+        & (sections >= MIN_SECTIONS)
         & (np.abs(x[:, 0]) + np.abs(x[:, 1]) < 1.5)
     )
     covariance = inverse_normal[:, :2, :2]
-    return EdgeFit(line=line, covariance=covariance, blur_px=blur, good=good)
+    return EdgeFit(line=line, covariance=covariance, blur_px=blur, step=step, good=good)

@@ -13,14 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.camera import focal_px
-from fgreg.detection.corners import (
-    COMMON_FALLBACK_PX,
-    COMMON_PX,
-    OUTWARD_FALLBACK_PX,
-    OUTWARD_PX,
-    grey,
-    square_corners,
-)
+from fgreg.detection.corners import grey, square_corners
 from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, choose_pose, without_strays
 from fgreg.detection.noise import CornerNoise, fit_covariance
 from fgreg.detection.pose import CornerSet, join
@@ -104,21 +97,14 @@ def view_corners(
                 np.full(count, view, dtype=np.int64),
                 np.zeros(count, dtype=np.int64),
                 squares.covariance[k][np.ix_(both, both)],
-                np.where(squares.from_edges[k][keep], COMMON_PX, COMMON_FALLBACK_PX),
-                _outward(squares.ideal_px[k], squares.from_edges[k])[keep],
+                squares.common_px[k][keep],
+                squares.outward_px[k][keep],
                 np.tile(focal_px(camera), (count, 1)),
                 np.tile(view_T_camera, (count, 1, 1)),
             )
         )
         ids.append(tag.id)
     return (join(parts) if parts else None), tuple(ids), left_out
-
-
-def _outward(corners_px: FloatArray, from_edges: npt.NDArray[np.bool_]) -> FloatArray:
-    """(4, 2) one sigma of the outward error of a square's corners."""
-    arm = corners_px - corners_px.mean(axis=0)
-    arm /= np.linalg.norm(arm, axis=1)[:, None]
-    return np.asarray(arm * np.where(from_edges, OUTWARD_PX, OUTWARD_FALLBACK_PX)[:, None])
 
 
 def detect_marker(

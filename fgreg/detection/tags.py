@@ -16,7 +16,7 @@ from fgreg.detection.edges import Image
 from fgreg.frames import FloatArray
 
 BORDER_PX = 12
-"""White frame put around the image: a tag whose quiet zone the image's edge cuts off is still a closed square."""
+"""The image is continued by so much: a tag whose quiet zone the image's edge cuts off is still a closed square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ def detector_parameters() -> cv2.aruco.DetectorParameters:
 
 def find_tags(image: Image, dictionary: str) -> list[FoundTag]:
     """All tags of a dictionary in a grey image (h, w); one id may come several times."""
-    padded = cv2.copyMakeBorder(image, BORDER_PX, BORDER_PX, BORDER_PX, BORDER_PX, cv2.BORDER_CONSTANT, value=255)
+    padded = cv2.copyMakeBorder(image, BORDER_PX, BORDER_PX, BORDER_PX, BORDER_PX, cv2.BORDER_REPLICATE)
     detector = cv2.aruco.ArucoDetector(dictionary_named(dictionary), detector_parameters())
     corners, ids, _ = detector.detectMarkers(padded)
     if ids is None:
