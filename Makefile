@@ -1,0 +1,39 @@
+# One venv for everything; made anew where pyproject.toml changes.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+JOBS ?= 2
+
+.PHONY: help demo test check clean
+
+help:
+	@echo "make demo   set up, then solve sessions/phantom from its raw frames and write out/phantom.rrd"
+	@echo "make test   set up, then run the tests"
+	@echo "make check  set up, then lint, types, import layers, and a wheel in an empty environment"
+	@echo "make clean  remove the environment and all that was built"
+
+$(VENV)/.ready: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "fgreg needs Python 3.11 or newer; try: make PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable . --group test --group check
+	@touch $@
+
+demo: $(VENV)/.ready
+	@mkdir -p out
+	$(BIN)/fgreg solve sessions/phantom --out out/phantom.yaml --rrd out/phantom.rrd
+	@echo "Look at it with: $(BIN)/rerun out/phantom.rrd"
+
+test: $(VENV)/.ready
+	$(BIN)/python -m pytest -n $(JOBS)
+
+check: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python tools/check_wheel.py
+
+clean:
+	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,5 @@
+"""``python -m fgreg``."""
+
+from fgreg.cli import main
+
+main()

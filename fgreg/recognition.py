@@ -1,0 +1,358 @@
+"""Recorded events to measurements: frames are looked at, defaults of the noise filled in, epochs and shots numbered.
+
+A shot whose marker or PM is not found is no error: it gets a reason and is left out. Detection runs in threads (OpenCV
+and numpy release the interpreter lock); the corner noise is pooled over the session before any covariance is formed.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.detection.board import BoardFit, board_corner, detect_board
+from fgreg.detection.find import NoSignal, PaFind
+from fgreg.detection.joint import NotFound
+from fgreg.detection.photoacoustic import locate_in_channels as locate_in_frame
+from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
+from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.drivers.frame_files import read_array, read_picture
+from fgreg.errors import InputError
+from fgreg.events import AimEvent, CameraMovedEvent, Event, MarkerRecord, PairEvent, TrackEvent, TrusRecord
+from fgreg.frames import FloatArray, as_float_array
+from fgreg.measurements import (
+    Aim,
+    EpochStart,
+    Look,
+    MarkerObservation,
+    Measurements,
+    Pair,
+    Track,
+    default_marker_covariance,
+)
+from fgreg.models import SessionModel, StereoRig
+from fgreg.session_frames import check_camera_frame, check_trus_frame
+
+Progress = Callable[[int, int], None]
+"""Called with frames done and frames in all."""
+Image = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recognised:
+    """What the session's events say, and what became of each.
+
+    Attributes:
+        measurements: aims, pairs and epochs that can be used.
+        tracks: queries whose marker was found.
+        aim_events, pair_events, track_events: index into the session's events of each aim, pair, track.
+        unused: reason, by event index, for every aim, pair or track left out; unused_aims: those that are aims.
+        markers: what was detected for each event whose marker came from frames.
+        boards: likewise of the board.
+        finds: what was located in each PA frame, by (event index, look).
+        marker_noise, board_noise: pooled corner noise.
+        epoch_of: camera epoch of every event.
+    """
+
+    measurements: Measurements
+    tracks: tuple[Track, ...]
+    aim_events: tuple[int, ...]
+    pair_events: tuple[int, ...]
+    track_events: tuple[int, ...]
+    unused: dict[int, str]
+    unused_aims: tuple[int, ...]
+    markers: dict[int, MarkerFit | NotFound]
+    boards: dict[int, BoardFit | NotFound]
+    finds: dict[tuple[int, int], PaFind | NoSignal]
+    marker_noise: CornerNoise
+    board_noise: CornerNoise
+    epoch_of: tuple[int, ...]
+
+
+@dataclass(slots=True, eq=False)
+class _Found:
+    markers: dict[int, MarkerFit | NotFound] = field(default_factory=dict)
+    boards: dict[int, BoardFit | NotFound] = field(default_factory=dict)
+    finds: dict[tuple[int, int], PaFind | NoSignal] = field(default_factory=dict)
+
+
+def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Image:
+    """An endoscope frame that an event names.
+
+    Raises:
+        InputError: missing, not a PNG image of the camera's size, or not decodable.
+    """
+    where = f"events.jsonl: line {line}: {key}"
+    check_camera_frame(path, path.name, where, None if rig is None else rig.left.image_size)
+    picture = read_picture(path)
+    if picture is None:
+        raise InputError(where, f"{path.name}, whose pixels cannot be decoded", "a PNG image")
+    return picture
+
+
+def load_trus_frame(path: Path, line: int, key: str, model: SessionModel) -> npt.NDArray[Any]:
+    """A probe frame that an event names.
+
+    Raises:
+        InputError: missing, not an NPY array that this probe can have recorded, or with numbers that are not finite.
+    """
+    where = f"events.jsonl: line {line}: {key}"
+    check_trus_frame(path, path.name, where, model.probe)
+    frame = read_array(path)
+    if frame is None:
+        raise InputError(where, f"{path.name}, which cannot be read", "an NPY array")
+    if frame.dtype.kind == "f" and not np.isfinite(frame).all():
+        raise InputError(where, f"{path.name} with entries that are not finite", "finite numbers")
+    return frame
+
+
+def needs_marker_frames(record: MarkerRecord, *, redetect: bool) -> bool:
+    """Whether the marker is to be found in the frames rather than taken from the recorded pose."""
+    return record.left is not None and (record.camera_T_marker is None or redetect)
+
+
+def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Image, Image | None]:
+    """Left and right frame of a shot; the right one only where the rig has a right camera."""
+    if record.left is None:
+        raise AssertionError("no frames to load")
+    left = load_picture(record.left, line, "marker.left", rig)
+    both = record.right is not None and rig.right is not None
+    right = load_picture(record.right, line, "marker.right", rig) if both and record.right is not None else None
+    return left, right
+
+
+def looks_of(event: Event) -> tuple[TrusRecord, ...]:
+    """The looks that an event brings."""
+    if isinstance(event, PairEvent):
+        return (event.trus,)
+    return event.looks if isinstance(event, TrackEvent) else ()
+
+
+def recognise(
+    events: Sequence[Event], model: SessionModel, *, redetect: bool = False, progress: Progress | None = None
+) -> Recognised:
+    """Turn a session's events into measurements.
+
+    Args:
+        events: as read.
+        model: the session's set-up.
+        redetect: look at the frames even where a pose is recorded.
+        progress: called as frames are done.
+
+    Raises:
+        InputError: a frame that is missing or not what it should be.
+    """
+    found = _detect(events, model, redetect, progress)
+    marker_fits = [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
+    board_fits = [fit for fit in found.boards.values() if isinstance(fit, BoardFit)]
+    builder = _Builder(
+        model,
+        found,
+        pool_corner_noise(fit.pose for fit in marker_fits),
+        pool_corner_noise(fit.pose for fit in board_fits),
+        redetect,
+    )
+    starts, epoch_of = number_epochs(events)
+    for index, event in enumerate(events):
+        builder.add(index, event, epoch_of[index])
+    return Recognised(
+        measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts),
+        tracks=tuple(builder.tracks),
+        aim_events=tuple(builder.aim_events),
+        pair_events=tuple(builder.pair_events),
+        track_events=tuple(builder.track_events),
+        unused=builder.unused,
+        unused_aims=tuple(i for i in sorted(builder.unused) if isinstance(events[i], AimEvent)),
+        markers=found.markers,
+        boards=found.boards,
+        finds=found.finds,
+        marker_noise=builder.marker_noise,
+        board_noise=builder.board_noise,
+        epoch_of=epoch_of,
+    )
+
+
+def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tuple[int, ...]]:
+    """Camera epochs, and the epoch of every event.
+
+    An epoch starts with its ``camera_moved``; where the program found the move out by itself, with the first event at
+    or after ``since_t``.
+    """
+    first = events[0].t if events else 0.0
+    starts = [EpochStart(min(0.0, first))]
+    places: list[int] = []
+    for index, event in enumerate(events):
+        if not isinstance(event, CameraMovedEvent):
+            continue
+        since = event.since_t if event.detected and event.since_t is not None else event.t
+        back = [i for i in range(index) if events[i].t >= since]
+        places.append(max(back[0] if back else index, places[-1] if places else 0))
+        starts.append(EpochStart(since, event.camera_new_T_camera_old, event.covariance))
+    epoch_of = tuple(sum(place <= index for place in places) for index in range(len(events)))
+    return tuple(starts), epoch_of
+
+
+def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progress: Progress | None) -> _Found:
+    found = _Found()
+    rig, marker, board = model.camera, model.marker, model.board
+    jobs: list[Callable[[], None]] = []
+
+    def optical(index: int, event: AimEvent | PairEvent | TrackEvent, wants_board: bool) -> None:
+        if rig is None or marker is None:
+            raise AssertionError("frames without camera or marker pass the reader")
+        left, right = marker_pictures(event.marker, event.line, rig)
+        if needs_marker_frames(event.marker, redetect=redetect):
+            found.markers[index] = detect_marker(left, right, rig, marker)
+        if wants_board and board is not None:
+            found.boards[index] = detect_board(left, right, rig, board)
+
+    def acoustic(index: int, number: int, event: PairEvent | TrackEvent, path: Path) -> None:
+        key = "trus.frame" if len(looks_of(event)) == 1 else f"looks[{number}].frame"
+        found.finds[index, number] = locate_in_frame(load_trus_frame(path, event.line, key, model), model.probe)
+
+    for index, event in enumerate(events):
+        if isinstance(event, AimEvent | PairEvent | TrackEvent):
+            wants_board = isinstance(event, AimEvent) and event.camera_p_spot_mm is None
+            if wants_board or needs_marker_frames(event.marker, redetect=redetect):
+                jobs.append(lambda i=index, e=event, b=wants_board: optical(i, e, b))  # type: ignore[misc]
+        if isinstance(event, PairEvent | TrackEvent):
+            for number, look in enumerate(looks_of(event)):
+                if look.frame is not None and look.x_mm is None:
+                    jobs.append(lambda i=index, n=number, e=event, p=look.frame: acoustic(i, n, e, p))  # type: ignore[misc]
+    _run(jobs, progress)
+    return found
+
+
+def _run(jobs: Sequence[Callable[[], None]], progress: Progress | None) -> None:
+    """All jobs, in threads; the first error in the events' order is raised."""
+    if not jobs:
+        return
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        futures = [pool.submit(job) for job in jobs]
+        try:
+            for done, future in enumerate(futures, 1):
+                future.result()
+                if progress is not None:
+                    progress(done, len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+class _Builder:
+    """Collects measurements event by event."""
+
+    def __init__(
+        self, model: SessionModel, found: _Found, marker_noise: CornerNoise, board_noise: CornerNoise, redetect: bool
+    ) -> None:
+        self.model, self.found, self.redetect = model, found, redetect
+        self.marker_noise, self.board_noise = marker_noise, board_noise
+        self.aims: list[Aim] = []
+        self.pairs: list[Pair] = []
+        self.tracks: list[Track] = []
+        self.aim_events: list[int] = []
+        self.pair_events: list[int] = []
+        self.track_events: list[int] = []
+        self.unused: dict[int, str] = {}
+        self._ids: dict[object, int] = {}
+
+    def add(self, index: int, event: Event, epoch: int) -> None:
+        """Turn one event into a measurement, or note why not."""
+        if not isinstance(event, AimEvent | PairEvent | TrackEvent):
+            return
+        marker = self._marker(index, event)
+        if isinstance(marker, str):
+            self.unused[index] = marker
+            return
+        if isinstance(event, AimEvent):
+            spot = self._spot(index, event)
+            if isinstance(spot, str):
+                self.unused[index] = spot
+                return
+            self.aims.append(Aim(event.t, marker, *spot))
+            self.aim_events.append(index)
+            return
+        looks: list[Look] = []
+        for number, record in enumerate(looks_of(event)):
+            look = self._look(index, number, record)
+            if isinstance(look, str):
+                self.unused[index] = look
+            else:
+                looks.append(look)
+        if isinstance(event, PairEvent):
+            if looks:
+                self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0]))
+                self.pair_events.append(index)
+            return
+        if event.looks and not looks:
+            return  # heard nothing: the reason is noted
+        self.unused.pop(index, None)  # one look heard is enough for a query
+        scan = None if event.scan_deg is None else self.model.stage.scan_from_device(math.radians(event.scan_deg))
+        self.tracks.append(Track(event.t, epoch, marker, tuple(looks), scan))
+        self.track_events.append(index)
+
+    def _marker(self, index: int, event: AimEvent | PairEvent | TrackEvent) -> MarkerObservation | str:
+        record = event.marker
+        key: object
+        if needs_marker_frames(record, redetect=self.redetect):
+            fit = self.found.markers[index]
+            if isinstance(fit, NotFound):
+                return fit.reason
+            transform, covariance = fit.camera_T_marker, marker_covariance(fit, self.marker_noise)
+            key = (record.left, record.right)
+        else:
+            if record.camera_T_marker is None:
+                raise AssertionError("a marker is a pose or frames")
+            transform = record.camera_T_marker
+            covariance = (
+                default_marker_covariance(transform, self.model.noise)
+                if record.covariance is None
+                else record.covariance
+            )
+            key = transform.tobytes()
+        number = self._ids.setdefault(key, len(self._ids))
+        return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number)
+
+    def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray] | str:
+        """The aimed-at spot (3,) in camera axes and its covariance (3, 3): where the corner is, and where the laser."""
+        laser = np.diag(np.square(self.model.noise.aim_mm))
+        if event.camera_p_spot_mm is not None:
+            return event.camera_p_spot_mm, laser if event.covariance is None else event.covariance
+        fit = self.found.boards[index]
+        if isinstance(fit, NotFound):
+            return fit.reason
+        if event.corner is None:
+            raise AssertionError("an aim has a spot or a corner")
+        spot, covariance = board_corner(fit, event.corner[0], event.corner[1], self.board_noise)
+        camera_R_board = fit.camera_T_board[:3, :3]
+        return spot, covariance + camera_R_board @ laser @ camera_R_board.T
+
+    def _look(self, index: int, number: int, record: TrusRecord) -> Look | str:
+        noise, stage = self.model.noise, self.model.stage
+        covariance = record.covariance
+        x_mm, range_mm, amplitude = record.x_mm, record.range_mm, record.amplitude
+        if x_mm is None or range_mm is None:
+            find = self.found.finds[index, number]
+            if isinstance(find, NoSignal):
+                return find.reason
+            x_mm, range_mm = find.x_mm, find.range_mm
+            covariance = find.covariance if covariance is None else covariance
+            amplitude = find.amplitude if amplitude is None else amplitude
+        if covariance is None:
+            covariance = np.diag([noise.lateral_mm**2, noise.range_mm**2])
+        return Look(
+            scan_rad=stage.scan_from_device(math.radians(record.scan_deg)),
+            scan_sigma_rad=noise.scan_rad,
+            x_mm=x_mm,
+            range_mm=range_mm,
+            covariance=as_float_array(covariance, 2, 2),
+            sweep=stage.direction * record.sweep,
+            amplitude=amplitude,
+        )

@@ -1,0 +1,139 @@
+"""The reduced problem and the explicit graph are two derivations of one answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fgreg.frames import FloatArray
+from fgreg.graph import ExplicitGraph, GraphOptions, build_graph
+from fgreg.graph_solver import GraphCovariance, GraphOptimum, optimize as optimize_graph
+from fgreg.graph_values import SharedValues, initial_values, read_shared
+from fgreg.models import NoiseModel
+from fgreg.packing import PackedProblem, pack
+from fgreg.reduced import evaluate, log_marginal, pm_contributions, refine
+from fgreg.reduced_blocks import initial_private
+from fgreg.reduced_solver import Optimum, optimize
+from fgreg.shared_state import SharedState, make_state, pose_difference
+from tests.forward import make_measurements, make_session
+
+CASES: dict[str, dict[str, Any]] = {
+    "first hit": {"pairs": 12},
+    "window only": {"pairs": 12, "first_hit": False},
+    "looks share a marker": {"pairs": 8, "looks_per_pm": 3, "share_marker": True},
+    "looks with markers of their own": {"pairs": 8, "looks_per_pm": 2},
+    "camera moved, motion known": {"pairs": 16, "epochs": 2, "known_motion": True},
+    "marker bias": {"pairs": 12, "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.3))},
+}
+
+
+def _both(case: str) -> tuple[PackedProblem, Optimum, ExplicitGraph, GraphOptimum, SharedValues]:
+    model, measurements, truth = make_measurements(np.random.default_rng(4), **CASES[case])
+    problem = pack(measurements, model)
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    found = optimize(problem, start, tolerance=1e-12)
+    options = GraphOptions(marker_T_nominal=truth.marker_T_laser, unknown_motion_sigma=None)
+    explicit = build_graph(measurements, model, options)
+    shared = SharedValues(truth.trus_T_camera, np.zeros(4))
+    reference = optimize_graph(explicit, initial_values(explicit, shared))
+    return problem, found, explicit, reference, read_shared(explicit, reference.values, shared)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_optimum_is_that_of_the_explicit_graph(case: str) -> None:
+    problem, found, explicit, reference, there = _both(case)
+    assert found.converged.all()
+    assert reference.converged
+    assert found.evaluation.cost[0] == pytest.approx(2.0 * reference.cost, rel=1e-5)
+    epochs = problem.columns.epochs
+    other = make_state(
+        np.stack(there.trus_T_camera)[None], found.state.marker_T_nominal, problem.radius_mm, there.marker_laser[None]
+    )
+    poses = np.concatenate([pose_difference(found.state, other, k)[0] for k in range(epochs)])
+    step = np.concatenate([poses, there.marker_laser - found.state.beam[0]])
+    size = len(step)
+    covariance = np.linalg.inv(found.evaluation.hessian[0])[:size, :size]
+    assert np.sqrt(step @ np.linalg.solve(covariance, step)) < 2e-3
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_covariance_is_that_of_the_explicit_graph(case: str) -> None:
+    problem, found, explicit, reference, _ = _both(case)
+    keys = [*explicit.keys.trus_T_camera, explicit.keys.marker_laser]
+    expected = GraphCovariance(explicit, reference.values).shared(keys)
+    size = len(expected)
+    covariance = np.linalg.inv(found.evaluation.hessian[0])[:size, :size]
+    sigma = np.sqrt(np.diag(expected))
+    assert np.abs((covariance - expected) / np.outer(sigma, sigma)).max() < 0.02
+
+
+def _profile_cost(problem: PackedProblem, state: SharedState) -> float:
+    private = initial_private(problem, state)
+    for _ in range(12):
+        cost, private = refine(problem, state, private)
+    return float(cost[0])
+
+
+def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:
+    model, measurements, truth = make_measurements(
+        np.random.default_rng(0),
+        pairs=8,
+        looks_per_pm=2,
+        epochs=2,
+        known_motion=True,
+        session=make_session(noise_model=NoiseModel(marker_bias_mm=0.1)),
+    )
+    problem = pack(measurements, model, sound_speed_sigma=0.01, radius_sigma_mm=0.3)
+    size = problem.columns.size
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    state = state.retract(np.random.default_rng(1).normal(size=(1, size)) * 0.01, problem.columns)
+    private = initial_private(problem, state)
+    for _ in range(12):
+        at = evaluate(problem, state, private)
+        private = at.private
+    numerical = np.empty(size)
+    for i in range(size):
+        step = np.zeros((1, size))
+        step[0, i] = 1e-5
+        ahead = _profile_cost(problem, state.retract(step, problem.columns))
+        behind = _profile_cost(problem, state.retract(-step, problem.columns))
+        numerical[i] = (ahead - behind) / 2e-5 / 2.0  # the gradient is of half the chi square
+    scale = np.sqrt(np.diag(at.hessian[0]))
+    assert np.abs((at.gradient[0] - numerical) / scale).max() < 1e-4 * np.abs(numerical / scale).max()
+
+
+def test_contributions_of_pms_sum_to_the_whole() -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=9, looks_per_pm=2)
+    problem = pack(measurements, model)
+    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0))
+    parts = pm_contributions(problem, found.state, found.evaluation.private)
+    alone = pack(replace(measurements, pairs=()), model)
+    aims = optimize(alone, found.state, max_iterations=1)
+    # Evaluated at the same shared state: what the pairs add is the whole less what aims and priors say.
+    rest = evaluate(alone, found.state, _aims_only(alone, found))
+    whole = evaluate(problem, found.state, found.evaluation.private)
+    assert aims.state.count == 1
+    np.testing.assert_allclose(parts.hessian.sum(axis=0) + rest.hessian[0], whole.hessian[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(parts.gradient.sum(axis=0) + rest.gradient[0], whole.gradient[0], atol=1e-5)
+    assert parts.cost.sum() + rest.cost[0] == pytest.approx(whole.cost[0], rel=1e-9)
+
+
+def _aims_only(alone: PackedProblem, found: Optimum) -> Any:
+    private = initial_private(alone, found.state)
+    of = found.evaluation.private
+    return replace(private, aim_error=of.aim_error, aim_shift=of.aim_shift)
+
+
+def test_hypotheses_side_by_side_do_not_touch_each_other() -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(5), pairs=7)
+    problem = pack(measurements, model)
+    good = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
+    steps: FloatArray = np.random.default_rng(6).normal(size=(3, problem.columns.size)) * 0.02
+    many = good.take([0, 0, 0]).retract(steps, problem.columns)
+    together = log_marginal(problem, many, initial_private(problem, many))
+    for i in range(3):
+        one = many.take([i])
+        assert log_marginal(problem, one, initial_private(problem, one))[0] == pytest.approx(together[i], rel=1e-12)
