@@ -16,8 +16,12 @@ from fgreg.simulation.render import project_points
 CANDIDATES = 8
 """Ways to take a shot that are drawn at once; the first that the camera can see is taken."""
 
-ROUNDS = 60
+ROUNDS = 40
 EDGE_PX = 12.0
+
+
+class UnseenError(ValueError):
+    """No way was found to take a shot so that the camera sees its marker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +44,7 @@ class Tissue:
     def point(self, x_mm: FloatArray, angle_rad: FloatArray) -> FloatArray:
         """TRUS points (..., 3) of the surface."""
         value = _quadric(self.coefficients, x_mm / self.x_mm, angle_rad / self.angle_rad)
-        share = (value - self.low) / (self.high - self.low)
+        share = np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
         rho = self.radius_mm + self.depth_mm[0] + share * (self.depth_mm[1] - self.depth_mm[0])
         return np.stack([x_mm + 0.0 * rho, rho * np.sin(angle_rad), rho * np.cos(angle_rad)], axis=-1)
 
@@ -291,7 +295,7 @@ def _draw_shots(
             nominals[index] = targets.nominal_mm[taken, first]
         pending = pending[~taken]
     if pending.size:
-        raise ValueError("no shot whose marker the camera can see was found in this geometry: widen its spans")
+        raise UnseenError("no shot whose marker the camera can see was found in this geometry: widen its spans")
     return Shots(camera_T_marker, lambdas, spots), _Targets(spots, boards, corners, nominals)
 
 

@@ -19,10 +19,13 @@ from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.documents import degrees, rows, session_document
 from fgreg.simulation.pictures import LookPicture, ShotPicture
-from fgreg.simulation.scene import AimShots, Scene, Shots, draw_aim_shots, draw_pm_shots, draw_scene
+from fgreg.simulation.scene import AimShots, Scene, Shots, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
 Frame = npt.NDArray[np.uint8] | npt.NDArray[np.int16]
 Document = dict[str, Any]
+
+SCENES = 6
+"""Scenes that are drawn before a configuration is given up as one in which the camera sees no marker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,12 +91,10 @@ class _Recorder:
 
     def record(self) -> SimulatedSession:
         config = self.config
-        self.scene = scene = draw_scene(config, self.scene_rng)
-        aims = draw_aim_shots(config, scene, self.aim_rng, self.miss_rng.standard_normal((config.aims, 3)))
         kinds = _interleaved(config.tracks_heard, config.tracks_silent)
         pair_epochs = np.arange(config.pairs) * config.epochs // max(config.pairs, 1)
         track_epochs = np.arange(kinds.size) * config.epochs // max(kinds.size, 1)
-        shots = draw_pm_shots(config, scene, np.concatenate([pair_epochs, track_epochs]), self.shot_rng)
+        scene, aims, shots = self._plan(np.concatenate([pair_epochs, track_epochs]))
         pms, tracks = _part(shots, slice(0, config.pairs)), _part(shots, slice(config.pairs, None))
         junk = np.zeros(config.pairs, dtype=bool)
         junk[self.misc_rng.permutation(config.pairs)[: config.junk_pairs]] = True
@@ -124,6 +125,19 @@ class _Recorder:
             scene,
             self.true_markers,
         )
+
+    def _plan(self, epochs: IntArray) -> tuple[Scene, AimShots, Shots]:
+        """Scene and shots; where a scene leaves the camera no view of the marker, another is drawn."""
+        miss = self.miss_rng.standard_normal((self.config.aims, 3))
+        for attempt in range(SCENES):
+            self.scene = draw_scene(self.config, self.scene_rng)
+            try:
+                aims = draw_aim_shots(self.config, self.scene, self.aim_rng, miss)
+                return self.scene, aims, draw_pm_shots(self.config, self.scene, epochs, self.shot_rng)
+            except UnseenError:
+                if attempt == SCENES - 1:
+                    raise
+        raise AssertionError
 
     def _truth(self, pms: Shots, answers: list[Document], junk: BoolArray) -> Document:
         config, scene = self.config, self.scene
