@@ -98,16 +98,16 @@ def print_summary(
     console = console or Console(highlight=False, emoji=False)
     summary = render_summary(model, estimate, extra)
     if console.is_terminal:
-        console.print(summary)
+        console.print(summary, crop=False)
         return
     with console.capture() as capture:
-        console.print(summary)
+        console.print(summary, crop=False)
     # Tables pad their lines; what goes to a file or a pipe should not end in blanks.
     console.file.write("".join(line.rstrip() + "\n" for line in capture.get().splitlines()))
 
 
 def render_summary(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras) -> RenderableType:
-    """The summary as one rich renderable."""
+    """The summary as one rich renderable; print it with ``crop=False`` so that long paths stay whole."""
     truth = extra.truth or TruthFigures()
     parts: list[RenderableType] = [_verdict(estimate)]
     parts += [_bullet(reason) for reason in estimate.reasons]

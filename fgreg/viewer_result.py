@@ -154,10 +154,12 @@ class ResultPainter:
     def _track(self, position: int, epoch: int) -> None:
         answer = self.estimate.tracks[position]
         marker = self.tracks[position].marker if position < len(self.tracks) else None
-        self.rec.clear("world/shot/arc", "world/shot/sound", "world/shot/pm")
+        self.rec.clear("world/shot/arc", "world/shot/sound")
         self._marker(marker)
         spot = self._beam(marker, answer.lambda_mm, epoch, keep=False)
-        if spot is not None:
+        if spot is None:
+            self.rec.clear("world/shot/pm")
+        else:
             self.rec.log("world/shot/pm", shapes.point(spot, shapes.PM, 5.0, "predicted spot"))
         if answer.stage_rad is None:
             self._say("track", False, answer.reason, None)

@@ -1,0 +1,443 @@
+"""A recording read back holds what was estimated, at the right places, times and in the right frames."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import math
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fgreg.errors import InputError
+from fgreg.estimate import SessionEstimate, TrackEstimate, Verdict
+from fgreg.frames import as_float_array, inverse
+from fgreg.measurements import Measurements, Track
+from fgreg.models import (
+    CameraModel,
+    ChannelModel,
+    MarkerModel,
+    SessionModel,
+    StageModel,
+    StereoRig,
+    TagModel,
+)
+from fgreg.viewer import NullViewer, Viewer, open_viewer
+from tests.answers import REGISTRATION_COVARIANCE, answer_from_truth
+from tests.forward import Truth, make_measurements, make_session
+from tests.recordings import Row, read_recording, transform_of, views
+
+AIMS, PAIRS = 2, 6
+UNUSED = 3
+TRACK_T = 100.0
+TRACK_DEVICE_DEG = -12.0
+
+
+def make_model() -> SessionModel:
+    """A session with everything: stereo, marker, channels, a stage that counts the other way from 5 degrees."""
+    base = make_session()
+    matrix = as_float_array([[300.0, 0.0, 160.0], [0.0, 310.0, 90.0], [0.0, 0.0, 1.0]])
+    camera = CameraModel((320, 180), matrix, as_float_array(np.zeros(5)))
+    right_T_left = np.eye(4)
+    right_T_left[0, 3] = -5.0
+    return replace(
+        base,
+        name="phantom",
+        probe=replace(base.probe, channels=ChannelModel(40.0)),
+        stage=StageModel(math.radians(2.0), (-1.5, 1.5), direction=-1, zero_device_rad=math.radians(5.0)),
+        camera=StereoRig(camera, camera, as_float_array(right_T_left)),
+        marker=MarkerModel("DICT_4X4_50", (TagModel(0, 20.0),)),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    path: Path
+    model: SessionModel
+    measurements: Measurements
+    estimate: SessionEstimate
+    truth: Truth
+    rows: dict[str, list[Row]]
+
+    def at(self, entity: str, shot: int) -> Row:
+        """The row of an entity that was logged at a shot."""
+        (found,) = [row for row in self.rows[entity] if row.shot == shot]
+        return found
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    rng = np.random.default_rng(11)
+    model, measurements, truth = make_measurements(
+        rng, aims=AIMS, pairs=PAIRS, epochs=2, noise=False, session=make_model()
+    )
+    last = measurements.pairs[-1]
+    track = TrackEstimate(TRACK_T, math.radians(TRACK_DEVICE_DEG), 0.01, truth.pair_lambda_mm[-1], causal=False)
+    estimate = answer_from_truth(rng, model, measurements, truth, unused=(UNUSED,), tracks=(track,))
+    path = tmp_path_factory.mktemp("recording") / "phantom.rrd"
+    frame = rng.normal(size=(128, 1200))
+    left = np.zeros((180, 320), dtype=np.uint8)
+    left[:, 160:] = 200
+    right = np.zeros((180, 320, 3), dtype=np.uint8)
+    right[..., 0] = 250
+    with open_viewer(path, model.name) as viewer:
+        viewer.session(model)
+        viewer.shot_images(
+            1.0, "aim", 0, left, right, [np.array([[1.0, 2], [3, 2], [3, 4], [1, 4]])], np.array([7.0, 8])
+        )
+        viewer.shot_images(2.0, "aim", 1, left)
+        look = measurements.pairs[0].look
+        viewer.pa_frame(measurements.pairs[0].t, AIMS, frame, look.x_mm, look.range_mm, look.covariance, model.probe)
+        viewer.pa_frame(measurements.pairs[1].t, AIMS + 1, frame, None, None, None, model.probe)
+        assert not path.exists()
+        viewer.result(model, measurements, estimate, truth, [Track(TRACK_T, 1, last.marker)])
+    return Recorded(path, model, measurements, estimate, truth, read_recording(path))
+
+
+def test_the_camera_stands_where_each_epoch_has_it(recorded: Recorded) -> None:
+    rows = recorded.rows["/world/camera"]
+    # Epoch 1 begins with the pair that first belongs to it.
+    first = next(i for i, pair in enumerate(recorded.measurements.pairs) if pair.epoch == 1)
+    assert [row.shot for row in rows] == [0, AIMS + first]
+    for row, expected in zip(rows, recorded.truth.trus_T_camera, strict=True):
+        np.testing.assert_allclose(transform_of(row), expected, atol=2e-5)
+    assert rows[1].seconds == pytest.approx(recorded.measurements.pairs[first].t)
+
+
+def test_the_marker_is_where_it_was_seen(recorded: Recorded) -> None:
+    seen = [aim.marker for aim in recorded.measurements.aims] + [pair.marker for pair in recorded.measurements.pairs]
+    for shot, marker in enumerate(seen):
+        np.testing.assert_allclose(
+            transform_of(recorded.at("/world/camera/marker", shot)), marker.camera_T_marker, atol=2e-5
+        )
+    (tag,) = recorded.rows["/world/camera/marker/tags"]
+    corners = np.array(tag.values["LineStrips3D:strips"][0])
+    np.testing.assert_allclose(corners[:4], [[-10, 10, 0], [10, 10, 0], [10, -10, 0], [-10, -10, 0]])
+
+
+def test_beams_end_at_their_photoacoustic_markers(recorded: Recorded) -> None:
+    for i, pair in enumerate(recorded.measurements.pairs):
+        shot = AIMS + i
+        if i == UNUSED:
+            assert all(row.shot != shot for row in recorded.rows["/world/looks/beam"])
+            continue
+        for entity in ("/world/looks/beam", "/world/shot/beam"):
+            row = recorded.at(entity, shot)
+            tip = row.array("Arrows3D:origins") + row.array("Arrows3D:vectors")
+            np.testing.assert_allclose(tip[0], recorded.truth.trus_p_pm_mm[pair.pm], atol=1e-4)
+
+
+def test_the_beam_of_an_aim_ends_at_its_spot(recorded: Recorded) -> None:
+    for i, spot in enumerate(recorded.truth.camera_p_spot_mm):
+        row = recorded.at("/world/shot/beam", i)
+        tip = (row.array("Arrows3D:origins") + row.array("Arrows3D:vectors"))[0]
+        camera_p = inverse(recorded.truth.trus_T_camera[0]) @ [*tip, 1.0]
+        np.testing.assert_allclose(camera_p[:3], spot, atol=1e-3)
+
+
+def test_arcs_pass_through_their_photoacoustic_markers(recorded: Recorded) -> None:
+    for i, pair in enumerate(recorded.measurements.pairs):
+        strip = np.array(recorded.at("/world/looks/arc", AIMS + i).values["LineStrips3D:strips"][0])
+        pm = recorded.truth.trus_p_pm_mm[pair.pm]
+        # The arc is drawn through 25 points: between two of them it bulges by less than 0.02 mm.
+        segment = np.diff(strip, axis=0)
+        along = np.clip(np.sum((pm - strip[:-1]) * segment, axis=1) / np.sum(segment**2, axis=1), 0.0, 1.0)
+        assert np.linalg.norm(strip[:-1] + along[:, None] * segment - pm, axis=1).min() < 0.05
+        sound = np.array(recorded.at("/world/shot/sound", AIMS + i).values["LineStrips3D:strips"][0])
+        np.testing.assert_allclose(sound[1], pm, atol=1e-4)
+        assert np.linalg.norm(sound[1] - sound[0]) == pytest.approx(pair.look.range_mm, rel=1e-5)
+
+
+def test_ellipsoids_are_the_covariances(recorded: Recorded) -> None:
+    for i, pair in enumerate(recorded.estimate.pairs):
+        row = recorded.at("/world/looks/pm", AIMS + i)
+        assert pair.trus_p_pm_mm is not None
+        assert pair.covariance is not None
+        np.testing.assert_allclose(row.array("Ellipsoids3D:centers")[0], pair.trus_p_pm_mm, atol=1e-5)
+        half, (x, y, z, w) = row.array("Ellipsoids3D:half_sizes")[0], row.array("Ellipsoids3D:quaternions")[0]
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        shown = rotation @ np.diag(half**2) @ rotation.T / 7.814728
+        np.testing.assert_allclose(shown, pair.covariance, atol=1e-4)
+
+
+def test_the_stage_turns_to_each_look_and_its_label_shows_the_device_angle(recorded: Recorded) -> None:
+    for i, pair in enumerate(recorded.measurements.pairs):
+        t = pair.look.scan_rad
+        plane = transform_of(recorded.at("/world/stage", AIMS + i)) @ [0.0, 0.0, 1.0, 0.0]
+        np.testing.assert_allclose(plane[:3], [0.0, math.sin(t), math.cos(t)], atol=1e-6)
+        label = recorded.at("/world/stage/label", AIMS + i).values["Points3D:labels"][0]
+        assert label == f"image plane, stage {5.0 - math.degrees(t):.1f}°"
+
+
+def test_a_track_turns_the_plane_to_its_answer(recorded: Recorded) -> None:
+    shot = AIMS + PAIRS
+    plane = transform_of(recorded.at("/world/stage", shot)) @ [0.0, 0.0, 1.0, 0.0]
+    scan = math.radians(5.0 - TRACK_DEVICE_DEG)
+    np.testing.assert_allclose(plane[:3], [0.0, math.sin(scan), math.cos(scan)], atol=1e-6)
+    label = recorded.at("/world/stage/label", shot).values["Points3D:labels"][0]
+    assert label == "turn the stage to -12.0 ± 0.6°"
+    spot = recorded.at("/world/shot/pm", shot).array("Points3D:positions")[0]
+    np.testing.assert_allclose(spot, recorded.truth.trus_p_pm_mm[recorded.measurements.pairs[-1].pm], atol=1e-4)
+
+
+def test_plots_hold_the_figures_of_their_shots(recorded: Recorded) -> None:
+    def plot(name: str) -> dict[int, float]:
+        return {row.shot: row.values["Scalars:scalars"][0] for row in recorded.rows[name] if row.shot is not None}
+
+    used = {AIMS + i: pair for i, pair in enumerate(recorded.estimate.pairs) if pair.used}
+    assert plot("/plots/residual_mm/pair") == {shot: pair.residual_mm for shot, pair in used.items()}
+    assert plot("/plots/nis/pair") == {shot: pair.nis for shot, pair in used.items()}
+    assert plot("/plots/lambda_mm/pair") == {shot: pair.lambda_mm for shot, pair in used.items()}
+    turns = plot("/plots/rotation_deg/pair")
+    assert turns.keys() == used.keys()
+    for shot, pair in used.items():
+        assert pair.rotation_rad is not None
+        assert turns[shot] == pytest.approx(math.degrees(pair.rotation_rad))
+    assert plot("/plots/residual_mm/pair_not_used") == {AIMS + UNUSED: recorded.estimate.pairs[UNUSED].residual_mm}
+    assert plot("/plots/residual_mm/aim") == {i: aim.residual_mm for i, aim in enumerate(recorded.estimate.aims)}
+
+
+def test_targets_carry_the_predicted_error(recorded: Recorded) -> None:
+    row = recorded.rows["/world/targets"][0]
+    np.testing.assert_allclose(row.array("Ellipsoids3D:centers"), recorded.model.targets_mm, atol=1e-5)
+    # The trace of a target's covariance, worked out without its Jacobian: variances of translation, plus those of the
+    # rotation about each camera axis times the squared distance from it.
+    trus_T_camera = recorded.truth.trus_T_camera[0]
+    camera_p = (np.c_[recorded.model.targets_mm, np.ones(27)] @ inverse(trus_T_camera).T)[:, :3]
+    variance = np.diag(REGISTRATION_COVARIANCE)
+    square = camera_p**2
+    trace = variance[3:].sum() + (square.sum(axis=1)[:, None] - square) @ variance[:3]
+    shown = np.sum(row.array("Ellipsoids3D:half_sizes") ** 2, axis=1) / 7.814728
+    np.testing.assert_allclose(shown, trace, rtol=1e-4)
+
+
+def test_images_come_back_as_they_went_in(recorded: Recorded) -> None:
+    def image(entity: str, shot: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        (blob,) = recorded.at(entity, shot).values["EncodedImage:blob"]
+        data = blob.encode() if isinstance(blob, str) else bytes(blob)
+        return np.asarray(Image.open(io.BytesIO(data)))
+
+    left = image("/world/camera/left", 0)
+    assert left.shape == (180, 320)
+    assert left[:, :150].max() < 20
+    assert left[:, 170:].min() > 180
+    right = image("/world/camera/right", 0)
+    # Blue came first in BGR and is last in RGB.
+    assert (np.abs(right.astype(int) - [0, 0, 250]) < 12).all()
+    assert image("/pa", AIMS).ndim == 2
+
+
+def test_outline_and_corner_lie_on_the_left_image(recorded: Recorded) -> None:
+    strip = np.array(recorded.at("/world/camera/left/marker/outline", 0).values["LineStrips2D:strips"][0])
+    np.testing.assert_allclose(strip, [[1, 2], [3, 2], [3, 4], [1, 4], [1, 2]])
+    corner = recorded.at("/world/camera/left/corner/spot", 0)
+    np.testing.assert_allclose(corner.array("Points2D:positions"), [[7, 8]])
+    # The next shot had neither: what is there is cleared.
+    cleared = [row.shot for row in recorded.rows["/world/camera/left/marker"] if "Clear:is_recursive" in row.values]
+    assert 1 in cleared
+    assert all(row.shot == 0 for row in recorded.rows["/world/camera/left/marker/outline"])
+
+
+def test_the_detection_is_marked_on_its_frame_and_cleared_where_there_is_none(recorded: Recorded) -> None:
+    captions = {row.shot: row.values["Points2D:labels"][0] for row in recorded.rows["/pa/caption"]}
+    look = recorded.measurements.pairs[0].look
+    assert captions == {
+        AIMS: f"shot {AIMS}: x {look.x_mm:.1f} mm, range {look.range_mm:.1f} mm",
+        AIMS + 1: f"shot {AIMS + 1}: no source found",
+    }
+    front = recorded.at("/pa/detection/wavefront", AIMS).array("Points2D:positions")
+    assert len(front) > 10
+    assert [row.shot for row in recorded.rows["/pa/detection/spot"]] == [AIMS]
+    assert [row.shot for row in recorded.rows["/pa/detection"]] == [AIMS, AIMS + 1]
+
+
+def test_frames_lie_on_the_image_plane_and_a_plain_plane_where_there_is_none(recorded: Recorded) -> None:
+    planes = {row.shot: "Mesh3D:albedo_texture_buffer" in row.values for row in recorded.rows["/world/stage/plane"]}
+    assert planes == {AIMS: True, AIMS + 1: True, AIMS + 2: False}
+
+
+def test_cameras_have_their_intrinsics_and_the_right_one_stands_beside_the_left(recorded: Recorded) -> None:
+    (left,) = [row for row in recorded.rows["/world/camera/left"] if "Pinhole:image_from_camera" in row.values]
+    assert left.shot is None
+    matrix = left.array("Pinhole:image_from_camera").reshape(3, 3).T
+    np.testing.assert_allclose(matrix, [[300, 0, 160], [0, 310, 90], [0, 0, 1]])
+    (right,) = [row for row in recorded.rows["/world/camera/right"] if "Transform3D:translation" in row.values]
+    np.testing.assert_allclose(transform_of(right)[:3, 3], [5.0, 0.0, 0.0])
+
+
+def test_the_truth_is_shown_beside_the_estimate(recorded: Recorded) -> None:
+    (pms,) = recorded.rows["/world/truth/pms"]
+    np.testing.assert_allclose(pms.array("Points3D:positions"), list(recorded.truth.trus_p_pm_mm.values()), atol=1e-4)
+    assert [row.shot for row in recorded.rows["/world/truth/camera"]] == [
+        row.shot for row in recorded.rows["/world/camera"]
+    ]
+
+
+def test_the_blueprint_shows_world_images_text_and_plots(recorded: Recorded) -> None:
+    shown = views(recorded.path)
+    assert set(shown) == {
+        "world",
+        "world/camera/left",
+        "world/camera/right",
+        "pa",
+        "summary",
+        "log",
+        "plots/residual_mm",
+        "plots/nis",
+        "plots/rotation_deg",
+        "plots/lambda_mm",
+    }
+    assert "REFUSED" not in shown["world"]
+
+
+def test_the_summary_says_ok_and_the_log_why_a_look_was_left_out(recorded: Recorded) -> None:
+    (page,) = recorded.rows["/summary"]
+    assert page.values["TextDocument:text"][0].startswith("# OK")
+    said = recorded.at("/log", AIMS + UNUSED)
+    assert "range is 4.1 sigma off" in said.values["TextLog:text"][0]
+    assert said.values["TextLog:level"][0] == "WARN"
+
+
+def record(
+    path: Path, model: SessionModel, measurements: Measurements, estimate: SessionEstimate
+) -> dict[str, list[Row]]:
+    with open_viewer(path, model.name) as viewer:
+        viewer.session(model)
+        viewer.result(model, measurements, estimate)
+    return read_recording(path)
+
+
+def test_a_refused_registration_says_so_everywhere(tmp_path: Path) -> None:
+    rng = np.random.default_rng(12)
+    model, measurements, truth = make_measurements(rng, aims=0, pairs=4, session=make_model())
+    estimate = answer_from_truth(
+        rng, model, measurements, truth, verdict=Verdict.REFUSED, reasons=("two registrations fit",)
+    )
+    path = tmp_path / "refused.rrd"
+    rows = record(path, model, measurements, estimate)
+    assert rows["/world/verdict"][0].values["Points3D:labels"] == ["REFUSED: do not use"]
+    page = rows["/summary"][0].values["TextDocument:text"][0]
+    assert page.startswith("# REFUSED: do not use this registration")
+    assert "- two registrations fit" in page
+    shown = views(path)
+    assert "REFUSED" in shown["world"]
+    assert not {"pa", "world/camera/left"} & set(shown)
+    # The last colour logged is the one shown.
+    colors = [row.values["Pinhole:color"][0] for row in rows["/world/camera/left"]]
+    red, green, blue = (colors[-1] >> shift & 255 for shift in (24, 16, 8))
+    assert red > 200 > 100 > max(green, blue)
+    blueprint = read_recording(path, blueprint=True)
+    (background,) = [
+        row.values["Background:color"][0]
+        for entity in blueprint.values()
+        for row in entity
+        if "Background:color" in row.values
+    ]
+    assert background >> 24 & 255 > 2 * (background >> 16 & 255)
+
+
+def test_an_epoch_without_a_registration_hides_its_camera_instead_of_standing_at_the_origin(tmp_path: Path) -> None:
+    rng = np.random.default_rng(13)
+    model, measurements, truth = make_measurements(rng, aims=0, pairs=4, epochs=2)
+    estimate = answer_from_truth(rng, model, measurements, truth, verdict=Verdict.REFUSED)
+    lost = replace(estimate.epochs[1], trus_T_camera=None, covariance=None, predicted_tre=None)
+    estimate = replace(estimate, epochs=(estimate.epochs[0], lost))
+    rows = record(tmp_path / "lost.rrd", model, measurements, estimate)
+    second = rows["/world/camera"][1]
+    assert second.shot == 2
+    np.testing.assert_array_equal(second.array("Transform3D:scale"), [[0.0, 0.0, 0.0]])
+    assert [row.shot for row in rows["/world/looks/beam"]] == [0, 1]
+    assert [row.shot for row in rows["/world/looks/arc"]] == [0, 1, 2, 3]
+
+
+def test_what_was_not_heard_or_is_not_finite_is_left_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(14)
+    model, measurements, truth = make_measurements(rng, aims=0, pairs=3)
+    estimate = answer_from_truth(rng, model, measurements, truth)
+    pairs = (
+        replace(estimate.pairs[0], nis=math.inf, covariance=np.diag([1.0, 1e8, 1.0])),
+        replace(estimate.pairs[1], used=False, reason="no marker found", lambda_mm=None, trus_p_pm_mm=None),
+        estimate.pairs[2],
+    )
+    heard = replace(measurements, pairs=(measurements.pairs[0], measurements.pairs[2]))
+    rows = record(tmp_path / "part.rrd", model, heard, replace(estimate, pairs=pairs))
+    assert [row.shot for row in rows["/plots/nis/pair"] if row.shot is not None] == [2]
+    assert [row.shot for row in rows["/world/looks/arc"]] == [0, 2]
+    sizes = {row.shot: len(row.values["Ellipsoids3D:half_sizes"]) for row in rows["/world/looks/pm"]}
+    assert sizes == {0: 0, 2: 1}
+
+
+def test_a_session_without_shots_makes_a_recording(tmp_path: Path) -> None:
+    estimate = SessionEstimate("empty", Verdict.REFUSED, ("no pairs",), None, (), (), ())
+    rows = record(tmp_path / "empty.rrd", make_session(), Measurements((), (), ()), estimate)
+    assert "/world/probe" in rows
+    assert "/world/verdict" in rows
+
+
+def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None:
+    path = tmp_path / "phantom.rrd"
+    path.write_bytes(b"an older one")
+
+    def crash() -> None:
+        with open_viewer(path, "phantom") as viewer:
+            viewer.session(make_session())
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        crash()
+    assert path.read_bytes() == b"an older one"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_recording_takes_the_place_of_an_older_one_and_leaves_no_other_file(tmp_path: Path) -> None:
+    path = tmp_path / "phantom.rrd"
+    path.write_bytes(b"an older one")
+    with open_viewer(path, "phantom") as viewer:
+        viewer.session(make_session())
+    assert "/world/probe" in read_recording(path)
+    assert "world" in views(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_does_not_exist_is_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        open_viewer(tmp_path / "nowhere" / "a.rrd", "a")
+    with pytest.raises(InputError, match="found a folder"):
+        open_viewer(tmp_path, "a")
+
+
+def test_the_null_viewer_takes_every_call_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    viewer = open_viewer(None, "phantom")
+    assert isinstance(viewer, NullViewer)
+    real = {name: method for name, method in vars(Viewer).items() if inspect.isfunction(method)}
+    public = {name for name in real if not name.startswith("_")} | {"__enter__", "__exit__"}
+    assert public == {name for name, method in vars(NullViewer).items() if inspect.isfunction(method)}
+    for name in public:
+        assert inspect.signature(getattr(Viewer, name)) == inspect.signature(getattr(NullViewer, name))
+    rng = np.random.default_rng(15)
+    model, measurements, truth = make_measurements(rng, aims=1, pairs=2)
+    with viewer:
+        viewer.session(model)
+        viewer.result(model, measurements, answer_from_truth(rng, model, measurements, truth))
+    assert not list(tmp_path.iterdir())
+
+
+def test_rerun_is_not_imported_before_a_recording_is_asked_for() -> None:
+    code = (
+        "import sys; from fgreg.viewer import open_viewer\n"
+        "with open_viewer(None, 'x') as v: pass\n"
+        "assert 'rerun' not in sys.modules and 'cv2' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
