@@ -118,7 +118,7 @@ def optimize(
                     if consistent_cost < trial_cost:
                         trial, trial_cost = consistent, consistent_cost
                 small = promise < tolerance * (1.0 + cost)
-                gain = (cost - trial_cost) / max(promise, 1e-300)
+                gain = min((cost - trial_cost) / max(promise, 1e-300), 1.0)
                 if trial_cost < cost:
                     values, cost = trial, trial_cost
                     damping = max(damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3), _LEAST_DAMPING)

@@ -82,6 +82,25 @@ def test_same_optimum_from_the_truth_and_from_elsewhere(case: str) -> None:
         assert elsewhere.cost == pytest.approx(from_truth.cost, rel=1e-7, abs=1e-7)
 
 
+@pytest.mark.parametrize(("case", "seed"), [("first hit", 25), ("three looks, own shots", 13), ("no aims", 30)])
+def test_far_starts_get_there_without_creeping_along_the_coincidences(case: str, seed: int) -> None:
+    # Starts 0.4 rad and 50 mm off: with straight steps alone these are still under way after a hundred.
+    explicit, shared, _ = make_case(seed, noise=True, **CASES[case])
+    from_truth = optimize(explicit, initial_values(explicit, shared))
+    start = perturbed(shared, np.random.default_rng(seed), rad=0.4, mm=50.0)
+    far = optimize(explicit, initial_values(explicit, start))
+    assert far.converged
+    assert far.iterations < 40
+    assert far.cost == pytest.approx(from_truth.cost, rel=1e-7)
+
+
+@pytest.mark.parametrize("seed", [2, 4, 6, 7])
+def test_a_gain_far_beyond_what_was_promised_is_no_overflow(seed: int) -> None:
+    # At sigmas of 1e-3 mm the last steps promise nothing and rounding may give more than that.
+    explicit, shared, _ = make_case(seed, noise=True, **FULL_CASES["nearly no noise"])
+    assert optimize(explicit, initial_values(explicit, shared)).converged
+
+
 def test_cost_falls_with_every_iteration() -> None:
     explicit, shared, _ = make_case(77, noise=True)
     values = initial_values(explicit, perturbed(shared, np.random.default_rng(77), rad=0.15, mm=10.0))
