@@ -9,24 +9,29 @@ coordinates, as in OpenCV. Nothing here is shared with the detectors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fgreg.frames import FloatArray
-from fgreg.models import BoardModel, CameraModel
-from fgreg.simulation.textures import (
-    BLACK,
-    WHITE,
-    CellTexture,
-    Float32Array,
-    board_texture,
-    plain_texture,
-    tag_texture,
-)
+from fgreg.models import CameraModel
+from fgreg.simulation.lens import project_points, undistorted_rays
+from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Sheet, Surface, TagSurface
+from fgreg.simulation.textures import BLACK, WHITE, Float32Array
+
+__all__ = [
+    "Background",
+    "BoardSurface",
+    "Optics",
+    "PatchSurface",
+    "Surface",
+    "TagSurface",
+    "project_points",
+    "render_frame",
+    "undistorted_rays",
+]
 
 UInt8Image = npt.NDArray[np.uint8]
 
@@ -58,161 +63,6 @@ class Optics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sheet:
-    """A textured plane: ``texture_from_surface`` (2, 3) maps (x, y, 1) mm to texture (u, v) mm."""
-
-    camera_T_surface: FloatArray
-    texture: CellTexture
-    texture_from_surface: FloatArray
-    albedo: tuple[float, float, float]
-    faces_camera: bool
-    outline_mm: FloatArray
-    depth_bias_mm: float = 0.0
-
-
-class Surface(Protocol):
-    """Anything flat that can be drawn."""
-
-    def sheet(self) -> Sheet:
-        """Plane, texture and colours, in the camera frame that the surface is expressed in."""
-        ...
-
-    def seen_from(self, other_T_camera: FloatArray) -> Surface:
-        """The same surface expressed in another camera's frame."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TagSurface:
-    """A printed tag. Tag frame: origin at the centre, x right and y up as printed, z out of the printed face.
-
-    Attributes:
-        dictionary, id: the OpenCV dictionary and the tag in it.
-        size_mm: outer edge of the black border.
-        camera_T_tag: (4, 4).
-        quiet_modules: width of the white zone around the border, in modules.
-    """
-
-    dictionary: str
-    id: int
-    size_mm: float
-    camera_T_tag: FloatArray
-    quiet_modules: float = 1.0
-    black: float = 0.06
-    white: float = 1.0
-
-    def sheet(self) -> Sheet:
-        texture = tag_texture(self.dictionary, self.id, self.size_mm, self.quiet_modules)
-        half = texture.u_mm[1] / 2.0
-        # u = x + half, v = half - y: the texture's v runs down, the tag's y up.
-        to_texture = np.array([[1.0, 0.0, half], [0.0, -1.0, half]])
-        # z towards the viewer: the camera's origin lies on the side that z points to.
-        front = float(self.camera_T_tag[:3, 2] @ self.camera_T_tag[:3, 3]) < 0.0
-        return Sheet(
-            self.camera_T_tag,
-            texture,
-            to_texture,
-            (0.0, self.black, self.white),
-            front,
-            np.array([[-half, -half], [half, -half], [half, half], [-half, half]]),
-        )
-
-    def seen_from(self, other_T_camera: FloatArray) -> TagSurface:
-        return replace(self, camera_T_tag=other_T_camera @ self.camera_T_tag)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardSurface:
-    """The calibration board.
-
-    Board frame: origin at inner corner [0, 0], x along the columns (right) and y along the rows (down), seen from the
-    front with the black corner square at the top left; z = x cross y points away from the viewer. Inner corner
-    [column, row] is at (column, row, 0) * square_mm.
-    """
-
-    board: BoardModel
-    camera_T_board: FloatArray
-    black: float = 0.06
-    white: float = 0.8
-
-    def sheet(self) -> Sheet:
-        texture = board_texture(self.board)
-        shift = 2.0 * self.board.square_mm
-        to_texture = np.array([[1.0, 0.0, shift], [0.0, 1.0, shift]])
-        front = float(self.camera_T_board[:3, 2] @ self.camera_T_board[:3, 3]) > 0.0
-        (u0, u1), (v0, v1) = texture.u_mm, texture.v_mm
-        outline = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]]) - shift
-        return Sheet(self.camera_T_board, texture, to_texture, (0.0, self.black, self.white), front, outline)
-
-    def seen_from(self, other_T_camera: FloatArray) -> BoardSurface:
-        return replace(self, camera_T_board=other_T_camera @ self.camera_T_board)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PatchSurface:
-    """A rectangle of one colour, seen from both sides: fibre, instrument shaft, clutter. Origin at its centre.
-
-    ``depth_bias_mm`` counts as additional distance when it is decided what hides what.
-    """
-
-    camera_T_patch: FloatArray
-    width_mm: float
-    height_mm: float
-    albedo: float
-    depth_bias_mm: float = 0.0
-
-    def sheet(self) -> Sheet:
-        w, h = self.width_mm / 2.0, self.height_mm / 2.0
-        return Sheet(
-            self.camera_T_patch,
-            plain_texture(self.width_mm, self.height_mm),
-            np.array([[1.0, 0.0, w], [0.0, 1.0, h]]),
-            (0.0, self.albedo, self.albedo),
-            True,
-            np.array([[-w, -h], [w, -h], [w, h], [-w, h]]),
-            self.depth_bias_mm,
-        )
-
-    def seen_from(self, other_T_camera: FloatArray) -> PatchSurface:
-        return replace(self, camera_T_patch=other_T_camera @ self.camera_T_patch)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Background:
-    """What lies behind everything: a plane (z = 0 of its frame) with smooth mottling, the same from every view.
-
-    Attributes:
-        camera_T_background: (4, 4).
-        albedo: mean; contrast: relative amplitude of the mottling.
-        seed: of the pattern.
-    """
-
-    camera_T_background: FloatArray
-    albedo: float = 0.22
-    contrast: float = 0.35
-    seed: int = 0
-
-    def seen_from(self, other_T_camera: FloatArray) -> Background:
-        """The same background expressed in another camera's frame."""
-        return replace(self, camera_T_background=other_T_camera @ self.camera_T_background)
-
-    def albedo_at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Albedo at points of the plane: waves of 25 to 90 mm and a few dark and bright spots."""
-        rng = np.random.default_rng(self.seed)
-        value = np.zeros(np.shape(x_mm))
-        for _ in range(8):
-            turn, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
-            wave = 2.0 * np.pi / rng.uniform(25.0, 90.0)
-            value += np.cos(wave * (np.cos(turn) * x_mm + np.sin(turn) * y_mm) + phase) / 8.0
-        for _ in range(12):
-            cx, cy = rng.uniform(-70.0, 70.0, 2)
-            value += rng.uniform(-1.0, 0.9) * np.exp(
-                -((x_mm - cx) ** 2 + (y_mm - cy) ** 2) / (2.0 * rng.uniform(4.0, 9.0) ** 2)
-            )
-        return np.asarray(self.albedo * np.clip(1.0 + self.contrast * 1.6 * value, 0.05, 2.0))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Rays:
     """Undistorted rays (x, y, 1): at pixel corners (h + 1, w + 1), on the coarse grid, and how to interpolate that."""
 
@@ -222,41 +72,6 @@ class _Rays:
     rows_from_coarse: Float32Array
     columns_from_coarse: Float32Array
     vignette: FloatArray = field(repr=False)
-
-
-def project_points(camera: CameraModel, camera_p_mm: FloatArray) -> FloatArray:
-    """Pixels (..., 2) of points (..., 3) in the camera's frame: pinhole and OpenCV's five distortion coefficients."""
-    normalised = camera_p_mm[..., :2] / camera_p_mm[..., 2:]
-    x, y = _distort(normalised[..., 0], normalised[..., 1], camera.distortion)
-    k = camera.matrix
-    return np.stack([k[0, 0] * x + k[0, 1] * y + k[0, 2], k[1, 1] * y + k[1, 2]], axis=-1)
-
-
-def undistorted_rays(camera: CameraModel, column_px: FloatArray, row_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rays (x, y) at z = 1 through pixels, by Newton's method on the distortion.
-
-    Raises:
-        ValueError: the distortion cannot be inverted over these pixels.
-    """
-    k = camera.matrix
-    yd = (row_px - k[1, 2]) / k[1, 1]
-    xd = (column_px - k[0, 2] - k[0, 1] * yd) / k[0, 0]
-    x, y = xd.copy(), yd.copy()
-    with np.errstate(all="ignore"):  # a lens that folds diverges; that is told below
-        for _ in range(25):
-            fx, fy = _distort(x, y, camera.distortion)
-            ex, ey = fx - xd, fy - yd
-            jxx, jxy, jyy = _distortion_jacobian(x, y, camera.distortion)
-            determinant = jxx * jyy - jxy * jxy
-            if max(np.abs(ex).max(), np.abs(ey).max()) < 1e-12:
-                break
-            x -= (jyy * ex - jxy * ey) / determinant
-            y -= (jxx * ey - jxy * ex) / determinant
-    # A solution beyond the fold of the polynomial is on the other side of the axis, or turns the image over.
-    unfolded = (determinant > 0.0) & (x * xd + y * yd >= 0.0)
-    if not (np.abs(ex) < 1e-9).all() or not (np.abs(ey) < 1e-9).all() or not unfolded.all():
-        raise ValueError(f"the lens distortion {camera.distortion.tolist()} cannot be inverted over the image")
-    return x, y
 
 
 def render_frame(
@@ -289,30 +104,6 @@ def render_frame(
     sigma = np.sqrt(np.maximum(image, 0.0) * np.float32(optics.shot_noise) + np.float32(optics.read_noise**2))
     image += sigma * rng.standard_normal(image.shape, dtype=np.float32)
     return np.asarray(np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8))
-
-
-def _distort(x: FloatArray, y: FloatArray, distortion: FloatArray) -> tuple[FloatArray, FloatArray]:
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return (
-        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-    )
-
-
-def _distortion_jacobian(
-    x: FloatArray, y: FloatArray, distortion: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # d radial / d(r2), times 2
-    return (
-        radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
-        slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y,
-        radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x,
-    )
 
 
 @lru_cache(maxsize=8)
