@@ -3,9 +3,9 @@
 The loop is our own, over ``graph.linearize(values)`` with values that Python holds: inside GTSAM's optimizers each
 callback of a Python factor copies all values, which makes one linearisation quadratic in the number of pairs.
 
-Elimination is by QR: GTSAM's Cholesky gives up as soon as two square roots on a diagonal differ by 4096 times, and
-with coincidences at 1e-3 mm beside noise of some mm or a hundredth of a radian that happens in sound problems. It takes
-1.6 times as long, and a solve less than twice as long as the linearisation it follows.
+Elimination is by QR: GTSAM's Cholesky calls a variable undetermined as soon as the last two diagonal entries of its
+factor differ by 2^12, which coincidences at 1e-3 mm beside noise of some tenths do in sound problems. QR takes some 1.6
+times as long.
 
 Costs are GTSAM's, half the chi square.
 """

@@ -1,6 +1,6 @@
 """Times the factors and the explicit graph: microseconds per callback, and solve time against the number of pairs.
 
-Prints medians; passes or fails nothing. The explicit graph is the reference, so what matters is that a factor stays
+Prints medians of CPU time; passes or fails nothing. The explicit graph is the reference, so what matters is that a factor stays
 cheap (10 to 15 us a linearisation) and that everything grows linearly.
 
     python tools/bench_graph.py
@@ -35,13 +35,13 @@ from tests.forward import make_measurements
 
 
 def median_time(run: Callable[[], object], repeats: int, number: int = 1) -> float:
-    """Median over ``repeats`` of the seconds that one ``run`` takes, each measured over ``number`` of them."""
+    """Median over ``repeats`` of the CPU seconds that one ``run`` takes, each measured over ``number`` of them."""
     times = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = time.process_time()
         for _ in range(number):
             run()
-        times.append((time.perf_counter() - start) / number)
+        times.append((time.process_time() - start) / number)
     return statistics.median(times)
 
 
