@@ -1,7 +1,7 @@
 """Times the factors and the explicit graph: microseconds per callback, and solve time against the number of pairs.
 
-Prints medians of CPU time; passes or fails nothing. The explicit graph is the reference, so what matters is that a factor stays
-cheap (10 to 15 us a linearisation) and that everything grows linearly.
+Prints medians of CPU time; passes or fails nothing. The explicit graph is the reference, so what matters is that a
+factor stays cheap (some 10 us a linearisation) and that everything grows linearly.
 
     python tools/bench_graph.py
     python tools/bench_graph.py --pairs 100 1000 --repeats 9
