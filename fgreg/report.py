@@ -256,7 +256,7 @@ def _pairs(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras)
             turn,
             _number(pair.lambda_mm, 1),
             "-" if look is None else _number(look.range_mm, 1),
-            _number(pair.residual_mm, 2),
+            _number(pair.residual_mm, 3),
             _number(pair.nis, 1),
             style=None if pair.used else "red",
         )

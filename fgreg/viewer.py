@@ -4,7 +4,7 @@ Entities, all in TRUS millimetres unless a parent's transform says otherwise:
 
 - ``world/probe``, ``world/trus``: the housing and the axes of TRUS.
 - ``world/stage``: turned to the shot's plane; ``plane`` (with the shot's frame on it), ``elements``, ``label`` below.
-- ``world/looks/{arc,beam,pm}``: one entry per look; the blueprint shows all up to the time cursor.
+- ``world/looks/{arc,beam,pm,pm_95}``: one entry per look; the blueprint shows all up to the time cursor.
 - ``world/shot/{arc,beam,pm,sound}``: those of the shot at the cursor, bold, with labels.
 - ``world/camera``: ``trus_T_camera`` of the epoch; ``left`` and ``right`` are pinholes with the endoscope's images,
   ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines below.
@@ -238,6 +238,7 @@ class Viewer:
         near, far = probe.radius_mm + low_range, probe.radius_mm + high_range
         corners = np.array([[low_x, 0.0, near], [high_x, 0.0, near], [high_x, 0.0, far], [low_x, 0.0, far]])
         rec.log("world/stage/plane", shapes.plane_mesh(corners, texture(picture)))
+        rec.log("world/stage/outline", shapes.plane_outline(corners))
         # The number of the shot is part of the caption: at later shots without a frame this one stays.
         found = "no source found" if x_mm is None or range_mm is None else f"x {x_mm:.1f} mm, range {range_mm:.1f} mm"
         above = np.array([[0.5 * picture.image.shape[1], -0.1 * picture.image.shape[0]]])
@@ -278,7 +279,7 @@ class Viewer:
             measurements: what entered the estimate.
             estimate: the answer; its looks are matched to the measured pairs by time and PM.
             truth: where it is known.
-            tracks: the queries behind ``estimate.tracks``, in order; without them only the plane is shown.
+            tracks: the queries behind ``estimate.tracks``, told apart by time; without one only the plane is shown.
         """
         painter = ResultPainter(
             rec=self._rec,
@@ -290,7 +291,7 @@ class Viewer:
             textured=frozenset(self._textured),
         )
         painter.paint()
-        eye = scene.best_eye(painter.eye_points())
+        eye = scene.best_eye(painter.eye_points(), trus_view=painter.trus_view())
         self._rec.blueprint(make_blueprint(self._contents(result=True), estimate.verdict, eye))
         self._finished = True
 

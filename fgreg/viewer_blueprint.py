@@ -23,7 +23,7 @@ BACKGROUND = {
     Verdict.WARNING: (18, 20, 24),
     Verdict.REFUSED: (58, 10, 12),
 }
-ACCUMULATED = ("world/looks/arc", "world/looks/beam", "world/looks/pm")
+ACCUMULATED = ("world/looks/arc", "world/looks/beam", "world/looks/pm", "world/looks/pm_95")
 """Entities of which every shot up to the time cursor is shown, not only the newest."""
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from fgreg import viewer_scene as scene
 from fgreg import viewer_shapes as shapes
-from fgreg.estimate import PairEstimate, SessionEstimate, Verdict
+from fgreg.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.frames import FloatArray, inverse, log_so3, transform_points
 from fgreg.matching import measured_pairs
 from fgreg.measurements import Look, MarkerObservation, Measurements, Pair, Track
@@ -38,7 +38,7 @@ class ResultPainter:
     Attributes:
         rec: where to draw.
         model, measurements, estimate, truth: of the session.
-        tracks: the queries behind ``estimate.tracks``.
+        tracks: the queries behind ``estimate.tracks`` whose marker was found.
         textured: numbers of the shots whose frame is on the image plane already.
     """
 
@@ -71,6 +71,7 @@ class ResultPainter:
             elif not plane_is_plain:
                 corners = scene.plane_corners_mm(self.model.probe, self._depth_mm())
                 self.rec.log("world/stage/plane", shapes.plane_mesh(corners, None))
+                self.rec.log("world/stage/outline", shapes.plane_outline(corners))
                 plane_is_plain = True
             if shot.kind == "pair":
                 self._pair(self.estimate.pairs[shot.position], looks[shot.position])
@@ -95,6 +96,13 @@ class ResultPainter:
             points.append(transform_points(trus_T_camera, np.array([np.zeros(3), *origins])))
         return np.concatenate(points)
 
+    def trus_view(self) -> FloatArray | None:
+        """(3,) the direction in which the last camera looks."""
+        for epoch in reversed(self.estimate.epochs):
+            if epoch.trus_T_camera is not None:
+                return np.asarray(epoch.trus_T_camera[:3, 2])
+        return None
+
     # ---- one shot ----
 
     def _epoch(self, epoch: int) -> None:
@@ -106,7 +114,8 @@ class ResultPainter:
         else:
             targets = self.model.targets_mm
             covariances = scene.target_covariances(trus_T_camera, covariance, targets)
-            self.rec.log("world/targets", shapes.ellipsoids(targets, covariances, shapes.TARGET))
+            centres = shapes.small_points(targets, shapes.TARGET, 1.2)
+            self.rec.log("world/targets", shapes.ellipsoids(targets, covariances, shapes.TARGET), centres)
         if self.truth is not None and epoch < len(self.truth.trus_T_camera):
             camera = None if self.model.camera is None else self.model.camera.left
             outline = scene.frustum_strips_mm(camera, shapes.IMAGE_DISTANCE_MM / 3.0)
@@ -124,9 +133,12 @@ class ResultPainter:
         else:
             label = f"PM {pair.pm}" + ("" if pair.used else " (not used)")
             self.rec.log("world/shot/pm", shapes.point(pair.trus_p_pm_mm, color, 5.0, label))
+            # The point, of one size at every zoom, is for ellipsoids too small to be seen.
+            centre = shapes.small_points(pair.trus_p_pm_mm[None], color, 3.5)
+            self.rec.log("world/looks/pm", centre)
             if pair.covariance is not None:
                 one = shapes.ellipsoids(pair.trus_p_pm_mm[None], pair.covariance[None], color)
-                self.rec.log("world/looks/pm", one)
+                self.rec.log("world/looks/pm_95", one)
         self._say(f"pair, PM {pair.pm}", pair.used, pair.reason, pair.residual_mm)
 
     def _sound(self, pair: PairEstimate, look: Look | None) -> None:
@@ -153,7 +165,8 @@ class ResultPainter:
 
     def _track(self, position: int, epoch: int) -> None:
         answer = self.estimate.tracks[position]
-        marker = self.tracks[position].marker if position < len(self.tracks) else None
+        query = self._query_of(answer)
+        marker = None if query is None else query.marker
         self.rec.clear("world/shot/arc", "world/shot/sound")
         self._marker(marker)
         spot = self._beam(marker, answer.lambda_mm, epoch, keep=False)
@@ -198,7 +211,7 @@ class ResultPainter:
 
         words = [what] if used else [what, f"not used: {reason}"]
         if residual_mm is not None:
-            words.append(f"residual {residual_mm:.2f} mm")
+            words.append(f"residual {residual_mm:.3f} mm")
         self.rec.log("log", rr.TextLog(", ".join(words), level="INFO" if used else "WARN"))
 
     # ---- once ----
@@ -234,8 +247,8 @@ class ResultPainter:
         import rerun as rr
 
         if self.truth is not None and self.truth.trus_p_pm_mm:
-            known = rr.Points3D(list(self.truth.trus_p_pm_mm.values()), colors=[shapes.TRUTH], radii=[shapes.ui(2.5)])
-            self.rec.static("world/truth/pms", known)
+            known = np.array(list(self.truth.trus_p_pm_mm.values()))
+            self.rec.static("world/truth/pms", shapes.small_points(known, shapes.TRUTH, 2.5))
         page = summary_markdown(self.model, self.estimate, self._camera_errors())
         if self.estimate.laser is not None:
             fibre = np.array([np.zeros(3), self.estimate.laser.marker_T_laser[:3, 3]])
@@ -264,9 +277,13 @@ class ResultPainter:
     def _epoch_of(self, shot: scene.Shot) -> int:
         if shot.kind == "pair":
             return self.estimate.pairs[shot.position].epoch
-        if shot.kind == "track" and shot.position < len(self.tracks):
-            return self.tracks[shot.position].epoch
+        if shot.kind == "track" and (query := self._query_of(self.estimate.tracks[shot.position])) is not None:
+            return query.epoch
         return max(0, sum(epoch.start_s <= shot.t for epoch in self.estimate.epochs) - 1)
+
+    def _query_of(self, answer: TrackEstimate) -> Track | None:
+        """The query of an answer; None where its marker was not found."""
+        return next((track for track in self.tracks if track.t == answer.t), None)
 
     def _depth_mm(self) -> float:
         """How deep the image plane is drawn: beyond the farthest PM and the farthest target."""

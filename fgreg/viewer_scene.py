@@ -168,15 +168,22 @@ class Eye:
     target_mm: FloatArray
 
 
-def best_eye(points_mm: FloatArray, half_height: float = 0.47, half_width: float = 0.42) -> Eye:
+def best_eye(
+    points_mm: FloatArray,
+    half_height: float = 0.47,
+    half_width: float = 0.42,
+    trus_view: FloatArray | None = None,
+) -> Eye:
     """The eye from which points (n, 3) fill the view, seen from above and obliquely to the probe's axis.
 
     Straight along the axis the probe is a disc, straight across it the arcs are lines: the eye stands 40 to 60 degrees
-    off the axis and 20 to 35 degrees up, in the one of the four quarters where the points are spread out most.
+    off the axis and 20 to 35 degrees up, in the one of the four quarters where the points are spread out most and the
+    endoscope's image is not seen edge on.
 
     Args:
         points_mm: what has to be in view.
         half_height, half_width: of the view, at distance 1 (tangents of half its angles, less a margin).
+        trus_view: (3,) the direction in which the camera looks, where there is one; a unit vector.
     """
     best, best_spread = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])), -1.0
     offsets = points_mm - points_mm.mean(axis=0)
@@ -187,6 +194,8 @@ def best_eye(points_mm: FloatArray, half_height: float = 0.47, half_width: float
             right = np.array([-flat[1], flat[0], 0.0])
             up = np.cross(away, right)
             spread = float(np.linalg.svd(offsets @ np.column_stack([right, up]), compute_uv=False)[1])
+            if trus_view is not None:
+                spread *= 0.2 + max(0.0, float(-away @ trus_view))
             if spread > best_spread:
                 best, best_spread = (away, right, up), spread
     away, right, up = best

@@ -165,6 +165,13 @@ def ellipsoids(centres_mm: FloatArray, covariances: FloatArray, color: Color) ->
     )
 
 
+def small_points(points_mm: FloatArray, color: Color, size: float) -> rr.Points3D:
+    """Points (n, 3) without labels, ``size`` screen points in radius."""
+    import rerun as rr
+
+    return rr.Points3D(points_mm, colors=[color], radii=[ui(size)])
+
+
 def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) -> rr.Mesh3D:
     """The image plane: see-through, with a picture (rows, columns, 3) on it where there is one.
 
@@ -176,7 +183,7 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
 
     triangles = [[0, 1, 2], [0, 2, 3]]
     if picture is None:
-        return rr.Mesh3D(vertex_positions=corners_mm, triangle_indices=triangles, albedo_factor=(*PLANE, 80))
+        return rr.Mesh3D(vertex_positions=corners_mm, triangle_indices=triangles, albedo_factor=(*PLANE, 110))
     return rr.Mesh3D(
         vertex_positions=corners_mm,
         triangle_indices=triangles,
@@ -184,6 +191,11 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
         albedo_texture=picture,
         albedo_factor=(255, 255, 255, 160),
     )
+
+
+def plane_outline(corners_mm: FloatArray) -> rr.LineStrips3D:
+    """The edge of the image plane; the plane itself is hardly seen where light does not fall on it."""
+    return strips([np.vstack([corners_mm, corners_mm[:1]])], PLANE, 0.8)
 
 
 def probe(length_mm: float, radius_mm: float) -> rr.Capsules3D:

@@ -94,7 +94,7 @@ def test_tables_are_not_torn_in_80_columns_even_with_large_figures() -> None:
     row = row_of(text, "123456")
     assert row[1:3] == ["0", "yes"]
     assert row[-4] == "1234.6"
-    assert row[-2:] == ["123.45", "98765.4"]
+    assert row[-2:] == ["123.450", "98765.4"]
 
 
 def test_the_registration_is_given_as_translation_rotation_and_matrix() -> None:
@@ -148,7 +148,7 @@ def test_pair_rows_hold_the_figures_in_degrees_of_the_device_and_millimetres() -
         assert row[6:] == [
             f"{pair.lambda_mm:.1f}",
             f"{look.range_mm:.1f}",
-            f"{pair.residual_mm:.2f}",
+            f"{pair.residual_mm:.3f}",
             f"{pair.nis:.1f}",
         ]
     assert "PM 2, 8.0 s, not used: range is 4.1 sigma off" in text

@@ -155,9 +155,11 @@ def test_arcs_pass_through_their_photoacoustic_markers(recorded: Recorded) -> No
 
 def test_ellipsoids_are_the_covariances(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.estimate.pairs):
-        row = recorded.at("/world/looks/pm", AIMS + i)
+        row = recorded.at("/world/looks/pm_95", AIMS + i)
         assert pair.trus_p_pm_mm is not None
         assert pair.covariance is not None
+        centre = recorded.at("/world/looks/pm", AIMS + i).array("Points3D:positions")[0]
+        np.testing.assert_allclose(centre, pair.trus_p_pm_mm, atol=1e-5)
         np.testing.assert_allclose(row.array("Ellipsoids3D:centers")[0], pair.trus_p_pm_mm, atol=1e-5)
         half, (x, y, z, w) = row.array("Ellipsoids3D:half_sizes")[0], row.array("Ellipsoids3D:quaternions")[0]
         rotation = np.array(
@@ -374,7 +376,7 @@ def test_what_was_not_heard_or_is_not_finite_is_left_out(tmp_path: Path) -> None
     rows = record(tmp_path / "part.rrd", model, heard, replace(estimate, pairs=pairs))
     assert [row.shot for row in rows["/plots/nis/pair"] if row.shot is not None] == [2]
     assert [row.shot for row in rows["/world/looks/arc"]] == [0, 2]
-    sizes = {row.shot: len(row.values["Ellipsoids3D:half_sizes"]) for row in rows["/world/looks/pm"]}
+    sizes = {row.shot: len(row.values["Ellipsoids3D:half_sizes"]) for row in rows["/world/looks/pm_95"]}
     assert sizes == {0: 0, 2: 1}
 
 
