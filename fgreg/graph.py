@@ -25,13 +25,9 @@ from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
 from fgreg.frames import FloatArray
-from fgreg.measurements import Measurements
+from fgreg.measurements import FLOOR_MM, POSE_FLOOR, Measurements, usable_covariance
 from fgreg.models import SessionModel
 from fgreg.sensitivity import sensitivity_priors
-
-FLOOR_RAD = 1e-5
-FLOOR_MM = 1e-3
-"""What a noise of zero (a session may say so) counts as; a covariance with a direction below these gets them added."""
 
 
 class Variable(Enum):
@@ -208,17 +204,6 @@ def _make_keys(measurements: Measurements, *, edge: bool, bias: bool, sound_spee
     )
 
 
-def _usable(covariance: FloatArray, floor: Sequence[float]) -> FloatArray:
-    """The covariance, with the floor's squares added where a direction of it is below the floor."""
-    sigma = np.asarray(floor)
-    if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma))[0] >= 1.0:
-        return covariance
-    return np.asarray(covariance + np.diag(sigma**2))
-
-
-_POSE_FLOOR = (FLOOR_RAD,) * 3 + (FLOOR_MM,) * 3
-
-
 def build_graph(
     measurements: Measurements, session: SessionModel, options: GraphOptions | None = None
 ) -> ExplicitGraph:
@@ -253,14 +238,14 @@ def build_graph(
     _add_shared_priors(graph, keys, session, options)
     _add_epoch_changes(graph, keys, measurements, options)
     for aim, own in zip(measurements.aims, keys.aims, strict=True):
-        covariance = _usable(aim.marker.covariance, _POSE_FLOOR)
+        covariance = usable_covariance(aim.marker.covariance, POSE_FLOOR)
         graph.add(marker_pose_factor(own.camera_T_marker, aim.marker.camera_T_marker, covariance, keys.marker_bias))
         graph.add(aim_point_on_line_factor(own.camera_T_marker, keys.marker_laser, own.lam, own.camera_p_spot, nominal))
-        spot_noise = gtsam.noiseModel.Gaussian.Covariance(_usable(aim.covariance, (FLOOR_MM,) * 3))
+        spot_noise = gtsam.noiseModel.Gaussian.Covariance(usable_covariance(aim.covariance, (FLOOR_MM,) * 3))
         graph.add(gtsam.PriorFactorPoint3(own.camera_p_spot, aim.camera_p_spot_mm, spot_noise))
     for shot in keys.shots:
         marker = measurements.pairs[shot.pair].marker
-        covariance = _usable(marker.covariance, _POSE_FLOOR)
+        covariance = usable_covariance(marker.covariance, POSE_FLOOR)
         graph.add(marker_pose_factor(shot.camera_T_marker, marker.camera_T_marker, covariance, keys.marker_bias))
         graph.add(
             point_on_line_factor(
@@ -275,7 +260,7 @@ def build_graph(
                 look.scan_rad,
                 look.x_mm,
                 look.range_mm,
-                _usable(look.covariance, (FLOOR_MM,) * 2),
+                usable_covariance(look.covariance, (FLOOR_MM,) * 2),
                 probe.radius_mm,
                 keys.sound_speed_ratio,
             )
@@ -330,5 +315,5 @@ def _add_epoch_changes(
                 continue
             rad, mm = options.unknown_motion_sigma
             motion, covariance = np.eye(4), np.diag([rad**2] * 3 + [mm**2] * 3)
-        covariance = _usable(covariance, _POSE_FLOOR)
+        covariance = usable_covariance(covariance, POSE_FLOOR)
         graph.add(epoch_change_factor(keys.trus_T_camera[k], keys.trus_T_camera[k + 1], motion, covariance))

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fgreg.frames import FloatArray, right_from_parent_covariance
 from fgreg.models import NoiseModel
+
+FLOOR_RAD = 1e-5
+FLOOR_MM = 1e-3
+"""What a noise of zero (a session may say so) counts as; a covariance with a direction below these gets them added."""
+POSE_FLOOR = (FLOOR_RAD,) * 3 + (FLOOR_MM,) * 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,3 +108,11 @@ def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) ->
     """(6, 6) right-tangent covariance of a marker pose that came without one (session-format, ``noise``)."""
     sigma = np.array([*noise.marker_rotation_rad, *noise.marker_translation_mm])
     return right_from_parent_covariance(camera_T_marker[:3, :3], np.diag(sigma**2))
+
+
+def usable_covariance(covariance: FloatArray, floor: Sequence[float]) -> FloatArray:
+    """The covariance, with the floor's squares added where a direction of it is below the floor."""
+    sigma = np.asarray(floor)
+    if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma))[0] >= 1.0:
+        return covariance
+    return np.asarray(covariance + np.diag(sigma**2))

@@ -13,7 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.frames import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
-from fgreg.measurements import EpochStart, MarkerObservation, Measurements, Pair
+from fgreg.measurements import (
+    FLOOR_MM,
+    POSE_FLOOR,
+    EpochStart,
+    MarkerObservation,
+    Measurements,
+    Pair,
+    usable_covariance,
+)
 from fgreg.models import SessionModel
 from fgreg.sensitivity import sensitivity_priors
 
@@ -112,7 +120,7 @@ def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
     if not markers:
         return BeamArrays(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)))
     transforms = np.stack([marker.camera_T_marker for marker in markers])
-    covariance = np.stack([marker.covariance for marker in markers])
+    covariance = np.stack([usable_covariance(marker.covariance, POSE_FLOOR) for marker in markers])
     rotation = np.ascontiguousarray(transforms[:, :3, :3])
     return BeamArrays(rotation, transforms[:, :3, 3].copy(), parent_from_right_covariance(rotation, covariance))
 
@@ -124,7 +132,8 @@ def _links(epochs: Sequence[EpochStart]) -> tuple[EpochLink, ...]:
         if motion is not None and covariance is not None:
             # new_T_old Exp(xi) inverted is old_T_new Exp(-Ad xi): the covariance moves to the other frame.
             turn = adjoint(motion)
-            information = np.asarray(np.linalg.inv(turn @ covariance @ turn.T), dtype=np.float64)
+            spread = turn @ usable_covariance(covariance, POSE_FLOOR) @ turn.T
+            information = np.asarray(np.linalg.inv(spread), dtype=np.float64)
             links.append(EpochLink(k, inverse(motion), information))
     return tuple(links)
 
@@ -162,7 +171,9 @@ def pack(
     priors = sensitivity_priors(looks, model.probe, model.stage.step_rad)
     weight = np.zeros((len(looks), 3, 3))
     if looks:
-        weight[:, :2, :2] = np.linalg.inv(np.stack([look.covariance for look in looks]))
+        weight[:, :2, :2] = np.linalg.inv(
+            np.stack([usable_covariance(look.covariance, (FLOOR_MM,) * 2) for look in looks])
+        )
         weight[:, 2, 2] = priors.sigma_rad**-2
 
     prior_information = np.zeros(columns.size)
@@ -193,7 +204,9 @@ def pack(
         ),
         aims=_beam_arrays([aim.marker for aim in aims]),
         aim_spot_mm=np.array([aim.camera_p_spot_mm for aim in aims], dtype=np.float64).reshape(-1, 3),
-        aim_spot_covariance=np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3),
+        aim_spot_covariance=np.array(
+            [usable_covariance(aim.covariance, (FLOOR_MM,) * 3) for aim in aims], dtype=np.float64
+        ).reshape(-1, 3, 3),
         links=_links(measurements.epochs),
         radius_mm=model.probe.radius_mm,
         prior_information=prior_information,

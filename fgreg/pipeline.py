@@ -116,9 +116,7 @@ def solve_session(
         show(viewer, session, recognised, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
-    return SolveReport(
-        session, recognised, solution, estimate, truth, errors, result_path, request.rrd, elapsed
-    )
+    return SolveReport(session, recognised, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
 
 
 def remove_older_result(folder: Path, result_path: Path) -> None:
@@ -221,7 +219,13 @@ def show(
         if event.marker.left is not None and model.camera is not None:
             left, right = marker_pictures(event.marker, event.line, model.camera)
             viewer.shot_images(
-                event.t, kind, shot, left, right, _outlines(recognised, index, model), _corner(recognised, index, event, model)
+                event.t,
+                kind,
+                shot,
+                left,
+                right,
+                _outlines(recognised, index, model),
+                _corner(recognised, index, event, model),
             )
         for number, look in enumerate(looks_of(event)):
             if look.frame is None:
@@ -248,9 +252,7 @@ def _outlines(recognised: Recognised, index: int, model: SessionModel) -> list[F
     if not isinstance(fit, MarkerFit) or model.marker is None or model.camera is None:
         return None
     left = model.camera.left
-    return [
-        project(left, transform_points(fit.camera_T_marker, tag.marker_p_corners_mm)) for tag in model.marker.tags
-    ]
+    return [project(left, transform_points(fit.camera_T_marker, tag.marker_p_corners_mm)) for tag in model.marker.tags]
 
 
 def _corner(recognised: Recognised, index: int, event: Event, model: SessionModel) -> FloatArray | None:

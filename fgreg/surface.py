@@ -1,6 +1,6 @@
 """The tissue surface that the PMs trace: where a beam with no PM heard will end.
 
-Heights along the beams' mean direction over the plane across it: a plane plus a Gaussian process (kriging with a
+Heights over the PMs' best plane: a plane plus a Gaussian process (kriging with a
 linear trend), its amplitude from the data, its predictive sigma widened where leaving out a PM shows it too small.
 """
 
@@ -17,8 +17,12 @@ LENGTH_MM = 15.0
 MIN_RELIEF_MM = 0.5
 """Least sigma of those deviations: no tissue is flatter."""
 MIN_POINTS = 5
-GRAZING = 0.2
-"""Least cosine-like of beam against normal: at less, the distance is not to be had."""
+MIN_SPREAD_MM = 1.0
+"""Least root mean square distance of the PMs from their best line."""
+GRAZING = 0.35
+"""Least cosine of beam against normal: at less, the distance is not to be had."""
+REACH_MM = 12.0
+"""Farthest from a PM that the surface is taken to be known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,10 +37,10 @@ class Meeting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TissueSurface:
-    """Heights over a plane in TRUS: ``axes`` (3, 3) columns u, v, height; all mm.
+    """Heights over a plane in TRUS: ``axes`` (3, 3) columns u, v, height (away from the fibre); all mm.
 
     Attributes:
-        axes: ``trus_R_surface``, third column along the beams.
+        axes: ``trus_R_surface``, third column the best plane's normal, on the side the beams go to.
         centre: (3,) TRUS origin of the surface's coordinates.
         place: (n, 2) of the PMs.
         covariance_inverse: (n, n). trend: (3,) coefficients over (1, u, v). trend_covariance: (3, 3).
@@ -65,7 +69,10 @@ class TissueSurface:
         return mean, self.inflation * np.sqrt(variance)
 
     def meet(self, trus_p: FloatArray, trus_d: FloatArray) -> Meeting | None:
-        """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where it misses it."""
+        """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where that is not known.
+
+        It may miss the surface, graze it, or meet it farther than ``REACH_MM`` from all PMs.
+        """
         along = np.linspace(1.0, 200.0, 400)
         points = (trus_p + along[:, None] * trus_d - self.centre) @ self.axes
         gap = points[:, 2] - self.height(points[:, :2])[0]
@@ -79,7 +86,9 @@ class TissueSurface:
         height, sigma = self.height(around)
         slope = np.array([height[1] - height[2], height[3] - height[4]]) / 0.2
         normal = self.axes @ np.array([-slope[0], -slope[1], 1.0])
-        if normal @ trus_d < GRAZING:
+        if normal @ trus_d < GRAZING * np.linalg.norm(normal):
+            return None
+        if np.linalg.norm(self.place - place, axis=1).min() > REACH_MM:
             return None
         return Meeting(distance, trus_p + distance * trus_d, normal, float(sigma[0]))
 
@@ -97,18 +106,16 @@ def fit_surface(trus_p_pm: FloatArray, covariance: FloatArray, trus_d_beam: Floa
     """The surface through PMs (n, 3) with covariances (n, 3, 3), seen along beams (n, 3); None below 5 PMs."""
     if len(trus_p_pm) < MIN_POINTS:
         return None
-    mean_direction = trus_d_beam.mean(axis=0)
-    length = float(np.linalg.norm(mean_direction))
-    if length < 0.5:
-        return None
-    axes = rotation_to_direction(mean_direction / length)
     centre = trus_p_pm.mean(axis=0)
+    _, spread, directions = np.linalg.svd(trus_p_pm - centre)
+    if spread[1] < MIN_SPREAD_MM * np.sqrt(len(trus_p_pm)):
+        return None  # PMs in a row: the slope across is anybody's guess
+    normal = directions[2] * (1.0 if directions[2] @ trus_d_beam.mean(axis=0) >= 0 else -1.0)
+    axes = rotation_to_direction(normal)
     local = (trus_p_pm - centre) @ axes
     place, height = local[:, :2], local[:, 2]
     noise = np.einsum("i,nij,j->n", axes[:, 2], covariance, axes[:, 2])
     design = _design(place)
-    if np.linalg.svd(place - place.mean(axis=0), compute_uv=False)[1] < 1.0:
-        return None  # PMs in a row: the slope across is anybody's guess
 
     def solve(relief_mm: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
         total = _kernel(place, place, relief_mm) + np.diag(noise + 1e-6)

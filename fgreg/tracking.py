@@ -121,7 +121,7 @@ def _from_surface(query: Track, context: TrackContext) -> tuple[float, float, fl
     origin, direction = _beam_in_trus(query, context.state, epoch, np.zeros((1, 6)))
     met = context.surface.meet(origin[0], direction[0])
     if met is None:
-        return "no PM is heard and the beam does not meet the surface that the session's PMs trace"
+        return "no PM is heard and the beam misses the part of the surface that the session's PMs trace"
     angle, _ = _angle(met.trus_p)
     # Spread of the angle over the posterior, the marker's noise and the surface's height: nonlinear enough to sample.
     rng = np.random.default_rng(0)
