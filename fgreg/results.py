@@ -291,7 +291,8 @@ def _escaped(c: str) -> str:
 def read_result(path: Path) -> SessionEstimate:
     """Reads a result and checks every field.
 
-    Times of the looks are not in the file: ``t`` of each pair is NaN; nor are the calibration shots.
+    Times of the looks are not in the file: ``t`` of each pair is NaN; nor are the calibration shots. A predicted error
+    that is ``null`` reads as infinite.
 
     Raises:
         InputError: the first problem of the file.
