@@ -34,7 +34,7 @@ OUTWARD_PX, OUTWARD_FALLBACK_PX = 0.002, 0.1
 BORDER_MARGIN_PX = 7.0
 """Corners nearer to the image's border than this have to come from edges."""
 MAX_FALLBACK_EDGE_PX = 60.0
-"""Longer edges than this can be fitted: where they cannot, the square's outline is not what the detector took it for."""
+"""Longer edges than this can be fitted: where they cannot, the detector took something else for the outline."""
 MIN_EDGE_PX = 12.0
 """Edges shorter than this are left to sub-pixel refinement."""
 
@@ -141,7 +141,7 @@ def square_corners(
     # Sub-pixel refinement of a corner counts only on small squares, whose outline lies between dark and light.
     step = (fit.step > MIN_CONTRAST).reshape(-1, 4)
     found[usable] &= step & np.roll(step, 1, axis=1) & (sides[usable].min(axis=1) < MAX_FALLBACK_EDGE_PX)[:, None]
-    for row, k in enumerate(usable):
+    for row, k in enumerate(usable.tolist()):
         jacobian = np.zeros((8, 8))
         for c in range(4):
             e, g = (c - 1) % 4, c  # the edges that end and start at this corner

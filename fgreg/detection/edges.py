@@ -293,8 +293,12 @@ def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatAr
     x, near, step = _locate(camera, image, start, end, cell_px, 8.0)
     far = np.flatnonzero(~near & (cell_px > 15.0))
     if far.size:
-        # The detector may have taken the inner outline of a thick border, some ten pixels off.
-        x[far], near[far], _ = _locate(camera, image, start[far], end[far], cell_px[far], 18.0)
+        # The detector may have taken the inner outline of a thick border, up to some ten pixels inside.
+        shift = np.minimum(0.3 * cell_px[far], 6.0)
+        _, _, normal, _ = segment_frames(start[far], end[far])
+        outward = shift[:, None] * normal
+        x[far], near[far], _ = _locate(camera, image, start[far] + outward, end[far] + outward, cell_px[far], 18.0)
+        x[far, 0] += shift
 
     # Second pass: about the line found, as wide as its blur asks for.
     _, _, normal, _ = segment_frames(start, end)
