@@ -1,0 +1,190 @@
+"""Channel data made ready: live channels, common flash removed, complex baseband in a frequency band.
+
+Arrays are (elements, samples); times in us after the laser pulse, frequencies in MHz.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft as scipy_fft
+
+from fgreg.errors import EstimationError
+from fgreg.frames import BoolArray
+from fgreg.models import ChannelModel
+
+Complex64Array = npt.NDArray[np.complex64]
+Float32Array = npt.NDArray[np.float32]
+
+PAD_US = 2.0
+"""Zeros after the record, so that the filters' circular ends do not meet."""
+MIN_RATE_MHZ = 30.0
+"""Sampling of the baseband: fine enough that linear interpolation of an envelope costs nothing."""
+LOUD = 2.0
+"""A channel this many times noisier than the typical one is scaled down to it."""
+FLASH_SIGMA = 0.6
+"""Level of the channels' median, in noise sigmas, from which on a common flash is suspected: the median of 128
+channels of noise stays below 0.5, and a source, which reaches few channels at any one time, moves it by 0.1."""
+FLASH_PARTICIPATION = 0.5
+FLASH_GUARD_US = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A Gaussian pass band: centre and standard deviation (MHz) of its amplitude response."""
+
+    centre_mhz: float
+    sigma_mhz: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channels:
+    """Cleaned channel data.
+
+    Attributes:
+        spectrum: (elements, bins) one-sided spectrum of the zero-padded records.
+        live: (elements,) channels that carry anything at all.
+        samples, padded: length of the record and of its transform.
+        sampling_mhz: of the record.
+        start_us: arrival time, pulse delay taken off, of a wave whose maximum is at sample 0.
+        noise: standard deviation of a sample, robust over the live channels, frame's units.
+        peak: largest sample, frame's units.
+    """
+
+    spectrum: Complex64Array
+    live: BoolArray
+    samples: int
+    padded: int
+    sampling_mhz: float
+    start_us: float
+    noise: float
+    peak: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Baseband:
+    """Complex envelopes of all channels in one band: the analytic signal is ``data * exp(2j pi carrier t)``.
+
+    Attributes:
+        data: (samples + 1, elements), time first; the last row is zero and stands for "outside the record".
+        rate_mhz: sampling of ``data``; row 0 is at ``start_us``.
+        carrier_mhz: frequency taken off.
+        start_us: as in :class:`Channels`.
+        variance: of the complex noise, the median over the channels.
+    """
+
+    data: Complex64Array
+    rate_mhz: float
+    carrier_mhz: float
+    start_us: float
+    variance: float
+
+
+def prepare_channels(frame: npt.NDArray[Any], sampling: ChannelModel) -> Channels:
+    """Take offsets off, find dead channels, remove a flash that all channels have in common.
+
+    Args:
+        frame: (elements, samples) real numbers, finite.
+        sampling: how it was sampled.
+
+    Raises:
+        EstimationError: every channel is dead (constant): nothing was recorded.
+    """
+    data = np.array(frame, dtype=np.float32)
+    # Zero where it does not change: a dead channel with an offset is as dead as one without.
+    live = np.asarray(np.ptp(data, axis=1) > 0.0)
+    if not live.any():
+        raise EstimationError("all channels are constant: nothing was recorded")
+    data -= data.mean(axis=1, keepdims=True)
+    data[~live] = 0.0
+    noise_each = np.zeros(data.shape[0])
+    noise_each[live] = 1.4826 * np.median(np.abs(data[live, ::2]), axis=1)
+    noise = float(np.median(noise_each[live]))
+    peak = float(np.abs(data).max())
+    loud = live & (noise_each > max(LOUD * noise, 1e-3 * peak))
+    if loud.any() and noise > 0.0:
+        data[loud] *= (noise / noise_each[loud])[:, None].astype(np.float32)
+    remove_flash(data, live, noise, sampling.sampling_mhz)
+    samples = data.shape[1]
+    padded = int(scipy_fft.next_fast_len(samples + math.ceil(PAD_US * sampling.sampling_mhz), real=True))
+    return Channels(
+        spectrum=np.asarray(scipy_fft.rfft(data, padded, axis=1)),
+        live=live,
+        samples=samples,
+        padded=padded,
+        sampling_mhz=sampling.sampling_mhz,
+        start_us=sampling.t0_us - sampling.pulse_delay_us,
+        noise=noise,
+        peak=peak,
+    )
+
+
+def remove_flash(data: Float32Array, live: BoolArray, noise: float, sampling_mhz: float) -> None:
+    """Take away, in place, what reaches all channels at the same time (the laser's light, interference).
+
+    A source's wavefront is curved: at any one time it is in few channels, so the channels' median does not see it.
+    Where the median does rise, each channel's share of it is fitted and subtracted there, if most channels share.
+    """
+    level = FLASH_SIGMA * noise * math.sqrt(max(1.0, 100.0 / int(live.sum())))
+    # What all channels share is in their mean too, which costs less to look at.
+    if float(np.abs(data[live].mean(axis=0)).max()) < 0.7 * level:
+        return
+    common = np.median(data[live], axis=0)
+    hit = np.abs(common) > max(level, 1e-6 * float(np.abs(data).max()))
+    if not hit.any():
+        return
+    guard = max(1, round(FLASH_GUARD_US * sampling_mhz))
+    window = np.convolve(hit, np.ones(2 * guard + 1), mode="same") > 0.5
+    pattern = common[window]
+    gain = data[:, window] @ pattern / float(pattern @ pattern)
+    share = float(gain[live].sum() ** 2 / (live.sum() * (gain[live] ** 2).sum()))
+    if share > FLASH_PARTICIPATION:
+        data[:, window] -= np.outer(gain, pattern).astype(np.float32)
+
+
+def baseband(channels: Channels, band: Band) -> Baseband:
+    """Complex envelopes of all channels in a pass band, resampled to a rate that suits an envelope.
+
+    The filter has zero phase: it does not move the maximum of a symmetric envelope.
+    """
+    step = channels.sampling_mhz / channels.padded
+    nyquist = channels.sampling_mhz / 2.0
+    low = max(1, math.ceil((band.centre_mhz - 4.0 * band.sigma_mhz) / step))
+    high = min(channels.spectrum.shape[1] - 1, math.floor(min(band.centre_mhz + 4.0 * band.sigma_mhz, nyquist) / step))
+    carrier = round(min(band.centre_mhz, nyquist) / step)
+    length = channels.padded
+    rate = channels.sampling_mhz
+    if rate > 1.5 * MIN_RATE_MHZ or rate < MIN_RATE_MHZ:
+        length = int(scipy_fft.next_fast_len(max(high - low + 1, math.ceil(MIN_RATE_MHZ / step))))
+        rate = length * step
+    bins = np.arange(low, high + 1)
+    gain = np.exp(-0.5 * ((bins * step - band.centre_mhz) / band.sigma_mhz) ** 2) * (2.0 * length / channels.padded)
+    shifted = np.zeros((channels.spectrum.shape[0], length), dtype=np.complex64)
+    shifted[:, (bins - carrier) % length] = channels.spectrum[:, low : high + 1] * gain.astype(np.float32)
+    kept = min(length, math.ceil(channels.samples * rate / channels.sampling_mhz))
+    data = np.zeros((kept + 1, channels.live.size), dtype=np.complex64)
+    data[:kept] = np.asarray(scipy_fft.ifft(shifted, axis=1, overwrite_x=True))[:, :kept].T
+    # |complex Gaussian|^2 is exponential: its median is log 2 times its mean. A source fills few of the samples.
+    power = np.abs(data[:kept:4, channels.live]) ** 2
+    variance = float(np.median(power)) / math.log(2.0)
+    return Baseband(data, rate, carrier * step, channels.start_us, max(variance, 1e-14 * float(power.max())))
+
+
+def check_frame(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The frame as an array, if it is two-dimensional, not empty, real and finite.
+
+    Raises:
+        ValueError: it is not; says what it is.
+    """
+    data = np.asarray(frame)
+    if data.ndim != 2 or 0 in data.shape:
+        raise ValueError(f"a frame of shape {data.shape}, expected two dimensions, none of them empty")
+    if data.dtype.kind not in "iuf":
+        raise ValueError(f"a frame of type {data.dtype}, expected real numbers (float32 or int16)")
+    if data.dtype.kind == "f" and not np.isfinite(data).all():
+        raise ValueError(f"a frame with {int((~np.isfinite(data)).sum())} entries that are not finite")
+    return data

@@ -1,0 +1,224 @@
+"""Where the photoacoustic source is, from a beamformed envelope image: sub-pixel peak with covariance.
+
+Power (envelope squared) is measured against the background at the same depth, smoothed at a few scales, and its highest
+value judged by the tail of the image's own distribution: an exponential fitted between two high quantiles, extended to
+the chance that is allowed. That needs no model of speckle, and what it gets wrong it gets wrong to the safe side (the
+tails of smoothed power fall faster further out). A bell is then fitted to the power about the peak.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage, optimize
+
+from fgreg.detection.channels import check_frame
+from fgreg.detection.find import NoSignal, PaFind
+from fgreg.frames import FloatArray
+from fgreg.models import ImageModel, ProbeModel
+
+FALSE_ALARMS = 4e-4
+SCALES_MM = ((0.0, 0.0), (0.1, 0.15), (0.2, 0.4))
+"""Standard deviations (range, x) of the smoothing; the first looks at single pixels."""
+LOW_QUANTILE, HIGH_QUANTILE = 0.97, 0.997
+AWAY_MM = (1.5, 2.5)
+"""Half size (range, x) of the surroundings of a peak that do not count as background."""
+ROWS = 15
+"""Rows over which the background's level is smoothed along depth."""
+FIT_LEVEL = 0.25
+"""Power, as a share of the peak's, down to which pixels enter the fit (half the envelope)."""
+FLOOR_PIXELS = 0.01
+TYPICAL_MM, SIZE_SIGMA = (0.14, 0.2), 0.8
+"""Widths (range, x) of a source's envelope, and how far the logarithm of them may be off."""
+SKEW_SIGMA, TILT_SIGMA = 0.2, 0.5
+MAX_FIT_PIXELS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class _Peak:
+    row: int
+    column: int
+    statistic: float
+    scale: int
+
+
+def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
+    """Find the photoacoustic source in one envelope image.
+
+    Args:
+        frame: (depth, lateral) envelope pixels, linear (not log-compressed), >= 0. Rows go with range, columns with TRUS
+            x, both increasing; ``probe.flip`` is about the order of channels and does not turn the image.
+        probe: with ``image``: pixel pitch and centre of pixel [0, 0], (range, x) mm.
+
+    Returns:
+        The find, or why there is none. ``range_mm`` is the image's: computed with the assumed sound speed. There is no
+        ratio of sound speeds in it (None): the wavefront is gone.
+
+    Raises:
+        ValueError: the probe has no image geometry, or the frame is no envelope image.
+    """
+    if probe.image is None:
+        raise ValueError("the probe has no image geometry (probe.image)")
+    image = check_frame(frame).astype(np.float64)
+    if float(image.min()) < 0.0:
+        raise ValueError("an envelope image with negative pixels, expected values >= 0")
+    if min(image.shape) < 8:
+        raise ValueError(f"an envelope image of shape {image.shape}, expected at least 8 x 8 pixels")
+    if float(np.ptp(image)) == 0.0:
+        return NoSignal(f"no signal: all pixels are {image[0, 0]:g}")
+    range_mm = probe.image.origin_mm[0] + probe.image.pixel_mm[0] * np.arange(image.shape[0])
+    usable = np.flatnonzero(range_mm > 0.0)
+    if usable.size < 8:
+        return NoSignal("no signal: hardly any row of the image is at a range > 0")
+    first = int(usable[0])
+    power = image[first:] ** 2
+    level = background(power)
+    relative = power / level[:, None]
+    peak = _find_peak(relative, probe.image)
+    threshold = math.log(len(SCALES_MM) * relative.size / FALSE_ALARMS)
+    if peak.statistic < threshold:
+        return NoSignal(f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}")
+    fit = _fit_bell(power, level, relative, peak, probe.image)
+    if fit is None:
+        return NoSignal(
+            f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}, but no peak inside the image"
+        )
+    row, column, amplitude, covariance = fit
+    noise = math.sqrt(0.5 * float(level[peak.row]))
+    return PaFind(
+        x_mm=probe.image.origin_mm[1] + column * probe.image.pixel_mm[1],
+        range_mm=probe.image.origin_mm[0] + (first + row) * probe.image.pixel_mm[0],
+        covariance=covariance,
+        amplitude=amplitude,
+        snr_db=20.0 * math.log10(amplitude / (math.sqrt(2.0) * noise)),
+        sound_speed_ratio=None,
+        sound_speed_ratio_sigma=None,
+        elements_used=None,
+        statistic=peak.statistic,
+        threshold=threshold,
+    )
+
+
+def background(power: FloatArray) -> FloatArray:
+    """Mean power of the background at each depth, (rows,), from medians along rows (exponential: median = ln 2 mean).
+
+    A row that is bright all over (a flash, the probe's face) is measured against itself, others against their
+    neighbourhood.
+    """
+    each = np.median(power, axis=1) / math.log(2.0)
+    smooth = ndimage.median_filter(each, size=min(ROWS, each.size), mode="nearest")
+    level = np.maximum(smooth, 0.7 * each)
+    return np.maximum(level, 1e-12 * float(power.max()))
+
+
+def _find_peak(relative: FloatArray, image: ImageModel) -> _Peak:
+    best = _Peak(0, 0, -math.inf, 0)
+    away = [max(1, round(size / pixel)) for size, pixel in zip(AWAY_MM, image.pixel_mm, strict=True)]
+    for number, scale in enumerate(SCALES_MM):
+        sigma = [size / pixel for size, pixel in zip(scale, image.pixel_mm, strict=True)]
+        if number and max(sigma) < 0.4:
+            continue
+        smooth = (
+            ndimage.gaussian_filter(relative, sigma, mode="constant", cval=1.0, truncate=3.0) if number else relative
+        )
+        row, column = (int(i) for i in np.unravel_index(int(np.argmax(smooth)), smooth.shape))
+        rest = np.ones(smooth.shape, dtype=np.bool_)
+        rest[max(0, row - away[0]) : row + away[0] + 1, max(0, column - away[1]) : column + away[1] + 1] = False
+        others = smooth[rest] if rest.sum() > 0.3 * rest.size else smooth.ravel()
+        low, high = np.quantile(others, (LOW_QUANTILE, HIGH_QUANTILE))
+        top = float(smooth[row, column])
+        decay = max(float(high - low) / math.log((1 - LOW_QUANTILE) / (1 - HIGH_QUANTILE)), 1e-9 * top)
+        statistic = (top - float(low)) / decay - math.log(1 - LOW_QUANTILE)
+        if statistic > best.statistic:
+            best = _Peak(row, column, statistic, number)
+    return best
+
+
+def _bell(p: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
+    """Power of a bell: log height, centre (z, x), log widths of the envelope, skew along z, tilt; pixels."""
+    height, z0, x0, wide_z, wide_x, skew, tilt = np.clip(p, -1e4, [500.0, 1e4, 1e4, 6.0, 6.0, 1.5, 10.0])
+    wide_z, wide_x = max(wide_z, -3.0), max(wide_x, -3.0)
+    u = (z - z0) * math.exp(-wide_z)
+    u = u / (1.0 + 0.5 * skew * np.tanh(3.0 * u))
+    v = (x - x0 - tilt * (z - z0)) * math.exp(-wide_x)
+    return np.asarray(math.exp(height) * np.exp(-(u * u + v * v)))
+
+
+def _fit_bell(
+    power: FloatArray, level: FloatArray, relative: FloatArray, peak: _Peak, image: ImageModel
+) -> tuple[float, float, float, FloatArray] | None:
+    """(row, column, amplitude, covariance (2, 2) over (x, range) mm^2) of the bell at a peak, None where there is none."""
+    sigma = [max(size / pixel, 0.6) for size, pixel in zip(SCALES_MM[max(peak.scale, 1)], image.pixel_mm, strict=True)]
+    smooth = ndimage.gaussian_filter(power - level[:, None], sigma, mode="constant", truncate=3.0)
+    reach = [max(3, round(2.0 / pixel)) for pixel in image.pixel_mm]
+    low = [max(0, peak.row - reach[0]), max(0, peak.column - reach[1])]
+    part = smooth[low[0] : peak.row + reach[0] + 1, low[1] : peak.column + reach[1] + 1]
+    labels, _ = ndimage.label(part > FIT_LEVEL * part[peak.row - low[0], peak.column - low[1]])
+    inside = labels == labels[peak.row - low[0], peak.column - low[1]]
+    inside = ndimage.binary_dilation(inside)
+    z, x = (index.astype(np.float64) for index in np.nonzero(inside))
+    if z.size > MAX_FIT_PIXELS:
+        pick = np.linspace(0, z.size - 1, MAX_FIT_PIXELS).astype(np.intp)
+        z, x = z[pick], x[pick]
+    z, x = z + low[0], x + low[1]
+    rows, columns = z.astype(np.intp), x.astype(np.intp)
+    value, mean = power[rows, columns], level[rows]
+    top = max(float(smooth[peak.row, peak.column]), 1e-300)
+    start = np.array([math.log(top), float(peak.row), float(peak.column), 0.0, 0.0, 0.0, 0.0])
+    typical = [math.log(size / pixel) for size, pixel in zip(TYPICAL_MM, image.pixel_mm, strict=True)]
+    start[3:5] = typical
+    expected = np.array([*typical, 0.0, 0.0])
+    prior = 1.0 / np.array([SIZE_SIGMA, SIZE_SIGMA, SKEW_SIGMA, TILT_SIGMA * image.pixel_mm[0] / image.pixel_mm[1]])
+
+    spread = np.ones(z.size)
+
+    def misfit(p: FloatArray) -> FloatArray:
+        return np.concatenate([(value - mean - _bell(p, z, x)) / spread, (p[3:] - expected) * prior])
+
+    solution = start
+    for _ in range(2):
+        # Rician pixels: variance of the power is background^2 + 2 background signal.
+        signal = _bell(solution, z, x)
+        spread = np.sqrt(mean**2 + 2.0 * mean * signal + (1e-3 * top) ** 2)
+        result = optimize.least_squares(misfit, solution, method="lm", max_nfev=200)
+        solution = result.x
+        centre = solution[1:3]
+        if not (np.isfinite(solution).all() and np.abs(centre - [peak.row, peak.column]).max() < 2.0 * max(reach)):
+            return None
+    if (centre < -0.5).any() or (centre > np.array(power.shape) - 0.5).any():
+        return None
+    jacobian = result.jac
+    data = z.size
+    # Pixels are correlated as the background is; the root of the correlation of powers is that of the amplitudes.
+    correlation = _correlation(relative, peak, rows, columns)
+    bread = np.linalg.pinv(jacobian.T @ jacobian)
+    meat = jacobian[:data].T @ correlation @ jacobian[:data] + jacobian[data:].T @ jacobian[data:]
+    scale = max(1.0, float(result.fun[:data] @ result.fun[:data]) / max(data - 5, 1))
+    covariance_px = (bread @ meat @ bread)[1:3, 1:3] * scale + np.eye(2) * FLOOR_PIXELS**2
+    swap = np.array([[0.0, image.pixel_mm[1]], [image.pixel_mm[0], 0.0]])
+    return float(centre[0]), float(centre[1]), math.exp(0.5 * solution[0]), swap @ covariance_px @ swap.T
+
+
+def _correlation(
+    relative: FloatArray, peak: _Peak, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]
+) -> FloatArray:
+    """(n, n) correlation between pixels, from the image's background; peaks are cut off so that they do not count."""
+    calm = np.minimum(relative, 6.0)
+    calm = calm - calm.mean()
+    spans = int(np.ptp(rows)), int(np.ptp(columns))
+    shape = [length + span for length, span in zip(calm.shape, spans, strict=True)]
+    spectrum = np.fft.rfft2(calm, shape)
+    raw = np.fft.irfft2(np.abs(spectrum) ** 2, shape)
+    table = np.zeros((spans[0] + 1, spans[1] + 1))
+    for i in range(spans[0] + 1):
+        # Both diagonal directions: speckle need not be symmetric.
+        table[i] = np.maximum(raw[i, : spans[1] + 1], raw[i, -np.arange(spans[1] + 1)])
+    table /= raw[0, 0]
+    # Chance correlation of so many pixels is not correlation.
+    chance = 4.0 / math.sqrt(relative.size)
+    table = np.where(table > chance, np.sqrt(np.clip(table, 0.0, 1.0)), 0.0)
+    return np.asarray(table[np.abs(rows[:, None] - rows[None, :]), np.abs(columns[:, None] - columns[None, :])])

@@ -1,0 +1,130 @@
+"""Where the photoacoustic source is: from channel data, or from an envelope image (envelope.py).
+
+Channel data hold one-way travel times. A wavefront is looked for by delay and sum over the image plane (wavefront.py)
+and, where there is one, fitted for x, range and the ratio of sound speeds (arrival.py). A frame without a source is
+answered with :class:`NoSignal`, not with a point.
+
+The ratio of sound speeds is always fitted along. Fixing it at 1 would gain next to nothing (at 0 dB the range's standard
+deviation is set by the envelope's maximum, which the ratio does not enter, and x is nearly uncorrelated with it except
+at the array's ends), while a speed 2 % off would then move the range by a tenth of a millimetre without a word.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.detection.arrival import WavefrontFit, fit_wavefront, path_mm
+from fgreg.detection.channels import check_frame, prepare_channels
+from fgreg.detection.envelope import locate_in_image
+from fgreg.detection.find import NoSignal, PaFind, pool_sound_speed_ratio
+from fgreg.detection.wavefront import MAX_TANGENT, find_peaks
+from fgreg.errors import EstimationError
+from fgreg.frames import BoolArray, FloatArray
+from fgreg.models import ProbeModel
+
+__all__ = ["NoSignal", "PaFind", "locate_in_channels", "locate_in_frame", "locate_in_image", "pool_sound_speed_ratio"]
+
+FALSE_ALARMS = 4e-4
+"""Share of frames of noise in which a source may be found by mistake."""
+INDEPENDENT = 9.0
+"""Independent points per grid point near the threshold, measured on frames of noise (tools/study_photoacoustic.py)."""
+FLAT_PERIODS = 0.9
+FLAT_SHARE = 0.4
+"""A flat wave (light, interference) fits a spherical one only where that is flat to half a period. A source is heard
+over more than FLAT_PERIODS periods of path, or FLAT_SHARE of all that the array could hear of it where that is less."""
+
+
+def locate_in_channels(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
+    """Find the photoacoustic source in one frame of channel data.
+
+    Args:
+        frame: (elements, samples) real numbers (float32, int16, ...), rows in the order of ``probe.element_x_mm``
+            (which holds ``probe.flip``). Offsets, dead (constant) channels and a flash common to all channels are no
+            obstacle. Nothing need be known of the pulse but that its spectrum lies between 1 and 12 MHz.
+        probe: with ``channels``.
+
+    Returns:
+        The find, or why there is none, with the figure. ``range_mm`` is the assumed sound speed times the arrival time
+        at the apex of the wavefront (where the element at the source's x would be), *whatever the true speed is*: with
+        the ratio of sound speeds the true range is ``ratio * range_mm``. ``x_mm`` needs no correction. The covariance
+        is that with the ratio unknown (prior 1 +- 3 %).
+
+    Raises:
+        ValueError: the probe has no channel sampling, or the frame is not one of this probe.
+    """
+    if probe.channels is None:
+        raise ValueError("the probe has no channel sampling (probe.channels)")
+    data = check_frame(frame)
+    if data.shape[0] != probe.elements:
+        swapped = ", which looks transposed" if data.shape[1] == probe.elements else ""
+        raise ValueError(f"channel data of shape {data.shape}{swapped}, expected ({probe.elements} elements, samples)")
+    speed_mm_us = probe.sound_speed_m_s * 1e-3
+    try:
+        channels = prepare_channels(data, probe.channels)
+    except EstimationError as error:
+        return NoSignal(f"no signal: {error}")
+    peaks, points = find_peaks(channels, probe, speed_mm_us)
+    threshold = math.log(INDEPENDENT * max(points, 1) / FALSE_ALARMS)
+    if not peaks:
+        return NoSignal("no signal: no arrival from the image plane falls into the record")
+    reason = f"no signal: statistic {peaks[0].statistic:.1f}, threshold {threshold:.1f}"
+    for peak in peaks:
+        if peak.statistic < threshold:
+            break
+        try:
+            fit = fit_wavefront(channels, probe.element_x_mm, speed_mm_us, peak.x_mm, peak.range_mm, peak.ratio)
+        except EstimationError as error:
+            reason = f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}, but {error}"
+            continue
+        heard, possible = heard_periods(fit, channels.live, probe.element_x_mm, speed_mm_us)
+        if heard < min(FLAT_PERIODS, FLAT_SHARE * possible):
+            reason = (
+                f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}, but the wave is flat: "
+                f"it fits a spherical one over {heard:.1f} periods only"
+            )
+            continue
+        noise = max(channels.noise, 1e-6 * channels.peak)
+        return PaFind(
+            x_mm=fit.x_mm,
+            range_mm=fit.range_mm,
+            covariance=fit.covariance,
+            amplitude=fit.amplitude,
+            snr_db=20.0 * math.log10(max(fit.amplitude, 1e-30) / (math.sqrt(2.0) * noise)),
+            sound_speed_ratio=fit.ratio,
+            sound_speed_ratio_sigma=fit.ratio_sigma,
+            elements_used=fit.elements_used,
+            statistic=peak.statistic,
+            threshold=threshold,
+        )
+    return NoSignal(reason)
+
+
+def locate_in_frame(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
+    """Find the photoacoustic source in a frame of either kind.
+
+    A frame with as many rows as the probe has elements is channel data, where the probe has ``channels``; any other is
+    an envelope image, where it has ``image``.
+
+    Raises:
+        ValueError: the probe has neither, or the frame fits neither.
+    """
+    data = check_frame(frame)
+    if probe.channels is not None and (data.shape[0] == probe.elements or probe.image is None):
+        return locate_in_channels(data, probe)
+    if probe.image is not None:
+        return locate_in_image(data, probe)
+    raise ValueError("the probe has neither channel sampling (probe.channels) nor image geometry (probe.image)")
+
+
+def heard_periods(
+    fit: WavefrontFit, live: BoolArray, element_x_mm: FloatArray, speed_mm_us: float
+) -> tuple[float, float]:
+    """Spread of path, in periods, over the elements that heard the wave, and over all that could have."""
+    path = path_mm(fit.x_mm, fit.range_mm, fit.ratio, element_x_mm)
+    could = live & (np.abs(element_x_mm - fit.x_mm) < MAX_TANGENT * fit.range_mm)
+    periods = fit.band.centre_mhz / speed_mm_us
+    return float(np.ptp(path[fit.gain > 0.0])) * periods, float(np.ptp(path[could])) * periods if could.any() else 0.0
