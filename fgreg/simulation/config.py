@@ -106,7 +106,8 @@ class SimulationConfig:
         laser_offset_mm, laser_tilt_rad: spans of the beam's distance from the marker's origin and of its angle to the
             marker's -z (the printed face looks back at the camera).
         marker_T_laser: fixes the calibration, else drawn.
-        camera_distance_mm: span, to the middle of the tissue. board_distance_mm: span of the boards' distances.
+        camera_distance_mm: span, to the middle of the tissue. camera_roll_rad: the image's long side lies across the
+            probe's axis, but for this to either side. board_distance_mm: span of the boards' distances.
         marker_distance_mm, tag_tilt_rad: shots outside this span, or with the tag's face turned farther away than
             this, or with the tag not wholly in both images, are not taken.
     """
@@ -149,7 +150,8 @@ class SimulationConfig:
     laser_offset_mm: tuple[float, float] = (5.0, 15.0)
     laser_tilt_rad: tuple[float, float] = (math.radians(10.0), math.radians(25.0))
     marker_T_laser: FloatArray | None = None
-    camera_distance_mm: tuple[float, float] = (110.0, 135.0)
+    camera_distance_mm: tuple[float, float] = (125.0, 150.0)
+    camera_roll_rad: float = math.radians(25.0)
     board_distance_mm: tuple[float, float] = (105.0, 150.0)
     marker_distance_mm: tuple[float, float] = (75.0, 160.0)
     tag_tilt_rad: float = math.radians(50.0)

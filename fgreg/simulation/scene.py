@@ -17,6 +17,8 @@ CANDIDATES = 8
 """Ways to take a shot that are drawn at once; the first that the camera can see is taken."""
 
 ROUNDS = 40
+PATIENCE = 12
+"""Rounds of candidates before a shot is given up; and before its PM is moved."""
 EDGE_PX = 12.0
 
 
@@ -95,11 +97,19 @@ def draw_scene(config: SimulationConfig, rng: np.random.Generator) -> Scene:
     """Places tissue, camera and fibre."""
     tissue = _draw_tissue(config, rng)
     trus_p_middle = tissue.point(np.zeros(()), np.zeros(()))
-    # The camera looks at the tissue from the side away from the probe, tilted by up to 20 deg, rolled by any angle.
+    # The camera looks at the tissue from the side away from the probe, tilted by up to 15 deg.
     up = _normalised(np.array([*np.tan(rng.uniform(-0.25, 0.25, 2)), 1.0]))
-    view = -_normalised(up + np.array([*rng.uniform(-0.05, 0.05, 2), 0.0]))
     trus_p_camera = trus_p_middle + rng.uniform(*config.camera_distance_mm) * up
-    trus_T_camera = make_transform(_frame_along(view, rng.uniform(-math.pi, math.pi)), trus_p_camera)
+    # Beams come in beside the line of sight; the camera is pointed at where the markers will be.
+    lean, azimuth = math.radians(rng.uniform(12.0, 32.0)), rng.uniform(-math.pi, math.pi)
+    down_frame = _frame_along(-up, azimuth)
+    trus_beam = math.cos(lean) * down_frame[:, 2] + math.sin(lean) * down_frame[:, 0]
+    trus_p_markers = trus_p_middle - 0.5 * sum(config.lambda_mm) * trus_beam
+    view = _normalised(trus_p_markers - trus_p_camera)
+    # The image's long side lies across the probe's axis, either way round, where the spots spread most.
+    across = np.array([0.0, rng.choice([-1.0, 1.0]), 0.0])
+    roll = rng.uniform(-config.camera_roll_rad, config.camera_roll_rad)
+    trus_T_camera = make_transform(_laser_rotation(view, across, np.asarray(roll)), trus_p_camera)
     transforms, moves = [trus_T_camera], []
     for _ in range(config.epochs - 1):
         camera_p_middle = transform_points(inverse(transforms[-1]), trus_p_middle)
@@ -110,10 +120,6 @@ def draw_scene(config: SimulationConfig, rng: np.random.Generator) -> Scene:
         transforms.append(transforms[-1] @ inverse(move))
 
     marker_T_laser = _draw_laser(config, rng) if config.marker_T_laser is None else config.marker_T_laser
-    # Beams come in beside the line of sight.
-    lean, azimuth = math.radians(rng.uniform(12.0, 32.0)), rng.uniform(-math.pi, math.pi)
-    view_frame = _frame_along(view, azimuth)
-    trus_beam = math.cos(lean) * view_frame[:, 2] + math.sin(lean) * view_frame[:, 0]
     trus_side = _frame_along(trus_beam, 0.0)[:, 0]
     # Of all rolls about the beam, one near that which turns the printed face best to the camera.
     rolls = np.linspace(-math.pi, math.pi, 24, endpoint=False)
@@ -171,12 +177,21 @@ def draw_pm_shots(config: SimulationConfig, scene: Scene, epochs: IntArray, rng:
         angle = np.asarray(rng.uniform(-config.pm_angle_rad, config.pm_angle_rad))
         line = scene.tissue.point(np.zeros(()), angle)
 
-    def draw(which: IntArray) -> _Targets:
-        shape = (which.size, CANDIDATES)
+    def draw_pms(shape: tuple[int, int]) -> FloatArray:
         x = rng.uniform(-config.pm_x_mm, config.pm_x_mm, shape)
         if line is None:
-            return _Targets(scene.tissue.point(x, rng.uniform(-config.pm_angle_rad, config.pm_angle_rad, shape)))
-        return _Targets(np.stack([x, np.full(shape, line[1]), np.full(shape, line[2])], axis=-1))
+            return scene.tissue.point(x, rng.uniform(-config.pm_angle_rad, config.pm_angle_rad, shape))
+        return np.stack([x, np.full(shape, line[1]), np.full(shape, line[2])], axis=-1)
+
+    wanted = draw_pms((epochs.size, 1))
+
+    def draw(which: IntArray, attempt: int) -> _Targets:
+        # The fibre is held in another way first; only a PM that no way can reach in sight is given up. Else the spots
+        # would crowd where the camera looks.
+        shape = (which.size, CANDIDATES)
+        if attempt < PATIENCE:
+            return _Targets(np.broadcast_to(wanted[which], (*shape, 3)))
+        return _Targets(draw_pms(shape))
 
     camera_T_trus = inverse(np.stack(scene.trus_T_camera))[epochs]
     plan = _Plan(camera_T_trus, scene.trus_beam, scene.trus_side, config.lambda_mm, config.beam_roll_rad)
@@ -205,7 +220,7 @@ def draw_aim_shots(config: SimulationConfig, scene: Scene, rng: np.random.Genera
     half = np.array([board.columns - 1, board.rows - 1, 0.0]) * (board.square_mm / 2.0)
     cells = np.array([board.columns, board.rows])
 
-    def draw(which: IntArray) -> _Targets:
+    def draw(which: IntArray, attempt: int) -> _Targets:  # noqa: ARG001
         shape = (which.size, CANDIDATES)
         turn = rng.uniform(-1.0, 1.0, (*shape, 3)) * [0.35, 0.35, 0.4]
         middle = rng.uniform(-12.0, 12.0, (*shape, 3))
@@ -257,7 +272,7 @@ def _draw_shots(
     config: SimulationConfig,
     scene: Scene,
     plan: _Plan,
-    draw: Callable[[IntArray], _Targets],
+    draw: Callable[[IntArray, int], _Targets],
     rng: np.random.Generator,
 ) -> tuple[Shots, _Targets]:
     """Draws each shot until the camera can see its marker (and, where there is a board, the corner aimed at)."""
@@ -267,10 +282,10 @@ def _draw_shots(
     laser_T_marker = inverse(scene.marker_T_laser)
     across = _cross(plan.beam, plan.side)
     pending = np.arange(n)
-    for _ in range(ROUNDS):
+    for attempt in range(ROUNDS):
         if pending.size == 0:
             break
-        targets = draw(pending)
+        targets = draw(pending, attempt)
         shape = (pending.size, CANDIDATES)
         lean = np.tan(rng.uniform(-config.beam_tilt_rad, config.beam_tilt_rad, (*shape, 2)))
         direction = _normalised(plan.beam + lean[..., :1] * plan.side + lean[..., 1:] * across)
