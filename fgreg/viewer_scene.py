@@ -170,7 +170,7 @@ class Eye:
 
 def best_eye(
     points_mm: FloatArray,
-    half_height: float = 0.47,
+    half_height: float = 0.45,
     half_width: float = 0.42,
     trus_view: FloatArray | None = None,
 ) -> Eye:
@@ -199,9 +199,19 @@ def best_eye(
             if spread > best_spread:
                 best, best_spread = (away, right, up), spread
     away, right, up = best
-    seen = points_mm @ np.column_stack([right, up, away])
+    axes = np.column_stack([right, up, away])
+    seen = points_mm @ axes
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2.0
-    seen = seen - middle
-    distance = float((np.maximum(np.abs(seen[:, 0]) / half_width, np.abs(seen[:, 1]) / half_height) + seen[:, 2]).max())
-    target = np.column_stack([right, up, away]) @ middle
-    return Eye(target + max(distance, 1.0) * away, target)
+    for _ in range(6):  # what is near looks larger, so the middle of the picture is not that of the points
+        centred = seen - middle
+        distance = _distance_that_shows(centred, half_height, half_width)
+        projected = centred[:, :2] / (distance - centred[:, 2])[:, None]
+        middle[:2] += distance * (projected.min(axis=0) + projected.max(axis=0)) / 2.0
+    distance = _distance_that_shows(seen - middle, half_height, half_width)
+    return Eye(axes @ middle + distance * away, axes @ middle)
+
+
+def _distance_that_shows(centred: FloatArray, half_height: float, half_width: float) -> float:
+    """Least distance from which points (n, 3), as right, up and towards the eye, are all in view."""
+    fit = np.maximum(np.abs(centred[:, 0]) / half_width, np.abs(centred[:, 1]) / half_height) + centred[:, 2]
+    return max(float(fit.max()), 1.0)

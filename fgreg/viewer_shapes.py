@@ -37,7 +37,7 @@ MARKER: Color = (245, 245, 245)
 TARGET: Color = (120, 112, 165)
 TRUTH: Color = (255, 80, 210)
 AXES: tuple[Color, ...] = ((235, 90, 90), (90, 210, 100), (100, 140, 255))
-IMAGE_DISTANCE_MM = 35.0
+IMAGE_DISTANCE_MM = 28.0
 """From the camera to where its image is drawn."""
 LARGEST_ELLIPSOID_MM = 50.0
 """Half size beyond which an ellipsoid is not drawn."""

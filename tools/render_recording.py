@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
+import io
 import os
 import shutil
 import signal
@@ -29,6 +30,9 @@ from pathlib import Path
 from typing import Any
 
 NO_DRIVER = "no Vulkan driver was found; install one (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
+
+
+MENU_HEIGHT_PX = 36
 
 
 class RenderError(Exception):
@@ -151,7 +155,7 @@ def render(
         size: width and height of the viewer's window, px.
         timeline, at: the moment shown, in shots on ``shot`` and in seconds on ``time``; as it opens where None.
         view: start of the name of the one view to show; the whole window where None.
-        menu: whether to show the viewer's menu bar.
+        menu: whether to show the viewer's menu bar (of a whole window).
         settle_s: time for the viewer to decode images, and for its start-up messages to fade.
         timeout_s: for all of it.
 
@@ -166,8 +170,6 @@ def render(
             client.set_time("shot", sequence=round(at), play_state="paused")
         elif at is not None:
             client.set_time(timeline, duration=at, play_state="paused")
-        if not menu:
-            client.run_command("ui.toggle_top_panel")
         time.sleep(settle_s)
         view_id = None
         if view is not None:
@@ -177,9 +179,21 @@ def render(
                 raise RenderError(f"no view is called {view!r}; there are: {names}")
             view_id = found[0].view_id
         data = client.take_screenshot(view_id)
+    if view is None and not menu:
+        data = without_menu(data)
     part = picture.with_name(picture.name + ".part")
     part.write_bytes(data)
     part.replace(picture)
+
+
+def without_menu(png: bytes) -> bytes:
+    """The picture of a whole window without its menu bar."""
+    from PIL import Image  # comes with rerun-sdk
+
+    picture = Image.open(io.BytesIO(png))
+    out = io.BytesIO()
+    picture.crop((0, MENU_HEIGHT_PX, picture.width, picture.height)).save(out, format="PNG", optimize=True)
+    return out.getvalue()
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -202,7 +216,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--timeline", help="timeline of --at: shot (default) or time")
     parser.add_argument("--at", type=float, help="moment to show: a shot number, or seconds; default: the end")
     parser.add_argument("--view", help="only the view whose name starts with this")
-    parser.add_argument("--no-menu", action="store_true", help="hide the viewer's menu bar")
+    parser.add_argument("--no-menu", action="store_true", help="cut off the viewer's menu bar")
     parser.add_argument(
         "--settle",
         type=float,
