@@ -19,15 +19,15 @@ from fgreg.estimate import (
     Verdict,
 )
 from fgreg.frames import FloatArray
-from fgreg.graph import GraphOptions, build_graph
-from fgreg.graph_solver import optimize as optimize_graph
-from fgreg.graph_values import SharedValues, initial_values, read_shared
+from fgreg.graph.explicit import GraphOptions, build_graph
+from fgreg.graph.explicit_solver import optimize as optimize_graph
+from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
+from fgreg.graph.shared_state import SharedState, make_state, pose_difference
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre, sample_posterior
 from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, register
-from fgreg.shared_state import SharedState, make_state, pose_difference
 from fgreg.surface import fit_surface
 from fgreg.tracking import TrackContext, track
 from fgreg.verdict import (

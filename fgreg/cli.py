@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import click
 import typer
 
 from fgreg import __version__
@@ -32,10 +31,13 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Register a stereo endoscope to a rotating transrectal ultrasound probe by laser-made photoacoustic markers.\n\n"
+    help="Register a stereo endoscope to a rotating transrectal ultrasound probe by photoacoustic markers.\n\n"
     "A session is a folder with session.yaml, events.jsonl and frames/ (sessions/README.md describes it). Try: "
     "fgreg simulate /tmp/demo --preset phantom && fgreg solve /tmp/demo --rrd /tmp/demo.rrd",
 )
+
+UsageError = typer.BadParameter.__mro__[1]
+"""What typer raises for wrong words on the command line; it has no public name in all its versions."""
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
@@ -48,9 +50,9 @@ def main() -> None:
         status = app(standalone_mode=False)
     except FgregError as error:
         _fail(str(error))
-    except click.exceptions.Abort:
+    except typer.Abort:
         sys.exit(EXIT_INTERRUPTED)
-    except click.ClickException as error:
+    except UsageError as error:
         _fail(error.format_message())
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
@@ -82,11 +84,15 @@ def _top(
     """Options before the command."""
 
 
+def _no_progress(_step: str, _done: int, _total: int) -> None:
+    """Says nothing."""
+
+
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     """Progress on standard error: a bar on a terminal, nothing elsewhere."""
     if quiet or not sys.stderr.isatty():
-        yield lambda step, done, total: None
+        yield _no_progress
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -192,7 +198,7 @@ def check(session: SessionArgument, as_json: JsonOption = False) -> None:
     Looks at session.yaml, events.jsonl, ground_truth.yaml and the headers of all frames. Exit status 2 where there are
     problems; warnings alone are 0.
     """
-    from fgreg.session import check_session
+    from fgreg.session.reading import check_session
 
     problems, warnings = check_session(session)
     if as_json:
@@ -211,7 +217,7 @@ def check(session: SessionArgument, as_json: JsonOption = False) -> None:
 
 @app.command()
 def simulate(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write; new or empty.")],
+    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to write; new or empty.")] = None,
     preset: Annotated[str, typer.Option("--preset", help="What to simulate; --list names them.")] = "phantom",
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same session, byte by byte.")] = 1,
     pairs: Annotated[int | None, typer.Option("--pairs", help="Number of photoacoustic markers.")] = None,
@@ -235,6 +241,8 @@ def simulate(
             kind = "raw frames" if config.frames else "poses"
             typer.echo(f"{name:12s} {config.aims} aims, {config.pairs} PMs, sweeps {config.sweep.value}, {kind}")
         return
+    if out is None:
+        raise InputError("OUT", "nothing", "the folder to write")
     if preset not in PRESETS:
         raise InputError("--preset", preset, "one of " + ", ".join(PRESETS))
     config = PRESETS[preset]

@@ -23,11 +23,11 @@ from fgreg.errors import InputError
 from fgreg.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.frames import FloatArray, inverse, transform_points
-from fgreg.ground_truth import GroundTruth
 from fgreg.models import SessionModel
 from fgreg.recognition import Recognised, load_trus_frame, looks_of, marker_pictures, recognise
-from fgreg.results import remove_result, write_result
-from fgreg.session import Session, read_ground_truth, read_session
+from fgreg.session.ground_truth import GroundTruth
+from fgreg.session.reading import Session, read_ground_truth, read_session
+from fgreg.session.results import remove_result, write_result
 from fgreg.verdict import Condition
 from fgreg.viewer import NullViewer, ShotKind, Viewer, open_viewer
 

@@ -1,7 +1,7 @@
 """Samples of the posterior of the shared variables, and what they say about the error at the targets.
 
 The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear. So the density with
-the private variables integrated out (fgreg.reduced.log_marginal) is sampled: importance sampling from a Student
+the private variables integrated out (fgreg.graph.reduced.log_marginal) is sampled: importance sampling from a Student
 density around the optimum, whose centre and spread are refitted to the weighted samples once (adaptive importance
 sampling, Cappe et al., 2004). Deterministic by seed.
 """
@@ -14,10 +14,10 @@ import numpy as np
 
 from fgreg.estimate import PredictedTre
 from fgreg.frames import FloatArray, exp_so3, inverse, transform_points
-from fgreg.packing import Columns, PackedProblem
-from fgreg.reduced import log_marginal, refine
-from fgreg.reduced_solver import Optimum
-from fgreg.shared_state import SharedState
+from fgreg.graph.packing import Columns, PackedProblem
+from fgreg.graph.reduced import log_marginal, refine
+from fgreg.graph.reduced_solver import Optimum
+from fgreg.graph.shared_state import SharedState
 
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposal: heavier tails than the posterior's, or rare samples would carry all the weight."""
@@ -78,7 +78,7 @@ def sample_posterior(
 
     Args:
         problem: the packed measurements.
-        optimum: of :func:`fgreg.reduced_solver.optimize`.
+        optimum: of :func:`fgreg.graph.reduced_solver.optimize`.
         covariance: (D, D) of the shared variables at the optimum (inverse Hessian).
         count: samples of the second round; the first takes half as many.
         seed: of the random numbers.

@@ -8,9 +8,9 @@ import numpy as np
 
 from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate
 from fgreg.frames import FloatArray, exp_so3, make_transform, rotation_to_direction
+from fgreg.graph.reduced import pm_contributions
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
-from fgreg.reduced import pm_contributions
 from fgreg.registration import Registration
 from fgreg.sensitivity import rotation_of_arc, wrap_angle
 

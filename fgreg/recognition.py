@@ -20,9 +20,9 @@ import numpy.typing as npt
 from fgreg.detection.board import BoardFit, board_corner, detect_board
 from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
-from fgreg.detection.photoacoustic import locate_in_channels as locate_in_frame
 from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.detection.photoacoustic import locate_in_channels as locate_in_frame
 from fgreg.drivers.frame_files import read_array, read_picture
 from fgreg.errors import InputError
 from fgreg.events import AimEvent, CameraMovedEvent, Event, MarkerRecord, PairEvent, TrackEvent, TrusRecord
@@ -38,7 +38,7 @@ from fgreg.measurements import (
     default_marker_covariance,
 )
 from fgreg.models import SessionModel, StereoRig
-from fgreg.session_frames import check_camera_frame, check_trus_frame
+from fgreg.session.frames_named import check_camera_frame, check_trus_frame
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""

@@ -16,13 +16,13 @@ import numpy as np
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.frames import FloatArray, inverse, transform_points
+from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.reduced_blocks import arc_points
+from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.shared_state import SharedState, make_state, nominal_frame, stack_states
 from fgreg.initialization import beam_starts, registration_starts
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.packing import PackedProblem, pack
-from fgreg.reduced_blocks import arc_points
-from fgreg.reduced_solver import Optimum, optimize
-from fgreg.shared_state import SharedState, make_state, nominal_frame, stack_states
 
 SEARCH_PAIRS = 40
 """The search for minima looks at no more pairs than this, spread over the session; all are used from there on."""

@@ -19,15 +19,17 @@ MIN_RELIEF_MM = 0.5
 MIN_POINTS = 5
 MIN_SPREAD_MM = 1.0
 """Least root mean square distance of the PMs from their best line."""
-GRAZING = 0.35
+GRAZING = 0.2
 """Least cosine of beam against normal: at less, the distance is not to be had."""
 REACH_MM = 12.0
 """Farthest from a PM that the surface is taken to be known."""
+LONGEST_MM = 30.0
+"""Longest stretch (four sigmas) of a beam on which it may end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """A ray's end: distance along it (mm), point (3,) in TRUS, normal (3,), sigma of ``normal @ point`` (mm)."""
+    """A ray's end: distance along it (mm), point (3,) in TRUS, unit normal (3,), sigma of ``normal @ point``."""
 
     distance_mm: float
     trus_p: FloatArray
@@ -75,22 +77,31 @@ class TissueSurface:
         """
         along = np.linspace(1.0, 200.0, 400)
         points = (trus_p + along[:, None] * trus_d - self.centre) @ self.axes
-        gap = points[:, 2] - self.height(points[:, :2])[0]
+        height, sigma = self.height(points[:, :2])
+        gap = points[:, 2] - height
         crossing = np.flatnonzero((gap[:-1] < 0) & (gap[1:] >= 0))
-        if crossing.size == 0:
+        begins, ends = np.flatnonzero(gap > -2.0 * sigma), np.flatnonzero(gap > 2.0 * sigma)
+        if crossing.size == 0 or ends.size == 0:
             return None
         i = int(crossing[0])
+        # From where it may have met the surface to where it must have: long where the ray grazes it or comes near it
+        # twice.
+        stretch = float(along[ends[0]] - along[begins[0]])
+        if ends[0] < i or stretch > LONGEST_MM:
+            return None
         distance = float(along[i] - gap[i] * (along[i + 1] - along[i]) / (gap[i + 1] - gap[i]))
         place = ((trus_p + distance * trus_d - self.centre) @ self.axes)[:2]
-        around = place + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])
-        height, sigma = self.height(around)
-        slope = np.array([height[1] - height[2], height[3] - height[4]]) / 0.2
-        normal = self.axes @ np.array([-slope[0], -slope[1], 1.0])
-        if normal @ trus_d < GRAZING * np.linalg.norm(normal):
-            return None
         if np.linalg.norm(self.place - place, axis=1).min() > REACH_MM:
             return None
-        return Meeting(distance, trus_p + distance * trus_d, normal, float(sigma[0]))
+        around = place + np.array([[0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])
+        near, _ = self.height(around)
+        slope = np.array([near[0] - near[1], near[2] - near[3]]) / 0.2
+        normal = self.axes @ np.array([-slope[0], -slope[1], 1.0])
+        normal = normal / np.linalg.norm(normal)
+        towards = float(normal @ trus_d)
+        if towards < GRAZING:
+            return None
+        return Meeting(distance, trus_p + distance * trus_d, normal, stretch / 4.0 * towards)
 
 
 def _kernel(first: FloatArray, second: FloatArray, relief_mm: float) -> FloatArray:

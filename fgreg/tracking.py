@@ -15,13 +15,13 @@ import numpy as np
 
 from fgreg.estimate import TrackEstimate
 from fgreg.frames import FloatArray, exp_so3
+from fgreg.graph.packing import pack
+from fgreg.graph.reduced import Evaluation, evaluate
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
-from fgreg.packing import pack
 from fgreg.posterior import Posterior
-from fgreg.reduced import Evaluation, evaluate
-from fgreg.reduced_blocks import initial_private
-from fgreg.shared_state import SharedState
 from fgreg.surface import GRAZING, TissueSurface
 
 ITERATIONS = 6

@@ -65,7 +65,9 @@ def frames_of(surfaces: list[Any], seed: int = 0, blur_px: float = 0.9, far_mm: 
     optics = Optics(blur_px=blur_px, reference_mm=0.6 * far_mm)
     back = Background(make_transform(np.eye(3), np.array([0.0, 0.0, far_mm])), seed=seed)
     left = render_frame(LEFT, surfaces, rng, optics, back)
-    right = render_frame(RIGHT, [s.seen_from(RIGHT_T_LEFT) for s in surfaces], rng, optics, back.seen_from(RIGHT_T_LEFT))
+    right = render_frame(
+        RIGHT, [s.seen_from(RIGHT_T_LEFT) for s in surfaces], rng, optics, back.seen_from(RIGHT_T_LEFT)
+    )
     return left, right
 
 

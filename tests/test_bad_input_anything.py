@@ -14,11 +14,11 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fgreg import safe_yaml
 from fgreg.errors import InputError
-from fgreg.results import read_result
-from fgreg.safe_yaml import parse_yaml
-from fgreg.session import Session, check_session, read_ground_truth, read_session
+from fgreg.session import safe_yaml
+from fgreg.session.reading import Session, check_session, read_ground_truth, read_session
+from fgreg.session.results import read_result
+from fgreg.session.safe_yaml import parse_yaml
 from tests import session_files
 
 Read = TypeVar("Read")

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fgreg import safe_yaml
 from fgreg.errors import InputError
-from fgreg.safe_yaml import load_yaml, parse_yaml
+from fgreg.session import safe_yaml
+from fgreg.session.safe_yaml import load_yaml, parse_yaml
 from tests import session_files
 from tests.session_files import error_of
 

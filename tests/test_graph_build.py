@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from fgreg.errors import EstimationError
-from fgreg.graph import GraphOptions, Variable, build_graph, variable_name
-from fgreg.graph_values import SharedValues, beam_of_chart, initial_values, laser_chart, read_estimate
+from fgreg.graph.explicit import GraphOptions, Variable, build_graph, variable_name
+from fgreg.graph.explicit_values import SharedValues, beam_of_chart, initial_values, laser_chart, read_estimate
 from fgreg.models import NoiseModel
 from tests.forward import make_measurements, make_session, random_marker_T_laser, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal

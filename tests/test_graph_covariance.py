@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from fgreg.errors import EstimationError
-from fgreg.graph import GraphOptions, build_graph, make_ordering
-from fgreg.graph_solver import GraphCovariance, optimize
-from fgreg.graph_values import SharedValues, initial_values, read_estimate
+from fgreg.graph.explicit import GraphOptions, build_graph, make_ordering
+from fgreg.graph.explicit_solver import GraphCovariance, optimize
+from fgreg.graph.explicit_values import SharedValues, initial_values, read_estimate
 from tests.forward import make_measurements
 from tests.graph_cases import CASES, make_case, pose_error
 

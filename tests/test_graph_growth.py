@@ -12,8 +12,8 @@ import pytest
 
 from fgreg.factors import marker_pose, point_on_arc, point_on_line, sensitivity_prior
 from fgreg.factors.adapter import Residual, custom_factor
-from fgreg.graph_solver import GraphCovariance, optimize
-from fgreg.graph_values import initial_values
+from fgreg.graph.explicit_solver import GraphCovariance, optimize
+from fgreg.graph.explicit_values import initial_values
 from tests.forward import make_session, with_noise
 from tests.graph_cases import make_case
 

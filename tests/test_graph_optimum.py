@@ -12,9 +12,9 @@ from scipy.linalg import logm
 
 from fgreg.factors.adapter import FactorError
 from fgreg.frames import FloatArray, inverse
-from fgreg.graph import ExplicitGraph
-from fgreg.graph_solver import optimize
-from fgreg.graph_values import (
+from fgreg.graph.explicit import ExplicitGraph
+from fgreg.graph.explicit_solver import optimize
+from fgreg.graph.explicit_values import (
     GraphEstimate,
     SharedValues,
     beam_of_chart,

@@ -1,14 +1,14 @@
-"""The posterior behind predicted errors: right in a case known in closed form, wider than the Hessian where it should."""
+"""The posterior behind predicted errors: known cases, and few pairs, where the Hessian is too narrow."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from fgreg.packing import pack
+from fgreg.graph.packing import pack
+from fgreg.graph.reduced_solver import optimize
+from fgreg.graph.shared_state import make_state, pose_difference
 from fgreg.posterior import Posterior, predicted_tre, sample_posterior, target_errors, weighted_quantile
-from fgreg.reduced_solver import optimize
-from fgreg.shared_state import make_state, pose_difference
 from tests.forward import make_measurements
 
 

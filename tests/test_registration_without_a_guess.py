@@ -10,10 +10,10 @@ from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.estimate import Verdict
 from fgreg.frames import inverse, transform_points
-from fgreg.packing import pack
-from fgreg.reduced_solver import optimize
+from fgreg.graph.packing import pack
+from fgreg.graph.reduced_solver import optimize
+from fgreg.graph.shared_state import make_state
 from fgreg.registration import calibrate_beam, register, search_epoch, targets_moved
-from fgreg.shared_state import make_state
 from tests.forward import make_measurements
 
 

@@ -26,8 +26,8 @@ from fgreg.estimate import (
 )
 from fgreg.frames import FloatArray, exp_so3, make_transform
 from fgreg.models import SessionModel
-from fgreg.results import read_result, remove_result, write_result
-from fgreg.session import read_session
+from fgreg.session.reading import read_session
+from fgreg.session.results import read_result, remove_result, write_result
 from tests import session_files
 
 

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from fgreg.errors import InputError
 from fgreg.events import AimEvent, CameraMovedEvent, OtherEvent, PairEvent, TrackEvent
 from fgreg.models import NoiseModel, default_targets_mm
-from fgreg.session import read_ground_truth, read_session
+from fgreg.session.reading import read_ground_truth, read_session
 from tests import session_files
 
 
@@ -63,16 +63,17 @@ format: fgreg-session/1
 probe:
   elements: 64
   pitch_mm: 0.5
+  flip: true
   radius_mm: 9
   sound_speed_m_s: 1500
-  sensitivity: {depth_mm: [30], half_width_deg: [6]}
+  sensitivity: {depth_mm: [30], half_width_deg: [6], edge_sigma_deg: 0.4}
 stage: {step_deg: 1}
 """
     session = read_session(session_files.write(tmp_path / "case-7", text, ""))
     model = session.model
     assert model.name == "case-7"
-    assert model.probe.flip is False
-    assert math.degrees(model.probe.sensitivity.edge_sigma_rad) == pytest.approx(0.3)
+    assert model.probe.flip is True
+    assert math.degrees(model.probe.sensitivity.edge_sigma_rad) == pytest.approx(0.4)
     assert [round(math.degrees(limit), 9) for limit in model.stage.limits_device_rad] == [-60, 60]
     assert (model.stage.direction, model.stage.zero_device_rad) == (1, 0.0)
     assert (model.camera, model.marker, model.board) == (None, None, None)
@@ -80,6 +81,15 @@ stage: {step_deg: 1}
     assert model.noise == NoiseModel()
     assert_allclose(model.targets_mm, default_targets_mm(9.0))
     assert session.events == ()
+
+
+@pytest.mark.parametrize("key", ["flip: true", "radius_mm: 9", "edge_sigma_deg: 0.4"])
+def test_what_the_probe_is_made_of_is_never_guessed(tmp_path: Path, key: str) -> None:
+    probe = "{elements: 64, pitch_mm: 0.5, flip: true, radius_mm: 9, sound_speed_m_s: 1500, sensitivity: "
+    probe += "{depth_mm: [30], half_width_deg: [6], edge_sigma_deg: 0.4}}"
+    text = f"format: fgreg-session/1\nprobe: {probe.replace(key, 'x_other: 1')}\nstage: {{step_deg: 1}}\n"
+    with pytest.raises(InputError, match=key.split(":")[0]):
+        read_session(session_files.write(tmp_path / "case", text, ""))
 
 
 def test_every_event(tmp_path: Path) -> None:

@@ -95,11 +95,7 @@ def _collinear(seed: int) -> tuple[SessionModel, Measurements, Truth]:
     points = truth.trus_p_pm_mm
     anchor, direction = np.array([0.0, 0.0, 40.0]), np.array([0.9, 0.3, 0.3])
     direction = direction / np.linalg.norm(direction)
-    near = [
-        pair
-        for pair in measurements.pairs
-        if np.linalg.norm(np.cross(points[pair.pm] - anchor, direction)) < 1.2
-    ]
+    near = [pair for pair in measurements.pairs if np.linalg.norm(np.cross(points[pair.pm] - anchor, direction)) < 1.2]
     return model, replace(measurements, pairs=tuple(near[:12])), truth
 
 

@@ -28,9 +28,9 @@ from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
 from fgreg.frames import exp_so3, make_transform
-from fgreg.graph import GraphOptions, build_graph
-from fgreg.graph_solver import GraphCovariance, optimize
-from fgreg.graph_values import SharedValues, initial_values
+from fgreg.graph.explicit import GraphOptions, build_graph
+from fgreg.graph.explicit_solver import GraphCovariance, optimize
+from fgreg.graph.explicit_values import SharedValues, initial_values
 from tests.forward import make_measurements
 
 

@@ -24,7 +24,7 @@ from fgreg.models import SessionModel
 from fgreg.posterior import sample_posterior
 from fgreg.recognition import recognise
 from fgreg.registration import register
-from fgreg.session import read_session
+from fgreg.session.reading import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session

@@ -22,9 +22,9 @@ import numpy as np
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.frames import inverse, transform_points
-from fgreg.graph import GraphOptions, build_graph
-from fgreg.graph_solver import optimize
-from fgreg.graph_values import SharedValues, initial_values, read_shared
+from fgreg.graph.explicit import GraphOptions, build_graph
+from fgreg.graph.explicit_solver import optimize
+from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
 from fgreg.models import NoiseModel
 from fgreg.pipeline import SolveReport, SolveRequest, solve_session
 from fgreg.simulation.config import Sweep

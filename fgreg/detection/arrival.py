@@ -22,8 +22,8 @@ import numpy.typing as npt
 from scipy import fft as scipy_fft
 
 from fgreg.detection.channels import Band, Baseband, Channels, baseband
-from fgreg.errors import EstimationError
 from fgreg.detection.wavefront import RATIO_SIGMA
+from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray
 
 Complex128Array = npt.NDArray[np.complex128]
@@ -32,7 +32,7 @@ WIDE_BAND = Band(5.0, 3.0)
 RATIO_FLOOR = 2e-4
 """The same for the ratio of sound speeds."""
 FLOOR_MM = 0.0005
-"""Standard deviation added to x and range for what sampling, interpolation and filters leave, measured without noise."""
+"""Standard deviation added to x and range for what sampling, interpolation and filters leave without noise."""
 SMOOTHINGS = (1.0, 1.4, 2.0, 3.0, 4.5, 7.0)
 """Widths of the filters before the envelope's maximum is taken, in widths of the pulse's spectrum."""
 ASYMMETRY = 0.12
@@ -233,7 +233,9 @@ def _envelope_maximum(
     noise = np.sqrt(0.5 / math.log(2.0) * np.median(quiet.real**2 + quiet.imag**2, axis=1))
     middle, reach = 0, math.ceil((1.5 * pulse_us + 0.25) * rate)
     width = max(1, round(0.2 * pulse_us * rate))
-    times, sigmas, height = [], [], 0.0
+    times: list[float] = []
+    sigmas: list[float] = []
+    height = 0.0
     for smoothing, signal, level in zip(SMOOTHINGS, signals, noise, strict=True):
         envelope = np.abs(signal[np.arange(middle - reach - width, middle + reach + width + 1) % size])
         at = width + int(np.argmax(envelope[width : envelope.size - width]))
@@ -286,9 +288,9 @@ def fit_wavefront(
     """
     state = np.array([x_mm, range_mm, ratio])
     wide = baseband(channels, WIDE_BAND)
-    delay_us = path_mm(*state, element_x_mm) / speed_mm_us
+    delay_us = path_mm(state[0], state[1], state[2], element_x_mm) / speed_mm_us
     half = round(1.2 * wide.rate_mhz)
-    gain = np.where(channels.live, (range_mm / path_mm(*state, element_x_mm)) ** 2, 0.0)
+    gain = np.where(channels.live, (range_mm / path_mm(state[0], state[1], state[2], element_x_mm)) ** 2, 0.0)
     away = round(2.6 * wide.rate_mhz) - half
     long_pulse = _mean_pulse(aligned(wide, delay_us, half + 2 * half + away), gain)
     size = 4 * (2 * half + 1)
@@ -309,7 +311,7 @@ def fit_wavefront(
     prior = np.diag([0.0, 0.0, ratio_sigma**-2])
     height, misfit = 0.0, 1.0
     for iteration in range(ITERATIONS):
-        path = path_mm(*state, element_x_mm)
+        path = path_mm(state[0], state[1], state[2], element_x_mm)
         delay_us = path / speed_mm_us
         elapsed = delay_us - channels.start_us
         audible = channels.live & (elapsed > spread_us) & (elapsed < record_us - spread_us)
@@ -333,7 +335,7 @@ def fit_wavefront(
         off_us, off_sigma_us, height = _envelope_maximum(
             *_aligned_spectrum(channels, delay_us, gain), band, channels.padded, channels.sampling_mhz
         )
-        jacobian = path_jacobian(*state, element_x_mm) / speed_mm_us
+        jacobian = path_jacobian(state[0], state[1], state[2], element_x_mm) / speed_mm_us
         mean = weight @ jacobian / weight.sum()
         centred = jacobian - mean
         late = lateness - weight @ lateness / weight.sum()

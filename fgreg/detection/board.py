@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fgreg.detection.camera import focal_px, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.corners import grey, refine_subpixel
-from fgreg.detection.edges import Image
+from fgreg.detection.edges import MIN_CONTRAST, Image
 from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, best_poses, choose_pose
 from fgreg.detection.noise import CornerNoise, fit_covariance
 from fgreg.detection.pose import CornerSet, join
@@ -136,7 +136,7 @@ def order_corners(image: Image, corners_px: FloatArray, board: BoardModel) -> Fl
     across = (level[:, 1:] - level[:, :-1]) * sign[:, 1:]
     along = (level[1:] - level[:-1]) * sign[1:]
     vote = np.concatenate([across.ravel(), along.ravel()])
-    if abs(vote.mean()) < 0.5 * np.abs(vote).mean():
+    if abs(vote.mean()) < max(0.5 * np.abs(vote).mean(), MIN_CONTRAST):
         return None
     if vote.mean() < 0.0:
         grid = grid[::-1, ::-1]

@@ -152,7 +152,7 @@ def square_corners(
             right = np.array([rows[j] @ middle[row, i] + line[row, i, 0] for j, i in enumerate((e, g))])
             inverse = np.linalg.inv(rows)
             corner = inverse @ right
-            if np.linalg.norm(corner - start.reshape(-1, 4, 2)[row, c]) > max(4.0, 0.5 * cell_px[k]):
+            if np.linalg.norm(corner - start.reshape(-1, 4, 2)[row, c]) > max(5.0, 0.8 * cell_px[k]):
                 continue
             ideal[k, c] = corner
             from_edges[k, c] = found[k, c] = True

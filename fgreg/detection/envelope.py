@@ -2,8 +2,8 @@
 
 Power (envelope squared) is measured against the background at the same depth, smoothed at a few scales, and its highest
 value judged by the tail of the image's own distribution: an exponential fitted between two high quantiles, extended to
-the chance that is allowed. That needs no model of speckle, and what it gets wrong it gets wrong to the safe side (the
-tails of smoothed power fall faster further out). A bell is then fitted to the power about the peak.
+the chance that is allowed, further where few independent grains of speckle tell that tail. That needs no model of
+speckle. A bell is then fitted to the power about the peak.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ SCALES_MM = ((0.0, 0.0), (0.1, 0.15), (0.2, 0.4))
 LOW_QUANTILE, HIGH_QUANTILE = 0.97, 0.997
 AWAY_MM = (1.5, 2.5)
 """Half size (range, x) of the surroundings of a peak that do not count as background."""
-ROWS = 15
-"""Rows over which the background's level is smoothed along depth."""
+ROWS, ROWS_SHARE = 15, 8
+"""The background's level is smoothed along depth over an eighth of the rows, at least 15."""
 FIT_LEVEL = 0.25
 """Power, as a share of the peak's, down to which pixels enter the fit (half the envelope)."""
 FLOOR_PIXELS = 0.01
@@ -44,14 +44,15 @@ class _Peak:
     column: int
     statistic: float
     scale: int
+    clusters: int
 
 
 def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
     """Find the photoacoustic source in one envelope image.
 
     Args:
-        frame: (depth, lateral) envelope pixels, linear (not log-compressed), >= 0. Rows go with range, columns with TRUS
-            x, both increasing; ``probe.flip`` is about the order of channels and does not turn the image.
+        frame: (depth, lateral) envelope pixels, linear (not log-compressed), >= 0. Rows go with range, columns with
+            TRUS x, both increasing; ``probe.flip`` is about the order of channels and does not turn the image.
         probe: with ``image``: pixel pitch and centre of pixel [0, 0], (range, x) mm.
 
     Returns:
@@ -79,7 +80,10 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     level = background(power)
     relative = power / level[:, None]
     peak = _find_peak(relative, probe.image)
-    threshold = math.log(len(SCALES_MM) * relative.size / FALSE_ALARMS)
+    # The exponential's scale is known from so many independent excesses only: its predictive tail is (1 + t / n)^-n.
+    head = -math.log(1 - LOW_QUANTILE)
+    excess = math.log(len(SCALES_MM) * relative.size / FALSE_ALARMS) - head
+    threshold = head + peak.clusters * math.expm1(min(excess / max(peak.clusters, 1), 50.0))
     if peak.statistic < threshold:
         return NoSignal(f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}")
     fit = _fit_bell(power, level, relative, peak, probe.image)
@@ -110,13 +114,13 @@ def background(power: FloatArray) -> FloatArray:
     neighbourhood.
     """
     each = np.median(power, axis=1) / math.log(2.0)
-    smooth = ndimage.median_filter(each, size=min(ROWS, each.size), mode="nearest")
+    smooth = ndimage.median_filter(each, size=min(max(ROWS, each.size // ROWS_SHARE), each.size), mode="nearest")
     level = np.maximum(smooth, 0.7 * each)
     return np.maximum(level, 1e-12 * float(power.max()))
 
 
 def _find_peak(relative: FloatArray, image: ImageModel) -> _Peak:
-    best = _Peak(0, 0, -math.inf, 0)
+    best = _Peak(0, 0, -math.inf, 0, 1)
     away = [max(1, round(size / pixel)) for size, pixel in zip(AWAY_MM, image.pixel_mm, strict=True)]
     for number, scale in enumerate(SCALES_MM):
         sigma = [size / pixel for size, pixel in zip(scale, image.pixel_mm, strict=True)]
@@ -134,7 +138,8 @@ def _find_peak(relative: FloatArray, image: ImageModel) -> _Peak:
         decay = max(float(high - low) / math.log((1 - LOW_QUANTILE) / (1 - HIGH_QUANTILE)), 1e-9 * top)
         statistic = (top - float(low)) / decay - math.log(1 - LOW_QUANTILE)
         if statistic > best.statistic:
-            best = _Peak(row, column, statistic, number)
+            _, clusters = ndimage.label(rest & (smooth > low))
+            best = _Peak(row, column, statistic, number, int(clusters))
     return best
 
 
@@ -151,7 +156,7 @@ def _bell(p: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
 def _fit_bell(
     power: FloatArray, level: FloatArray, relative: FloatArray, peak: _Peak, image: ImageModel
 ) -> tuple[float, float, float, FloatArray] | None:
-    """(row, column, amplitude, covariance (2, 2) over (x, range) mm^2) of the bell at a peak, None where there is none."""
+    """(row, column, amplitude, covariance (2, 2) over (x, range), mm^2) of the bell at a peak, None if there is none."""
     sigma = [max(size / pixel, 0.6) for size, pixel in zip(SCALES_MM[max(peak.scale, 1)], image.pixel_mm, strict=True)]
     smooth = ndimage.gaussian_filter(power - level[:, None], sigma, mode="constant", truncate=3.0)
     reach = [max(3, round(2.0 / pixel)) for pixel in image.pixel_mm]
@@ -185,27 +190,26 @@ def _fit_bell(
         signal = _bell(solution, z, x)
         spread = np.sqrt(mean**2 + 2.0 * mean * signal + (1e-3 * top) ** 2)
         result = optimize.least_squares(misfit, solution, method="lm", max_nfev=200)
-        solution = result.x
+        solution = np.asarray(result.x)
         centre = solution[1:3]
         if not (np.isfinite(solution).all() and np.abs(centre - [peak.row, peak.column]).max() < 2.0 * max(reach)):
             return None
     if (centre < -0.5).any() or (centre > np.array(power.shape) - 0.5).any():
         return None
-    jacobian = result.jac
+    jacobian = np.asarray(result.jac)
+    remaining = np.asarray(result.fun)[: z.size]
     data = z.size
     # Pixels are correlated as the background is; the root of the correlation of powers is that of the amplitudes.
-    correlation = _correlation(relative, peak, rows, columns)
+    correlation = _correlation(relative, rows, columns)
     bread = np.linalg.pinv(jacobian.T @ jacobian)
     meat = jacobian[:data].T @ correlation @ jacobian[:data] + jacobian[data:].T @ jacobian[data:]
-    scale = max(1.0, float(result.fun[:data] @ result.fun[:data]) / max(data - 5, 1))
+    scale = max(1.0, float(remaining @ remaining) / max(data - 5, 1))
     covariance_px = (bread @ meat @ bread)[1:3, 1:3] * scale + np.eye(2) * FLOOR_PIXELS**2
     swap = np.array([[0.0, image.pixel_mm[1]], [image.pixel_mm[0], 0.0]])
     return float(centre[0]), float(centre[1]), math.exp(0.5 * solution[0]), swap @ covariance_px @ swap.T
 
 
-def _correlation(
-    relative: FloatArray, peak: _Peak, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]
-) -> FloatArray:
+def _correlation(relative: FloatArray, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> FloatArray:
     """(n, n) correlation between pixels, from the image's background; peaks are cut off so that they do not count."""
     calm = np.minimum(relative, 6.0)
     calm = calm - calm.mean()

@@ -26,6 +26,8 @@ OTHER_POSE_RAD = 0.02
 AMBIGUITY_SIGMA_PX = 0.15
 """Corner noise against which two hypotheses are told apart: more than what is measured, for what is not modelled (a
 tag that is not quite flat, a lens not quite as calibrated)."""
+STRAY_PX, STRAY_START_PX = 2.0, 15.0
+"""RMS of a tag beyond which it is not part of the body: at the pose fitted, and at the pose of another tag."""
 AMBIGUITY_CHI2 = 25.0
 """Difference in chi-square at that noise (or at the residuals', where they are larger) below which a pose is ambiguous:
 odds of 2.7e5 to 1."""
@@ -127,19 +129,43 @@ def _half_turn(axis: FloatArray) -> FloatArray:
 
 
 def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, list[str]]:
-    """Drop tags that do not fit the body where most of them do (a tag read wrongly, or one that came off)."""
+    """Drop tags that do not fit the body where most of them do (a tag read wrongly, or one that came off).
+
+    Two ways to a pose that strays do not spoil: a robust fit to all corners, good where tags are many and small; and
+    the hypothesis of one tag that most others agree with, good where they are few and large. The one with which more
+    tags agree decides.
+
+    Args:
+        names: of each group, for the reasons.
+
+    Returns:
+        the corners kept, and what was left out.
+    """
     groups = np.unique(corners.group)
     if len(groups) < 3:
         return corners, []
-    fits = best_poses(corners, huber=3.0)
-    if not fits:
+    forgiving = corners.with_excess(AMBIGUITY_SIGMA_PX**2)
+    poses = [fit.camera_T_body for fit in best_poses(forgiving, huber=3.0)[:1]]
+    ranked = sorted(pose_hypotheses(corners), key=lambda pose: float(_agreement(corners, pose)[1]))
+    for pose in ranked[:3]:
+        agreed = np.isin(corners.group, groups[_agreement(corners, pose)[0] < STRAY_START_PX])
+        fit = fit_pose(forgiving.subset(agreed), pose) if agreed.sum() >= 4 else None
+        poses += [] if fit is None else [fit.camera_T_body]
+    if not poses:
         return corners, []
-    rms = np.array([rms_px(fits[0].residual_px[corners.group == g]) for g in groups])
-    stray = rms > max(5.0 * float(np.median(rms)), 2.0)
+    rms, _ = min((_agreement(corners, pose) for pose in poses), key=lambda item: item[1])
+    stray = rms > max(5.0 * float(np.median(rms)), STRAY_PX)
     if not stray.any() or (~stray).sum() < 2:
         return corners, []
     kept = corners.subset(~np.isin(corners.group, groups[stray]))
     return kept, [f"{names[int(g)]} is {r:.1f} px off the body" for g, r in zip(groups[stray], rms[stray], strict=True)]
+
+
+def _agreement(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArray, float]:
+    """RMS (px) of each group at a pose, and their sum with each capped: small where many groups agree."""
+    residual, _, in_front = corner_residuals(corners, camera_T_body)
+    rms = np.array([rms_px(residual[corners.group == g]) for g in np.unique(corners.group)])
+    return rms, float(np.minimum(rms, STRAY_START_PX).sum()) if in_front else np.inf
 
 
 def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit | NotFound:

@@ -4,9 +4,8 @@ Channel data hold one-way travel times. A wavefront is looked for by delay and s
 and, where there is one, fitted for x, range and the ratio of sound speeds (arrival.py). A frame without a source is
 answered with :class:`NoSignal`, not with a point.
 
-The ratio of sound speeds is always fitted along. Fixing it at 1 would gain next to nothing (at 0 dB the range's standard
-deviation is set by the envelope's maximum, which the ratio does not enter, and x is nearly uncorrelated with it except
-at the array's ends), while a speed 2 % off would then move the range by a tenth of a millimetre without a word.
+The ratio of sound speeds is always fitted along. Fixing it at 1 gains little (tools/study_photoacoustic.py has the
+figures), while a speed 2 % off would then move the range without a word.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peak:
-    """A likely source: TRUS x (mm), range (mm), ratio of sound speeds, log likelihood ratio, and where it is seen best."""
+    """A likely source: TRUS x (mm), range (mm), ratio of sound speeds, log likelihood ratio, and the data it is in."""
 
     x_mm: float
     range_mm: float
@@ -233,7 +233,7 @@ def search_nearby(
     range_offsets_mm: tuple[float, ...],
     ratios: tuple[float, ...],
 ) -> Peak:
-    """The best point of a fine grid about a peak, sound speeds included (those under their prior); never worse than it."""
+    """The best point of a fine grid about a peak, sound speeds included (under their prior); never worse than it."""
     x_offsets = peak.x_step_mm * np.linspace(-0.5, 0.5, 5)
     grid = np.meshgrid(ratios, peak.range_mm + np.array(range_offsets_mm), peak.x_mm + x_offsets, indexing="ij")
     ratio, range_mm, x_mm = (axis.ravel() for axis in grid)

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgreg.factors.point_on_line import aim_residual, residual
 from fgreg.frames import FloatArray
-from fgreg.graph import ExplicitGraph, ShotKeys
+from fgreg.graph.explicit import ExplicitGraph, ShotKeys
 from fgreg.measurements import Look
 from fgreg.models import SessionModel
 from fgreg.sensitivity import SensitivityPrior, arc_of_rotation, sensitivity_prior

@@ -20,10 +20,10 @@ from fgreg.events import (
     TrusRecord,
 )
 from fgreg.frames import FloatArray
-from fgreg.safe_yaml import open_file
-from fgreg.schema import NOT_NEGATIVE, Bounds, Fields, Place, shown
-from fgreg.session_frames import FrameKind, FrameUse, locate_frame
-from fgreg.session_setup import COORDINATE_MM, LATERAL_MM, RANGE_MM, SCAN_DEG, Setup
+from fgreg.session.frames_named import FrameKind, FrameUse, locate_frame
+from fgreg.session.safe_yaml import open_file
+from fgreg.session.schema import NOT_NEGATIVE, Bounds, Fields, Place, shown
+from fgreg.session.setup import COORDINATE_MM, LATERAL_MM, RANGE_MM, SCAN_DEG, Setup
 
 MAX_LINE_BYTES = 1_000_000
 _MAX_INTEGER_DIGITS = 30

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.packing import PackedProblem
-from fgreg.reduced import Evaluation, evaluate, refine
-from fgreg.reduced_blocks import PrivateState, initial_private
-from fgreg.shared_state import SharedState
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced import Evaluation, evaluate, refine
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
+from fgreg.graph.shared_state import SharedState
 
 WEIGHT_FLOOR = 1e-12
 """Curvature lent to shared variables that nothing observes (a registration without pairs): they stay where they are."""

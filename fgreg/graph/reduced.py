@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.frames import FloatArray, hat, log_so3
-from fgreg.packing import EpochLink, PackedProblem
-from fgreg.reduced_blocks import (
+from fgreg.graph.packing import EpochLink, PackedProblem
+from fgreg.graph.reduced_blocks import (
     LineBlock,
     LookBlock,
     PrivateState,
@@ -37,7 +37,7 @@ from fgreg.reduced_blocks import (
     times,
     transposed,
 )
-from fgreg.shared_state import SharedState
+from fgreg.graph.shared_state import SharedState
 
 
 @dataclass(frozen=True, slots=True, eq=False)

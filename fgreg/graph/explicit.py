@@ -1,7 +1,8 @@
 """The explicit graph of a session: every variable and factor of design.md, section 2, as they stand there.
 
 This is the reference. The reduced problem, with everything private eliminated in closed form, has to reach the same
-optimum and is what bulk work uses. Solving is in graph_solver.py, starting values and reading back in graph_values.py.
+optimum and is what bulk work uses. Solving is in
+explicit_solver.py, starting values and reading back in explicit_values.py.
 
 Shots: a *shot* is one marker observation of one spot. Aims come first, one shot each; then the pairs' shots, one per PM
 and marker observation: looks at a PM that share an observation share the shot (its pose counts once), looks with

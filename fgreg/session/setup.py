@@ -1,9 +1,9 @@
 """``session.yaml``: how a session was set up. Degrees in the file become radians here.
 
-Required: ``format``, ``probe`` with ``elements``, ``pitch_mm``, ``radius_mm``, ``sound_speed_m_s`` and the table of
-``sensitivity``, and ``stage.step_deg``. Defaults: ``name`` the folder's; ``flip`` false; ``edge_sigma_deg`` 0.3;
-``limits_deg`` [-60, 60]; ``direction`` 1; ``zero_deg`` 0; ``channels.t0_us`` and ``pulse_delay_us`` 0;
-``marker_T_tag`` identity; ``noise`` as in NoiseModel; ``targets_mm`` the 27 of default_targets_mm.
+Required: ``format``, ``probe`` without ``channels``, ``image`` and ``sensitivity.curve``, and ``stage.step_deg``.
+Defaults: ``name`` the folder's; ``limits_deg`` [-60, 60]; ``direction`` 1; ``zero_deg`` 0; ``channels.t0_us`` and
+``pulse_delay_us`` 0; ``marker_T_tag`` identity; ``noise`` as in NoiseModel; ``targets_mm`` those of
+``default_targets_mm``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from fgreg.models import (
     TagModel,
     default_targets_mm,
 )
-from fgreg.schema import (
+from fgreg.session.schema import (
     MAX_TRANSLATION_MM,
     NOISE_MM,
     NOT_NEGATIVE,
@@ -115,7 +115,7 @@ def read_setup(data: Mapping[str, object], file: str, default_name: str, problem
     """Reads the mapping of a ``session.yaml``; appends to ``problems`` all that is wrong with it.
 
     Args:
-        data: as :func:`fgreg.safe_yaml.load_yaml` gives it.
+        data: as :func:`fgreg.session.safe_yaml.load_yaml` gives it.
         file: how messages name the file.
         default_name: the session's name where the file has none.
     """
@@ -181,7 +181,7 @@ def _probe(top: Fields) -> ProbeModel | None:
         return None
     elements = fields.integer("elements", 1, 65536)
     pitch_mm = fields.number("pitch_mm", POSITIVE_MM)
-    flip = fields.boolean("flip", default=False)
+    flip = fields.boolean("flip")
     radius_mm = fields.number("radius_mm", POSITIVE_MM)
     sound_speed = fields.number("sound_speed_m_s", Bounds(0.0, 1e5, above=True, unit="m/s"))
     sensitivity = _sensitivity(fields)
@@ -202,7 +202,7 @@ def _sensitivity(probe: Fields) -> SensitivityModel | None:
         return None
     depth_mm = fields.numbers("depth_mm", None, _DEPTH_MM)
     half_width_deg = fields.numbers("half_width_deg", None, _HALF_WIDTH_DEG)
-    edge_sigma_deg = fields.number("edge_sigma_deg", Bounds(0.0, 45.0, unit="deg"), default=0.3)
+    edge_sigma_deg = fields.number("edge_sigma_deg", Bounds(0.0, 45.0, unit="deg"))
     if fields.ok:
         _check_table(fields, "depth_mm", depth_mm, "half_width_deg", half_width_deg)
     curve = fields.child("curve", ("rotation_deg", "amplitude")) if fields.has("curve") else None

@@ -17,8 +17,8 @@ from numpy.lib import format as npy_format
 
 from fgreg.errors import InputError
 from fgreg.models import ProbeModel
-from fgreg.safe_yaml import open_file
-from fgreg.schema import shown
+from fgreg.session.safe_yaml import open_file
+from fgreg.session.schema import shown
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _MAX_NAME = 1024

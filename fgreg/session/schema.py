@@ -16,7 +16,7 @@ import numpy as np
 
 from fgreg.errors import InputError, one_line
 from fgreg.frames import RIGID_TOLERANCE, FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
-from fgreg.safe_yaml import YamlMapping, YamlSequence
+from fgreg.session.safe_yaml import YamlMapping, YamlSequence
 
 MAX_TRANSLATION_MM = 2000.0
 SHOWN_CHARACTERS = 60

@@ -22,8 +22,8 @@ import numpy as np
 from fgreg.errors import EstimationError
 from fgreg.factors.adapter import FactorError
 from fgreg.frames import FloatArray
-from fgreg.graph import ExplicitGraph, Variable, make_ordering
-from fgreg.graph_values import made_consistent
+from fgreg.graph.explicit import ExplicitGraph, Variable, make_ordering
+from fgreg.graph.explicit_values import made_consistent
 
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1e-12, 1e12
 _LEAST_EIGENVALUE = 1e-12
@@ -90,7 +90,7 @@ def optimize(
     """Levenberg-Marquardt from starting values.
 
     A step is tried as it is, and where that does not pay as its linear model says, with points and angles made
-    consistent again (:func:`fgreg.graph_values.made_consistent`); the better of the two counts.
+    consistent again (:func:`fgreg.graph.explicit_values.made_consistent`); the better of the two counts.
 
     Args:
         explicit: the graph.

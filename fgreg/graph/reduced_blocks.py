@@ -1,6 +1,6 @@
 """Residuals of the reduced problem in blocks, and the private variables they are linearised at.
 
-Shapes lead with S, the hypotheses side by side; see fgreg.reduced for how the blocks are put together.
+Shapes lead with S, the hypotheses side by side; see fgreg.graph.reduced for how the blocks are put together.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from fgreg.frames import FloatArray, IntArray, exp_so3, hat
-from fgreg.packing import LINE_SIGMA_MM, BeamArrays, PackedProblem
+from fgreg.graph.packing import LINE_SIGMA_MM, BeamArrays, PackedProblem
+from fgreg.graph.shared_state import SharedState
 from fgreg.sensitivity import arc_of_rotation
-from fgreg.shared_state import SharedState
 
 
 @dataclass(frozen=True, slots=True, eq=False)

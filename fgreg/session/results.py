@@ -28,8 +28,8 @@ from fgreg.estimate import (
 )
 from fgreg.frames import FloatArray
 from fgreg.models import SessionModel
-from fgreg.safe_yaml import load_yaml
-from fgreg.schema import FINITE, Bounds, Fields, Place, as_rigid, shown, transform_problem
+from fgreg.session.safe_yaml import load_yaml
+from fgreg.session.schema import FINITE, Bounds, Fields, Place, as_rigid, shown, transform_problem
 
 RESULT_FILE = "result.yaml"
 RESULT_FORMAT = "fgreg-result/1"
