@@ -24,7 +24,7 @@ def square_image(corners: FloatArray, blur_px: float, fall_off: float = 0.0, noi
         inside *= ndtr(-((x - a[0]) * d[1] - (y - a[1]) * d[0]) / total)
     light = 1.0 + fall_off * (x - 200)
     image = light * (170 - 150 * inside)
-    return image + noise * np.random.default_rng(0).normal(size=image.shape)
+    return np.asarray(image + noise * np.random.default_rng(0).normal(size=image.shape))
 
 
 def as_bytes(image: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
