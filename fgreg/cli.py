@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -36,7 +36,7 @@ app = typer.Typer(
     "fgreg simulate /tmp/demo --preset phantom && fgreg solve /tmp/demo --rrd /tmp/demo.rrd",
 )
 
-UsageError = typer.BadParameter.__mro__[1]
+UsageError: type[Exception] = cast("type[Exception]", typer.BadParameter.__mro__[1])
 """What typer raises for wrong words on the command line; it has no public name in all its versions."""
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
@@ -53,7 +53,7 @@ def main() -> None:
     except typer.Abort:
         sys.exit(EXIT_INTERRUPTED)
     except UsageError as error:
-        _fail(error.format_message())
+        _fail(str(getattr(error, "format_message", error.__str__)()))
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
     except BrokenPipeError:

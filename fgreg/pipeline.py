@@ -29,7 +29,7 @@ from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import remove_result, write_result
 from fgreg.verdict import Condition
-from fgreg.viewer import NullViewer, ShotKind, Viewer, open_viewer
+from fgreg.viewer.recording import NullViewer, ShotKind, Viewer, open_viewer
 
 RESULT_FILE = "result.yaml"
 SOUND_SPEED_TOLERANCE = 0.005
@@ -260,4 +260,4 @@ def _corner(recognised: Recognised, index: int, event: Event, model: SessionMode
     if not isinstance(event, AimEvent) or index not in recognised.aim_events or model.camera is None:
         return None
     aim = recognised.measurements.aims[recognised.aim_events.index(index)]
-    return project(model.camera.left, aim.camera_p_spot_mm[None])[0]
+    return np.asarray(project(model.camera.left, aim.camera_p_spot_mm[None])[0])

@@ -8,11 +8,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from fgreg import viewer_scene as scene
 from fgreg.frames import as_float_array, exp_so3, make_transform
 from fgreg.matching import measured_pairs
 from fgreg.measurements import Look, Measurements
 from fgreg.models import CameraModel
+from fgreg.viewer import scene as scene
 from tests.answers import answer_from_truth, random_covariance
 from tests.forward import make_measurements, make_session
 

@@ -9,7 +9,7 @@ import pytest
 
 from fgreg.frames import FloatArray
 from fgreg.models import ChannelModel, ImageModel, ProbeModel
-from fgreg.viewer_pa import PaPicture, pa_picture, texture
+from fgreg.viewer.pa import PaPicture, pa_picture, texture
 from tests.forward import make_session
 
 

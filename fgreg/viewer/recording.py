@@ -25,17 +25,17 @@ from typing import Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from fgreg import viewer_scene as scene
-from fgreg import viewer_shapes as shapes
 from fgreg.errors import InputError
 from fgreg.estimate import SessionEstimate
 from fgreg.frames import FloatArray, exp_so3
 from fgreg.measurements import Measurements, Track
 from fgreg.models import ProbeModel, SessionModel
-from fgreg.viewer_blueprint import Contents, make_blueprint
-from fgreg.viewer_pa import pa_picture, texture
-from fgreg.viewer_result import ResultPainter, Truth
-from fgreg.viewer_shapes import Image8
+from fgreg.viewer import scene as scene
+from fgreg.viewer import shapes as shapes
+from fgreg.viewer.blueprint import Contents, make_blueprint
+from fgreg.viewer.pa import pa_picture, texture
+from fgreg.viewer.result import ResultPainter, Truth
+from fgreg.viewer.shapes import Image8
 
 ShotKind = Literal["aim", "pair", "track"]
 

@@ -9,14 +9,14 @@ from typing import Protocol
 
 import numpy as np
 
-from fgreg import viewer_scene as scene
-from fgreg import viewer_shapes as shapes
 from fgreg.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.frames import FloatArray, inverse, log_so3, transform_points
 from fgreg.matching import measured_pairs
 from fgreg.measurements import Look, MarkerObservation, Measurements, Pair, Track
 from fgreg.models import SessionModel
-from fgreg.viewer_text import summary_markdown
+from fgreg.viewer import scene as scene
+from fgreg.viewer import shapes as shapes
+from fgreg.viewer.text import summary_markdown
 
 FAR_MM = 1000.0
 """A camera farther from the probe than this is not what the opening picture is fitted to."""

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from fgreg.frames import FloatArray, inverse
 from fgreg.models import CameraModel, SessionModel
-from fgreg.viewer_pa import PaPicture
-from fgreg.viewer_scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
+from fgreg.viewer.pa import PaPicture
+from fgreg.viewer.scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
 
 if TYPE_CHECKING:
     import rerun as rr

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from fgreg.estimate import Verdict
-from fgreg.viewer_scene import Eye
+from fgreg.viewer.scene import Eye
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
