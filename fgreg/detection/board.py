@@ -19,7 +19,7 @@ import numpy.typing as npt
 from fgreg.detection.camera import focal_px, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.corners import grey, refine_subpixel
 from fgreg.detection.edges import MIN_CONTRAST, Image
-from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, best_poses, choose_pose
+from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, choose_pose, robust_pose
 from fgreg.detection.noise import CornerNoise, fit_covariance
 from fgreg.detection.pose import CornerSet, join
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named
@@ -228,10 +228,10 @@ def _view_corners(
 
 def _strays(corners: CornerSet) -> BoolArray:
     """(n,) corners far off the pose that most of them agree on: a glint, a finger, a marker read wrongly."""
-    fits = best_poses(corners, huber=3.0)
-    if not fits:
+    fit = robust_pose(corners)
+    if fit is None:
         return np.zeros(len(corners.view), dtype=bool)
-    size = np.linalg.norm(fits[0].residual_px, axis=1)
+    size = np.linalg.norm(fit.residual_px, axis=1)
     return np.asarray(size > max(6.0 * float(np.median(size)), 0.5))
 
 

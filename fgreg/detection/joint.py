@@ -16,7 +16,7 @@ from fgreg.detection.pose import (
     pose_hypotheses,
     whitener,
 )
-from fgreg.frames import FloatArray, log_so3
+from fgreg.frames import FloatArray
 
 VIEW_NAMES = ("left", "right")
 MAX_RMS_PX = 4.0
@@ -73,7 +73,7 @@ class RigidFit:
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Angle (rad) between the rotations of two poses (4, 4)."""
-    return float(np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3])))
+    return float(np.arccos(np.clip(0.5 * (np.sum(a[:3, :3] * b[:3, :3]) - 1.0), -1.0, 1.0)))
 
 
 def rms_px(residual_px: FloatArray) -> float:
@@ -81,8 +81,8 @@ def rms_px(residual_px: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1))))
 
 
-def best_poses(corners: CornerSet, *, huber: float | None = None) -> list[PoseFit]:
-    """Up to two distinct minima of the joint fit, best first, from all planar hypotheses."""
+def _ranked_hypotheses(corners: CornerSet) -> list[FloatArray]:
+    """Starting poses, the likeliest first."""
     white = whitener(corners.covariance)
     ranked: list[tuple[float, FloatArray]] = []
     for pose in pose_hypotheses(corners):
@@ -91,21 +91,25 @@ def best_poses(corners: CornerSet, *, huber: float | None = None) -> list[PoseFi
             # Capped, so that one bad tag does not decide which hypothesis is tried first.
             size = np.sum((white @ residual.ravel()).reshape(-1, 2) ** 2, axis=1)
             ranked.append((float(np.minimum(size, 4.0 * np.median(size) + 1e-12).sum()), pose))
-    ranked.sort(key=lambda item: item[0])
+    return [pose for _, pose in sorted(ranked, key=lambda item: item[0])]
+
+
+def best_poses(corners: CornerSet) -> list[PoseFit]:
+    """Up to two distinct minima of the joint fit, best first, from all planar hypotheses."""
     fits: list[PoseFit] = []
     tried: list[FloatArray] = []
-    for _, pose in ranked:
+    for pose in _ranked_hypotheses(corners):
         if any(angle_between(pose, other) < 0.1 for other in tried):
             continue
         tried.append(pose)
-        fit = fit_pose(corners, pose, huber=huber)
+        fit = fit_pose(corners, pose)
         if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
             fits.append(fit)
-        if len(tried) >= 6:
+        if len(tried) >= 4:
             break
     if fits:
         # Where the perspective is weak the other hypothesis mirrors the tilt; a solver may have given only one.
-        fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body), huber=huber)
+        fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body))
         if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
             fits.append(fit)
     return sorted(fits, key=lambda fit: fit.cost)[:2]
@@ -128,6 +132,12 @@ def _half_turn(axis: FloatArray) -> FloatArray:
     return 2.0 * np.outer(axis, axis) - np.eye(3)
 
 
+def robust_pose(corners: CornerSet) -> PoseFit | None:
+    """One minimum, from the likeliest hypothesis, with corners that do not fit weighing less."""
+    ranked = _ranked_hypotheses(corners)
+    return fit_pose(corners, ranked[0], huber=3.0) if ranked else None
+
+
 def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, list[str]]:
     """Drop tags that do not fit the body where most of them do (a tag read wrongly, or one that came off).
 
@@ -145,7 +155,10 @@ def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, lis
     if len(groups) < 3:
         return corners, []
     forgiving = corners.with_excess(AMBIGUITY_SIGMA_PX**2)
-    poses = [fit.camera_T_body for fit in best_poses(forgiving, huber=3.0)[:1]]
+    robust = robust_pose(forgiving)
+    if robust is not None and (_agreement(corners, robust.camera_T_body)[0] <= STRAY_PX).all():
+        return corners, []
+    poses = [] if robust is None else [robust.camera_T_body]
     ranked = sorted(pose_hypotheses(corners), key=lambda pose: float(_agreement(corners, pose)[1]))
     for pose in ranked[:3]:
         agreed = np.isin(corners.group, groups[_agreement(corners, pose)[0] < STRAY_START_PX])
