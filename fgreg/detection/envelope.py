@@ -156,7 +156,7 @@ def _bell(p: FloatArray, z: FloatArray, x: FloatArray) -> FloatArray:
 def _fit_bell(
     power: FloatArray, level: FloatArray, relative: FloatArray, peak: _Peak, image: ImageModel
 ) -> tuple[float, float, float, FloatArray] | None:
-    """(row, column, amplitude, covariance (2, 2) over (x, range), mm^2) of the bell at a peak, None if there is none."""
+    """(row, column, amplitude, covariance (2, 2) over (x, range), mm^2) of the bell at a peak, if there is one."""
     sigma = [max(size / pixel, 0.6) for size, pixel in zip(SCALES_MM[max(peak.scale, 1)], image.pixel_mm, strict=True)]
     smooth = ndimage.gaussian_filter(power - level[:, None], sigma, mode="constant", truncate=3.0)
     reach = [max(3, round(2.0 / pixel)) for pixel in image.pixel_mm]

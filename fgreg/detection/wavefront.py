@@ -153,7 +153,7 @@ def support(live: BoolArray, plan: Plan) -> FloatArray:
     return out
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def _plan_and_support(
     geometry: tuple[int, float, float, float, int, float, float, int, float], live: bytes
 ) -> tuple[Plan, FloatArray]:

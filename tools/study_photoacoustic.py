@@ -1,0 +1,349 @@
+"""How well photoacoustic sources are found: every figure the requirement asks for, against its target.
+
+Frames are simulated (fgreg.simulation.acoustics) with sources at x -20 to 20 mm and range 15 to 60 mm, pulses of 3 to
+7 MHz with 50 to 80 % bandwidth, 128 elements of 0.43 mm, 800 samples at 40 MHz that begin shortly before the wave does.
+The signal-to-noise ratio is the peak amplitude / sqrt(2) over the noise's standard deviation, per sample, on the
+element that hears the source loudest.
+
+Exit status is 1 if a target is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.detection.arrival import fit_wavefront
+from fgreg.detection.channels import prepare_channels
+from fgreg.detection.photoacoustic import (
+    NoSignal,
+    PaFind,
+    locate_in_channels,
+    locate_in_image,
+    pool_sound_speed_ratio,
+)
+from fgreg.frames import FloatArray, as_float_array
+from fgreg.models import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.simulation.acoustics import Hearing, Pulse, noise_channels, simulate_channels, simulate_envelope_image
+
+ASSUMED_M_S = 1540.0
+SAMPLES = 800
+WRONG_MM = 1.0
+"""A find further than this from the source is not of the source."""
+RANGES_MM = (15.0, 60.0)
+
+
+@dataclass
+class Tally:
+    """What came of many frames of one kind."""
+
+    frames: int = 0
+    wrong: int = 0
+    error_mm: list[FloatArray] = field(default_factory=list)
+    mahalanobis2: list[float] = field(default_factory=list)
+    finds: list[PaFind] = field(default_factory=list)
+
+    def add(self, answer: PaFind | NoSignal, x_mm: float, range_mm: float) -> None:
+        self.frames += 1
+        if isinstance(answer, NoSignal):
+            return
+        error = np.array([answer.x_mm - x_mm, answer.range_mm - range_mm])
+        if np.abs(error).max() > WRONG_MM:
+            self.wrong += 1
+            return
+        self.error_mm.append(error)
+        self.mahalanobis2.append(float(error @ np.linalg.solve(answer.covariance, error)))
+        self.finds.append(answer)
+
+    def summary(self) -> dict[str, float]:
+        error = np.array(self.error_mm).reshape(-1, 2)
+        if not len(error):
+            return {"frames": self.frames, "found": 0, "wrong": self.wrong}
+        rms = np.sqrt((error**2).mean(axis=0))
+        return {
+            "frames": self.frames,
+            "found": len(error),
+            "wrong": self.wrong,
+            "x_rms_mm": round(float(rms[0]), 5),
+            "range_rms_mm": round(float(rms[1]), 5),
+            "x_worst_mm": round(float(np.abs(error[:, 0]).max()), 5),
+            "range_worst_mm": round(float(np.abs(error[:, 1]).max()), 5),
+            "mahalanobis2_mean": round(float(np.mean(self.mahalanobis2)), 3),
+            "snr_db_mean": round(float(np.mean([find.snr_db for find in self.finds])), 2),
+        }
+
+
+def probe_for(t0_us: float, pulse_delay_us: float = 0.2) -> ProbeModel:
+    sensitivity = SensitivityModel(as_float_array([30.0]), as_float_array([0.1]), 0.005)
+    channels = ChannelModel(40.0, t0_us, pulse_delay_us)
+    image = ImageModel((0.1, 0.15), (8.0, -25.0))
+    return ProbeModel(128, 0.43, False, 10.0, ASSUMED_M_S, sensitivity, channels, image)
+
+
+def channel_frames(
+    frames: int,
+    seed: int,
+    snr_db: float,
+    x_mm: float = 20.0,
+    speed_m_s: float = ASSUMED_M_S,
+    asymmetry: float = 0.0,
+    locate: Callable[[npt.NDArray[Any], ProbeModel], PaFind | NoSignal] = locate_in_channels,
+) -> Tally:
+    """Simulated sources, one per frame; the range counted as true is the assumed speed times the arrival's time."""
+    tally = Tally()
+    for number in range(frames):
+        rng = np.random.default_rng([seed, number])
+        x, r = rng.uniform(-x_mm, x_mm), rng.uniform(*RANGES_MM)
+        pulse = Pulse(rng.uniform(3.0, 7.0), rng.uniform(0.5, 0.8), asymmetry, rng.uniform(0.0, 2.0 * math.pi))
+        # In steps, as a session has one crop: the first sample is 1.5 to 6.5 us before the arrival.
+        probe = probe_for(max(0.0, 5.0 * math.floor((r / (speed_m_s * 1e-3) - 1.5) / 5.0)))
+        source = np.array([x, 0.0, probe.radius_mm + r])
+        hearing = Hearing(elevation=None)
+        frame = simulate_channels(probe, source, 0.0, rng, pulse, snr_db, SAMPLES, speed_m_s, hearing)
+        tally.add(locate(frame, probe), x, r * ASSUMED_M_S / speed_m_s)
+        progress(number + 1, frames)
+    return tally
+
+
+def with_ratio_fixed(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
+    """The same answer but for a sound speed taken for known: what does fitting it along cost?"""
+    free = locate_in_channels(frame, probe)
+    if isinstance(free, NoSignal) or probe.channels is None:
+        return free
+    channels = prepare_channels(frame, probe.channels)
+    speed_mm_us = probe.sound_speed_m_s * 1e-3
+    fit = fit_wavefront(channels, probe.element_x_mm, speed_mm_us, free.x_mm, free.range_mm, 1.0, ratio_sigma=1e-6)
+    return replace(free, x_mm=fit.x_mm, range_mm=fit.range_mm, covariance=fit.covariance)
+
+
+def band_limited(rng: np.random.Generator, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """Noise between 2 and 8 MHz, standard deviation 1: what an amplifier's filter leaves."""
+    spectrum = np.fft.rfft(rng.standard_normal(shape), axis=1)
+    frequency = np.fft.rfftfreq(shape[1], 1.0 / 40.0)
+    spectrum *= (frequency > 2.0) & (frequency < 8.0)
+    noise = np.fft.irfft(spectrum, shape[1], axis=1)
+    return np.asarray(noise / noise.std(), dtype=np.float32)
+
+
+def flash(rng: np.random.Generator, shape: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """Noise and a flash at the same time on all channels, up to 100 times the noise, channels unequal."""
+    at = rng.uniform(0.0, 3.0) if rng.random() < 0.7 else rng.uniform(0.0, 20.0)
+    time_us = np.arange(shape[1]) / 40.0
+    bell = np.exp(-0.5 * ((time_us - at) / rng.uniform(0.08, 0.4)) ** 2)
+    wave = bell * np.cos(2.0 * np.pi * rng.uniform(1.0, 8.0) * (time_us - at))
+    gain = 10.0 ** rng.uniform(0.0, 2.0) * (1.0 + rng.uniform(0.0, 0.3) * rng.standard_normal((shape[0], 1)))
+    return np.asarray(rng.standard_normal(shape) + gain * wave, dtype=np.float32)
+
+
+def speckle(rng: np.random.Generator, shape: tuple[int, int], grain: float) -> npt.NDArray[np.float32]:
+    """Envelope of noise with grains of this size in pixels (0: every pixel for itself)."""
+    noise = rng.standard_normal((2, *shape))
+    if grain:
+        f = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
+        noise = np.fft.irfft2(np.fft.rfft2(noise) * np.exp(-2.0 * (np.pi * grain * f) ** 2), shape)
+    return np.asarray(np.hypot(noise[0], noise[1]), dtype=np.float32)
+
+
+def image_frames(frames: int, seed: int, snr_db: float, asymmetry: float = 0.0) -> Tally:
+    tally = Tally()
+    probe = probe_for(0.0)
+    for number in range(frames):
+        rng = np.random.default_rng([seed, number])
+        x, r = rng.uniform(-20.0, 20.0), rng.uniform(15.0, 50.0)
+        pulse = Pulse(rng.uniform(3.0, 7.0), rng.uniform(0.5, 0.8), asymmetry)
+        source = np.array([x, 0.0, probe.radius_mm + r])
+        hearing = Hearing(elevation=None)
+        shape = (512, 336)
+        image = simulate_envelope_image(probe, source, 0.0, rng, shape, pulse, snr_db, None, hearing)
+        tally.add(locate_in_image(image, probe), x, r)
+        progress(number + 1, frames)
+    return tally
+
+
+def progress(done: int, of: int) -> None:
+    if sys.stderr.isatty() and (done % 20 == 0 or done == of):
+        print(f"\r  {done}/{of} ", end="" if done < of else "\r", file=sys.stderr, flush=True)
+
+
+class Study:
+    """Collects figures and holds them against targets."""
+
+    def __init__(self) -> None:
+        self.figures: dict[str, Any] = {}
+        self.missed: list[str] = []
+
+    def note(self, name: str, figures: dict[str, Any], text: str) -> None:
+        self.figures[name] = figures
+        print(f"{name:34s} {text}", flush=True)
+
+    def target(self, name: str, value: float, limit: float, low: float = -math.inf) -> str:
+        met = low <= value <= limit
+        if not met:
+            self.missed.append(f"{name}: {value:g}, target {low:g} to {limit:g}")
+        return f"{value:.4g} ({'ok' if met else 'MISSED'}, {'' if math.isinf(low) else f'{low:g} to '}{limit:g})"
+
+
+def line(figures: dict[str, float]) -> str:
+    if not figures["found"]:
+        return f"found 0 of {figures['frames']}, wrong {figures['wrong']}"
+    return (
+        f"found {figures['found']} of {figures['frames']}, wrong {figures['wrong']}, x {figures['x_rms_mm']:.4f} range "
+        f"{figures['range_rms_mm']:.4f} mm RMS, Mahalanobis^2 {figures['mahalanobis2_mean']:.2f}"
+    )
+
+
+def accuracy(study: Study, options: argparse.Namespace) -> None:
+    """RMS errors at 20, 10 and 0 dB."""
+    limits = {20.0: (0.03, 0.02), 10.0: (0.1, 0.05), 0.0: (0.1, 0.05)}
+    for snr_db, (x_limit, range_limit) in limits.items():
+        figures = channel_frames(options.frames, options.seed, snr_db).summary()
+        name = f"accuracy {snr_db:g} dB"
+        study.note(name, figures, line(figures))
+        print("    x", study.target(name + " x", figures["x_rms_mm"], x_limit), end="; ")
+        print("range", study.target(name + " range", figures["range_rms_mm"], range_limit), end="; ")
+        print("found", study.target(name + " found", figures["found"] / figures["frames"], 1.0, 0.99))
+    for snr_db in (20.0, 0.0):
+        figures = channel_frames(options.frames, options.seed + 1, snr_db, x_mm=27.0).summary()
+        study.note(f"array's end (|x| to 27) {snr_db:g} dB", figures, line(figures))
+        figures = channel_frames(options.frames, options.seed + 2, snr_db, asymmetry=0.5).summary()
+        study.note(f"pulse falls 1.5 times as slowly {snr_db:g} dB", figures, line(figures))
+        figures = channel_frames(options.frames, options.seed, snr_db, locate=with_ratio_fixed).summary()
+        study.note(f"sound speed taken for known {snr_db:g} dB", figures, line(figures))
+
+
+def curve(study: Study, options: argparse.Namespace) -> None:
+    """Detection and honesty of the covariance against the signal-to-noise ratio."""
+    for snr_db in (25.0, 20.0, 15.0, 10.0, 5.0, 2.5, 0.0, -2.5, -5.0, -7.5, -10.0, -12.5, -15.0):
+        tally = channel_frames(options.frames, options.seed + 3, snr_db)
+        figures = tally.summary()
+        study.note(f"curve {snr_db:+.1f} dB", figures, line(figures))
+        if snr_db >= -5.0 and figures["found"]:
+            text = study.target(f"honesty {snr_db:g} dB", figures["mahalanobis2_mean"], 3.0, 1.0)
+            print("    mean squared Mahalanobis, 2 degrees of freedom:", text)
+
+
+def false_finds(study: Study, options: argparse.Namespace) -> None:
+    """Frames without a source."""
+    probe = probe_for(5.0)
+    shape = (probe.elements, SAMPLES)
+    kinds: dict[str, Callable[[np.random.Generator], npt.NDArray[Any]]] = {
+        "white noise": lambda rng: noise_channels(probe, rng, SAMPLES),
+        "band-limited noise": lambda rng: band_limited(rng, shape),
+        "flash on all channels": lambda rng: flash(rng, shape),
+        "zeros": lambda rng: np.zeros(shape, dtype=np.int16),
+    }
+    for name, make in kinds.items():
+        frames = min(options.noise_frames, 10) if name == "zeros" else options.noise_frames
+        found = 0
+        for number in range(frames):
+            found += isinstance(locate_in_channels(make(np.random.default_rng([options.seed, number])), probe), PaFind)
+            progress(number + 1, frames)
+        name = f"false finds, {name}"
+        text = study.target(name, found / frames, 1e-3)
+        study.note(name, {"frames": frames, "found": found}, f"{found} in {frames} frames: {text}")
+
+
+def image_false_finds(study: Study, options: argparse.Namespace) -> None:
+    """Images without a source."""
+    probe = probe_for(0.0)
+    for grain in (0.0, 1.5, 3.0):
+        found = 0
+        for number in range(options.noise_frames):
+            image = speckle(np.random.default_rng([options.seed, number]), (512, 336), grain)
+            found += isinstance(locate_in_image(image, probe), PaFind)
+            progress(number + 1, options.noise_frames)
+        name = f"image false finds, grain {grain:g} px"
+        text = study.target(name, found / options.noise_frames, 1e-3)
+        figures = {"frames": options.noise_frames, "found": found}
+        study.note(name, figures, f"{found} in {options.noise_frames} images: {text}")
+
+
+def sound_speed(study: Study, options: argparse.Namespace) -> None:
+    """A speed 2 % off has to show."""
+    for ratio in (1.02, 0.98, 1.0):
+        for snr_db in (20.0, 10.0, 0.0):
+            tally = channel_frames(options.frames, options.seed + 5, snr_db, speed_m_s=ratio * ASSUMED_M_S)
+            ratios = np.array([find.sound_speed_ratio for find in tally.finds], dtype=np.float64)
+            sigmas = np.array([find.sound_speed_ratio_sigma for find in tally.finds], dtype=np.float64)
+            shows = int(np.sum(np.abs(ratios - 1.0) > np.maximum(3.0 * sigmas, 0.005)))
+            pooled = pool_sound_speed_ratio(tally.finds)
+            if pooled is None:
+                raise SystemExit("no find has a ratio of sound speeds")
+            figures = tally.summary() | {
+                "shows": shows,
+                "ratio_rms": round(float(np.sqrt(np.mean((ratios - ratio) ** 2))), 6),
+                "ratio_z_rms": round(float(np.sqrt(np.mean(((ratios - ratio) / sigmas) ** 2))), 3),
+                "pooled": [round(value, 6) for value in pooled],
+            }
+            name = f"sound speed x {ratio:g}, {snr_db:g} dB"
+            text = f"shows in {shows} of {figures['found']}; pooled {pooled[0]:.5f} +- {pooled[1]:.5f}; {line(figures)}"
+            study.note(name, figures, text)
+            if ratio != 1.0:
+                print("    share:", study.target(name, shows / len(ratios), 1.0, 0.95 if snr_db < 5 else 0.99))
+
+
+def images(study: Study, options: argparse.Namespace) -> None:
+    """Envelope images."""
+    for snr_db in (30.0, 20.0, 15.0, 12.5, 10.0):
+        figures = image_frames(options.frames, options.seed + 6, snr_db).summary()
+        study.note(f"image {snr_db:g} dB", figures, line(figures))
+
+
+def timing(study: Study, options: argparse.Namespace) -> None:
+    """Time per frame, one geometry, first frame apart."""
+    probe = probe_for(10.0)
+    hearing = Hearing(elevation=None)
+    rng = np.random.default_rng(options.seed)
+    source = np.array([3.0, 0.0, 35.0])
+    made = [simulate_channels(probe, source, 0.0, rng, None, 10.0, SAMPLES, None, hearing) for _ in range(20)]
+    laps = []
+    for frame in made:
+        start = time.perf_counter()
+        locate_in_channels(frame, probe)
+        laps.append(1e3 * (time.perf_counter() - start))
+    middle = float(np.median(laps[1:]))
+    figures = {"first_ms": round(laps[0], 1), "median_ms": round(middle, 1), "best_ms": round(min(laps), 1)}
+    study.note("time, 128 x 800 samples", figures, f"{figures}")
+
+
+SECTIONS = {
+    "accuracy": accuracy,
+    "curve": curve,
+    "false-finds": false_finds,
+    "sound-speed": sound_speed,
+    "images": images,
+    "image-false-finds": image_false_finds,
+    "timing": timing,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=300, help="frames per signal-to-noise ratio (default 300)")
+    parser.add_argument("--noise-frames", type=int, default=2000, help="frames per kind of noise (default 2000)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, metavar="SECTION", help=f"of {', '.join(SECTIONS)}")
+    parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    options = parser.parse_args()
+    study = Study()
+    for name, section in SECTIONS.items():
+        if not options.only or name in options.only:
+            section(study, options)
+    if options.json:
+        options.json.write_text(json.dumps({"figures": study.figures, "missed": study.missed}, indent=1) + "\n")
+    print("all targets met" if not study.missed else "missed:\n  " + "\n  ".join(study.missed))
+    return 1 if study.missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
