@@ -11,7 +11,7 @@ from fgreg.detection.marker import MarkerFit, detect_marker
 from fgreg.detection.tags import dictionary_named, find_tags
 from fgreg.frames import FloatArray, as_float_array, exp_so3, make_transform
 from fgreg.models import MarkerModel, StereoRig, TagModel
-from fgreg.simulation.render import TagSurface
+from fgreg.simulation.render import Optics, TagSurface, render_frame
 from tests.marker_scene import (
     LEFT,
     ONE_TAG,
@@ -52,6 +52,14 @@ def test_marker_in_one_view_only_uses_that_view(pair: tuple[Frame, Frame], empty
     assert left.pose.views == ("left",)
     right = assert_right(detect_marker(empty[0], pair[1], RIG, ONE_TAG), TRUE)
     assert right.pose.views == ("right",)
+
+
+def test_blurred_faint_and_noisy() -> None:
+    optics = Optics(blur_px=2.6, read_noise=4.0, shot_noise=0.03, white_level=70.0)
+    for seed in range(4):
+        true = facing_pose((8.0, -4.0, 140.0), 10.0 * seed, roll_deg=40.0 * seed)
+        left = render_frame(LEFT, surfaces_of(ONE_TAG, true), np.random.default_rng(seed), optics)
+        assert_right(detect_marker(left, None, RIG, ONE_TAG), true, mm=0.5, deg=0.5)
 
 
 def test_no_marker_says_which_and_where(empty: tuple[Frame, Frame]) -> None:

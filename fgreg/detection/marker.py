@@ -78,6 +78,8 @@ def view_corners(
     """The body's corners in one view: (corners, tag id of each group, what was left out)."""
     picture = grey(image)
     tags, left_out = _own_tags(find_tags(picture, marker.dictionary), marker, VIEW_NAMES[view])
+    if not tags and not left_out:
+        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, VIEW_NAMES[view])
     if not tags:
         return None, (), left_out
     cells = tag_cells(marker.dictionary)
