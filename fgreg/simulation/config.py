@@ -144,15 +144,15 @@ class SimulationConfig:
     collinear: bool = False
     lambda_mm: tuple[float, float] = (20.0, 60.0)
     aim_lambda_mm: tuple[float, float] = (20.0, 60.0)
-    beam_tilt_rad: float = math.radians(20.0)
+    beam_tilt_rad: float = math.radians(30.0)
     beam_roll_rad: float = math.radians(40.0)
     aim_roll_rad: float = math.radians(60.0)
     laser_offset_mm: tuple[float, float] = (5.0, 15.0)
     laser_tilt_rad: tuple[float, float] = (math.radians(10.0), math.radians(25.0))
     marker_T_laser: FloatArray | None = None
-    camera_distance_mm: tuple[float, float] = (125.0, 150.0)
+    camera_distance_mm: tuple[float, float] = (140.0, 170.0)
     camera_roll_rad: float = math.radians(25.0)
-    board_distance_mm: tuple[float, float] = (105.0, 150.0)
+    board_distance_mm: tuple[float, float] = (110.0, 160.0)
     marker_distance_mm: tuple[float, float] = (75.0, 160.0)
     tag_tilt_rad: float = math.radians(50.0)
 

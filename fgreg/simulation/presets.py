@@ -46,8 +46,8 @@ PRESETS: dict[str, SimulationConfig] = {
     "raw-small": replace(
         PHANTOM,
         name="raw-small",
-        aims=5,
-        pairs=5,
+        aims=6,
+        pairs=6,
         tracks_heard=1,
         tracks_silent=1,
         camera=default_rig(800),
