@@ -240,7 +240,7 @@ def false_finds(study: Study, options: argparse.Namespace) -> None:
         "white noise": lambda rng: noise_channels(probe, rng, SAMPLES),
         "band-limited noise": lambda rng: band_limited(rng, shape),
         "flash on all channels": lambda rng: flash(rng, shape),
-        "zeros": lambda rng: np.zeros(shape, dtype=np.int16),
+        "zeros": lambda _: np.zeros(shape, dtype=np.int16),
     }
     for name, make in kinds.items():
         frames = min(options.noise_frames, 10) if name == "zeros" else options.noise_frames
@@ -279,14 +279,16 @@ def sound_speed(study: Study, options: argparse.Namespace) -> None:
             pooled = pool_sound_speed_ratio(tally.finds)
             if pooled is None:
                 raise SystemExit("no find has a ratio of sound speeds")
-            figures = tally.summary() | {
+            summary = tally.summary()
+            figures = {
+                **summary,
                 "shows": shows,
                 "ratio_rms": round(float(np.sqrt(np.mean((ratios - ratio) ** 2))), 6),
                 "ratio_z_rms": round(float(np.sqrt(np.mean(((ratios - ratio) / sigmas) ** 2))), 3),
                 "pooled": [round(value, 6) for value in pooled],
             }
             name = f"sound speed x {ratio:g}, {snr_db:g} dB"
-            text = f"shows in {shows} of {figures['found']}; pooled {pooled[0]:.5f} +- {pooled[1]:.5f}; {line(figures)}"
+            text = f"shows in {shows} of {summary['found']}; pooled {pooled[0]:.5f} +- {pooled[1]:.5f}; {line(summary)}"
             study.note(name, figures, text)
             if ratio != 1.0:
                 print("    share:", study.target(name, shows / len(ratios), 1.0, 0.95 if snr_db < 5 else 0.99))

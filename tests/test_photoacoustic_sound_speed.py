@@ -1,0 +1,72 @@
+"""A wrong sound speed shows in the wavefront; range stays that of the arrival at the apex."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fgreg.detection.photoacoustic import PaFind, locate_in_channels, pool_sound_speed_ratio
+from fgreg.frames import as_float_array
+from fgreg.models import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.simulation.acoustics import Hearing, simulate_channels
+
+
+def finds(ratio: float, snr_db: float, frames: int) -> list[tuple[PaFind, float, float]]:
+    """Finds with the true x and range, where the tissue's speed is ``ratio`` times the assumed one."""
+    sensitivity = SensitivityModel(as_float_array([30.0]), as_float_array([0.1]), 0.005)
+    probe = ProbeModel(128, 0.43, False, 10.0, 1540.0, sensitivity, ChannelModel(40.0, 12.0, 0.0))
+    out = []
+    for seed in range(frames):
+        rng = np.random.default_rng([seed, 17])
+        x_mm, range_mm = rng.uniform(-15.0, 15.0), rng.uniform(22.0, 32.0)
+        position = np.array([x_mm, 0.0, 10.0 + range_mm])
+        frame = simulate_channels(probe, position, 0.0, rng, None, snr_db, 800, 1540.0 * ratio, Hearing(elevation=None))
+        find = locate_in_channels(frame, probe)
+        assert isinstance(find, PaFind)
+        out.append((find, x_mm, range_mm))
+    return out
+
+
+@pytest.mark.parametrize("ratio", [0.98, 1.02])
+@pytest.mark.parametrize("snr_db", [20.0, 5.0])
+def test_two_percent_show_in_every_frame(ratio: float, snr_db: float) -> None:
+    for find, x_mm, range_mm in finds(ratio, snr_db, 8):
+        assert find.sound_speed_ratio is not None
+        assert find.sound_speed_ratio_sigma is not None
+        assert find.sound_speed_ratio == pytest.approx(ratio, abs=5.0 * find.sound_speed_ratio_sigma)
+        assert abs(find.sound_speed_ratio - 1.0) > 3.0 * find.sound_speed_ratio_sigma
+        # x is the true one, range the assumed speed's; ratio times that is the true range again.
+        assert find.x_mm == pytest.approx(x_mm, abs=5.0 * math.sqrt(find.covariance[0, 0]))
+        assert find.range_mm == pytest.approx(range_mm / ratio, abs=5.0 * math.sqrt(find.covariance[1, 1]))
+
+
+def test_the_right_speed_raises_no_alarm() -> None:
+    pooled = pool_sound_speed_ratio(find for find, _, _ in finds(1.0, 5.0, 10))
+    assert pooled is not None
+    ratio, sigma = pooled
+    assert abs(ratio - 1.0) < max(3.0 * sigma, 0.005)
+    assert sigma < 0.002
+
+
+def test_water_instead_of_tissue_is_found_all_the_same() -> None:
+    for find, x_mm, range_mm in finds(1480.0 / 1540.0, 0.0, 5):
+        assert find.x_mm == pytest.approx(x_mm, abs=0.1)
+        assert find.range_mm == pytest.approx(range_mm * 1540.0 / 1480.0, abs=0.1)
+
+
+def test_pooling_weighs_by_variance() -> None:
+    def find(ratio: float | None, sigma: float | None) -> PaFind:
+        return PaFind(0.0, 20.0, np.eye(2), 1.0, 10.0, ratio, sigma, 100, 50.0, 20.0)
+
+    pooled = pool_sound_speed_ratio([find(1.0, 0.01), find(1.02, 0.02), find(None, None)])
+    assert pooled is not None
+    # Weights 4 to 1: 1.004; sigma 1 / sqrt(1 / 0.01^2 + 1 / 0.02^2); spread (0.02^2 / 0.0005 = 0.8) below expectation.
+    assert pooled[0] == pytest.approx(1.004)
+    assert pooled[1] == pytest.approx(0.01 * math.sqrt(0.8))
+    # Three finds that contradict each other: sigma grows with their spread.
+    spread = pool_sound_speed_ratio([find(0.9, 0.001), find(1.0, 0.001), find(1.1, 0.001)])
+    assert spread is not None
+    assert spread[1] == pytest.approx(0.1 / math.sqrt(3.0))
+    assert pool_sound_speed_ratio([find(None, None)]) is None
