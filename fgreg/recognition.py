@@ -22,7 +22,7 @@ from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
 from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
-from fgreg.detection.photoacoustic import locate_in_channels as locate_in_frame
+from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.drivers.frame_files import read_array, read_picture
 from fgreg.errors import InputError
 from fgreg.events import AimEvent, CameraMovedEvent, Event, MarkerRecord, PairEvent, TrackEvent, TrusRecord
