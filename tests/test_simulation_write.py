@@ -16,6 +16,7 @@ from fgreg.models import MarkerModel, TagModel
 from fgreg.simulation import PRESETS, simulate, write_session
 from fgreg.simulation.write import encoded
 
+EXAMPLES = Path(__file__).resolve().parent.parent / "sessions"
 SMALL = replace(PRESETS["raw-small"], aims=1, pairs=1, tracks_heard=1, tracks_silent=0)
 
 
@@ -120,3 +121,32 @@ def test_a_write_that_fails_leaves_the_old_session_and_no_rest(tmp_path: Path) -
 def test_frames_of_other_kinds_are_refused() -> None:
     with pytest.raises(ValueError, match=r"neither \.png nor \.npy"):
         encoded("frames/a.gif", np.zeros((2, 2), dtype=np.uint8))
+
+
+@pytest.mark.parametrize("name", ["phantom", "paper"])
+def test_example_sessions_are_what_their_preset_makes(name: str) -> None:
+    truth = yaml.safe_load((EXAMPLES / name / "ground_truth.yaml").read_text())
+    simulated = simulate(PRESETS[name], truth["x_seed"])
+    assert yaml.safe_load((EXAMPLES / name / "session.yaml").read_text()) == simulated.session
+    for key in ("trus_T_camera", "marker_T_laser"):
+        np.testing.assert_allclose(truth[key], simulated.truth[key], atol=1e-6)
+    np.testing.assert_allclose(list(truth["pms"].values()), list(simulated.truth["pms"].values()), atol=1e-6)
+    events = [json.loads(line) for line in (EXAMPLES / name / "events.jsonl").read_text().splitlines()]
+    assert [e["type"] for e in events] == [e["type"] for e in simulated.events]
+    assert [e.get("corner") for e in events] == [e.get("corner") for e in simulated.events]
+
+
+def test_phantom_frames_are_all_there_and_small_enough() -> None:
+    simulated = simulate(PRESETS["phantom"], 1)
+    files = contents(EXAMPLES / "phantom")
+    assert set(files) - {"result.yaml"} == {"session.yaml", "events.jsonl", "ground_truth.yaml", *simulated.frames}
+    assert sum(map(len, files.values())) < 45e6
+    for name in ("frames/aim-04-right.png", "frames/pm-09-left.png"):
+        stored = cv2.imread(str(EXAMPLES / "phantom" / name), cv2.IMREAD_UNCHANGED)
+        assert stored is not None
+        difference = np.abs(stored.astype(int) - simulated.frames[name]().astype(int))
+        # Rounding may differ between machines at a few pixels, nothing else.
+        assert (difference > 0).mean() < 1e-3
+        assert difference.max() <= 3
+    stored_channels = np.load(EXAMPLES / "phantom" / "frames" / "pm-09.npy")
+    assert np.abs(stored_channels.astype(int) - simulated.frames["frames/pm-09.npy"]()).max() <= 1
