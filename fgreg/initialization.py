@@ -49,7 +49,7 @@ def beam_starts(aims: tuple[Aim, ...]) -> list[tuple[FloatArray, FloatArray]]:
     directions: list[FloatArray] = []
     clear = False
     if len(aims) >= 2:
-        _, spread, axes = np.linalg.svd(marker_p - centre)
+        _, spread, axes = np.linalg.svd(marker_p - centre, full_matrices=False)
         clear = bool(len(aims) > 2 and spread[1] < CLEAR_AXIS * spread[0])
         directions.extend(axes[:1] if clear else axes[spread > CLEAR_AXIS * spread[0]])
     length = np.linalg.norm(centre)

@@ -126,3 +126,12 @@ def test_a_nominal_tip_places_the_lasers_origin_along_the_beam() -> None:
     assert laser is not None
     along = (laser.marker_T_laser[:3, 3] - tip[:3, 3]) @ laser.marker_T_laser[:3, 2]
     assert abs(along) < 1e-6
+
+
+@pytest.mark.parametrize("aims", [1, 2, 3])
+def test_a_few_aims_start_the_beam_and_the_pairs_do_the_rest(aims: int) -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(5), aims=aims, pairs=25)
+    found = register(measurements, model, SolveConfig())
+    moved = targets_moved(truth.trus_T_camera[0], found.optimum.state.trus_T_camera()[0], model.targets_mm)
+    assert moved < 8.0
+    assert found.optimum.state.beam_direction()[0] @ truth.marker_T_laser[:3, 2] > np.cos(np.radians(5.0))
