@@ -31,7 +31,7 @@ Complex128Array = npt.NDArray[np.complex128]
 WIDE_BAND = Band(5.0, 3.0)
 RATIO_FLOOR = 2e-4
 """The same for the ratio of sound speeds."""
-FLOOR_MM = 0.0005
+FLOOR_MM = 0.0003
 """Standard deviation added to x and range for what sampling, interpolation and filters leave without noise."""
 SMOOTHINGS = (1.0, 1.4, 2.0, 3.0, 4.5, 7.0)
 """Widths of the filters before the envelope's maximum is taken, in widths of the pulse's spectrum."""

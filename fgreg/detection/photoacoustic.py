@@ -27,9 +27,9 @@ from fgreg.models import ProbeModel
 
 __all__ = ["NoSignal", "PaFind", "locate_in_channels", "locate_in_frame", "locate_in_image", "pool_sound_speed_ratio"]
 
-FALSE_ALARMS = 4e-4
+FALSE_ALARMS = 2e-4
 """Share of frames of noise in which a source may be found by mistake."""
-INDEPENDENT = 9.0
+INDEPENDENT = 15.0
 """Independent points per grid point near the threshold, measured on frames of noise (tools/study_photoacoustic.py)."""
 FLAT_PERIODS = 0.9
 FLAT_SHARE = 0.4
