@@ -21,6 +21,9 @@ from fgreg.detection.tags import FoundTag, find_tags, tag_cells
 from fgreg.frames import FloatArray
 from fgreg.models import CameraModel, MarkerModel, StereoRig
 
+LARGE_WIDTH_PX = 1000
+"""From this width on a single tag is looked for at half the resolution first."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerFit:
@@ -77,7 +80,12 @@ def view_corners(
 ) -> tuple[CornerSet | None, tuple[int, ...], list[str]]:
     """The body's corners in one view: (corners, tag id of each group, what was left out)."""
     picture = grey(image)
-    tags, left_out = _own_tags(find_tags(picture, marker.dictionary), marker, VIEW_NAMES[view])
+    tags: list[FoundTag] = []
+    left_out: list[str] = []
+    if len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX:
+        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, half=True), marker, VIEW_NAMES[view])
+    if not tags:
+        tags, left_out = _own_tags(find_tags(picture, marker.dictionary), marker, VIEW_NAMES[view])
     if not tags and not left_out:
         tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, VIEW_NAMES[view])
     if not tags:
