@@ -28,7 +28,7 @@ def _frames_of(folder: Path, kind: str) -> list[dict[str, object]]:
 
 def test_raw_frames_give_a_registration_near_the_truth(raw_session: Path) -> None:
     seen: list[tuple[int, int]] = []
-    report = solve_session(SolveRequest(raw_session), progress=lambda step, done, total: seen.append((done, total)))
+    report = solve_session(SolveRequest(raw_session), progress=lambda _, done, total: seen.append((done, total)))
     assert report.errors is not None
     tre = report.errors.tre_mm[0]
     assert tre is not None
