@@ -40,6 +40,8 @@ ASYMMETRY = 0.12
 pulse, 0.10 for one that falls 1.25 times as slowly as it rises, 0.19 for 1.5 times (measured without noise)."""
 LINEAR = 0.12
 """Noise of the maximum, in lengths of the pulse, up to which it is near enough linear in the noise to be weighed in."""
+MISMATCH = 0.07
+"""Share of that movement that does not go as one over the filter's width."""
 FINE_RATE_MHZ = 100.0
 MAX_SIGNAL_MHZ = 16.0
 SIGNIFICANT = 3.0
@@ -261,7 +263,7 @@ def _envelope_maximum(
     correlation = weighted @ weighted.T
     correlation /= np.sqrt(np.outer(np.diag(correlation), np.diag(correlation)))
     shift = ASYMMETRY * pulse_us / np.array(SMOOTHINGS[:count])
-    covariance = np.outer(sigmas, sigmas) * correlation + np.outer(shift, shift) + np.diag((0.1 * shift) ** 2)
+    covariance = np.outer(sigmas, sigmas) * correlation + np.outer(shift, shift) + np.diag((MISMATCH * shift) ** 2)
     weight = np.linalg.solve(covariance, np.ones(count))
     return float(weight @ times / weight.sum()), float(1.0 / math.sqrt(weight.sum())), height
 
