@@ -70,3 +70,20 @@ def test_pooling_weighs_by_variance() -> None:
     assert spread is not None
     assert spread[1] == pytest.approx(0.1 / math.sqrt(3.0))
     assert pool_sound_speed_ratio([find(None, None)]) is None
+
+
+def test_delays_in_the_tissue_widen_the_covariance() -> None:
+    """Layers that delay neighbouring elements together: no noise explains it, so the covariance has to allow for it."""
+    sensitivity = SensitivityModel(as_float_array([30.0]), as_float_array([0.1]), 0.005)
+    probe = ProbeModel(128, 0.43, False, 10.0, 1540.0, sensitivity, ChannelModel(40.0, 10.0, 0.0))
+    rng = np.random.default_rng(3)
+    position = np.array([3.0, 0.0, 35.0])
+    frame = simulate_channels(probe, position, 0.0, rng, None, 20.0, 800, None, Hearing(elevation=None))
+    delay_us = 0.02 * np.sin(np.arange(128) / 5.0)
+    turn = np.exp(-2j * np.pi * np.fft.rfftfreq(800, 1 / 40.0) * delay_us[:, None])
+    delayed = np.fft.irfft(np.fft.rfft(frame, axis=1) * turn, 800, axis=1)
+    plain, widened = locate_in_channels(frame, probe), locate_in_channels(delayed, probe)
+    assert isinstance(plain, PaFind)
+    assert isinstance(widened, PaFind)
+    assert widened.covariance[0, 0] > 9.0 * plain.covariance[0, 0]
+    assert widened.x_mm == pytest.approx(3.0, abs=0.1)

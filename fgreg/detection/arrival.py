@@ -47,6 +47,8 @@ MAX_SIGNAL_MHZ = 16.0
 SIGNIFICANT = 3.0
 """Standard deviations from which on an element counts as hearing the wave."""
 ITERATIONS = 8
+SETTLED = 0.03
+"""Last step, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +56,8 @@ class WavefrontFit:
     """Result of :func:`fit_wavefront`; x and range mm, covariance (2, 2), ratio without the prior on it.
 
     ``gain`` (elements,): the wave's amplitude in each element's channel, relative; ``amplitude`` at the strongest.
-    ``misfit``: squared remaining delays over their variance, per degree of freedom.
+    ``misfit``: squared remaining delays over their variance, per degree of freedom; ``beyond_noise_us``: RMS of what
+    of them noise does not explain.
     """
 
     x_mm: float
@@ -66,6 +69,7 @@ class WavefrontFit:
     gain: FloatArray
     elements_used: int
     misfit: float
+    beyond_noise_us: float
     band: Band
 
 
@@ -268,6 +272,18 @@ def _envelope_maximum(
     return float(weight @ times / weight.sum()), float(1.0 / math.sqrt(weight.sum())), height
 
 
+def _correlated_elements(residual: FloatArray) -> float:
+    """Over how many neighbours a residual goes together: 1 + 2 sum of its autocorrelation up to where that ends."""
+    together = 1.0
+    power = float(residual @ residual)
+    for lag in range(1, residual.size // 2):
+        correlation = float(residual[:-lag] @ residual[lag:]) / power
+        if correlation < 0.1:
+            break
+        together += 2.0 * correlation
+    return together
+
+
 def fit_wavefront(
     channels: Channels,
     element_x_mm: FloatArray,
@@ -354,10 +370,18 @@ def fit_wavefront(
         state = state + step
         if not (np.isfinite(state).all() and 0.5 < state[1] < 310.0 and 0.8 < state[2] < 1.25):
             raise EstimationError("the fit of the wavefront does not settle")
-        if np.abs(step[:2]).max() < 2e-4 and abs(step[2]) < 1e-5:
+        if np.abs(step[:2]).max() < 0.02 and float(np.max(step**2 * np.diag(information))) < SETTLED**2:
             break
-    scale = max(1.0, misfit)
-    information = relative / scale + absolute
+    # What noise does not explain (a lens, layers of other speed) goes together over neighbouring elements: as many of
+    # them count as one, and it moves the mean, hence the range, too.
+    count = int(used.sum())
+    beyond_us = math.sqrt(max(misfit - 1.0, 0.0) * max(count - 4, 1) / float(weight.sum()))
+    scale, common_us2 = max(1.0, misfit), 0.0
+    if misfit > 1.0 + 3.0 * math.sqrt(2.0 / count):
+        together = _correlated_elements((left_over * np.sqrt(weight))[used])
+        scale = 1.0 + (misfit - 1.0) * together
+        common_us2 = beyond_us**2 * min(1.0, together / count)
+    information = relative / scale + absolute / (1.0 + common_us2 / off_sigma_us**2)
     covariance = np.linalg.inv(information + prior)[:2, :2] + np.eye(2) * FLOOR_MM**2
     # The ratio as the data alone have it: information about it with x and range free, and the prior's pull undone.
     own = information[2, 2] - information[2, :2] @ np.linalg.solve(information[:2, :2], information[:2, 2])
@@ -372,5 +396,6 @@ def fit_wavefront(
         gain=gain,
         elements_used=int((gain > 0.1 * gain.max()).sum()),
         misfit=misfit,
+        beyond_noise_us=beyond_us,
         band=band,
     )

@@ -33,6 +33,8 @@ MIN_RANGE_MM, MAX_RANGE_MM = 2.0, 300.0
 FINE_RANGE_MM = (-0.12, -0.06, 0.0, 0.06, 0.12)
 COARSE_RANGE_MM = tuple(0.15 * k for k in range(-5, 6))
 RATIOS = (0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06)
+SIDELOBES_MM = tuple(0.075 * k for k in range(-4, 5))
+"""Where the sound speed is off, the best point of the assumed speed's grid may be on a sidelobe this far off."""
 RATIO_SIGMA = 0.03
 """How far the sound speed may reasonably be off."""
 MIN_SUPPORT = 6.0
@@ -232,9 +234,10 @@ def search_nearby(
     speed_mm_us: float,
     range_offsets_mm: tuple[float, ...],
     ratios: tuple[float, ...],
+    x_offsets_mm: tuple[float, ...] | None = None,
 ) -> Peak:
     """The best point of a fine grid about a peak, sound speeds included (under their prior); never worse than it."""
-    x_offsets = peak.x_step_mm * np.linspace(-0.5, 0.5, 5)
+    x_offsets = peak.x_step_mm * np.linspace(-0.5, 0.5, 5) if x_offsets_mm is None else np.array(x_offsets_mm)
     grid = np.meshgrid(ratios, peak.range_mm + np.array(range_offsets_mm), peak.x_mm + x_offsets, indexing="ij")
     ratio, range_mm, x_mm = (axis.ravel() for axis in grid)
     range_mm = np.maximum(range_mm, 0.5 * MIN_RANGE_MM)
