@@ -98,7 +98,7 @@ def solve(
     )
     readout = read_laser(registration, model)
     pairs = read_pairs(measurements, registration, model, readout.origin_shift_mm)
-    aims = read_aims(registration, readout.origin_shift_mm)
+    aims = read_aims(measurements, registration, readout.origin_shift_mm)
     common = [*conditions, *_common_conditions(registration, pairs, aims)]
     epochs, found = _judge_epochs(measurements, registration, posterior, pairs, model, config, common)
     context = _track_context(registration, posterior, model, readout.origin_shift_mm)
