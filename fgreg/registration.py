@@ -36,6 +36,7 @@ from fgreg.robust import (
     deviant,
     graduated,
     innovations_at,
+    plausible_cost,
     sort_shots,
 )
 
@@ -153,8 +154,8 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
         return Calibration(tuple(candidates), everything)
     alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model)
     found = optimize(alone, _beam_states(candidates, model))
-    best = [int(np.argmin(found.evaluation.cost))]
-    if len(aims) > MIN_KEPT_AIMS and _deviants(alone, found.state.take(best)):
+    best = int(np.argmin(found.evaluation.cost))
+    if len(aims) > MIN_KEPT_AIMS and not _is_clean(alone, found.state.take([best]), found.evaluation.cost[best]):
         candidates += [nominal_frame(origin, direction) for origin, direction in consensus_beams(aims)]
         robust = graduated(alone, _beam_states(candidates, model), robust_aims=True)
         at = int(np.argmin(robust.cost))
@@ -188,11 +189,13 @@ def _beams(found: Optimum) -> list[FloatArray]:
     return frames
 
 
-def _deviants(problem: PackedProblem, state: SharedState) -> bool:
-    """Whether some shot deviates from the others at the least squares optimum of all (one hypothesis)."""
+def _is_clean(problem: PackedProblem, state: SharedState, cost: float) -> bool:
+    """Whether each shot and all together fit at the least squares optimum of all (one hypothesis)."""
+    if cost > plausible_cost(problem):
+        return False
     pm, aim = np.ones(len(problem.pms), dtype=bool), np.ones(len(problem.aims.rotation), dtype=bool)
     found = deviant(problem, innovations_at(problem, state, pm, aim))
-    return bool(found.pm.any() or found.aim.any())
+    return not (found.pm.any() or found.aim.any())
 
 
 def _search_subset(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
@@ -265,7 +268,7 @@ def search_epoch(
     problem = pack(subset, model)
     found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
     minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
-    if _deviants(problem, minima[0].state):
+    if len(problem.pms) > MIN_KEPT_PMS and not _is_clean(problem, minima[0].state, minima[0].cost):
         return _search_among_junk(subset, problem, model, frames, minima, keep_within)
     mirrored_problem = _mirrored(problem)
     mirrored = optimize(mirrored_problem, _starts(mirrored_problem, frames, model), keep_within=keep_within)
@@ -423,7 +426,7 @@ def _solve_jointly(
         optimum = optimize(whole, start, tolerance=1e-9)
         found = innovations_at(whole, optimum.state, *everyone)
         deviants = deviant(whole, found)
-        if not (deviants.pm.any() or deviants.aim.any()):
+        if not (deviants.pm.any() or deviants.aim.any() or optimum.evaluation.cost[0] > plausible_cost(whole)):
             shots = Shots(whole, optimum.evaluation, *everyone, found, deviants.pm, deviants.aim)
             return measurements, whole, optimum, shots
         start = optimum.state

@@ -33,6 +33,7 @@ from fgreg.measurements import Aim
 
 JUNK_P = 1e-3
 """A shot is junk where a good one would deviate as much this rarely."""
+IMPLAUSIBLE_P = 1e-4
 TRIPLES = 160
 """Random triples of the consensus: at 60 % junk still ten of good pairs only."""
 SEED = 40961
@@ -60,6 +61,14 @@ def pm_limits(problem: PackedProblem) -> FloatArray:
 
 
 AIM_LIMIT = float(chi2.isf(JUNK_P, 2))
+
+
+def plausible_cost(problem: PackedProblem) -> float:
+    """Chi square of all shots beyond which they do not fit, whatever their innovations say."""
+    unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
+    seen = unknowns if len(problem.pms) else 4  # aims alone see the beam only
+    equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
+    return float(chi2.isf(IMPLAUSIBLE_P, max(equations - seen, 1)))
 
 
 # --- 1. consensus ---------------------------------------------------------------------------------------------------
