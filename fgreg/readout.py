@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate
-from fgreg.frames import FloatArray, exp_so3, make_transform, rotation_to_direction
+from fgreg.frames import exp_so3, make_transform, rotation_to_direction
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
 from fgreg.registration import Registration

@@ -71,12 +71,14 @@ class EpochSearch:
         minima: best first, with the chi square of the shots that fit.
         mirrored_cost: best cost of the mirrored hypothesis, comparable with that of the first minimum.
         other_way_cost: likewise with every sweep's sign turned round; None where all fitted and that was not tried.
+        own_beam_cost: likewise with a beam of the pairs' own, whatever the aims say; None where not tried.
         clean: whether every shot fits.
     """
 
     minima: tuple[Minimum, ...]
     mirrored_cost: float | None
     other_way_cost: float | None = None
+    own_beam_cost: float | None = None
     clean: bool = True
 
 
@@ -129,7 +131,7 @@ class Registration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """The beam from the aims: candidate ``marker_T_nominal`` (z along the beam), best first, and which aims fit (A,)."""
+    """The beam from the aims: candidates for ``marker_T_nominal`` (z along it), best first; and which aims fit (A,)."""
 
     frames: tuple[FloatArray, ...]
     aim_kept: BoolArray
@@ -290,9 +292,7 @@ def _search_among_junk(
     other_way = _robust_minima(_other_way(problem), frames, model, []) if problem.looks.edge_gain.any() else None
     order = np.argsort(robust.cost)
     aims = np.ones(len(problem.aims.rotation), dtype=bool)
-    kept = sort_shots(
-        problem, robust.state.take([order[0]]), robust.pm_kept[order[0]], aims, doubt_aims=False
-    ).pm_kept
+    kept = sort_shots(problem, robust.state.take([order[0]]), robust.pm_kept[order[0]], aims, doubt_aims=False).pm_kept
     if kept.sum() < MIN_KEPT_PMS:
         kept = np.ones(len(problem.pms), dtype=bool)
     names = {pm for pm, keep in zip(problem.pms, kept, strict=True) if keep}
@@ -308,10 +308,14 @@ def _search_among_junk(
         both, either = (robust.pm_kept[index] & best).sum(), (robust.pm_kept[index] | best).sum()
         if both < RIVAL_OVERLAP * either:
             all_minima += (Minimum(level + float(robust.cost[index]) - base, robust.state.take([index])),)
+    # The pairs without the aims: a marker swapped or knocked between calibration and registration.
+    free = graduated(pack(replace(measurements, aims=()), model), robust.state)
+    aims_cost = float(robust.parts.aim.cost[order[0]].sum())
     return EpochSearch(
         tuple(sorted(all_minima, key=lambda minimum: minimum.cost)),
         level + float(mirrored.cost.min()) - base,
         None if other_way is None else level + float(other_way.cost.min()) - base,
+        level + float(free.cost.min()) + aims_cost - base,
         clean=False,
     )
 

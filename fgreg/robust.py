@@ -231,13 +231,17 @@ def _cauchy(parts: Parts, scale: float, aim_scale: float) -> _Weights:
 def _truncated(parts: Parts, limit: FloatArray, aim_limit: float) -> _Weights:
     cost = parts.prior.cost[:, 0] + np.sum(np.minimum(parts.pm.cost, limit), axis=1)
     cost += np.sum(np.minimum(parts.aim.cost, aim_limit), axis=1)
-    return _Weights((parts.pm.cost <= limit) * 1.0, (parts.aim.cost <= aim_limit) * 1.0, cost)
+    return _Weights((parts.pm.cost <= limit).astype(float), (parts.aim.cost <= aim_limit).astype(float), cost)
 
 
 def _fixed(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> _Weights:
     cost = parts.prior.cost[:, 0] + np.sum(pm_kept * parts.pm.cost, axis=1) + np.sum(aim_kept * parts.aim.cost, axis=1)
-    weights = (np.broadcast_to(kept * 1.0, of.cost.shape) for kept, of in ((pm_kept, parts.pm), (aim_kept, parts.aim)))
-    return _Weights(*weights, cost)
+    return _Weights(_repeated(pm_kept, parts.pm), _repeated(aim_kept, parts.aim), cost)
+
+
+def _repeated(kept: BoolArray, part: Contributions) -> FloatArray:
+    """Weights (S, n) of 0 and 1 for every hypothesis."""
+    return np.array(np.broadcast_to(kept, part.cost.shape), dtype=np.float64)
 
 
 Loss = Callable[[Parts], _Weights]
@@ -327,7 +331,7 @@ def innovations(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> Innova
     With total Hessian H, leaving a shot of cost c, gradient g, Hessian A out moves the optimum to where the rest costs
     g' (H - A)^-1 g less: the innovation is c + g' (H - A)^-1 g. For a shot that was not in it is c - g' (H + A)^-1 g.
     """
-    _, hessian = _weighted(parts, pm_kept[None] * 1.0, aim_kept[None] * 1.0)
+    _, hessian = _weighted(parts, _repeated(pm_kept, parts.pm), _repeated(aim_kept, parts.aim))
     return Innovations(_innovation(parts.pm, hessian[0], pm_kept), _innovation(parts.aim, hessian[0], aim_kept))
 
 
@@ -348,9 +352,7 @@ def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> Fl
     return out
 
 
-def innovations_at(
-    problem: PackedProblem, state: SharedState, pm_kept: BoolArray, aim_kept: BoolArray
-) -> Innovations:
+def innovations_at(problem: PackedProblem, state: SharedState, pm_kept: BoolArray, aim_kept: BoolArray) -> Innovations:
     """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the kept shots."""
     return innovations(_Descent(problem, state).parts, pm_kept, aim_kept)
 

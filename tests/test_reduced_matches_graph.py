@@ -14,7 +14,7 @@ from fgreg.graph.explicit_solver import GraphCovariance, GraphOptimum
 from fgreg.graph.explicit_solver import optimize as optimize_graph
 from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
 from fgreg.graph.packing import PackedProblem, pack
-from fgreg.graph.reduced import evaluate, log_marginal, contributions, refine
+from fgreg.graph.reduced import contributions, evaluate, log_marginal, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference

@@ -78,7 +78,7 @@ def truth_state_cost(measurements: Measurements, model: SessionModel, truth: Tru
     private = initial_private(problem, state)
     for _ in range(4):
         _, private = refine(problem, state, private)
-    return contributions(problem, state, private).pm.cost[0]
+    return np.asarray(contributions(problem, state, private).pm.cost[0])
 
 
 def tre_mm(found: Registration, truth: Truth, model: SessionModel) -> FloatArray:
