@@ -352,9 +352,19 @@ def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> Fl
     return out
 
 
-def innovations_at(problem: PackedProblem, state: SharedState, pm_kept: BoolArray, aim_kept: BoolArray) -> Innovations:
-    """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the kept shots."""
-    return innovations(_Descent(problem, state).parts, pm_kept, aim_kept)
+def innovations_at(
+    problem: PackedProblem,
+    state: SharedState,
+    pm_kept: BoolArray,
+    aim_kept: BoolArray,
+    private: PrivateState | None = None,
+) -> Innovations:
+    """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the kept shots.
+
+    ``private`` where its private variables are known, else they are found.
+    """
+    parts = _Descent(problem, state).parts if private is None else contributions(problem, state, private)
+    return innovations(parts, pm_kept, aim_kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -413,3 +423,12 @@ def sort_shots(
             return Sorted(state, pm_kept, aim_kept, settled=True)
         pm_kept, aim_kept = pm_next, aim_next
     return Sorted(state, pm_kept, aim_kept, settled=False)
+
+
+def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted) -> BoolArray:
+    """Whether PMs that are not in ``problem``, over the same shared variables, fit what is kept of it (J,)."""
+    kept = _Descent(problem, judged.state).parts
+    _, hessian = _weighted(kept, _repeated(judged.pm_kept, kept.pm), _repeated(judged.aim_kept, kept.aim))
+    none = np.zeros(len(others.pms), dtype=bool)
+    innovation = _innovation(_Descent(others, judged.state).parts.pm, hessian[0], none)
+    return np.asarray(innovation < pm_limits(others))
