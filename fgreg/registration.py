@@ -104,6 +104,10 @@ class Registration:
     shots: Shots
 
 
+FEW = 0.05
+"""So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
+
+
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
     """Epochs with minima of their own or tied to such a one by measured camera motions."""
     known = {k for k, search in enumerate(searches) if search.minima}
@@ -229,14 +233,20 @@ def _solve_jointly(
     if clean and aim_kept.all():
         optimum = optimize(whole, start, tolerance=1e-9)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
-        deviants = deviant(whole, found)
-        if not (deviants.pm.any() or deviants.aim.any() or optimum.evaluation.cost[0] > plausible_cost(whole)):
-            shots = Shots(whole, optimum.evaluation, *everyone, found, deviants.pm, deviants.aim)
+        beyond = deviant(whole, found)
+        plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
+        if plausible and not (beyond.pm.any() or beyond.aim.any()):
+            shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
             return measurements, whole, optimum, shots
         start = optimum.state
-    robust = graduated(whole, start, robust_aims=True)
-    first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
-    judged = sort_shots(whole, robust.state, *first)
+        clean = bool(plausible and beyond.pm.mean() <= FEW and beyond.aim.sum() <= 1)
+    if clean and aim_kept.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
+        first = _enough(whole, ~beyond.pm, ~beyond.aim)
+    else:
+        robust = graduated(whole, start, robust_aims=True)
+        start = robust.state
+        first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
+    judged = sort_shots(whole, start, *first)
     kept = _enough(whole, judged.pm_kept, judged.aim_kept)
     apart = _split_looks(measurements, whole, kept, judged, model)
     if apart is not None:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import poselib
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from fgreg.frames import BoolArray, FloatArray, IntArray, inverse, log_so3, make_transform, transform_points
 from fgreg.graph.packing import PackedProblem
@@ -57,10 +57,10 @@ def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
 
 def pm_limits(problem: PackedProblem) -> FloatArray:
     """(J,) chi square beyond which a PM is junk."""
-    return np.asarray(chi2.isf(JUNK_P, np.maximum(pm_degrees_of_freedom(problem), 1)))
+    return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), JUNK_P))
 
 
-AIM_LIMIT = float(chi2.isf(JUNK_P, 2))
+AIM_LIMIT = float(chdtri(2, JUNK_P))
 
 
 def plausible_cost(problem: PackedProblem) -> float:
@@ -68,7 +68,7 @@ def plausible_cost(problem: PackedProblem) -> float:
     unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
     seen = unknowns if len(problem.pms) else 4  # aims alone see the beam only
     equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
-    return float(chi2.isf(IMPLAUSIBLE_P, max(equations - seen, 1)))
+    return float(chdtri(max(equations - seen, 1), IMPLAUSIBLE_P))
 
 
 # --- 1. consensus ---------------------------------------------------------------------------------------------------
