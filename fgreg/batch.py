@@ -35,9 +35,15 @@ from fgreg.verdict import (
     accuracy,
     ambiguity,
     beam_sides,
+    causes_of_error,
     consistency,
+    hypotheses,
+    left_out,
+    sound_speed_condition,
     spread,
     sweeps,
+    too_few_to_tell,
+    understated_noise,
     verdict_of,
 )
 
@@ -98,7 +104,7 @@ def solve(
     )
     readout = read_laser(registration, model)
     pairs = read_pairs(measurements, registration, model, readout.origin_shift_mm)
-    aims = read_aims(registration, readout.origin_shift_mm)
+    aims = read_aims(measurements, registration, readout.origin_shift_mm)
     common = [*conditions, *_common_conditions(registration, pairs, aims)]
     epochs, found = _judge_epochs(measurements, registration, posterior, pairs, model, config, common)
     context = _track_context(registration, posterior, model, readout.origin_shift_mm)
@@ -150,11 +156,21 @@ def _common_conditions(
 ) -> list[Condition]:
     """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
-    equations = 2 * len(aims) + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
+    shots, kept_aims = registration.shots, len(registration.measurements.aims)
+    equations = 2 * kept_aims + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
     unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
-    lambdas = [pair.lambda_mm for pair in pairs if pair.lambda_mm is not None]
-    lambdas += [aim.lambda_mm for aim in aims if aim.lambda_mm is not None]
+    lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
+    lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]
     found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
+    nis = shots.innovations
+    if aims:
+        found.extend(left_out(shots.aim_kept, nis.aim, "aims"))
+        found.extend(
+            too_few_to_tell(shots.aim_deviant, shots.aim_kept, nis.aim, [f"the aim at {a.t:.1f} s" for a in aims])
+        )
+    deviant = np.concatenate([shots.pm_deviant, shots.aim_deviant])
+    found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
+    found.extend(sound_speed_condition(registration))
     if len(pairs) <= GRAPH_PAIRS:
         found.extend(_agreement(registration))
     return found
@@ -205,7 +221,7 @@ def _judge_epochs(
     reasons: list[Condition] = []
     state = registration.optimum.state
     for k, start in enumerate(measurements.epochs):
-        count = sum(pair.epoch == k for pair in measurements.pairs)
+        count = sum(pair.epoch == k and pair.used for pair in pairs)
         pms = len({pair.pm for pair in measurements.pairs if pair.epoch == k})
         if k not in registration.epochs:
             text = f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
@@ -213,9 +229,9 @@ def _judge_epochs(
             out.append(EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None))
         else:
             place = registration.epochs.index(k)
-            found = _epoch_conditions(measurements, registration, pairs, k, model, config)
+            found = _epoch_conditions(registration, pairs, k, model, config)
             tre = predicted_tre(posterior, place, model.targets_mm)
-            found.extend(accuracy(tre, config))
+            found.extend(accuracy(tre, config, causes_of_error(registration, place, model.targets_mm)))
             block = slice(6 * place, 6 * place + 6)
             out.append(
                 EpochEstimate(
@@ -234,7 +250,6 @@ def _judge_epochs(
 
 
 def _epoch_conditions(
-    measurements: Measurements,
     registration: Registration,
     pairs: Sequence[PairEstimate],
     epoch: int,
@@ -242,7 +257,7 @@ def _epoch_conditions(
     config: SolveConfig,
 ) -> list[Condition]:
     place, state = registration.epochs.index(epoch), registration.optimum.state
-    mine = [pair for pair in measurements.pairs if pair.epoch == epoch]
+    mine = [pair for pair in registration.measurements.pairs if pair.epoch == place]
     search = registration.searches[epoch]
     linked = any(link.index in (place - 1, place) for link in registration.problem.links)
     found = ambiguity(
@@ -252,13 +267,27 @@ def _epoch_conditions(
         has_initial=model.initial_trus_T_camera is not None or linked,
         config=config,
     )
+    found.extend(hypotheses(search, config))
+    found.extend(_junk_conditions(registration, place))
     if mine:
         directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
-        points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.trus_p_pm_mm is not None])
+        points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.used and e.trus_p_pm_mm is not None])
         if not linked or len(mine) >= config.min_pairs:
             found.extend(spread(directions, points, config))
         found.extend(sweeps(mine, config))
     return found
+
+
+def _junk_conditions(registration: Registration, place: int) -> list[Condition]:
+    """PMs of one epoch that were left out, or should have been."""
+    shots = registration.shots
+    mine = np.zeros(len(shots.problem.pms), dtype=bool)
+    mine[shots.problem.beam_pm[shots.problem.beam_epoch == place]] = True
+    if not mine.any():
+        return []
+    kept, nis = shots.pm_kept[mine], shots.innovations.pm[mine]
+    names = [f"PM {pm}" for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
+    return [*left_out(kept, nis, "pairs"), *too_few_to_tell(shots.pm_deviant[mine], kept, nis, names)]
 
 
 def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate
-from fgreg.frames import FloatArray, exp_so3, make_transform, rotation_to_direction
-from fgreg.graph.reduced import pm_contributions
+from fgreg.frames import exp_so3, make_transform, rotation_to_direction
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
 from fgreg.registration import Registration
@@ -60,12 +59,13 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
 def read_pairs(
     measurements: Measurements, registration: Registration, model: SessionModel, origin_shift_mm: float
 ) -> tuple[PairEstimate, ...]:
-    """One estimate per pair of ``measurements``, in order; those of unsolved epochs are listed as not used."""
-    problem, at = registration.problem, registration.optimum.evaluation
+    """One estimate per pair of ``measurements``, in order; those left out say why."""
+    shots = registration.shots
+    problem, at = shots.problem, shots.evaluation
     state = registration.optimum.state
     gain, points = at.point_gain[0], at.private.trus_p_pm[0]
     covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
-    nis = _innovations(registration)
+    nis, kept = shots.innovations.pm, shots.pm_kept
     looks = problem.looks
     radius, ratio = float(state.radius_mm[0]), float(state.sound_speed_ratio[0])
     out: list[PairEstimate] = []
@@ -85,7 +85,8 @@ def read_pairs(
                 t=pair.t,
                 pm=pair.pm,
                 epoch=pair.epoch,
-                used=True,
+                used=bool(kept[pm]),
+                reason="" if kept[pm] else junk_reason(float(nis[pm])),
                 lambda_mm=float(at.lambda_mm[0, problem.look_beam[look]]) - origin_shift_mm,
                 theta_rad=scan + delta,
                 rotation_rad=model.stage.direction * rotation,
@@ -99,41 +100,29 @@ def read_pairs(
     return tuple(out)
 
 
-def _innovations(registration: Registration) -> FloatArray:
-    """(J,) normalised innovation squared of each PM against the estimate without it.
-
-    In closed form: leaving a PM with cost c, gradient g and Hessian A out of the total H moves the optimum to where the
-    rest costs g' (H - A)^-1 g less, so NIS = c + g' (H - A)^-1 g, chi square of two degrees of freedom for one look.
-    Infinite where the rest does not determine the estimate.
-    """
-    optimum = registration.optimum
-    parts = pm_contributions(registration.problem, optimum.state, optimum.evaluation.private)
-    rest = optimum.evaluation.hessian[0] - parts.hessian
-    scale = np.sqrt(np.diagonal(rest, axis1=1, axis2=2))
-    out = np.full(len(parts.cost), np.inf)
-    good = (scale > 1e-9).all(axis=1)
-    scale = scale[good]
-    correlation = rest[good] / scale[:, :, None] / scale[:, None, :]
-    eigenvalue, vector = np.linalg.eigh(correlation)
-    along = np.einsum("jab,ja->jb", vector, parts.gradient[good] / scale)
-    moved = np.sum(along**2 / np.maximum(eigenvalue, 1e-12), axis=1)
-    out[good] = np.where(eigenvalue[:, 0] > 1e-9, parts.cost[good] + moved, np.inf)
-    return out
+def junk_reason(nis: float) -> str:
+    """Why a shot was left out, with the figure."""
+    return f"junk: it does not fit the other shots (nis {nis:.1f})"
 
 
-def read_aims(registration: Registration, origin_shift_mm: float) -> tuple[AimEstimate, ...]:
-    """One estimate per aim, in order."""
-    at = registration.optimum.evaluation
+def read_aims(
+    measurements: Measurements, registration: Registration, origin_shift_mm: float
+) -> tuple[AimEstimate, ...]:
+    """One estimate per aim of ``measurements``, in order."""
+    shots = registration.shots
+    at = shots.evaluation
     out = []
-    for index, aim in enumerate(registration.measurements.aims):
+    for index, aim in enumerate(measurements.aims):
+        nis, kept = float(shots.innovations.aim[index]), bool(shots.aim_kept[index])
         residual = at.aim_residual[0, index]
         out.append(
             AimEstimate(
                 t=aim.t,
-                used=True,
+                used=kept,
+                reason="" if kept else junk_reason(nis),
                 lambda_mm=float(at.aim_lambda_mm[0, index]) - origin_shift_mm,
                 residual_mm=float(np.linalg.norm(residual)),
-                nis=float(residual @ np.linalg.solve(at.aim_covariance[0, index], residual)),
+                nis=nis,
             )
         )
     return tuple(out)

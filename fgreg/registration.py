@@ -1,10 +1,9 @@
 """Calibration and registration in the one graph, from no guess: all minima worth knowing, best first.
 
-1. Beam: lines through the aimed-at spots, refined on the aims alone (the graph without pairs).
-2. Registration starts of each epoch from the beams and the arc points (fgreg.initialization).
-3. Levenberg-Marquardt on the reduced graph from all of them at once; distinct minima are kept with their costs.
-4. The mirrored hypothesis (stage turning the other way, or elements counted from the other end) the same way.
-5. All epochs together from the best of each.
+1. Beam and minima of each camera epoch (fgreg.search).
+2. All epochs together from the best of each: Levenberg-Marquardt on the reduced graph.
+3. Where a shot does not fit (its innovation is beyond what the stated noise explains), who is kept is settled on the
+   joint problem (fgreg.robust), and the answer is the plain least squares optimum of those.
 """
 
 from __future__ import annotations
@@ -15,37 +14,68 @@ import numpy as np
 
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, inverse, transform_points
+from fgreg.frames import BoolArray, FloatArray, inverse
 from fgreg.graph.packing import PackedProblem, pack
-from fgreg.graph.reduced_blocks import arc_points
+from fgreg.graph.reduced import Evaluation, evaluate, refine
+from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
-from fgreg.graph.shared_state import SharedState, make_state, nominal_frame, stack_states
-from fgreg.initialization import beam_starts, registration_starts
-from fgreg.measurements import EpochStart, Measurements, Pair
+from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
+from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
+from fgreg.robust import (
+    Innovations,
+    Sorted,
+    deviant,
+    graduated,
+    innovations_at,
+    plausible_cost,
+    predicted_pms,
+    sort_shots,
+)
+from fgreg.search import (
+    MIN_KEPT_AIMS,
+    MIN_KEPT_PMS,
+    EpochSearch,
+    Minimum,
+    calibrate_beam,
+    choose_minimum,
+    search_epoch,
+    targets_moved,
+)
 
-SEARCH_PAIRS = 40
-"""The search for minima looks at no more pairs than this, spread over the session; all are used from there on."""
-SAME_MINIMUM_MM = 1.5
-"""Minima whose registrations move no target by more than this are one."""
-BEAM_CHI2 = 30.0
-"""Beams of calibrations worse than the best by more than this are not tried."""
+__all__ = [
+    "EpochSearch",
+    "Minimum",
+    "Registration",
+    "Shots",
+    "calibrate_beam",
+    "choose_minimum",
+    "register",
+    "restrict_epochs",
+    "search_epoch",
+    "targets_moved",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Minimum:
-    """One local minimum: chi square, and the state (one hypothesis)."""
+class Shots:
+    """All shots of the epochs solved, at the optimum of those kept.
 
-    cost: float
-    state: SharedState
+    Attributes:
+        problem: all of them packed; a registration's own problem where all are kept.
+        evaluation: at the registration's optimum (one hypothesis).
+        pm_kept (J,), aim_kept (A,): over ``problem``'s PMs and aims.
+        innovations: likewise: how far each is from what the others predict.
+        pm_deviant (J,), aim_deviant (A,): those beyond the limit, also where too few shots are there to leave one out.
+    """
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EpochSearch:
-    """What the search of one epoch found: minima best first, and the best cost of the mirrored hypothesis."""
-
-    minima: tuple[Minimum, ...]
-    mirrored_cost: float | None
+    problem: PackedProblem
+    evaluation: Evaluation
+    pm_kept: BoolArray
+    aim_kept: BoolArray
+    innovations: Innovations
+    pm_deviant: BoolArray
+    aim_deviant: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,12 +84,13 @@ class Registration:
 
     Attributes:
         model: the session's set-up.
-        measurements: what entered: the pairs of ``epochs``, with their epochs renumbered 0, 1, ...
+        measurements: what entered: the shots kept of ``epochs``, with their epochs renumbered 0, 1, ...
         epochs: the session's numbers of the epochs solved.
         problem, optimum: packed measurements and the optimum of the reduced graph.
         searches: of every epoch of the session; no minima where it had too few pairs of its own.
         ambiguous: the session's epochs in which two minima cannot be told apart.
         covariance: (D, D) inverse Hessian of the shared variables (``problem.columns``).
+        shots: all shots of ``epochs``, also those left out.
     """
 
     model: SessionModel
@@ -70,118 +101,11 @@ class Registration:
     searches: tuple[EpochSearch, ...]
     ambiguous: tuple[int, ...]
     covariance: FloatArray
+    shots: Shots
 
 
-def calibrate_beam(measurements: Measurements, model: SessionModel) -> list[FloatArray]:
-    """Candidate ``marker_T_nominal`` (z along the beam), best first: from the aims, and from ``initial``.
-
-    Raises:
-        EstimationError: no aims and no initial beam.
-    """
-    candidates = [nominal_frame(origin, direction) for origin, direction in beam_starts(measurements.aims)]
-    if model.initial_marker_T_laser is not None:
-        candidates.append(model.initial_marker_T_laser)
-    if not candidates:
-        raise EstimationError(
-            "no aims and no initial.marker_T_laser: the beam has nowhere to start; take at least 6 aim shots"
-        )
-    if not measurements.aims:
-        return candidates
-    alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model)
-    state = make_state(np.tile(np.eye(4), (len(candidates), 1, 1, 1)), np.array(candidates), model.probe.radius_mm)
-    found = optimize(alone, state)
-    cost = found.evaluation.cost
-    direction, origin = found.state.beam_direction(), found.state.beam_origin()
-    frames: list[FloatArray] = []
-    for index in np.argsort(cost):
-        if cost[index] > cost.min() + BEAM_CHI2:
-            break
-        lambdas = found.evaluation.aim_lambda_mm[index]
-        sign = 1.0 if np.median(lambdas) >= 0 else -1.0
-        frame = nominal_frame(origin[index], sign * direction[index])
-        if all(frame[:3, 2] @ other[:3, 2] < np.cos(0.02) for other in frames):
-            frames.append(frame)
-    return frames
-
-
-def _search_subset(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
-    if len(pairs) <= SEARCH_PAIRS:
-        return pairs
-    return tuple(pairs[i] for i in np.linspace(0, len(pairs) - 1, SEARCH_PAIRS).round().astype(int))
-
-
-def _mirrored(problem: PackedProblem) -> PackedProblem:
-    """The same data with lateral positions counted from the other end.
-
-    A stage that turns the other way gives this, too, but for half a turn of the TRUS frame about z: one hypothesis
-    stands for both.
-    """
-    return replace(problem, looks=replace(problem.looks, x_mm=-problem.looks.x_mm))
-
-
-def _starts(problem: PackedProblem, frames: list[FloatArray], model: SessionModel) -> SharedState:
-    """Starts of a one-epoch problem: for each beam the registrations that bring its lines to the arc points."""
-    arcs = arc_points(problem, np.zeros(1))[0]
-    states = []
-    for frame in frames:
-        beams = problem.beams
-        origin = (beams.rotation @ frame[:3, 3] + beams.translation_mm)[problem.look_beam]
-        direction = (beams.rotation @ frame[:3, 2])[problem.look_beam]
-        starts = registration_starts(origin, direction, arcs)
-        states.append(make_state(starts[:, None], frame, model.probe.radius_mm))
-    if model.initial_trus_T_camera is not None:
-        states.append(make_state(model.initial_trus_T_camera[None, None], frames[0], model.probe.radius_mm))
-    return stack_states(states)
-
-
-def targets_moved(first: FloatArray, second: FloatArray, targets_mm: FloatArray) -> float:
-    """Largest distance (mm) between where two registrations (4, 4) put the camera points under the targets."""
-    camera_p = transform_points(inverse(first), targets_mm)
-    return float(np.linalg.norm(transform_points(second, camera_p) - targets_mm, axis=1).max())
-
-
-def _distinct(found: Optimum, targets_mm: FloatArray, keep: int = 6) -> tuple[Minimum, ...]:
-    minima: list[Minimum] = []
-    for index in np.argsort(found.evaluation.cost):
-        state = found.state.take([index])
-        here = state.trus_T_camera()[0]
-        if all(targets_moved(other.state.trus_T_camera()[0], here, targets_mm) > SAME_MINIMUM_MM for other in minima):
-            minima.append(Minimum(float(found.evaluation.cost[index]), state))
-        if len(minima) == keep:
-            break
-    return tuple(minima)
-
-
-def search_epoch(
-    measurements: Measurements, model: SessionModel, frames: list[FloatArray], epoch: int, *, keep_within: float = 60.0
-) -> EpochSearch:
-    """All minima of one epoch's pairs with the aims; none where it has fewer than three pairs."""
-    pairs = tuple(replace(pair, epoch=0) for pair in measurements.pairs if pair.epoch == epoch)
-    if len({pair.pm for pair in pairs}) < 3:
-        return EpochSearch((), None)
-    subset = replace(measurements, pairs=_search_subset(pairs), epochs=measurements.epochs[:1])
-    problem = pack(subset, model)
-    found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
-    mirrored_problem = _mirrored(problem)
-    mirrored = optimize(mirrored_problem, _starts(mirrored_problem, frames, model), keep_within=keep_within)
-    return EpochSearch(_distinct(found, model.targets_mm), float(mirrored.evaluation.cost.min()))
-
-
-def choose_minimum(search: EpochSearch, model: SessionModel, config: SolveConfig) -> tuple[Minimum, bool]:
-    """The minimum to use, and whether the choice is open.
-
-    Open: another minimum's cost lies within ``second_minimum_chi2`` of the best and ``initial.trus_T_camera`` does not
-    clearly favour one of them (at most half as far from it, at the worst target, as the next).
-    """
-    rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
-    if len(rivals) == 1:
-        return rivals[0], False
-    if model.initial_trus_T_camera is None:
-        return rivals[0], True
-    initial = model.initial_trus_T_camera
-    far = [targets_moved(initial, m.state.trus_T_camera()[0], model.targets_mm) for m in rivals]
-    order = np.argsort(far)
-    return rivals[order[0]], bool(far[order[0]] > 0.5 * far[order[1]])
+FEW = 0.05
+"""So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
 
 
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
@@ -221,14 +145,137 @@ def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measuremen
     return Measurements(measurements.aims, pairs, starts)
 
 
+def _keep(measurements: Measurements, pms: tuple[int, ...], pm_kept: BoolArray, aim_kept: BoolArray) -> Measurements:
+    names = {pm for pm, keep in zip(pms, pm_kept, strict=True) if keep}
+    return replace(
+        measurements,
+        aims=tuple(aim for aim, keep in zip(measurements.aims, aim_kept, strict=True) if keep),
+        pairs=tuple(pair for pair in measurements.pairs if pair.pm in names),
+    )
+
+
+def _enough(problem: PackedProblem, pm_kept: BoolArray, aim_kept: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Who is kept, where an epoch with too few left (or the aims) takes all of its own back."""
+    pm_kept = pm_kept.copy()
+    epoch_of = np.zeros(len(problem.pms), dtype=np.int64)
+    epoch_of[problem.beam_pm] = problem.beam_epoch
+    for epoch in range(problem.columns.epochs):
+        mine = epoch_of == epoch
+        if (pm_kept & mine).sum() < MIN_KEPT_PMS:
+            pm_kept |= mine
+    if aim_kept.sum() < MIN_KEPT_AIMS:
+        aim_kept = np.ones_like(aim_kept)
+    return pm_kept, aim_kept
+
+
+def _split_looks(
+    measurements: Measurements,
+    whole: PackedProblem,
+    kept: tuple[BoolArray, BoolArray],
+    judged: Sorted,
+    model: SessionModel,
+) -> tuple[Measurements, BoolArray] | None:
+    """Several looks at a PM of which one is junk: that one becomes a PM of its own, and the others are kept.
+
+    Only where leaving out one look, and no other one, makes the rest fit. None where there is no such PM.
+
+    Returns:
+        the measurements with the junk looks under PM numbers of their own, and which of their PMs are kept.
+    """
+    pm_kept, _ = kept
+    out = {pm for pm, keep in zip(whole.pms, pm_kept, strict=True) if not keep}
+    looks: dict[int, list[int]] = {}
+    for index, pair in enumerate(measurements.pairs):
+        if pair.pm in out:
+            looks.setdefault(pair.pm, []).append(index)
+    trials = [(pm, left) for pm, indices in looks.items() if len(indices) > 1 for left in indices]
+    if not trials:
+        return None
+    # Every trial as a PM of its own.
+    variants = [
+        replace(measurements.pairs[index], pm=number)
+        for number, (pm, left) in enumerate(trials)
+        for index in looks[pm]
+        if index != left
+    ]
+    fits = predicted_pms(pack(replace(measurements, pairs=tuple(variants)), model), whole, judged)
+    single: dict[int, list[int]] = {}
+    for (pm, left), good in zip(trials, fits, strict=True):
+        if good:
+            single.setdefault(pm, []).append(left)
+    junk = {lefts[0] for lefts in single.values() if len(lefts) == 1}
+    if not junk:
+        return None
+    spare = min(whole.pms) - 1
+    pairs = tuple(
+        replace(pair, pm=spare - index) if index in junk else pair for index, pair in enumerate(measurements.pairs)
+    )
+    rescued = {measurements.pairs[index].pm for index in junk}
+    names = dict.fromkeys(pair.pm for pair in pairs)
+    before = dict(zip(whole.pms, pm_kept, strict=True))
+    return replace(measurements, pairs=pairs), np.array([name in rescued or before.get(name, False) for name in names])
+
+
+def _solve_jointly(
+    measurements: Measurements, model: SessionModel, start: SharedState, aim_kept: BoolArray, *, clean: bool
+) -> tuple[Measurements, PackedProblem, Optimum, Shots]:
+    """What is kept, packed, its optimum, and all shots judged by it.
+
+    Args:
+        measurements: of the epochs to be solved.
+        model: the session's set-up.
+        start: one hypothesis.
+        aim_kept: (A,) aims that fitted when looked at alone.
+        clean: whether no PM has deviated so far.
+    """
+    whole = pack(measurements, model)
+    everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
+    if clean and aim_kept.all():
+        optimum = optimize(whole, start, tolerance=1e-9)
+        found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
+        beyond = deviant(whole, found)
+        plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
+        if plausible and not (beyond.pm.any() or beyond.aim.any()):
+            shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
+            return measurements, whole, optimum, shots
+        start = optimum.state
+        clean = bool(plausible and beyond.pm.mean() <= FEW and beyond.aim.sum() <= 1)
+    if clean and aim_kept.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
+        first = _enough(whole, ~beyond.pm, ~beyond.aim)
+    else:
+        robust = graduated(whole, start, robust_aims=True)
+        start = robust.state
+        first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
+    judged = sort_shots(whole, start, *first)
+    kept = _enough(whole, judged.pm_kept, judged.aim_kept)
+    apart = _split_looks(measurements, whole, kept, judged, model)
+    if apart is not None:
+        measurements, pm_kept = apart
+        whole = pack(measurements, model)
+        judged = sort_shots(whole, judged.state, pm_kept, kept[1])
+        kept = _enough(whole, judged.pm_kept, judged.aim_kept)
+    chosen = _keep(measurements, whole.pms, *kept)
+    problem = pack(chosen, model)
+    optimum = optimize(problem, judged.state, tolerance=1e-9)
+    found = innovations_at(whole, optimum.state, *kept)
+    deviants = deviant(whole, found)
+    private = initial_private(whole, optimum.state)
+    for _ in range(4):
+        _, private = refine(whole, optimum.state, private)
+    at = evaluate(whole, optimum.state, private)
+    return chosen, problem, optimum, Shots(whole, at, *kept, found, deviants.pm, deviants.aim)
+
+
 def register(measurements: Measurements, model: SessionModel, config: SolveConfig) -> Registration:
     """Calibrate and register: the joint optimum over all epochs that can be solved.
 
     Raises:
         EstimationError: no beam to start from, or no epoch with three PMs.
     """
-    frames = calibrate_beam(measurements, model)
-    searches = tuple(search_epoch(measurements, model, frames, k) for k in range(len(measurements.epochs)))
+    beam = calibrate_beam(measurements, model)
+    trusted = _keep(measurements, (), np.zeros(0, dtype=bool), beam.aim_kept).aims
+    fitting = replace(measurements, aims=trusted)
+    searches = tuple(search_epoch(fitting, model, beam.frames, k) for k in range(len(measurements.epochs)))
     solvable = _solvable(measurements, searches)
     if not solvable:
         counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
@@ -238,9 +285,11 @@ def register(measurements: Measurements, model: SessionModel, config: SolveConfi
         )
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
-    kept = restrict_epochs(measurements, solvable)
-    problem = pack(kept, model)
-    optimum = optimize(problem, _joint_start(measurements, chosen, solvable, model), tolerance=1e-9)
+    start = _joint_start(measurements, chosen, solvable, model)
+    clean = all(search.clean for search in searches)
+    kept, problem, optimum, shots = _solve_jointly(
+        restrict_epochs(measurements, solvable), model, start, beam.aim_kept, clean=clean
+    )
     hessian = optimum.evaluation.hessian[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     try:
@@ -257,4 +306,5 @@ def register(measurements: Measurements, model: SessionModel, config: SolveConfi
         searches=searches,
         ambiguous=tuple(k for k, (_, is_open) in choices.items() if is_open),
         covariance=np.asarray(covariance, dtype=np.float64),
+        shots=shots,
     )

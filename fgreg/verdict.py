@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 
 from fgreg.config import SolveConfig
 from fgreg.estimate import PredictedTre, Verdict, worst_verdict
-from fgreg.frames import FloatArray
+from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
+from fgreg.graph.packing import pack
+from fgreg.graph.reduced import evaluate
 from fgreg.measurements import Pair
-from fgreg.registration import EpochSearch
+from fgreg.registration import EpochSearch, Registration
+from fgreg.robust import JUNK_P
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
+WARN_LEFT_OUT = 0.25
+REFUSE_LEFT_OUT = 0.5
+"""Shares of the shots that may be junk."""
+CERTAIN_NIS = 30.0
+"""Innovation of one shot that noise does not explain, nor a bad estimate from few others."""
+MILD_NIS = 60.0
+"""Junk is mostly farther off than this."""
+SOUND_SPEED_SIGMA = 0.1
+"""Prior of the ratio in its score test: wide, so that the pairs speak."""
+SUSPICIOUS_Z = 4.0
+SOUND_SPEED_TOLERANCE = 0.005
+DOMINANT = 0.5
+"""Share of the error's variance from which a cause is named."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +82,79 @@ def ambiguity(
             )
         )
     return found
+
+
+def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
+    """Sweep signs turned round, and another beam in the pairs than in the aims; tried where something does not fit."""
+    found = []
+    if not search.minima:
+        return []
+    cost = search.minima[0].cost
+    if search.other_way_cost is not None and search.other_way_cost < cost:
+        gap = cost - search.other_way_cost
+        found.append(
+            Condition(
+                Verdict.REFUSED if gap > config.second_minimum_chi2 else Verdict.WARNING,
+                f"the sweeps fit better with their signs turned round (chi square {search.other_way_cost:.1f} against "
+                f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it",
+            )
+        )
+    if search.own_beam_cost is not None and search.own_beam_cost < cost - chi2.isf(IMPOSSIBLE_P, 4):
+        found.append(
+            Condition(
+                Verdict.REFUSED,
+                f"the pairs have another beam than the aims (chi square {search.own_beam_cost:.1f} with a beam of "
+                f"their own, {cost:.1f} with that of the aims): the marker was swapped, or moved on the fibre, after "
+                "calibration; take the aims again",
+            )
+        )
+    return found
+
+
+def left_out(kept: BoolArray, nis: FloatArray, what: str) -> list[Condition]:
+    """Too large a share of the shots left out as junk."""
+    out = int(np.sum(~kept))
+    if out <= WARN_LEFT_OUT * len(kept):
+        return []
+    refuse = out > REFUSE_LEFT_OUT * len(kept)
+    return [
+        Condition(
+            Verdict.REFUSED if refuse else Verdict.WARNING,
+            f"{out} of {len(kept)} {what} do not fit the others and are left out (nis {nis[~kept].min():.0f} to "
+            f"{nis[~kept].max():.0f}, at most {WARN_LEFT_OUT:.0%} accepted): look at what was detected there, check "
+            f"noise, probe and marker in session.yaml, and take {out} {what} anew",
+        )
+    ]
+
+
+def understated_noise(deviant: BoolArray, nis: FloatArray) -> list[Condition]:
+    """Several shots beyond their limit, but not by far: that is noise larger than stated rather than junk."""
+    mild = deviant & (nis < MILD_NIS)
+    if float(binom.sf(int(mild.sum()) - 1, len(nis), JUNK_P)) >= SUSPICIOUS_P:
+        return []
+    return [
+        Condition(
+            Verdict.WARNING,
+            f"the residuals of {int(mild.sum())} of {len(nis)} shots are larger than the stated noise explains, though "
+            f"not by far (nis {nis[mild].min():.0f} to {nis[mild].max():.0f}): rather than junk that is noise; correct "
+            "noise in session.yaml, or the covariances of the detections",
+        )
+    ]
+
+
+def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names: Sequence[str]) -> list[Condition]:
+    """Shots that do not fit where there are too few to leave one out."""
+    suspects = np.flatnonzero(deviant & kept)
+    if not len(suspects):
+        return []
+    worst = int(suspects[np.argmax(nis[suspects])])
+    return [
+        Condition(
+            Verdict.REFUSED if nis[worst] > CERTAIN_NIS else Verdict.WARNING,
+            f"{names[worst]} does not fit the others (nis {nis[worst]:.1f}), and {int(kept.sum())} are too few to tell "
+            "which is wrong: take more, and look at what was detected there",
+        )
+    ]
 
 
 def spread(directions: FloatArray, points: FloatArray, config: SolveConfig) -> list[Condition]:
@@ -131,16 +220,73 @@ def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
     ]
 
 
-def accuracy(tre: PredictedTre, config: SolveConfig) -> list[Condition]:
-    """Predicted error at the worst target against the limit."""
+@dataclass(frozen=True, slots=True)
+class Causes:
+    """Share of the variance at the worst target that would go if the beam, or the window edge, were known."""
+
+    beam: float
+    edge: float
+
+
+def accuracy(tre: PredictedTre, config: SolveConfig, causes: Causes | None = None) -> list[Condition]:
+    """Predicted error at the worst target against the limit, with what would lower it most."""
     if tre.worst_mm <= config.limit_mm:
         return []
     far = tre.worst_mm > 2.0 * config.limit_mm
+    advice = "take more pairs, spread over the field and with sweeps from both sides"
+    if causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
+        advice = (
+            f"{causes.beam:.0%} of its variance is the beam's: take more aims, at short and long distances, and roll "
+            "the fibre about its beam during calibration"
+        )
+    elif causes is not None and causes.edge > DOMINANT:
+        advice = f"{causes.edge:.0%} of its variance is the window edge's: take as many pairs sweeping the other way"
     return [
         Condition(
             Verdict.REFUSED if far else Verdict.WARNING,
             f"the predicted error at the worst target is {tre.worst_mm:.1f} mm (95 %), the limit {config.limit_mm:.1f} "
-            "mm: take more pairs, spread over the field and with sweeps from both sides",
+            f"mm: {advice}",
+        )
+    ]
+
+
+def causes_of_error(registration: Registration, place: int, targets_mm: FloatArray) -> Causes:
+    """What the error of an epoch (``place`` in ``registration.epochs``) comes from, by the Gaussian at the optimum."""
+    columns, covariance = registration.problem.columns, registration.covariance
+    camera_p = transform_points(inverse(registration.optimum.state.trus_T_camera(place)[0]), targets_mm)
+    # A right perturbation (omega, v) moves the camera point p by omega x p + v.
+    move = np.concatenate([-hat(camera_p), np.broadcast_to(np.eye(3), (len(camera_p), 3, 3))], axis=-1)
+    pose = slice(6 * place, 6 * place + 6)
+    total = np.einsum("nij,jk,nik->n", move, covariance[pose, pose], move)
+    worst = int(np.argmax(total))
+    shares = []
+    for known in (slice(columns.beam, columns.beam + 4), slice(columns.edge, columns.edge + 1)):
+        cross, own = covariance[pose, known], covariance[known, known]
+        explained = cross @ np.linalg.solve(own, cross.T)
+        shares.append(float(np.trace(move[worst] @ explained @ move[worst].T) / total[worst]))
+    return Causes(beam=shares[0], edge=shares[1])
+
+
+def sound_speed_condition(registration: Registration) -> list[Condition]:
+    """Whether the pairs ask for another sound speed: one Gauss-Newton step with the ratio as an unknown."""
+    problem = pack(registration.measurements, registration.model, sound_speed_sigma=SOUND_SPEED_SIGMA)
+    column, optimum = problem.columns.sound_speed, registration.optimum
+    at = evaluate(problem, optimum.state, optimum.evaluation.private)
+    hessian, gradient = at.hessian[0], at.gradient[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    try:
+        covariance = np.linalg.inv(hessian * scale * scale[:, None]) * scale * scale[:, None]
+    except np.linalg.LinAlgError:
+        return []
+    change = -float(covariance[column] @ gradient)
+    sigma = math.sqrt(max(float(covariance[column, column]), 0.0))
+    if sigma == 0.0 or abs(change) < max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE):
+        return []
+    return [
+        Condition(
+            Verdict.WARNING,
+            f"the pairs fit better with sound at {1.0 + change:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: measure "
+            "the medium's temperature or sound speed, and correct it in session.yaml (with ranges computed anew)",
         )
     ]
 

@@ -196,19 +196,33 @@ def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _Sys
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contributions:
-    """What each PM adds to the reduced problem at one hypothesis: cost (J,), gradient (J, D), hessian (J, D, D)."""
+    """What n parts add to the reduced problem: cost (S, n), gradient (S, n, D), hessian (S, n, D, D)."""
 
     cost: FloatArray
     gradient: FloatArray
     hessian: FloatArray
 
 
-def pm_contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Contributions:
-    """The parts of :func:`evaluate` by PM, for a state of one hypothesis."""
-    pms = len(problem.pms)
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """The reduced problem at S hypotheses, taken apart: what each PM, each aim and the priors (n = 1) add.
+
+    ``private`` and ``point_gain`` are as in :class:`Evaluation`.
+    """
+
+    pm: Contributions
+    aim: Contributions
+    prior: Contributions
+    private: PrivateState
+    point_gain: FloatArray
+
+
+def contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Parts:
+    """:func:`evaluate`, but not summed: the terms of the sum."""
+    pms, size = len(problem.pms), problem.columns.size
     system = _system(problem, state, private)
     by = _shared_derivatives(problem, state, system)
-    line, look = system.line, system.look
+    line, look, aim = system.line, system.look, system.aim
     line_t, look_t = transposed(system.line_weight @ by.line), transposed(problem.looks.weight @ look.by_shared)
     hessian = sum_by(line_t @ by.line, problem.beam_pm, pms) + sum_by(look_t @ look.by_shared, problem.look_pm, pms)
     hessian = hessian + transposed(by.h_ps) @ by.point_gain
@@ -218,7 +232,19 @@ def pm_contributions(problem: PackedProblem, state: SharedState, private: Privat
     cost = sum_by(np.sum(line.residual * times(system.line_weight, line.residual), axis=-1), problem.beam_pm, pms)
     look_cost = np.sum(look.residual * times(problem.looks.weight, look.residual), axis=-1)
     cost = cost + sum_by(look_cost, problem.look_pm, pms) + np.sum(system.b_p * system.point_step, axis=-1)
-    return Contributions(cost[0], gradient[0], hessian[0])
+    aim_weighted = times(system.aim_weight, aim.residual)
+    aim_t = transposed(by.aim)
+    prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
+    _add_priors(problem, state, prior_gradient, prior_hessian)
+    return Parts(
+        pm=Contributions(cost, gradient, hessian),
+        aim=Contributions(
+            np.sum(aim.residual * aim_weighted, axis=-1), times(aim_t, aim_weighted), aim_t @ system.aim_weight @ by.aim
+        ),
+        prior=Contributions(_prior_cost(problem, state)[:, None], prior_gradient[:, None], prior_hessian[:, None]),
+        private=system.private,
+        point_gain=by.point_gain,
+    )
 
 
 def evaluate(problem: PackedProblem, state: SharedState, private: PrivateState) -> Evaluation:

@@ -1,0 +1,434 @@
+"""Junk among the shots: consensus from minimal sets, graduated truncated loss, and who is in or out by innovation.
+
+A false PM or a flipped marker is not noise: one such shot moves a least squares estimate by centimetres. Three steps:
+
+1. Consensus: the minimal solver (three points on three lines) over random triples, each solution scored by all lines
+   with a truncated cost (MSAC; Torr and Zisserman, 2000). For the beam: the lines through two aimed-at spots.
+2. Graduated loss: the chi square of each PM (and aim) on the reduced graph under a Cauchy loss that narrows, then a
+   truncated one, by iteratively reweighted least squares from all starts side by side.
+3. Innovation: each shot against the estimate *without* it, in closed form. Chi square of known degrees of freedom
+   under the stated noise, so the share of good shots lost is known; those wrongly left out come back in.
+
+What is kept is then solved by plain least squares: a session without junk is answered as if none of this were there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import poselib
+from scipy.special import chdtri
+
+from fgreg.frames import BoolArray, FloatArray, IntArray, inverse, log_so3, make_transform, transform_points
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced import Contributions, Parts, contributions, refine
+from fgreg.graph.reduced_blocks import PrivateState, arc_points, initial_private, perpendicular_basis
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import Aim
+
+JUNK_P = 1e-3
+"""A shot is junk where a good one would deviate as much this rarely."""
+IMPLAUSIBLE_P = 1e-4
+TRIPLES = 160
+"""Random triples of the consensus: at 60 % junk still ten of good pairs only."""
+SEED = 40961
+SCORE_LIMIT = 13.8
+CAUCHY_SCALES = (100.0, 20.0, 4.0)
+"""Squared scales of the narrowing Cauchy loss, in chi square."""
+STEPS_PER_SCALE = 3
+MAX_STEPS = 30
+SETTLE_ROUNDS = 8
+WEIGHT_FLOOR = 1e-12
+UNKNOWN = 1e-9
+"""Correlation eigenvalue below which the rest of the shots leaves a direction open."""
+
+
+def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
+    """(J,) equations that each PM leaves over: 2 per beam and 3 per look less its 3 coordinates."""
+    pms = len(problem.pms)
+    beams = np.bincount(problem.beam_pm, minlength=pms)
+    return np.asarray(2 * beams + 3 * np.bincount(problem.look_pm, minlength=pms) - 3)
+
+
+def pm_limits(problem: PackedProblem) -> FloatArray:
+    """(J,) chi square beyond which a PM is junk."""
+    return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), JUNK_P))
+
+
+AIM_LIMIT = float(chdtri(2, JUNK_P))
+
+
+def plausible_cost(problem: PackedProblem) -> float:
+    """Chi square of all shots beyond which they do not fit, whatever their innovations say."""
+    unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
+    seen = unknowns if len(problem.pms) else 4  # aims alone see the beam only
+    equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
+    return float(chdtri(max(equations - seen, 1), IMPLAUSIBLE_P))
+
+
+# --- 1. consensus ---------------------------------------------------------------------------------------------------
+
+
+def consensus_starts(problem: PackedProblem, marker_T_beam: FloatArray, lambda_mm: float, keep: int = 8) -> FloatArray:
+    """Registrations that most PMs of a one-epoch problem agree on, best first.
+
+    Args:
+        problem: packed; the first look of each PM is used.
+        marker_T_beam: (4, 4), z along the beam.
+        lambda_mm: typical distance of a spot from the frame's origin, at which the beam's uncertainty is taken.
+        keep: at most so many distinct ones.
+
+    Returns:
+        (m, 4, 4) ``trus_T_camera``; empty for fewer than three PMs.
+    """
+    pms = len(problem.pms)
+    if pms < 3:
+        return np.zeros((0, 4, 4))
+    look = np.zeros(pms, dtype=np.int64)
+    look[problem.look_pm[::-1]] = np.arange(len(problem.look_pm))[::-1]
+    beam = problem.look_beam[look]
+    origin = problem.beams.rotation[beam] @ marker_T_beam[:3, 3] + problem.beams.translation_mm[beam]
+    direction = problem.beams.rotation[beam] @ marker_T_beam[:3, 2]
+    points = arc_points(problem, np.zeros(1))[0, look]
+
+    found = _minimal_poses(origin, direction, points)
+    if not len(found):
+        return np.zeros((0, 4, 4))
+    camera_R_trus, camera_t = found[:, :3, :3], found[:, :3, 3]
+    # Across the beam a PM is off by the beam's error and its own; along its arc by what the window leaves open.
+    covariance = problem.beams.covariance[beam]
+    reach = np.sqrt(lambda_mm**2 + float(marker_T_beam[:3, 3] @ marker_T_beam[:3, 3]))
+    variance = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
+    variance = variance + reach**2 * np.trace(covariance[:, :3, :3], axis1=1, axis2=2) / 3 + 1.0
+    radial = points - problem.radius_mm * np.stack(
+        [points[:, 0] * 0, np.sin(problem.looks.scan_rad[look]), np.cos(problem.looks.scan_rad[look])], axis=-1
+    )
+    tangent = np.stack([np.zeros(pms), radial[:, 2], -radial[:, 1]], axis=-1)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    slack = (problem.radius_mm + problem.looks.range_mm[look]) ** 2 / problem.looks.weight[look, 2, 2]
+    across = perpendicular_basis(direction)
+    camera_R_trus_t = camera_R_trus.swapaxes(1, 2)
+    gap = np.einsum("nia,sni->sna", across, points @ camera_R_trus_t + camera_t[:, None] - origin)
+    along_arc = np.einsum("nia,sni->sna", across, tangent @ camera_R_trus_t)
+    # (variance I + slack v v')^-1 by Sherman and Morrison.
+    projected = np.sum(gap * along_arc, axis=-1)
+    square = np.sum(gap**2, axis=-1) - slack * projected**2 / (variance + slack * np.sum(along_arc**2, axis=-1))
+    score = np.sum(np.minimum(square / variance, SCORE_LIMIT), axis=1)
+    chosen: list[int] = []
+    for index in np.argsort(score)[: 40 * keep]:
+        turn = log_so3(camera_R_trus[chosen].swapaxes(-1, -2) @ camera_R_trus[index]) if chosen else np.ones((1, 3))
+        if np.linalg.norm(turn, axis=-1).min() > 0.1:
+            chosen.append(int(index))
+        if len(chosen) == keep:
+            break
+    return inverse(found[chosen])
+
+
+def _minimal_poses(origin: FloatArray, direction: FloatArray, points: FloatArray) -> FloatArray:
+    """``camera_T_trus`` (m, 4, 4) of the minimal solver over triples of lines."""
+    count = len(points)
+    if count * (count - 1) * (count - 2) // 6 <= TRIPLES:
+        triples = np.array(list(combinations(range(count), 3)))
+    else:
+        triples = np.argsort(np.random.default_rng(SEED).random((TRIPLES, count)), axis=1)[:, :3]
+    rotations, translations = [], []
+    for rows in triples:
+        for pose in poselib.gp3p(origin[rows], direction[rows], points[rows]):
+            rotations.append(pose.R)
+            translations.append(pose.t)
+    if not rotations:
+        return np.zeros((0, 4, 4))
+    poses = make_transform(np.array(rotations), np.array(translations))
+    return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def consensus_beams(aims: tuple[Aim, ...], keep: int = 4) -> list[tuple[FloatArray, FloatArray]]:
+    """Beams (origin mm, unit direction, marker frame) through two aimed-at spots that most spots agree on."""
+    if len(aims) < 3:
+        return []
+    marker_p = np.array([transform_points(inverse(a.marker.camera_T_marker), a.camera_p_spot_mm) for a in aims])
+    first, second = np.array(list(combinations(range(len(aims)), 2))[:2000]).T
+    apart = marker_p[second] - marker_p[first]
+    length = np.linalg.norm(apart, axis=1)
+    long = length > 1.0
+    start, along = marker_p[first[long]], apart[long] / length[long, None]
+    variance = np.array(
+        [
+            (np.trace(a.covariance) + np.trace(a.marker.covariance[3:, 3:])) / 3
+            + p @ p * np.trace(a.marker.covariance[:3, :3]) / 3
+            for a, p in zip(aims, marker_p, strict=True)
+        ]
+    )
+    offset = marker_p - start[:, None]
+    square = np.sum(offset**2, axis=-1) - np.sum(offset * along[:, None], axis=-1) ** 2
+    score = np.sum(np.minimum(square / variance, SCORE_LIMIT), axis=1)
+    out: list[tuple[FloatArray, FloatArray]] = []
+    for index in np.argsort(score):
+        towards = along[index] if along[index] @ marker_p.mean(axis=0) >= 0 else -along[index]
+        if all(towards @ other < np.cos(0.05) for _, other in out):
+            inside = offset[index][square[index] < SCORE_LIMIT * variance]
+            centre = start[index] + inside.mean(axis=0)
+            out.append((centre - (centre @ towards) * towards, towards))
+        if len(out) == keep:
+            break
+    return out
+
+
+# --- 2. graduated loss ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobustOptimum:
+    """S hypotheses at local minima of the truncated cost.
+
+    Attributes:
+        state, private: of each hypothesis.
+        parts: the reduced problem there.
+        cost: (S,) truncated chi square.
+        pm_kept (S, J), aim_kept (S, A): which shots count in full.
+    """
+
+    state: SharedState
+    private: PrivateState
+    parts: Parts
+    cost: FloatArray
+    pm_kept: BoolArray
+    aim_kept: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Weights:
+    pm: FloatArray
+    aim: FloatArray
+    cost: FloatArray
+
+
+def _weighted(parts: Parts, pm: FloatArray, aim: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradient (S, D) and Hessian (S, D, D) of the weighted sum of all parts."""
+    gradient, hessian = parts.prior.gradient[:, 0].copy(), parts.prior.hessian[:, 0].copy()
+    for weight, part in ((pm, parts.pm), (aim, parts.aim)):
+        gradient += np.einsum("sn,sna->sa", weight, part.gradient)
+        hessian += np.einsum("sn,snab->sab", weight, part.hessian)
+    return gradient, hessian
+
+
+def _cauchy(parts: Parts, scale: float, aim_scale: float) -> _Weights:
+    """Cauchy loss: cost k log(1 + c / k), weight 1 / (1 + c / k). An infinite scale is least squares."""
+    cost = parts.prior.cost[:, 0].copy()
+    weights = []
+    for part, k in ((parts.pm, scale), (parts.aim, aim_scale)):
+        c = np.maximum(part.cost, 0.0)
+        weights.append(1.0 / (1.0 + c / k))
+        cost += np.sum(c if np.isinf(k) else k * np.log1p(c / k), axis=1)
+    return _Weights(weights[0], weights[1], cost)
+
+
+def _truncated(parts: Parts, limit: FloatArray, aim_limit: float) -> _Weights:
+    cost = parts.prior.cost[:, 0] + np.sum(np.minimum(parts.pm.cost, limit), axis=1)
+    cost += np.sum(np.minimum(parts.aim.cost, aim_limit), axis=1)
+    return _Weights((parts.pm.cost <= limit).astype(float), (parts.aim.cost <= aim_limit).astype(float), cost)
+
+
+def _fixed(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> _Weights:
+    cost = parts.prior.cost[:, 0] + np.sum(pm_kept * parts.pm.cost, axis=1) + np.sum(aim_kept * parts.aim.cost, axis=1)
+    return _Weights(_repeated(pm_kept, parts.pm), _repeated(aim_kept, parts.aim), cost)
+
+
+def _repeated(kept: BoolArray, part: Contributions) -> FloatArray:
+    """Weights (S, n) of 0 and 1 for every hypothesis."""
+    return np.array(np.broadcast_to(kept, part.cost.shape), dtype=np.float64)
+
+
+Loss = Callable[[Parts], _Weights]
+
+
+def _select(good: BoolArray, new: Any, old: Any) -> Any:
+    """``new`` where good (S,), else ``old``: arrays that lead with S, or dataclasses of such."""
+    if isinstance(new, np.ndarray):
+        return np.where(good.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+    return type(new)(*(_select(good, getattr(new, name), getattr(old, name)) for name in new.__slots__))
+
+
+class _Descent:
+    """Levenberg-Marquardt with weights that follow the costs (iteratively reweighted least squares)."""
+
+    def __init__(self, problem: PackedProblem, state: SharedState, private: PrivateState | None = None) -> None:
+        self.problem, self.state = problem, state
+        private = initial_private(problem, state) if private is None else private
+        for _ in range(3):
+            _, private = refine(problem, state, private)
+        self.parts = contributions(problem, state, private)
+
+    def run(self, loss: Loss, steps: int, tolerance: float = 1e-4) -> _Weights:
+        """At most so many steps under one loss; until the Newton decrement (chi square) is below the tolerance."""
+        here = loss(self.parts)
+        damping = np.full(self.state.count, 1e-4)
+        done = np.zeros(self.state.count, dtype=bool)
+        for _ in range(steps):
+            gradient, hessian = _weighted(self.parts, here.pm, here.aim)
+            diagonal = np.arange(hessian.shape[1])
+            hessian[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+            hessian[:, diagonal, diagonal] += WEIGHT_FLOOR
+            step = np.asarray(-np.linalg.solve(hessian, gradient[..., None])[..., 0], dtype=np.float64)
+            moved = self.state.retract(step, self.problem.columns)
+            before = self.parts.private
+            points = before.trus_p_pm + (self.parts.point_gain @ step[:, None, :, None])[..., 0]
+            _, ahead = refine(self.problem, moved, replace(before, trus_p_pm=points))
+            trial = contributions(self.problem, moved, ahead)
+            there = loss(trial)
+            good = np.isfinite(there.cost) & (there.cost <= here.cost + 1e-9 * (1.0 + np.abs(here.cost)))
+            self.state = _select(good, moved, self.state)
+            self.parts = _select(good, trial, self.parts)
+            here = _select(good, there, here)
+            damping = np.clip(np.where(good, damping * 0.1, damping * 8.0), 1e-9, 1e12)
+            done |= (good & (-np.sum(step * gradient, axis=1) < tolerance)) | (damping > 1e9)
+            if done.all():
+                break
+        return here
+
+
+def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
+    """Local minima of the truncated cost from S starts, by way of narrowing Cauchy losses.
+
+    Args:
+        problem: the packed measurements.
+        state: S starts.
+        robust_aims: doubt the aims, too; else they count in full.
+    """
+    descent = _Descent(problem, state)
+    limit, aim_limit = pm_limits(problem), AIM_LIMIT if robust_aims else np.inf
+    for scale in CAUCHY_SCALES:
+        descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
+    weights = descent.run(partial(_truncated, limit=limit, aim_limit=aim_limit), MAX_STEPS)
+    return RobustOptimum(
+        descent.state, descent.parts.private, descent.parts, weights.cost, weights.pm > 0.5, weights.aim > 0.5
+    )
+
+
+# --- 3. innovation --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovations:
+    """Squared deviation of each shot from what the *other* kept shots predict, over its predicted covariance.
+
+    ``pm`` (J,) and ``aim`` (A,): chi square of the shot's degrees of freedom. Infinite where the rest leaves the
+    prediction open.
+    """
+
+    pm: FloatArray
+    aim: FloatArray
+
+
+def innovations(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> Innovations:
+    """Innovations of all shots at an optimum of the kept ones (one hypothesis), in closed form.
+
+    With total Hessian H, leaving a shot of cost c, gradient g, Hessian A out moves the optimum to where the rest costs
+    g' (H - A)^-1 g less: the innovation is c + g' (H - A)^-1 g. For a shot that was not in it is c - g' (H + A)^-1 g.
+    """
+    _, hessian = _weighted(parts, _repeated(pm_kept, parts.pm), _repeated(aim_kept, parts.aim))
+    return Innovations(_innovation(parts.pm, hessian[0], pm_kept), _innovation(parts.aim, hessian[0], aim_kept))
+
+
+def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
+    sign = np.where(kept, -1.0, 1.0)
+    cost, gradient, own = part.cost[0], part.gradient[0], part.hessian[0]
+    seen = np.diag(hessian + own.sum(axis=0)) > UNKNOWN  # what no shot sees (the pose, of aims alone) does not matter
+    gradient = gradient[:, seen]
+    rest = (hessian + sign[:, None, None] * own)[:, seen][:, :, seen]
+    scale = np.sqrt(np.maximum(np.diagonal(rest, axis1=1, axis2=2), 0.0))
+    out = np.full(len(cost), np.inf)
+    good = (scale > UNKNOWN).all(axis=1)
+    scale = scale[good]
+    eigenvalue, vector = np.linalg.eigh(rest[good] / scale[:, :, None] / scale[:, None, :])
+    along = np.einsum("nab,na->nb", vector, gradient[good] / scale)
+    moved = np.sum(along**2 / np.maximum(eigenvalue, 1e-12), axis=1)
+    out[good] = np.where(eigenvalue[:, 0] > UNKNOWN, cost[good] - sign[good] * moved, np.inf)
+    return out
+
+
+def innovations_at(
+    problem: PackedProblem,
+    state: SharedState,
+    pm_kept: BoolArray,
+    aim_kept: BoolArray,
+    private: PrivateState | None = None,
+) -> Innovations:
+    """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the kept shots.
+
+    ``private`` where its private variables are known, else they are found.
+    """
+    parts = _Descent(problem, state).parts if private is None else contributions(problem, state, private)
+    return innovations(parts, pm_kept, aim_kept)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deviants:
+    """Shots beyond their limits: PMs (J,), aims (A,)."""
+
+    pm: BoolArray
+    aim: BoolArray
+
+
+def deviant(problem: PackedProblem, found: Innovations) -> Deviants:
+    """Shots that deviate more than a good one may. Infinite innovations say nothing: the rest predicted nothing."""
+    pm, aim = found.pm > pm_limits(problem), found.aim > AIM_LIMIT
+    return Deviants(pm & np.isfinite(found.pm), aim & np.isfinite(found.aim))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sorted:
+    """Which shots are kept, PMs (J,) and aims (A,), at the least squares optimum of those kept (one hypothesis).
+
+    ``settled``: every shot kept, and none of the others, is within its limit.
+    """
+
+    state: SharedState
+    pm_kept: BoolArray
+    aim_kept: BoolArray
+    settled: bool
+
+
+def sort_shots(
+    problem: PackedProblem,
+    state: SharedState,
+    pm_kept: BoolArray,
+    aim_kept: BoolArray,
+    *,
+    doubt_aims: bool = True,
+) -> Sorted:
+    """Least squares on those kept and innovations of all, in turn, until who is kept no longer changes.
+
+    Args:
+        problem: the packed measurements.
+        state: one hypothesis.
+        pm_kept (J,), aim_kept (A,): where to begin.
+        doubt_aims: False leaves ``aim_kept`` as it is.
+    """
+    private: PrivateState | None = None
+    for _ in range(SETTLE_ROUNDS):
+        descent = _Descent(problem, state, private)
+        descent.run(partial(_fixed, pm_kept=pm_kept, aim_kept=aim_kept), MAX_STEPS)
+        state, private = descent.state, descent.parts.private
+        found = innovations(descent.parts, pm_kept, aim_kept)
+        beyond = deviant(problem, found)
+        pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
+        aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
+        if (pm_next == pm_kept).all() and (aim_next == aim_kept).all():
+            return Sorted(state, pm_kept, aim_kept, settled=True)
+        pm_kept, aim_kept = pm_next, aim_next
+    return Sorted(state, pm_kept, aim_kept, settled=False)
+
+
+def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted) -> BoolArray:
+    """Whether PMs that are not in ``problem``, over the same shared variables, fit what is kept of it (J,)."""
+    kept = _Descent(problem, judged.state).parts
+    _, hessian = _weighted(kept, _repeated(judged.pm_kept, kept.pm), _repeated(judged.aim_kept, kept.aim))
+    none = np.zeros(len(others.pms), dtype=bool)
+    innovation = _innovation(_Descent(others, judged.state).parts.pm, hessian[0], none)
+    return np.asarray(innovation < pm_limits(others))
