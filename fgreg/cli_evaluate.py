@@ -99,6 +99,41 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         if any(item.whole.verdict is Verdict.REFUSED for item in found):
             raise typer.Exit(EXIT_REFUSED)
 
+    @app.command()
+    def advise(
+        session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session so far.")],
+        count: Annotated[int, typer.Option("--count", "-n", help="How many shots to list.")] = 5,
+        as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    ) -> None:
+        """Where the next shot helps most: spots and beam directions, ranked by the predicted TRE after them.
+
+        Reads what has been taken so far; at least 4 pairs. The last camera epoch counts. Exit status 1 where there is
+        no registration to advise on.
+        """
+        from fgreg.advice import advise as run
+        from fgreg.config import SolveConfig
+        from fgreg.errors import EstimationError
+        from fgreg.evaluation.advised import advice_dict, print_advice
+        from fgreg.registration import register
+
+        if count < 1:
+            raise InputError("--count", str(count), "a number >= 1")
+        with progress_bar(quiet or as_json) as progress:
+            case, _ = read_case(session, progress)
+            try:
+                advice = run(register(case.measurements, case.model, SolveConfig()), count=count)
+            except EstimationError as error:
+                if as_json:
+                    typer.echo(json.dumps({"session": case.name, "shots": [], "notes": [str(error)]}, indent=2))
+                else:
+                    sys.stderr.write(f"fgreg: no advice: {error}\n")
+                raise typer.Exit(EXIT_REFUSED) from error
+        if as_json:
+            typer.echo(json.dumps(advice_dict(case.name, advice), indent=2))
+        else:
+            print_advice(case.name, advice)
+
 
 def _sizes(text: str | None) -> tuple[int, ...] | None:
     if text is None:
