@@ -64,6 +64,24 @@ def _exact_aim(aim: Aim, true_T: FloatArray, truth: FullTruth, bias_mm: FloatArr
 
 def truth_covariance(measurements: Measurements, model: SessionModel, truth: FullTruth) -> FloatArray:
     """(D, D) inverse information of the shared variables at the truth; epochs' right tangents come first."""
+    return _inverse(_truth_information(measurements, model, truth)[0])
+
+
+def beam_covariance(measurements: Measurements, model: SessionModel, truth: FullTruth) -> FloatArray:
+    """(4, 4) bound of the beam chart (x, y, a, b) about the true beam, from the aims alone."""
+    alone = replace(measurements, pairs=(), epochs=measurements.epochs[:1])
+    information, at = _truth_information(alone, model, replace(truth, pair_camera_T_marker=()))
+    # Without pairs the registration is not determined, and nothing but the aims and the bias's prior bears on the beam.
+    return _inverse(information[at:, at:])[:4, :4]
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    scale = 1.0 / np.sqrt(np.diag(information))
+    return np.asarray(np.linalg.inv(information * scale * scale[:, None]) * scale * scale[:, None])
+
+
+def _truth_information(measurements: Measurements, model: SessionModel, truth: FullTruth) -> tuple[FloatArray, int]:
+    """Information (D, D) of the shared variables at the truth, and where the beam chart's part begins."""
     bias = np.zeros(3) if truth.marker_bias_mm is None else np.asarray(truth.marker_bias_mm, dtype=np.float64)
     pairs = tuple(
         replace(
@@ -78,12 +96,11 @@ def truth_covariance(measurements: Measurements, model: SessionModel, truth: Ful
         for aim, true_T in zip(measurements.aims, truth.aim_camera_T_marker, strict=True)
     )
     problem = pack(replace(measurements, aims=aims, pairs=pairs), model)
-    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    epochs = len(measurements.epochs)
+    state = make_state(np.stack(truth.trus_T_camera[:epochs])[None], truth.marker_T_laser, model.probe.radius_mm)
     state = replace(state, edge_rad=np.array([truth.window_edge_rad]))
     if problem.columns.bias is not None:
         state = replace(state, bias_mm=bias[None])
-    points = np.stack([truth.trus_p_pm_mm[pm] for pm in problem.pms])[None]
+    points = np.array([truth.trus_p_pm_mm[pm] for pm in problem.pms], dtype=np.float64).reshape(1, -1, 3)
     private = replace(initial_private(problem, state), trus_p_pm=points)
-    hessian = evaluate(problem, state, private).hessian[0]
-    scale = 1.0 / np.sqrt(np.diag(hessian))
-    return np.asarray(np.linalg.inv(hessian * scale * scale[:, None]) * scale * scale[:, None])
+    return evaluate(problem, state, private).hessian[0], problem.columns.beam

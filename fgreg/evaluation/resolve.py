@@ -14,6 +14,7 @@ from fgreg.frames import FloatArray
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced import pm_contributions, refine
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Measurements, Pair
 from fgreg.registration import Registration, register
 from fgreg.targets import expected_tre_mm, tre_mm
@@ -107,13 +108,17 @@ def resolve(case: Case, kept: Sequence[int], config: EvaluationConfig, held: Seq
     )
 
 
-def pair_residuals(registration: Registration, pairs: Sequence[Pair]) -> FloatArray:
-    """Eq. 12 for pairs (n,) of solved epochs: distances (mm) between beam and arc, lambda and theta' refitted."""
-    state = registration.optimum.state
+def pair_residuals(state: SharedState, epochs: Sequence[int], pairs: Sequence[Pair]) -> FloatArray:
+    """Eq. 12 for pairs (n,): distances (mm) between beam and arc, lambda and theta' refitted.
+
+    Args:
+        state: the estimate (one hypothesis). epochs: the pairs' numbers of its epochs, in its order.
+        pairs: of those epochs.
+    """
     marker = np.stack([pair.marker.camera_T_marker for pair in pairs])
     camera_p = marker[:, :3, :3] @ state.beam_origin()[0] + marker[:, :3, 3] - state.bias_mm[0]
     camera_d = marker[:, :3, :3] @ state.beam_direction()[0]
-    epoch = np.array([registration.epochs.index(pair.epoch) for pair in pairs])
+    epoch = np.array([list(epochs).index(pair.epoch) for pair in pairs])
     rotation, translation = state.rotation[0, epoch], state.translation_mm[0, epoch]
     found = line_to_arc(
         np.einsum("nij,nj->ni", rotation, camera_p) + translation,
@@ -137,7 +142,7 @@ def predict(registration: Registration, pairs: Sequence[Pair]) -> tuple[HeldOutP
     pairs = [pair for pair in pairs if pair.epoch in registration.epochs]
     if not pairs:
         return ()
-    residual = pair_residuals(registration, pairs)
+    residual = pair_residuals(registration.optimum.state, registration.epochs, pairs)
     renumbered = tuple(replace(pair, epoch=registration.epochs.index(pair.epoch)) for pair in pairs)
     problem = pack(Measurements((), renumbered, registration.measurements.epochs), registration.model)
     state = registration.optimum.state
