@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from fgreg import __version__
+from fgreg.cli_evaluate import add_commands
 from fgreg.errors import FgregError, InputError
 
 if TYPE_CHECKING:
@@ -258,6 +259,9 @@ def simulate(
         write_session(simulated, out, overwrite, lambda done, total: progress("rendering", done, total))
     if not quiet:
         typer.echo(f"{out}: {config.aims} aims, {config.pairs} PMs, {len(simulated.frames)} frames, seed {seed}")
+
+
+add_commands(app, _progress)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,71 @@
+"""What each PM does to the answer: what would change if it were left out, in closed form at the optimum.
+
+The reduced problem is a sum over PMs, half cost = rest + part i. At the optimum the gradients cancel, so without part i
+(gradient g, Hessian A) a Newton step moves the shared variables by (H - A)^-1 g. No solve is repeated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.graph.reduced import pm_contributions
+from fgreg.registration import Registration
+from fgreg.targets import expected_tre_mm, moved_mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Influence:
+    """One PM's influence on the registration of its epoch.
+
+    Attributes:
+        pm, epoch: which.
+        step: (6,) right tangent by which leaving it out moves ``trus_T_camera``; infinite where the rest does not
+            determine it.
+        moved_mm: mean distance that moves the targets; worst_moved_mm: the largest.
+        expected_mm, expected_without_mm: predicted TRE (mean over targets) with and without it.
+    """
+
+    pm: int
+    epoch: int
+    step: FloatArray
+    moved_mm: float
+    worst_moved_mm: float
+    expected_mm: float
+    expected_without_mm: float
+
+
+def influences(registration: Registration, targets_mm: FloatArray) -> tuple[Influence, ...]:
+    """Influence of every PM that entered a registration, in order of first look."""
+    problem, optimum = registration.problem, registration.optimum
+    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
+    hessian = optimum.evaluation.hessian[0]
+    out = []
+    for index, pm in enumerate(problem.pms):
+        place = int(problem.beam_epoch[np.flatnonzero(problem.beam_pm == index)[0]])
+        transform = optimum.state.trus_T_camera(place)[0]
+        block = slice(6 * place, 6 * place + 6)
+        rest = hessian - parts.hessian[index]
+        expected = float(expected_tre_mm(registration.covariance[block, block], transform, targets_mm).mean())
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest), 1e-12))
+        scaled = rest * scale * scale[:, None]
+        step, without, moved = np.full(6, np.inf), np.inf, np.full(1, np.inf)
+        if np.linalg.eigvalsh(scaled)[0] > 1e-9:
+            covariance = np.linalg.inv(scaled) * scale * scale[:, None]
+            step = (covariance @ parts.gradient[index])[block]
+            moved = moved_mm(step, transform, targets_mm)
+            without = float(expected_tre_mm(covariance[block, block], transform, targets_mm).mean())
+        out.append(
+            Influence(
+                pm=pm,
+                epoch=registration.epochs[place],
+                step=step,
+                moved_mm=float(moved.mean()),
+                worst_moved_mm=float(moved.max()),
+                expected_mm=expected,
+                expected_without_mm=without,
+            )
+        )
+    return tuple(out)

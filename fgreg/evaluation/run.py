@@ -1,0 +1,276 @@
+"""Evaluate sessions: all the solves it takes, over all cores, in a fixed order.
+
+What is computed does not depend on the number of processes: tasks are listed first, with their subsets drawn by seed,
+and results come back in that order.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgreg.batch import solve
+from fgreg.estimate import PredictedTre, Verdict
+from fgreg.evaluation.case import (
+    Case,
+    EvaluationConfig,
+    curve_sizes,
+    folds_of,
+    left_out_one_by_one,
+    subsets_of,
+)
+from fgreg.evaluation.influence import Influence, influences
+from fgreg.evaluation.resolve import Resolved, resolve
+from fgreg.frames import FloatArray
+from fgreg.sensitivity import wrap_angle
+from fgreg.targets import tre_mm
+from fgreg.verdict import Condition
+
+Progress = Callable[[str, int, int], None]
+"""Called with the step's name, items done and items in all."""
+STEP = "evaluating"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WholeSolve:
+    """The solve of everything, and its errors where the truth is known.
+
+    Attributes:
+        verdict, reasons: of the session.
+        trus_T_camera: (4, 4) of each epoch, None where none. epoch_pms: PMs of each.
+        predicted: TRE that the posterior predicts, per epoch.
+        tre_mm: errors (n,) at the targets, per epoch. beam_angle_rad, beam_offset_mm: of the laser line.
+        track_error_rad, track_sigma_rad: answer less truth, and its predicted sigma, per track; None where unknown.
+        influence: of every PM used.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    trus_T_camera: tuple[FloatArray | None, ...]
+    epoch_pms: tuple[int, ...]
+    predicted: tuple[PredictedTre | None, ...]
+    tre_mm: tuple[FloatArray | None, ...]
+    beam_angle_rad: float | None
+    beam_offset_mm: float | None
+    track_error_rad: tuple[float | None, ...]
+    track_sigma_rad: tuple[float | None, ...]
+    influence: tuple[Influence, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SizedSolves:
+    """The solves of the curve with one number of pairs."""
+
+    pairs: int
+    solves: tuple[Resolved, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionEvaluation:
+    """All that was found about one session.
+
+    Attributes:
+        name: of the session. whole: the solve of everything.
+        leave_one_out, k_fold: solves without one PM, and without one fold of them.
+        curve: solves from fewer PMs of ``curve_epoch``, by size.
+    """
+
+    name: str
+    whole: WholeSolve
+    leave_one_out: tuple[Resolved, ...]
+    k_fold: tuple[Resolved, ...]
+    curve: tuple[SizedSolves, ...]
+    curve_epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One solve: of everything where ``kept`` is None; ``held``: PMs to predict."""
+
+    case: int
+    kept: tuple[int, ...] | None
+    held: tuple[int, ...] = ()
+
+
+@dataclass(slots=True, eq=False)
+class _Work:
+    """What every process holds: filled once, when the process starts."""
+
+    cases: Sequence[Case] = ()
+    conditions: Sequence[Sequence[Condition]] = ()
+    config: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+_work = _Work()
+
+
+def _load(cases: Sequence[Case], conditions: Sequence[Sequence[Condition]], config: EvaluationConfig) -> None:
+    _work.cases, _work.conditions, _work.config = cases, conditions, config
+
+
+def _run(task: _Task) -> WholeSolve | Resolved:
+    case = _work.cases[task.case]
+    if task.kept is None:
+        return solve_whole(case, _work.config, _work.conditions[task.case] if _work.conditions else ())
+    return resolve(case, task.kept, _work.config, task.held)
+
+
+def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condition] = ()) -> WholeSolve:
+    """Solve a session from all its measurements and compare with the truth where there is one."""
+    model, truth = case.model, case.truth
+    solution = solve(case.measurements, case.tracks, model, config.solve, conditions)
+    errors: list[FloatArray | None] = []
+    for epoch in solution.epochs:
+        known = truth is not None and epoch.index < len(truth.trus_T_camera)
+        errors.append(
+            tre_mm(epoch.trus_T_camera, truth.trus_T_camera[epoch.index], model.targets_mm)
+            if truth is not None and known and epoch.trus_T_camera is not None
+            else None
+        )
+    angle = offset = None
+    if truth is not None and truth.marker_T_laser is not None and solution.laser is not None:
+        angle, offset = beam_error(solution.laser.marker_T_laser, truth.marker_T_laser)
+    stages = truth.track_stage_rad if truth is not None else ()
+    track_error: list[float | None] = []
+    for index, answer in enumerate(solution.tracks):
+        right = stages[index] if index < len(stages) else None
+        found = answer.stage_rad
+        track_error.append(None if right is None or found is None else float(wrap_angle(found - right)))
+    return WholeSolve(
+        verdict=solution.verdict,
+        reasons=solution.reasons,
+        trus_T_camera=tuple(epoch.trus_T_camera for epoch in solution.epochs),
+        epoch_pms=tuple(len(case.pms_of_epoch(epoch.index)) for epoch in solution.epochs),
+        predicted=tuple(epoch.predicted_tre for epoch in solution.epochs),
+        tre_mm=tuple(errors),
+        beam_angle_rad=angle,
+        beam_offset_mm=offset,
+        track_error_rad=tuple(track_error),
+        track_sigma_rad=tuple(answer.sigma_rad for answer in solution.tracks),
+        influence=() if solution.registration is None else influences(solution.registration, model.targets_mm),
+    )
+
+
+def beam_error(marker_T_laser: FloatArray, true_marker_T_laser: FloatArray) -> tuple[float, float]:
+    """Angle between two beams (rad), and distance (mm) of the true beam's origin from the estimated beam."""
+    cross = np.cross(marker_T_laser[:3, 2], true_marker_T_laser[:3, 2])
+    angle = float(np.arctan2(np.linalg.norm(cross), marker_T_laser[:3, 2] @ true_marker_T_laser[:3, 2]))
+    gap = true_marker_T_laser[:3, 3] - marker_T_laser[:3, 3]
+    return angle, float(np.linalg.norm(np.cross(gap, marker_T_laser[:3, 2])))
+
+
+def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, int, _Task]]:
+    """(kind, size, task) of everything to be computed for one case, in order."""
+    pms = case.pms
+    out: list[tuple[str, int, _Task]] = [("whole", 0, _Task(index, None))]
+
+    def without(held: tuple[int, ...]) -> _Task:
+        return _Task(index, tuple(pm for pm in pms if pm not in held), held)
+
+    if config.leave_one_out and len(pms) > 3:
+        out += [("one", 0, without(held)) for held in left_out_one_by_one(case, config.most_left_out)]
+    if config.folds and len(pms) > config.folds:
+        out += [("fold", 0, without(held)) for held in folds_of(case, config.folds, config.seed)]
+    if config.curve:
+        mine = case.pms_of_epoch(case.largest_epoch)
+        for size in curve_sizes(len(mine), config):
+            for kept in subsets_of(mine, size, config.subsets, config.seed):
+                out.append(("curve", size, _Task(index, kept, tuple(pm for pm in mine if pm not in kept))))
+    return out
+
+
+def evaluate(
+    cases: Sequence[Case],
+    config: EvaluationConfig | None = None,
+    *,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    conditions: Sequence[Sequence[Condition]] = (),
+) -> tuple[SessionEvaluation, ...]:
+    """Evaluate sessions.
+
+    Args:
+        cases: the sessions.
+        config: what to compute.
+        jobs: processes; 1 stays in this one. More need the caller's script to be importable (guard its main).
+        progress: called as solves are done.
+        conditions: of each case, found before (detection), for its verdict.
+    """
+    config = config or EvaluationConfig()
+    listed = [_tasks(index, case, config) for index, case in enumerate(cases)]
+    tasks = [task for of_case in listed for _, _, task in of_case]
+    results: list[WholeSolve | Resolved] = []
+    for result in _results(tasks, cases, conditions, config, jobs):
+        results.append(result)
+        if progress is not None:
+            progress(STEP, len(results), len(tasks))
+    out = []
+    place = 0
+    for case, of_case in zip(cases, listed, strict=True):
+        mine = list(zip(of_case, results[place : place + len(of_case)], strict=True))
+        place += len(of_case)
+        out.append(_gather(case, mine))
+    return tuple(out)
+
+
+def _gather(case: Case, results: list[tuple[tuple[str, int, _Task], WholeSolve | Resolved]]) -> SessionEvaluation:
+    whole = next(result for _, result in results if isinstance(result, WholeSolve))
+    resolved = [(kind, size, result) for (kind, size, _), result in results if isinstance(result, Resolved)]
+    sizes = dict.fromkeys(size for kind, size, _ in resolved if kind == "curve")
+    return SessionEvaluation(
+        name=case.name,
+        whole=whole,
+        leave_one_out=tuple(result for kind, _, result in resolved if kind == "one"),
+        k_fold=tuple(result for kind, _, result in resolved if kind == "fold"),
+        curve=tuple(
+            SizedSolves(size, tuple(result for kind, of, result in resolved if kind == "curve" and of == size))
+            for size in sizes
+        ),
+        curve_epoch=case.largest_epoch,
+    )
+
+
+def _results(
+    tasks: Sequence[_Task],
+    cases: Sequence[Case],
+    conditions: Sequence[Sequence[Condition]],
+    config: EvaluationConfig,
+    jobs: int,
+) -> Iterator[WholeSolve | Resolved]:
+    """Results in the order of the tasks."""
+    jobs = min(jobs, len(tasks))
+    if jobs <= 1:
+        _load(cases, conditions, config)
+        try:
+            yield from map(_run, tasks)
+        finally:
+            _load((), (), EvaluationConfig())
+        return
+    # Fresh processes: a fork would inherit the threads of linear algebra libraries in whatever state they are.
+    context = multiprocessing.get_context("spawn")
+    with _one_thread_each(), ProcessPoolExecutor(jobs, context, _load, (cases, conditions, config)) as pool:
+        try:
+            yield from pool.map(_run, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs))))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started within use one thread each for linear algebra: there is one process per core already."""
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update({name: "1" for name, value in before.items() if value is None})
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
