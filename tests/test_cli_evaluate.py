@@ -72,6 +72,16 @@ def test_svg_plots(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert (tmp_path / "tre.svg").read_text().startswith("<?xml")
 
 
+def test_sessions_of_one_name_are_told_apart(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ("--subsets", "0", "--folds", "0", "--no-leave-one-out", "--jobs", "1", "--json")
+    run(monkeypatch, "evaluate", str(session), str(session.parent / "." / "eight"), *few)
+    document = json.loads(capsys.readouterr().out)
+    assert [found["session"] for found in document["sessions"]] == [str(session)] * 2
+    assert document["together"]["tre_mm"]["count"] == 54
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
