@@ -31,6 +31,8 @@ from fgreg.registration import Registration, register
 from fgreg.surface import fit_surface
 from fgreg.tracking import TrackContext, track
 from fgreg.verdict import (
+    SURE_OF_AIMS,
+    SURE_OF_PAIRS,
     Condition,
     accuracy,
     ambiguity,
@@ -164,7 +166,7 @@ def _common_conditions(
     found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
     nis = shots.innovations
     if aims:
-        found.extend(left_out(shots.aim_kept, nis.aim, "aims"))
+        found.extend(left_out(shots.aim_kept, nis.aim, "aims", SURE_OF_AIMS))
         found.extend(
             too_few_to_tell(shots.aim_deviant, shots.aim_kept, nis.aim, [f"the aim at {a.t:.1f} s" for a in aims])
         )
@@ -287,7 +289,7 @@ def _junk_conditions(registration: Registration, place: int) -> list[Condition]:
         return []
     kept, nis = shots.pm_kept[mine], shots.innovations.pm[mine]
     names = [f"PM {pm}" for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
-    return [*left_out(kept, nis, "pairs"), *too_few_to_tell(shots.pm_deviant[mine], kept, nis, names)]
+    return [*left_out(kept, nis, "pairs", SURE_OF_PAIRS), *too_few_to_tell(shots.pm_deviant[mine], kept, nis, names)]
 
 
 def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:

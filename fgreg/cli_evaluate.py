@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,7 +86,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         )
         with progress_bar(quiet or as_json) as progress:
             read = [read_case(folder, progress) for folder in sessions]
-            cases, conditions = [case for case, _ in read], [found for _, found in read]
+            cases, conditions = named_apart([case for case, _ in read], sessions), [found for _, found in read]
             found = run(cases, config, jobs=jobs or _cores(), progress=progress, conditions=conditions)
         if csv is not None:
             write_text(csv, as_csv(found), "--csv")
@@ -150,6 +151,15 @@ def _sizes(text: str | None) -> tuple[int, ...] | None:
 def _cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def named_apart(cases: list[Case], folders: list[Path]) -> list[Case]:
+    """Sessions of the same name are called by their folders."""
+    names = [case.name for case in cases]
+    return [
+        replace(case, name=str(folder)) if names.count(case.name) > 1 else case
+        for case, folder in zip(cases, folders, strict=True)
+    ]
 
 
 def write_text(path: Path, text: str, option: str) -> None:

@@ -69,7 +69,7 @@ class PairEstimate:
         rotation_rad: turn of the *device* from the look's scan angle that brings the PM into the plane.
         trus_p_pm_mm, covariance: the PM and its (3, 3) covariance.
         residual_mm: root of the squared (x, range) misfit, both in mm.
-        nis: squared misfit over its predicted covariance.
+        nis: squared misfit over its predicted covariance, both by the estimate without this PM.
         reason: why it was not used; empty where it was.
     """
 
@@ -101,7 +101,7 @@ class TrackEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AimEstimate:
-    """One calibration shot: distance of the spot from the beam (mm) and its squared misfit over covariance."""
+    """One calibration shot: distance of the spot from the beam (mm), and its misfit (``nis`` as of a pair)."""
 
     t: float
     used: bool

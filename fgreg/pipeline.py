@@ -22,12 +22,13 @@ from fgreg.detection.marker import MarkerFit
 from fgreg.errors import InputError
 from fgreg.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.events import AimEvent, Event, PairEvent, TrackEvent
-from fgreg.frames import FloatArray, inverse, transform_points
+from fgreg.frames import FloatArray, transform_points
 from fgreg.models import SessionModel
 from fgreg.recognition import Recognised, load_trus_frame, looks_of, marker_pictures, recognise
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import remove_result, write_result
+from fgreg.targets import beam_error, tre_mm
 from fgreg.verdict import Condition
 from fgreg.viewer.recording import NullViewer, ShotKind, Viewer, open_viewer
 
@@ -180,15 +181,10 @@ def truth_errors(estimate: SessionEstimate, truth: GroundTruth, targets_mm: Floa
         if epoch.trus_T_camera is None or epoch.index >= len(truth.trus_T_camera):
             tre.append(None)
             continue
-        # Where the estimate puts the camera points that are at the targets in truth.
-        camera_p = transform_points(inverse(truth.trus_T_camera[epoch.index]), targets_mm)
-        tre.append(np.linalg.norm(transform_points(epoch.trus_T_camera, camera_p) - targets_mm, axis=1))
+        tre.append(tre_mm(epoch.trus_T_camera, truth.trus_T_camera[epoch.index], targets_mm))
     angle = offset = None
     if estimate.laser is not None and truth.marker_T_laser is not None:
-        found, real = estimate.laser.marker_T_laser, truth.marker_T_laser
-        cross = np.cross(found[:3, 2], real[:3, 2])
-        angle = float(np.arctan2(np.linalg.norm(cross), found[:3, 2] @ real[:3, 2]))
-        offset = float(np.linalg.norm(np.cross(real[:3, 3] - found[:3, 3], found[:3, 2])))
+        angle, offset = beam_error(estimate.laser.marker_T_laser, truth.marker_T_laser)
     stage = {round(track.t, 6): track.stage_rad for track in truth.tracks}
     track_rad = tuple(
         None

@@ -1,4 +1,4 @@
-"""Errors at the targets: what a registration's error, or its covariance, comes to in millimetres where it matters."""
+"""Errors against a truth, and what a registration's error or covariance comes to at the targets, where it matters."""
 
 from __future__ import annotations
 
@@ -16,6 +16,14 @@ def tre_mm(trus_T_camera: FloatArray, true_trus_T_camera: FloatArray, targets_mm
     """
     camera_p = transform_points(inverse(true_trus_T_camera), targets_mm)
     return np.asarray(np.linalg.norm(transform_points(trus_T_camera, camera_p) - targets_mm, axis=-1))
+
+
+def beam_error(marker_T_laser: FloatArray, true_marker_T_laser: FloatArray) -> tuple[float, float]:
+    """Angle between two beams (rad), and distance (mm) of the true beam's origin from the estimated beam."""
+    cross = np.cross(marker_T_laser[:3, 2], true_marker_T_laser[:3, 2])
+    angle = float(np.arctan2(np.linalg.norm(cross), marker_T_laser[:3, 2] @ true_marker_T_laser[:3, 2]))
+    gap = true_marker_T_laser[:3, 3] - marker_T_laser[:3, 3]
+    return angle, float(np.linalg.norm(np.cross(gap, marker_T_laser[:3, 2])))
 
 
 def target_jacobians(trus_T_camera: FloatArray, targets_mm: FloatArray) -> FloatArray:

@@ -23,12 +23,18 @@ IMPOSSIBLE_P = 1e-9
 WARN_LEFT_OUT = 0.25
 REFUSE_LEFT_OUT = 0.5
 """Shares of the shots that may be junk."""
+SURE_OF_PAIRS = 9
+SURE_OF_AIMS = 6
+"""Shots that have to agree before those that do not are safely junk: half as many again as a solution takes."""
+JUNK_CAUTION = 2
+"""Where shots were left out other hypotheses have more freedom to fit by chance: so many times the gap is needed."""
 CERTAIN_NIS = 30.0
 """Innovation of one shot that noise does not explain, nor a bad estimate from few others."""
 MILD_NIS = 60.0
-"""Junk is mostly farther off than this."""
+MILD_JUNK = 0.1
+"""Junk is mostly farther off than this; so large a share is not."""
 SOUND_SPEED_SIGMA = 0.1
-"""Prior of the ratio in its score test: wide, so that the pairs speak."""
+"""Prior of the ratio in its score test: wide, so that the pairs speak. No medium is farther off than this."""
 SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
@@ -72,15 +78,21 @@ def ambiguity(
             )
         )
     if search.mirrored_cost is not None and search.minima and search.mirrored_cost < search.minima[0].cost:
-        gap = search.minima[0].cost - search.mirrored_cost
-        found.append(
-            Condition(
-                Verdict.REFUSED if gap > config.second_minimum_chi2 else Verdict.WARNING,
-                f"the mirrored hypothesis fits better (chi square {search.mirrored_cost:.1f} against "
-                f"{search.minima[0].cost:.1f}): the stage turns the other way (stage.direction) or the elements are "
-                "counted from the other end (probe.flip); check the wiring and correct session.yaml",
+        costs = f"(chi square {search.mirrored_cost:.1f} against {search.minima[0].cost:.1f})"
+        wiring = "the stage turns the other way (stage.direction) or the elements are counted from the other end"
+        certain = config.second_minimum_chi2 * (1 if search.clean else JUNK_CAUTION)
+        if search.minima[0].cost - search.mirrored_cost > certain:
+            text = (
+                f"the mirrored hypothesis fits better {costs}: {wiring} (probe.flip); check the wiring and correct "
+                "session.yaml"
             )
-        )
+            found.append(Condition(Verdict.REFUSED, text))
+        else:
+            text = (
+                f"the mirrored hypothesis fits as well {costs}, that {wiring} (probe.flip): take more pairs at other "
+                "spots and beam directions, which will tell"
+            )
+            found.append(Condition(Verdict.WARNING, text))
     return found
 
 
@@ -90,15 +102,13 @@ def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
     if not search.minima:
         return []
     cost = search.minima[0].cost
-    if search.other_way_cost is not None and search.other_way_cost < cost:
-        gap = cost - search.other_way_cost
-        found.append(
-            Condition(
-                Verdict.REFUSED if gap > config.second_minimum_chi2 else Verdict.WARNING,
-                f"the sweeps fit better with their signs turned round (chi square {search.other_way_cost:.1f} against "
-                f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it",
-            )
+    # With all sweeps one way the sign does not show, and a small gap is chance.
+    if search.other_way_cost is not None and search.other_way_cost < cost - JUNK_CAUTION * config.second_minimum_chi2:
+        text = (
+            f"the sweeps fit better with their signs turned round (chi square {search.other_way_cost:.1f} against "
+            f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it"
         )
+        found.append(Condition(Verdict.REFUSED, text))
     if search.own_beam_cost is not None and search.own_beam_cost < cost - chi2.isf(IMPOSSIBLE_P, 4):
         found.append(
             Condition(
@@ -111,9 +121,15 @@ def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
     return found
 
 
-def left_out(kept: BoolArray, nis: FloatArray, what: str) -> list[Condition]:
-    """Too large a share of the shots left out as junk."""
+def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Condition]:
+    """Too large a share of the shots left out as junk, or fewer kept than it takes to be ``sure``."""
     out = int(np.sum(~kept))
+    if out and out <= WARN_LEFT_OUT * len(kept) and kept.sum() < sure:
+        text = (
+            f"{out} of {len(kept)} {what} do not fit the others and are left out; the {kept.sum()} kept are few to be "
+            f"sure which are wrong ({sure} needed): take more {what}"
+        )
+        return [Condition(Verdict.WARNING, text)]
     if out <= WARN_LEFT_OUT * len(kept):
         return []
     refuse = out > REFUSE_LEFT_OUT * len(kept)
@@ -130,7 +146,9 @@ def left_out(kept: BoolArray, nis: FloatArray, what: str) -> list[Condition]:
 def understated_noise(deviant: BoolArray, nis: FloatArray) -> list[Condition]:
     """Several shots beyond their limit, but not by far: that is noise larger than stated rather than junk."""
     mild = deviant & (nis < MILD_NIS)
-    if float(binom.sf(int(mild.sum()) - 1, len(nis), JUNK_P)) >= SUSPICIOUS_P:
+    share_of_junk = float(np.mean(deviant & ~mild))
+    expected = min(JUNK_P + MILD_JUNK * share_of_junk, 1.0)
+    if float(binom.sf(int(mild.sum()) - 1, len(nis), expected)) >= SUSPICIOUS_P:
         return []
     return [
         Condition(
@@ -280,7 +298,7 @@ def sound_speed_condition(registration: Registration) -> list[Condition]:
         return []
     change = -float(covariance[column] @ gradient)
     sigma = math.sqrt(max(float(covariance[column, column]), 0.0))
-    if sigma == 0.0 or abs(change) < max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE):
+    if not max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE) < abs(change) < SOUND_SPEED_SIGMA:
         return []
     return [
         Condition(

@@ -13,8 +13,6 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from fgreg.batch import solve
 from fgreg.estimate import PredictedTre, Verdict
 from fgreg.evaluation.case import (
@@ -29,7 +27,7 @@ from fgreg.evaluation.influence import Influence, influences
 from fgreg.evaluation.resolve import Resolved, resolve
 from fgreg.frames import FloatArray
 from fgreg.sensitivity import wrap_angle
-from fgreg.targets import tre_mm
+from fgreg.targets import beam_error, tre_mm
 from fgreg.verdict import Condition
 
 Progress = Callable[[str, int, int], None]
@@ -155,14 +153,6 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
         track_sigma_rad=tuple(answer.sigma_rad for answer in solution.tracks),
         influence=() if solution.registration is None else influences(solution.registration, model.targets_mm),
     )
-
-
-def beam_error(marker_T_laser: FloatArray, true_marker_T_laser: FloatArray) -> tuple[float, float]:
-    """Angle between two beams (rad), and distance (mm) of the true beam's origin from the estimated beam."""
-    cross = np.cross(marker_T_laser[:3, 2], true_marker_T_laser[:3, 2])
-    angle = float(np.arctan2(np.linalg.norm(cross), marker_T_laser[:3, 2] @ true_marker_T_laser[:3, 2]))
-    gap = true_marker_T_laser[:3, 3] - marker_T_laser[:3, 3]
-    return angle, float(np.linalg.norm(np.cross(gap, marker_T_laser[:3, 2])))
 
 
 def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, int, _Task]]:

@@ -24,6 +24,8 @@ from fgreg.evaluation.summary import (
 )
 
 MOST_ROWS = 40
+MOST_INFLUENCES = 4
+"""Tables of influence are printed for so many sessions."""
 STYLES = {Verdict.OK: "bold green", Verdict.WARNING: "bold yellow", Verdict.REFUSED: "bold red"}
 NOT_A_TRE = (
     "pair residual: line to arc of a pair held out, lambda and theta refitted (Eq. 12 of the publication). It is not a "
@@ -65,7 +67,11 @@ def _everything(evaluations: Sequence[SessionEvaluation]) -> Iterator[Renderable
         yield Text()
         yield _heading("Error against number of pairs" + (f", {len(evaluations)} sessions" * (len(evaluations) > 1)))
         yield _indented(_curve(curve))
-    for evaluation in evaluations:
+    if len(evaluations) > MOST_INFLUENCES:
+        yield Text(
+            f"\n  influence of each pair: for up to {MOST_INFLUENCES} sessions, or in --csv and --json", style="dim"
+        )
+    for evaluation in evaluations[: MOST_INFLUENCES * (len(evaluations) <= MOST_INFLUENCES)]:
         if evaluation.whole.influence:
             yield Text()
             yield _heading(f"What changes if a pair is left out: {_clean(evaluation.name)}")
