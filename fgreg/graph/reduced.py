@@ -38,6 +38,7 @@ from fgreg.graph.reduced_blocks import (
     transposed,
 )
 from fgreg.graph.shared_state import SharedState
+from fgreg.graph.windows import log_shape_ratio
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,11 +155,16 @@ def log_marginal(problem: PackedProblem, state: SharedState, private: PrivateSta
     """Log density (S,) of the shared variables with the private ones integrated out (Laplace), up to a constant.
 
     ``-cost / 2`` less half the log determinants that the Gaussian integrals over marker errors and PMs leave:
-    of each line residual's covariance, of each PM's information, of each aim residual's covariance.
+    of each line residual's covariance, of each PM's information, of each aim residual's covariance. Where the problem
+    keeps the windows' own shapes they take the place of its Gaussian stand-ins (fgreg.graph.windows).
     """
     system = _system(problem, state, private)
+    by_rotation = system.look.by_point[..., 2, :]
+    offset = system.look.residual[..., 2] + np.sum(by_rotation * system.point_step[:, problem.look_pm], axis=-1)
+    spread = times(system.point_covariance[:, problem.look_pm], by_rotation)
     return np.asarray(
-        -0.5 * system.cost
+        log_shape_ratio(problem, state.edge_rad, offset, np.sum(by_rotation * spread, axis=-1))
+        - 0.5 * system.cost
         - 0.5 * np.sum(np.log(determinant2(system.line.covariance)), axis=1)
         - 0.5 * np.sum(np.log(np.linalg.det(system.h_pp)), axis=1)
         - 0.5 * np.sum(np.log(determinant2(system.aim_covariance)), axis=1)
