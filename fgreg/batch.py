@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.answer import answer
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.estimate import (
@@ -25,9 +26,9 @@ from fgreg.graph.explicit_values import SharedValues, initial_values, read_share
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
-from fgreg.posterior import Posterior, predicted_tre, sample_posterior
+from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
-from fgreg.registration import Registration, register
+from fgreg.registration import Registration, SoundSpeedPrior, register
 from fgreg.surface import fit_surface
 from fgreg.tracking import TrackContext, track
 from fgreg.verdict import (
@@ -79,6 +80,7 @@ def solve(
     model: SessionModel,
     config: SolveConfig,
     conditions: Sequence[Condition] = (),
+    sound_speed: SoundSpeedPrior | None = None,
 ) -> Solution:
     """Calibrate, register, judge, and answer the tracking queries from all of it.
 
@@ -88,22 +90,22 @@ def solve(
         model: the session's set-up.
         config: limits of the verdict.
         conditions: found before (detection), to be weighed with those found here.
+        sound_speed: what is known of the sound speed ratio, where the configuration makes it a variable.
     """
     try:
-        registration = register(measurements, model, config)
+        registration = register(measurements, model, config, sound_speed)
     except EstimationError as error:
         return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
-    posterior = sample_posterior(
-        registration.problem, registration.optimum, registration.covariance, config.posterior_samples, config.seed
-    )
-    readout = read_laser(registration, model)
-    pairs = read_pairs(measurements, registration, model, readout.origin_shift_mm)
-    aims = read_aims(registration, readout.origin_shift_mm)
+    answered = answer(registration, config)
+    posterior, centred = answered.posterior, answered.registration
+    readout = read_laser(centred, model)
+    pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm, judged=registration)
+    aims = read_aims(centred, readout.origin_shift_mm)
     common = [*conditions, *_common_conditions(registration, pairs, aims)]
-    epochs, found = _judge_epochs(measurements, registration, posterior, pairs, model, config, common)
-    context = _track_context(registration, posterior, model, readout.origin_shift_mm)
+    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
+    context = _track_context(centred, posterior, model, readout.origin_shift_mm)
     refused = {epoch.index for epoch in epochs if epoch.verdict is Verdict.REFUSED}
-    answers = tuple(
+    tracked = tuple(
         TrackEstimate(query.t, None, None, None, False, f"the registration of camera epoch {query.epoch} is refused")
         if query.epoch in refused
         else track(query, context)
@@ -119,7 +121,7 @@ def solve(
         laser=readout.laser,
         epochs=epochs,
         pairs=pairs,
-        tracks=answers,
+        tracks=tracked,
         aims=aims,
         registration=registration,
         posterior=posterior,

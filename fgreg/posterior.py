@@ -26,8 +26,10 @@ from fgreg.graph.shared_state import SharedState
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
 QUANTILE = 0.95
-CHUNK = 500
+CHUNK = 100
 """Samples evaluated at once: what stays in the cache."""
+REFINED_PMS = 8
+"""With fewer PMs the samples reach so far that the private variables are refined once more for each."""
 KERNELS = 40
 """Proposals of a later round that sit on samples of the earlier ones."""
 
@@ -59,8 +61,9 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mode:
-    """Where to look for probability: an optimum (one hypothesis) and the covariance (D, D) about it."""
+    """Where to look for probability: an optimum of a problem (one hypothesis) and the covariance (D, D) about it."""
 
+    problem: PackedProblem
     optimum: Optimum
     covariance: FloatArray
 
@@ -131,14 +134,16 @@ def _repeat(state: SharedState, count: int) -> SharedState:
     return state.take(np.zeros(count, dtype=np.int64))
 
 
-def log_density(problem: PackedProblem, optimum: Optimum, step: FloatArray) -> FloatArray:
-    """(S,) log marginal density at steps (S, D) from the optimum of one hypothesis, up to a constant."""
+def log_density(mode: Mode, step: FloatArray) -> FloatArray:
+    """(S,) log density at steps (S, D) from a mode's optimum, up to a constant common to a session's modes."""
+    problem, optimum = mode.problem, mode.optimum
     state = _repeat(optimum.state, len(step)).retract(step, problem.columns)
     at = optimum.evaluation
     points = at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0]
     private = replace(at.private.take(np.zeros(len(step), dtype=np.int64)), trus_p_pm=points)
     with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
-        _, private = refine(problem, state, private)
+        if len(problem.pms) < REFINED_PMS:
+            _, private = refine(problem, state, private)
         log = log_marginal(problem, state, private)
     return np.where(np.isfinite(log), log, -np.inf)
 
@@ -207,28 +212,31 @@ def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: 
 class _Target:
     """The density to sample, over tangents about the first mode."""
 
-    problem: PackedProblem
     modes: tuple[Mode, ...]
+
+    @property
+    def columns(self) -> Columns:
+        return self.modes[0].problem.columns
 
     def nearest(self, tangent: FloatArray) -> FloatArray:
         """(S,) the mode nearest each sample, by its own covariance."""
         if len(self.modes) == 1:
             return np.zeros(len(tangent), dtype=np.int64)
-        state = self._state(tangent)
+        state = self.state(tangent)
         far = []
         for mode in self.modes:
-            step = step_between(mode.optimum.state, state, self.problem.columns)
+            step = step_between(mode.optimum.state, state, self.columns)
             whitened = np.linalg.solve(_root(mode.covariance), step.T)
             far.append(np.sum(whitened**2, axis=0))
         return np.asarray(np.argmin(far, axis=0))
 
-    def _state(self, tangent: FloatArray) -> SharedState:
+    def state(self, tangent: FloatArray) -> SharedState:
         base = self.modes[0].optimum.state
-        return _repeat(base, len(tangent)).retract(step_of_tangent(tangent, self.problem.columns), self.problem.columns)
+        return _repeat(base, len(tangent)).retract(step_of_tangent(tangent, self.columns), self.columns)
 
     def log(self, tangent: FloatArray) -> FloatArray:
         out = np.empty(len(tangent))
-        columns = self.problem.columns
+        columns = self.columns
         which = self.nearest(tangent)
         for index, mode in enumerate(self.modes):
             rows = np.flatnonzero(which == index)
@@ -238,25 +246,22 @@ class _Target:
                 if index == 0:
                     step = step_of_tangent(tangent[part], columns)
                 else:
-                    step = step_between(mode.optimum.state, self._state(tangent[part]), columns)
-                out[part] = log_density(self.problem, mode.optimum, step)
+                    step = step_between(mode.optimum.state, self.state(tangent[part]), columns)
+                out[part] = log_density(mode, step)
         return out + _log_volume(tangent, columns)
 
 
-def sample_posterior(
-    problem: PackedProblem, modes: tuple[Mode, ...], *, goal: float, most: int, seed: int, centre: str = "mean"
-) -> Posterior:
-    """Weighted samples of the posterior.
+def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: int) -> Posterior:
+    """Weighted samples of the posterior, about its mean (of the part that is nearest to the weightiest mode).
 
     Args:
-        problem: the packed measurements (with ``shapes`` where the windows' own shape is to count).
-        modes: minima, the one to report first.
+        modes: minima of one session, the best first.
         goal: effective samples to go for.
         most: draws after which to be content with less.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
-    columns, target = problem.columns, _Target(problem, modes)
+    columns, target = modes[0].problem.columns, _Target(modes)
     fallback = modes[0].covariance
     starts = [np.zeros((1, columns.size))]
     starts += [
@@ -291,26 +296,55 @@ def sample_posterior(
         proposals.append(_refitted(x, log_weight, fallback, rng))
         draws = min(max(300, len(x) // 2), max(most - len(x), 100))
     weight = np.exp(log_weight - logsumexp(log_weight))
-    state, base = target._state(x), modes[0].optimum.state
-    mean = base
-    if centre == "mean":
-        which = target.nearest(x)
-        mass = np.array([weight[which == k].sum() for k in range(len(modes))])
-        main = np.where(which == int(np.argmax(mass)), weight, 0.0)
-        shift = (main / main.sum()) @ x
-        mean = base.retract(step_of_tangent(shift[None], columns), columns)
-    step = step_between(mean, state, columns)
+    which = target.nearest(x)
+    mass = np.bincount(which, weight, minlength=len(modes))
+    main = np.where(which == int(np.argmax(mass)), weight, 0.0)
+    return _about_mean(target, x, weight, main / main.sum(), log_target, _effective(log_weight))
+
+
+def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
+    """Samples of the Gaussian at a mode: what the posterior is with many pairs."""
+    x = np.random.default_rng(seed).standard_normal((count, len(mode.covariance)))
+    x = np.concatenate([x, -x])  # in pairs about the mode, which so stays the mean
+    weight = np.full(len(x), 1.0 / len(x))
+    # Stretched to have the mode's covariance exactly.
+    x = np.linalg.solve(_root(x.T @ x / len(x)), x.T).T @ _root(mode.covariance).T
+    log = -0.5 * np.sum(np.linalg.solve(_root(mode.covariance), x.T) ** 2, axis=0)
+    return _about_mean(_Target((mode,)), x, weight, weight, log, float(count))
+
+
+def _about_mean(
+    target: _Target, x: FloatArray, weight: FloatArray, main: FloatArray, log: FloatArray, effective: float
+) -> Posterior:
+    columns = target.columns
+    shift = step_of_tangent((main @ x)[None], columns)
+    mean = target.modes[0].optimum.state.retract(shift, columns)
+    step = step_between(mean, target.state(x), columns)
     tangent = tangent_of_step(step, columns)
-    return Posterior(
-        columns=columns,
-        mean=mean,
-        step=step,
-        tangent=tangent,
-        weight=weight,
-        log_density=log_target,
-        effective=_effective(log_weight),
-        covariance=np.asarray((tangent * weight[:, None]).T @ tangent),
-    )
+    covariance = np.asarray((tangent * weight[:, None]).T @ tangent)
+    return Posterior(columns, mean, step, tangent, weight, log, effective, covariance)
+
+
+def region_contains(posterior: Posterior, trus_T_camera: FloatArray, epoch: int = 0) -> bool:
+    """Whether a registration (4, 4) lies in the posterior's 95 % region of that epoch.
+
+    The region: an ellipsoid of the posterior's covariance in GTSAM's tangent about the estimate, as large as it takes
+    to hold 95 % of the posterior (which is not Gaussian at few pairs).
+    """
+    at = slice(6 * epoch, 6 * epoch + 6)
+    information = np.linalg.inv(posterior.covariance[at, at])
+    tangent = pose_tangent(posterior.mean.trus_T_camera(epoch)[0], trus_T_camera)
+    square = np.einsum("si,ij,sj->s", posterior.tangent[:, at], information, posterior.tangent[:, at])
+    limit = weighted_quantile(square[:, None], posterior.weight, QUANTILE)[0]
+    return bool(tangent @ information @ tangent <= limit)
+
+
+def pose_tangent(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(6,) ``Logmap(first^-1 second)`` of transforms (4, 4), GTSAM's: rotation rad, then translation mm."""
+    back = first[:3, :3].T
+    omega = log_so3(back @ second[:3, :3])
+    shift = back @ (second[:3, 3] - first[:3, 3])
+    return np.concatenate([omega, np.linalg.solve(_expmap_gain(omega), shift)])
 
 
 def weighted_quantile(values: FloatArray, weight: FloatArray, quantile: float) -> FloatArray:

@@ -58,14 +58,21 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
 
 
 def read_pairs(
-    measurements: Measurements, registration: Registration, model: SessionModel, origin_shift_mm: float
+    measurements: Measurements,
+    registration: Registration,
+    model: SessionModel,
+    origin_shift_mm: float,
+    judged: Registration | None = None,
 ) -> tuple[PairEstimate, ...]:
-    """One estimate per pair of ``measurements``, in order; those of unsolved epochs are listed as not used."""
+    """One estimate per pair of ``measurements``, in order; those of unsolved epochs are listed as not used.
+
+    ``judged`` is the registration at its optimum, for the innovations, where ``registration`` is not there.
+    """
     problem, at = registration.problem, registration.optimum.evaluation
     state = registration.optimum.state
     gain, points = at.point_gain[0], at.private.trus_p_pm[0]
     covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
-    nis = _innovations(registration)
+    nis = _innovations(judged or registration)
     looks = problem.looks
     radius, ratio = float(state.radius_mm[0]), float(state.sound_speed_ratio[0])
     out: list[PairEstimate] = []

@@ -32,6 +32,14 @@ BEAM_CHI2 = 30.0
 """Beams of calibrations worse than the best by more than this are not tried."""
 
 
+@dataclass(frozen=True, slots=True)
+class SoundSpeedPrior:
+    """What is known beforehand of the ratio of true to assumed sound speed."""
+
+    mean: float
+    sigma: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
     """One local minimum: chi square, and the state (one hypothesis)."""
@@ -193,7 +201,7 @@ def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> 
     return sorted(known)
 
 
-def _joint_start(
+def joint_start(
     measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
 ) -> SharedState:
     """All solvable epochs in one state: from their own minima, else carried over by the measured motions."""
@@ -221,8 +229,28 @@ def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measuremen
     return Measurements(measurements.aims, pairs, starts)
 
 
-def register(measurements: Measurements, model: SessionModel, config: SolveConfig) -> Registration:
+def pack_session(
+    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+) -> PackedProblem:
+    """The measurements as arrays, with the variables and shapes that the configuration asks for."""
+    prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+    return pack(
+        measurements,
+        model,
+        sound_speed_sigma=prior.sigma if config.estimate_sound_speed else None,
+        sound_speed_mean=prior.mean if config.estimate_sound_speed else 1.0,
+        radius_sigma_mm=config.radius_sigma_mm if config.estimate_radius else None,
+        shapes=config.window_shape,
+        amplitude_sigma=config.amplitude_sigma,
+    )
+
+
+def register(
+    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+) -> Registration:
     """Calibrate and register: the joint optimum over all epochs that can be solved.
+
+    ``sound_speed`` is what is known of the ratio where it is estimated; the configuration's prior where None.
 
     Raises:
         EstimationError: no beam to start from, or no epoch with three PMs.
@@ -239,8 +267,8 @@ def register(measurements: Measurements, model: SessionModel, config: SolveConfi
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
     kept = restrict_epochs(measurements, solvable)
-    problem = pack(kept, model)
-    optimum = optimize(problem, _joint_start(measurements, chosen, solvable, model), tolerance=1e-9)
+    problem = pack_session(kept, model, config, sound_speed)
+    optimum = optimize(problem, joint_start(measurements, chosen, solvable, model), tolerance=1e-9)
     hessian = optimum.evaluation.hessian[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     try:

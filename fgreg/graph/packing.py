@@ -132,6 +132,7 @@ class PackedProblem:
     radius_mm: float
     prior_information: FloatArray
     shapes: RotationShapes | None = None
+    sound_speed_mean: float = 1.0
 
 
 def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
@@ -161,6 +162,7 @@ def pack(
     model: SessionModel,
     *,
     sound_speed_sigma: float | None = None,
+    sound_speed_mean: float = 1.0,
     radius_sigma_mm: float | None = None,
     shapes: bool = False,
     amplitude_sigma: float = AMPLITUDE_SIGMA,
@@ -170,7 +172,8 @@ def pack(
     Args:
         measurements: aims, pairs and epochs.
         model: the session's set-up.
-        sound_speed_sigma: prior sigma of the sound speed ratio (1 is the mean); None: not estimated.
+        sound_speed_sigma: prior sigma of the sound speed ratio; None: not estimated.
+        sound_speed_mean: its prior mean.
         radius_sigma_mm: prior sigma of the probe's radius; None: not estimated.
         shapes: keep the windows' own shape, and the amplitudes, for the posterior beside the Gaussian priors.
         amplitude_sigma: relative noise of amplitudes.
@@ -233,6 +236,7 @@ def pack(
         radius_mm=model.probe.radius_mm,
         prior_information=prior_information,
         shapes=_rotation_shapes(pairs, pm_index, model, amplitude_sigma) if shapes else None,
+        sound_speed_mean=sound_speed_mean,
     )
 
 

@@ -54,7 +54,7 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
     before = np.full(len(precision), np.inf)
     settled = False
     for _ in range(ROUNDS):
-        covariance = _inverse(at.hessian[0])
+        covariance = inverse_hessian(at.hessian[0])
         if covariance is None:
             return None
         mean, variance = _look_marginals(problem, state, at, covariance)
@@ -82,7 +82,8 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
     return problem, optimize(problem, state, private, tolerance=1e-9)
 
 
-def _inverse(hessian: FloatArray) -> FloatArray | None:
+def inverse_hessian(hessian: FloatArray) -> FloatArray | None:
+    """The inverse (D, D) of a Hessian whose units differ by orders of magnitude; None where it is not positive."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     try:
         inverse = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
