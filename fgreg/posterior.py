@@ -317,7 +317,14 @@ def _about_mean(
     target: _Target, x: FloatArray, weight: FloatArray, main: FloatArray, log: FloatArray, effective: float
 ) -> Posterior:
     columns = target.columns
-    shift = step_of_tangent((main @ x)[None], columns)
+    centre = main @ x
+    spread = x - centre
+    moment = (spread * main[:, None]).T @ spread
+    # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
+    # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
+    square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
+    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12))
+    shift = step_of_tangent(keep * centre[None], columns)
     mean = target.modes[0].optimum.state.retract(shift, columns)
     step = step_between(mean, target.state(x), columns)
     tangent = tangent_of_step(step, columns)
