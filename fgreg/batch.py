@@ -103,7 +103,7 @@ def solve(
     aims = read_aims(centred, readout.origin_shift_mm)
     common = [*conditions, *_common_conditions(registration, pairs, aims)]
     epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
-    context = _track_context(centred, posterior, model, readout.origin_shift_mm)
+    context = _track_context(centred, posterior, model, config, readout.origin_shift_mm)
     refused = {epoch.index for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     tracked = tuple(
         TrackEstimate(query.t, None, None, None, False, f"the registration of camera epoch {query.epoch} is refused")
@@ -269,7 +269,11 @@ def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: 
 
 
 def _track_context(
-    registration: Registration, posterior: Posterior, model: SessionModel, origin_shift_mm: float
+    registration: Registration,
+    posterior: Posterior,
+    model: SessionModel,
+    config: SolveConfig,
+    origin_shift_mm: float,
 ) -> TrackContext:
     problem, at = registration.problem, registration.optimum.evaluation
     gain = at.point_gain[0]
@@ -286,4 +290,5 @@ def _track_context(
         posterior=posterior,
         surface=surface,
         origin_shift_mm=origin_shift_mm,
+        config=config,
     )

@@ -21,7 +21,7 @@ from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_p
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced import log_marginal, refine
 from fgreg.graph.reduced_solver import Optimum
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import SharedState, step_between
 
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
@@ -109,25 +109,6 @@ def _log_volume(tangent: FloatArray, columns: Columns) -> FloatArray:
         half2 = np.maximum(0.25 * angle2, 1e-12)
         total += 4.0 * np.log(np.abs(np.sinc(np.sqrt(half2) / np.pi)) + 1e-30)
     return total
-
-
-def step_between(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
-    """(S, D) such that ``first.retract(step) = second``; both with the same beam chart."""
-    out = np.zeros((second.count, columns.size))
-    for k in range(columns.epochs):
-        back = np.swapaxes(first.rotation[:, k], -1, -2)
-        out[:, 6 * k : 6 * k + 3] = log_so3(back @ second.rotation[:, k])
-        shift = second.translation_mm[:, k] - first.translation_mm[:, k]
-        out[:, 6 * k + 3 : 6 * k + 6] = (back @ shift[..., None])[..., 0]
-    out[:, columns.beam : columns.beam + 4] = second.beam - first.beam
-    out[:, columns.edge] = second.edge_rad - first.edge_rad
-    if columns.bias is not None:
-        out[:, columns.bias : columns.bias + 3] = second.bias_mm - first.bias_mm
-    if columns.sound_speed is not None:
-        out[:, columns.sound_speed] = second.sound_speed_ratio - first.sound_speed_ratio
-    if columns.radius is not None:
-        out[:, columns.radius] = second.radius_mm - first.radius_mm
-    return out
 
 
 def _repeat(state: SharedState, count: int) -> SharedState:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-
 from scipy.special import log_ndtr
 
 from fgreg.frames import FloatArray
@@ -67,6 +66,7 @@ def arc_of_rotation(rotation_rad: _Angles, range_mm: _Angles, radius_mm: float) 
     widest = np.where(r < radius_mm, np.arcsin(np.minimum(r / radius_mm, 1.0)), np.pi)
     rotation = np.clip(rotation, -widest, widest)
     return np.asarray(rotation + np.arcsin(np.clip(radius_mm * np.sin(rotation) / r, -1.0, 1.0)))
+
 
 AMPLITUDE_SIGMA = 0.05
 """Relative noise of amplitudes."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from fgreg.measurements import (
 )
 from fgreg.models import SessionModel
 from fgreg.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
+
+if TYPE_CHECKING:
+    from fgreg.graph.shared_state import SharedState
 
 LINE_SIGMA_MM = 1e-3
 """Width of the beam itself: point on line is an equality; this keeps its covariance invertible (as in the factors)."""
@@ -114,6 +118,14 @@ class EpochLink:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """A Gaussian prior of all shared variables: about a state (one hypothesis), information (D, D) of steps from it."""
+
+    state: SharedState
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PackedProblem:
     """All measurements of a session as arrays; indices say which PM and epoch each belongs to."""
 
@@ -133,6 +145,7 @@ class PackedProblem:
     prior_information: FloatArray
     shapes: RotationShapes | None = None
     sound_speed_mean: float = 1.0
+    anchor: Anchor | None = None
 
 
 def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:

@@ -37,7 +37,7 @@ from fgreg.graph.reduced_blocks import (
     times,
     transposed,
 )
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.graph.windows import log_shape_ratio
 
 
@@ -160,6 +160,7 @@ def log_marginal(problem: PackedProblem, state: SharedState, private: PrivateSta
     """
     system = _system(problem, state, private)
     import os
+
     mode = os.environ.get("DETS", "all")
     out = _log_shapes(problem, state, system) - 0.5 * system.cost
     if mode in ("all", "line"):
@@ -299,6 +300,9 @@ def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
     for link in problem.links:
         residual, _ = _link_residual(link, state)
         cost = cost + np.sum(residual * (residual @ link.information), axis=1)
+    if problem.anchor is not None:
+        step = step_between(problem.anchor.state, state, problem.columns)
+        cost = cost + np.sum(step * (step @ problem.anchor.information), axis=1)
     return np.asarray(cost)
 
 
@@ -313,6 +317,9 @@ def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray
         columns = slice(6 * link.index, 6 * link.index + 12)
         hessian[:, columns, columns] += transposed(jacobian) @ weighted
         gradient[:, columns] += times(transposed(weighted), residual)
+    if problem.anchor is not None:
+        hessian += problem.anchor.information
+        gradient += step_between(problem.anchor.state, state, problem.columns) @ problem.anchor.information
 
 
 def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:

@@ -119,7 +119,9 @@ def _new_sites(
     windows = shapes.windows
     # The half width's error moves a first hit's interval as a whole, which the site follows by its gain; of a window
     # known as a whole it moves the ends apart, which counts as softness here.
-    edge_variance = 1.0 / problem.prior_information[problem.columns.edge]
+    edge = problem.columns.edge
+    held = problem.prior_information[edge] + (0.0 if problem.anchor is None else problem.anchor.information[edge, edge])
+    edge_variance = 1.0 / held
     soft = np.sqrt(windows.soft_rad**2 + np.where(problem.looks.edge_gain == 0.0, edge_variance, 0.0))
     low, high = windows.low_rad - cavity, windows.high_rad - cavity
     slope, curvature = interval_moments(low, high, np.sqrt(soft**2 + 1.0 / q))

@@ -60,7 +60,9 @@ def interval_at(shapes: RotationShapes, edge_rad: FloatArray) -> tuple[FloatArra
     return low, np.maximum(high, low + 1e-6)
 
 
-def log_shape_ratio(problem: PackedProblem, edge_rad: FloatArray, offset: FloatArray, variance: FloatArray) -> FloatArray:
+def log_shape_ratio(
+    problem: PackedProblem, edge_rad: FloatArray, offset: FloatArray, variance: FloatArray
+) -> FloatArray:
     """(S,) log of what the intervals make of the density with Gaussian sites.
 
     Args:
