@@ -13,12 +13,13 @@ import numpy as np
 
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray
-from fgreg.graph.packing import PackedProblem
+from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced import evaluate, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.sites import inverse_hessian, propagate
+from fgreg.models import SessionModel
 from fgreg.posterior import Mode, Posterior, gaussian_posterior, sample_posterior
 from fgreg.registration import Registration, targets_moved
 
@@ -26,6 +27,8 @@ RIVALS = 3
 """At most so many other minima enter the posterior."""
 RIVAL_CHI2 = 14.0
 """Minima whose chi square is larger by more than this hold too little of the posterior to matter."""
+FREE_SOUND_SPEED = 0.1
+"""Prior sigma of a sound speed ratio that only the residuals are to determine."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +58,42 @@ def answer(registration: Registration, config: SolveConfig) -> Answer:
         replace(registration, problem=problem, optimum=moved, covariance=posterior.covariance),
         posterior,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """A session-wide variable: value and standard deviation."""
+
+    value: float
+    sigma: float
+
+
+def sound_speed_from_residuals(registration: Registration, model: SessionModel) -> Estimated:
+    """The ratio of true to assumed sound speed that the pairs ask for, next to no prior on it.
+
+    For a registration in which it is no variable: a few steps from its optimum with the ratio set free.
+    """
+    free = pack(registration.measurements, model, sound_speed_sigma=FREE_SOUND_SPEED)
+    freed = optimize(free, registration.optimum.state, max_iterations=6)
+    column = free.columns.sound_speed
+    inverse = inverse_hessian(freed.evaluation.hessian[0])
+    if inverse is None or column is None:
+        return Estimated(1.0, FREE_SOUND_SPEED)
+    return Estimated(float(freed.state.sound_speed_ratio[0]), float(np.sqrt(inverse[column, column])))
+
+
+def estimated_sound_speed(found: Registration) -> Estimated | None:
+    """The ratio of true to assumed sound speed where it is a variable."""
+    at = found.problem.columns.sound_speed
+    value = float(found.optimum.state.sound_speed_ratio[0])
+    return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
+
+
+def estimated_radius(found: Registration) -> Estimated | None:
+    """The probe's radius (mm) where it is a variable."""
+    at = found.problem.columns.radius
+    value = float(found.optimum.state.radius_mm[0])
+    return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
 
 
 def _with_sites(problem: PackedProblem, optimum: Optimum, covariance: FloatArray) -> Mode:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.answer import answer
+from fgreg.answer import answer, estimated_radius, estimated_sound_speed, sound_speed_from_residuals
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.estimate import (
@@ -37,6 +37,9 @@ from fgreg.verdict import (
     ambiguity,
     beam_sides,
     consistency,
+    estimated,
+    sampling,
+    sound_speed,
     spread,
     sweeps,
     verdict_of,
@@ -80,7 +83,7 @@ def solve(
     model: SessionModel,
     config: SolveConfig,
     conditions: Sequence[Condition] = (),
-    sound_speed: SoundSpeedPrior | None = None,
+    sound_speed_prior: SoundSpeedPrior | None = None,
 ) -> Solution:
     """Calibrate, register, judge, and answer the tracking queries from all of it.
 
@@ -90,10 +93,10 @@ def solve(
         model: the session's set-up.
         config: limits of the verdict.
         conditions: found before (detection), to be weighed with those found here.
-        sound_speed: what is known of the sound speed ratio, where the configuration makes it a variable.
+        sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
     """
     try:
-        registration = register(measurements, model, config, sound_speed)
+        registration = register(measurements, model, config, sound_speed_prior)
     except EstimationError as error:
         return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
     answered = answer(registration, config)
@@ -101,7 +104,12 @@ def solve(
     readout = read_laser(centred, model)
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm, judged=registration)
     aims = read_aims(centred, readout.origin_shift_mm)
-    common = [*conditions, *_common_conditions(registration, pairs, aims)]
+    common = [
+        *conditions,
+        *_common_conditions(registration, pairs, aims),
+        *sampling(posterior.effective),
+        *_variable_conditions(registration, centred, sound_speed_prior, config),
+    ]
     epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
     context = _track_context(centred, posterior, model, config, readout.origin_shift_mm)
     refused = {epoch.index for epoch in epochs if epoch.verdict is Verdict.REFUSED}
@@ -157,8 +165,26 @@ def _common_conditions(
     lambdas = [pair.lambda_mm for pair in pairs if pair.lambda_mm is not None]
     lambdas += [aim.lambda_mm for aim in aims if aim.lambda_mm is not None]
     found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
-    if len(pairs) <= GRAPH_PAIRS:
+    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph knows its radius
         found.extend(_agreement(registration))
+    return found
+
+
+def _variable_conditions(
+    registration: Registration, centred: Registration, prior: SoundSpeedPrior | None, config: SolveConfig
+) -> list[Condition]:
+    """Sound speed and radius: what they came out as, or what the residuals say against the one given."""
+    found = []
+    speed, radius = estimated_sound_speed(centred), estimated_radius(centred)
+    if speed is None:
+        asked = sound_speed_from_residuals(registration, registration.model)
+        found.extend(sound_speed(asked.value, asked.sigma, config))
+    else:
+        given = prior or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+        found.append(estimated("sound speed ratio", speed.value, speed.sigma, given.mean, given.sigma, ""))
+    if radius is not None:
+        given_mm = registration.model.probe.radius_mm
+        found.append(estimated("radius", radius.value, radius.sigma, given_mm, config.radius_sigma_mm, " mm"))
     return found
 
 
@@ -175,7 +201,13 @@ def distance_to_explicit(registration: Registration) -> float:
     """Mahalanobis distance between the reduced optimum's registrations and the explicit graph's (reference)."""
     state, problem = registration.optimum.state, registration.problem
     epochs = problem.columns.epochs
-    options = GraphOptions(marker_T_nominal=state.marker_T_nominal[0], unknown_motion_sigma=None)
+    speed = problem.columns.sound_speed
+    options = GraphOptions(
+        marker_T_nominal=state.marker_T_nominal[0],
+        unknown_motion_sigma=None,
+        sound_speed_sigma=None if speed is None else float(problem.prior_information[speed] ** -0.5),
+        sound_speed_mean=problem.sound_speed_mean,
+    )
     explicit = build_graph(registration.measurements, registration.model, options)
     shared = SharedValues(
         trus_T_camera=tuple(state.trus_T_camera(k)[0] for k in range(epochs)),

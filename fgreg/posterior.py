@@ -1,8 +1,7 @@
 """Samples of the posterior of the shared variables, and what they say: the estimate, its covariance, regions, errors.
 
 The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear, and the windows are
-intervals. So the density with the private variables integrated out (fgreg.graph.reduced.log_marginal) is sampled by
-adaptive multiple importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what
+intervals. So the density of the shared variables (fgreg.graph.reduced.log_posterior) is sampled by adaptive multiple importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what
 the samples so far show, all samples weighted by the mixture of all proposals. Deterministic by seed.
 
 Chart: ``trus_T_camera = estimate * Expmap(xi)``, GTSAM's tangent. In it a turn about any point of the scene is a
@@ -19,7 +18,7 @@ from scipy.special import logsumexp
 from fgreg.estimate import PredictedTre
 from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.packing import Columns, PackedProblem
-from fgreg.graph.reduced import log_marginal, refine
+from fgreg.graph.reduced import log_posterior, refine
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import SharedState, step_between
 
@@ -125,7 +124,7 @@ def log_density(mode: Mode, step: FloatArray) -> FloatArray:
     with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
         if len(problem.pms) < REFINED_PMS:
             _, private = refine(problem, state, private)
-        log = log_marginal(problem, state, private)
+        log = log_posterior(problem, state, private)
     return np.where(np.isfinite(log), log, -np.inf)
 
 

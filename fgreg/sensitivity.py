@@ -184,7 +184,8 @@ def log_interval(low: _Angles, high: _Angles, sigma: _Angles) -> FloatArray:
 
     Exact far out in either tail, where the difference of the two distribution functions would be 0.
     """
-    a, b = np.asarray(low, dtype=np.float64) / sigma, np.asarray(high, dtype=np.float64) / sigma
+    per_sigma = 1.0 / np.asarray(sigma, dtype=np.float64)
+    a, b = np.asarray(low, dtype=np.float64) * per_sigma, np.asarray(high, dtype=np.float64) * per_sigma
     flip = a + b > 0.0  # on the side where the distribution function is small
     lower, upper = np.where(flip, -b, a), np.where(flip, -a, b)
     log_upper = log_ndtr(upper)

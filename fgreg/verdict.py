@@ -17,6 +17,9 @@ from fgreg.registration import EpochSearch
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
+SUSPICIOUS_SIGMAS = 3.0
+LEAST_EFFECTIVE = 60.0
+"""Independent samples of the posterior below which its 95 % quantiles are not worth much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +132,38 @@ def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
             "probe and marker in session.yaml",
         )
     ]
+
+
+def sound_speed(ratio: float, sigma: float, config: SolveConfig) -> list[Condition]:
+    """A sound speed that the pairs contradict, from the ratio of true to assumed speed that they ask for."""
+    off = abs(ratio - 1.0)
+    if off <= SUSPICIOUS_SIGMAS * sigma or off <= 0.5 * config.sound_speed_sigma:
+        return []
+    text = (
+        f"the pairs fit better with sound at {ratio:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: correct it in "
+        "session.yaml, or solve with --estimate sound_speed"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
+def estimated(name: str, value: float, sigma: float, prior: float, prior_sigma: float, unit: str) -> Condition:
+    """What a session-wide variable came out as; a warning where it left its prior."""
+    far = abs(value - prior) > SUSPICIOUS_SIGMAS * prior_sigma
+    text = f"estimated {name} {value:.4g} +- {sigma:.2g}{unit} (given {prior:.4g} +- {prior_sigma:.2g}{unit})"
+    if far:
+        return Condition(Verdict.WARNING, f"{text}: farther than its prior allows; correct it in session.yaml")
+    return Condition(Verdict.OK, text)
+
+
+def sampling(effective: float) -> list[Condition]:
+    """Too few independent samples of the posterior for the figures that rest on them."""
+    if effective >= LEAST_EFFECTIVE:
+        return []
+    text = (
+        f"the posterior is hard to sample (worth {effective:.0f} independent samples, {LEAST_EFFECTIVE:.0f} needed), "
+        "so predicted errors are rough: take more pairs"
+    )
+    return [Condition(Verdict.WARNING, text)]
 
 
 def accuracy(tre: PredictedTre, config: SolveConfig) -> list[Condition]:

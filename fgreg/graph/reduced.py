@@ -151,24 +151,17 @@ def refine(problem: PackedProblem, state: SharedState, private: PrivateState) ->
     return system.cost, system.private
 
 
-def log_marginal(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
-    """Log density (S,) of the shared variables with the private ones integrated out (Laplace), up to a constant.
+def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
+    """Log density (S,) of the shared variables, up to a constant.
 
-    ``-cost / 2`` less half the log determinants that the Gaussian integrals over marker errors and PMs leave:
-    of each line residual's covariance, of each PM's information, of each aim residual's covariance. Where the problem
-    keeps the windows' own shapes they take the place of its Gaussian stand-ins (fgreg.graph.windows).
+    Private variables: at their optimum, ``-cost / 2``. Not integrated out with flat priors, which would multiply the
+    density by the volume they are free in, and so by how steeply beams happen to cross arcs: as in straight line fits
+    with errors in both coordinates that estimate is inconsistent (Neyman and Scott, 1948; Kendall and Stuart, vol. 2,
+    ch. 29), the one with the private variables at their optimum is not. Where the problem keeps the windows' own
+    shapes, the PMs' rotations are integrated over them (fgreg.graph.windows).
     """
     system = _system(problem, state, private)
-    import os
-
-    mode = os.environ.get("DETS", "all")
-    out = _log_shapes(problem, state, system) - 0.5 * system.cost
-    if mode in ("all", "line"):
-        out = out - 0.5 * np.sum(np.log(determinant2(system.line.covariance)), axis=1)
-        out = out - 0.5 * np.sum(np.log(determinant2(system.aim_covariance)), axis=1)
-    if mode in ("all", "point"):
-        out = out - 0.5 * np.sum(np.log(np.linalg.det(system.h_pp)), axis=1)
-    return np.asarray(out)
+    return np.asarray(_log_shapes(problem, state, system) - 0.5 * system.cost)
 
 
 def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
