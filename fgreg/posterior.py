@@ -1,8 +1,9 @@
 """Samples of the posterior of the shared variables, and what they say: the estimate, its covariance, regions, errors.
 
 The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear, and the windows are
-intervals. So the density of the shared variables (fgreg.graph.reduced.log_posterior) is sampled by adaptive multiple importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what
-the samples so far show, all samples weighted by the mixture of all proposals. Deterministic by seed.
+intervals. So the density of the shared variables (fgreg.graph.reduced.log_posterior) is sampled by adaptive multiple
+importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what the samples so far
+show, all samples weighted by the mixture of all proposals. Deterministic by seed.
 
 Chart: ``trus_T_camera = estimate * Expmap(xi)``, GTSAM's tangent. In it a turn about any point of the scene is a
 straight line, where (rotation, translation) apart bend: the lever from camera to tissue is long.

@@ -28,7 +28,6 @@ from fgreg.graph.reduced_blocks import (
     LookBlock,
     PrivateState,
     beam_columns,
-    determinant2,
     inverse2,
     inverse3,
     line_block,
