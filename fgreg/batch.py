@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.answer import answer, estimated_radius, estimated_sound_speed
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.estimate import (
@@ -25,9 +26,9 @@ from fgreg.graph.explicit_values import SharedValues, initial_values, read_share
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
-from fgreg.posterior import Posterior, predicted_tre, sample_posterior
+from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
-from fgreg.registration import Registration, register
+from fgreg.registration import Registration, SoundSpeedPrior, register
 from fgreg.surface import fit_surface
 from fgreg.tracking import TrackContext, track
 from fgreg.verdict import (
@@ -39,8 +40,10 @@ from fgreg.verdict import (
     beam_sides,
     causes_of_error,
     consistency,
+    estimated,
     hypotheses,
     left_out,
+    sampling,
     sound_speed_condition,
     spread,
     sweeps,
@@ -87,6 +90,7 @@ def solve(
     model: SessionModel,
     config: SolveConfig,
     conditions: Sequence[Condition] = (),
+    sound_speed_prior: SoundSpeedPrior | None = None,
 ) -> Solution:
     """Calibrate, register, judge, and answer the tracking queries from all of it.
 
@@ -96,22 +100,27 @@ def solve(
         model: the session's set-up.
         config: limits of the verdict.
         conditions: found before (detection), to be weighed with those found here.
+        sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
     """
     try:
-        registration = register(measurements, model, config)
+        registration = register(measurements, model, config, sound_speed_prior)
     except EstimationError as error:
         return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
-    posterior = sample_posterior(
-        registration.problem, registration.optimum, registration.covariance, config.posterior_samples, config.seed
-    )
-    readout = read_laser(registration, model)
-    pairs = read_pairs(measurements, registration, model, readout.origin_shift_mm)
-    aims = read_aims(measurements, registration, readout.origin_shift_mm)
-    common = [*conditions, *_common_conditions(registration, pairs, aims)]
-    epochs, found = _judge_epochs(measurements, registration, posterior, pairs, model, config, common)
-    context = _track_context(registration, posterior, model, readout.origin_shift_mm)
+    answered = answer(registration, config)
+    posterior, centred = answered.posterior, answered.registration
+    readout = read_laser(centred, model)
+    pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
+    aims = read_aims(measurements, centred, readout.origin_shift_mm)
+    common = [
+        *conditions,
+        *_common_conditions(registration, pairs, aims),
+        *sampling(posterior.effective),
+        *_variable_conditions(centred, sound_speed_prior, config),
+    ]
+    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
+    context = track_context(centred, posterior, model, config, readout.origin_shift_mm)
     refused = {epoch.index for epoch in epochs if epoch.verdict is Verdict.REFUSED}
-    answers = tuple(
+    tracked = tuple(
         TrackEstimate(query.t, None, None, None, False, f"the registration of camera epoch {query.epoch} is refused")
         if query.epoch in refused
         else track(query, context)
@@ -127,7 +136,7 @@ def solve(
         laser=readout.laser,
         epochs=epochs,
         pairs=pairs,
-        tracks=answers,
+        tracks=tracked,
         aims=aims,
         registration=registration,
         posterior=posterior,
@@ -172,9 +181,23 @@ def _common_conditions(
         )
     deviant = np.concatenate([shots.pm_deviant, shots.aim_deviant])
     found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
-    found.extend(sound_speed_condition(registration))
-    if len(pairs) <= GRAPH_PAIRS:
+    if problem.columns.sound_speed is None:
+        found.extend(sound_speed_condition(registration))
+    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph knows its radius
         found.extend(_agreement(registration))
+    return found
+
+
+def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, config: SolveConfig) -> list[Condition]:
+    """Sound speed and radius: what they came out as."""
+    found = []
+    speed, radius = estimated_sound_speed(centred), estimated_radius(centred)
+    if speed is not None:
+        given = prior or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+        found.append(estimated("sound speed ratio", speed.value, speed.sigma, given.mean, given.sigma, ""))
+    if radius is not None:
+        given_mm = centred.model.probe.radius_mm
+        found.append(estimated("radius", radius.value, radius.sigma, given_mm, config.radius_sigma_mm, " mm"))
     return found
 
 
@@ -191,7 +214,13 @@ def distance_to_explicit(registration: Registration) -> float:
     """Mahalanobis distance between the reduced optimum's registrations and the explicit graph's (reference)."""
     state, problem = registration.optimum.state, registration.problem
     epochs = problem.columns.epochs
-    options = GraphOptions(marker_T_nominal=state.marker_T_nominal[0], unknown_motion_sigma=None)
+    speed = problem.columns.sound_speed
+    options = GraphOptions(
+        marker_T_nominal=state.marker_T_nominal[0],
+        unknown_motion_sigma=None,
+        sound_speed_sigma=None if speed is None else float(problem.prior_information[speed] ** -0.5),
+        sound_speed_mean=problem.sound_speed_mean,
+    )
     explicit = build_graph(registration.measurements, registration.model, options)
     shared = SharedValues(
         trus_T_camera=tuple(state.trus_T_camera(k)[0] for k in range(epochs)),
@@ -297,8 +326,12 @@ def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: 
     return np.asarray(camera_d @ state.rotation[0, epoch].T)
 
 
-def _track_context(
-    registration: Registration, posterior: Posterior, model: SessionModel, origin_shift_mm: float
+def track_context(
+    registration: Registration,
+    posterior: Posterior,
+    model: SessionModel,
+    config: SolveConfig,
+    origin_shift_mm: float,
 ) -> TrackContext:
     problem, at = registration.problem, registration.optimum.evaluation
     gain = at.point_gain[0]
@@ -315,4 +348,5 @@ def _track_context(
         posterior=posterior,
         surface=surface,
         origin_shift_mm=origin_shift_mm,
+        config=config,
     )

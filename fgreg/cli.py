@@ -127,6 +127,15 @@ def solve(
     redetect: Annotated[
         bool, typer.Option("--redetect", help="Detect in the frames even where events bring poses.")
     ] = False,
+    estimate: Annotated[
+        str,
+        typer.Option(
+            "--estimate",
+            metavar="NAMES",
+            help="Estimate these too, with the values in session.yaml as priors: sound_speed, probe_radius, or both "
+            "with a comma between.",
+        ),
+    ] = "",
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -140,8 +149,15 @@ def solve(
     from fgreg.pipeline import SolveRequest, solve_session
     from fgreg.report import print_summary, summary_dict
 
+    wanted = {name.strip() for name in estimate.split(",") if name.strip()}
+    if not wanted <= {"sound_speed", "probe_radius"}:
+        raise InputError("--estimate", estimate, "sound_speed, probe_radius, or both with a comma between")
     try:
-        config = SolveConfig(limit_mm=limit_mm)
+        config = SolveConfig(
+            limit_mm=limit_mm,
+            estimate_sound_speed="sound_speed" in wanted,
+            estimate_radius="probe_radius" in wanted,
+        )
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
     with _progress(quiet or as_json) as progress:

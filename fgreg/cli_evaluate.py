@@ -176,6 +176,7 @@ def write_text(path: Path, text: str, option: str) -> None:
 
 def read_case(folder: Path, progress: Progress) -> tuple[Case, list[Condition]]:
     """A session with its frames recognised (once) and its truth, and what the frames say against it."""
+    from fgreg.config import SolveConfig
     from fgreg.evaluation.case import Case, Truth
     from fgreg.pipeline import detection_conditions
     from fgreg.recognition import recognise
@@ -193,4 +194,4 @@ def read_case(folder: Path, progress: Progress) -> tuple[Case, list[Condition]]:
         answers = tuple(stage.get(round(track.t, 6)) for track in recognised.tracks)
         truth = Truth(known.trus_T_camera, known.marker_T_laser, answers)
     case = Case(session.model.name, session.model, recognised.measurements, recognised.tracks, truth)
-    return case, detection_conditions(recognised)
+    return case, detection_conditions(recognised, SolveConfig())

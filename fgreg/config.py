@@ -18,7 +18,15 @@ class SolveConfig:
         refuse_beam_spread_rad, warn_beam_spread_rad: root mean square angle of the beams about their mean direction.
         refuse_spot_spread_mm, warn_spot_spread_mm: root mean square distance of the PMs from their best line.
         min_sweeps_per_side: below, a session that relies on first hits counts as one-way.
-        posterior_samples: draws behind the predicted target registration error.
+        window_shape: the sensitivity window as the interval it is, and amplitudes by the sensitivity curve; False: a
+            Gaussian of the same mean and variance, and no amplitudes.
+        amplitude_sigma: relative noise of amplitudes.
+        estimate_sound_speed, estimate_radius: make these variables, with the priors that follow.
+        sound_speed_sigma: prior of the ratio of true to assumed sound speed, about 1.
+        radius_sigma_mm: prior of the probe's radius, about the session's.
+        posterior_effective: independent samples that the draws from the posterior should be worth.
+        posterior_samples: draws after which fewer have to do.
+        posterior_looks: with more looks than this the posterior counts as the Gaussian that it then is.
         seed: of those draws.
     """
 
@@ -30,7 +38,15 @@ class SolveConfig:
     refuse_spot_spread_mm: float = 2.0
     warn_spot_spread_mm: float = 4.0
     min_sweeps_per_side: int = 3
-    posterior_samples: int = 400
+    window_shape: bool = True
+    amplitude_sigma: float = 0.05
+    estimate_sound_speed: bool = False
+    estimate_radius: bool = False
+    sound_speed_sigma: float = 0.01
+    radius_sigma_mm: float = 0.3
+    posterior_effective: float = 250.0
+    posterior_samples: int = 3000
+    posterior_looks: int = 80
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -38,3 +54,7 @@ class SolveConfig:
             raise ValueError(f"limit_mm is {self.limit_mm}, expected a number > 0")
         if self.posterior_samples < 100:
             raise ValueError(f"posterior_samples is {self.posterior_samples}, expected at least 100")
+        for name in ("amplitude_sigma", "sound_speed_sigma", "radius_sigma_mm", "posterior_effective"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}, expected a number > 0")

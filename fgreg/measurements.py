@@ -77,13 +77,17 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A query in camera epoch ``epoch``; ``looks`` where the PM is heard now."""
+    """A query in camera epoch ``epoch``; ``looks`` where the PM is heard now.
+
+    ``look_markers``: one per look, where the marker was detected anew at each; else ``marker`` serves them all.
+    """
 
     t: float
     epoch: int
     marker: MarkerObservation
     looks: tuple[Look, ...] = ()
     scan_rad: float | None = None
+    look_markers: tuple[MarkerObservation, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

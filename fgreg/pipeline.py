@@ -25,6 +25,7 @@ from fgreg.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.frames import FloatArray, transform_points
 from fgreg.models import SessionModel
 from fgreg.recognition import Recognised, load_trus_frame, looks_of, marker_pictures, recognise
+from fgreg.registration import SoundSpeedPrior
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import remove_result, write_result
@@ -110,7 +111,12 @@ def solve_session(
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
         solution = solve(
-            recognised.measurements, recognised.tracks, session.model, config, detection_conditions(recognised)
+            recognised.measurements,
+            recognised.tracks,
+            session.model,
+            config,
+            detection_conditions(recognised, config),
+            sound_speed_prior(recognised, config),
         )
         estimate = session_estimate(session, recognised, solution)
         errors = None if truth is None else truth_errors(estimate, truth, session.model.targets_mm)
@@ -131,11 +137,22 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
     remove_result(result_path)
 
 
-def detection_conditions(recognised: Recognised) -> list[Condition]:
-    """What the frames say against the session: wrong sound speed, calibration shots lost."""
+def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:
+    """What the wavefronts say of the sound speed, weighed with the configuration's prior; None without wavefronts."""
+    pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
+    if pooled is None:
+        return None
+    ratio, sigma = pooled
+    by_frames, by_prior = sigma**-2, config.sound_speed_sigma**-2
+    mean = (ratio * by_frames + by_prior) / (by_frames + by_prior)
+    return SoundSpeedPrior(mean, (by_frames + by_prior) ** -0.5)
+
+
+def detection_conditions(recognised: Recognised, config: SolveConfig) -> list[Condition]:
+    """What the frames say against the session: wrong sound speed (unless estimated), calibration shots lost."""
     found = []
     pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
-    if pooled is not None:
+    if pooled is not None and not config.estimate_sound_speed:
         ratio, sigma = pooled
         if abs(ratio - 1.0) > max(3.0 * sigma, SOUND_SPEED_TOLERANCE):
             text = (

@@ -1,9 +1,12 @@
-"""Samples of the posterior of the shared variables, and what they say about the error at the targets.
+"""Samples of the posterior of the shared variables, and what they say: the estimate, its covariance, regions, errors.
 
-The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear. So the density with
-the private variables integrated out (fgreg.graph.reduced.log_marginal) is sampled: importance sampling from a Student
-density around the optimum, whose centre and spread are refitted to the weighted samples once (adaptive importance
-sampling, Cappe et al., 2004). Deterministic by seed.
+The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear, and the windows are
+intervals. So the density of the shared variables (fgreg.graph.reduced.log_posterior) is sampled by adaptive multiple
+importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what the samples so far
+show, all samples weighted by the mixture of all proposals. Deterministic by seed.
+
+Chart: ``trus_T_camera = estimate * Expmap(xi)``, GTSAM's tangent. In it a turn about any point of the scene is a
+straight line, where (rotation, translation) apart bend: the lever from camera to tissue is long.
 """
 
 from __future__ import annotations
@@ -11,17 +14,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logsumexp
 
 from fgreg.estimate import PredictedTre
-from fgreg.frames import FloatArray, exp_so3, inverse, transform_points
+from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.packing import Columns, PackedProblem
-from fgreg.graph.reduced import log_marginal, refine
+from fgreg.graph.reduced import log_posterior, refine
 from fgreg.graph.reduced_solver import Optimum
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import SharedState, step_between
 
 DEGREES_OF_FREEDOM = 6.0
-"""Of the Student proposal: heavier tails than the posterior's, or rare samples would carry all the weight."""
+"""Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
 QUANTILE = 0.95
+CHUNK = 100
+"""Samples evaluated at once: what stays in the cache."""
+REFINED_PMS = 8
+"""With fewer PMs the samples reach so far that the private variables are refined once more for each."""
+KERNELS = 40
+"""Proposals of a later round that sit on samples of the earlier ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,82 +41,298 @@ class Posterior:
     Attributes:
         columns: where each shared variable sits in ``step``.
         mean: the estimate they are centred on (one hypothesis).
-        step: (S, D) right-tangent deviations of the samples from it.
+        step: (S, D) deviations of the samples from it, as :meth:`SharedState.retract` takes them.
+        tangent: (S, D) the same with registrations in GTSAM's tangent.
         weight: (S,) sums to 1.
+        log_density: (S,) of the samples, up to a constant; see :meth:`contains`.
         effective: number of independent samples they are worth.
-        covariance: (D, D) second moment about the estimate.
+        covariance: (D, D) second moment of ``tangent`` about the estimate.
     """
 
     columns: Columns
     mean: SharedState
     step: FloatArray
+    tangent: FloatArray
     weight: FloatArray
+    log_density: FloatArray
     effective: float
     covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mode:
+    """Where to look for probability: an optimum of a problem (one hypothesis) and the covariance (D, D) about it."""
+
+    problem: PackedProblem
+    optimum: Optimum
+    covariance: FloatArray
+
+
+def _expmap_gain(omega: FloatArray) -> FloatArray:
+    """V (..., 3, 3) of SE(3): the translation of ``Expmap(omega, rho)`` is ``V rho``."""
+    angle2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    small = angle2 < 1e-8
+    angle = np.sqrt(np.where(small, 1.0, angle2))
+    a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(angle)) / angle**2)
+    b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (angle - np.sin(angle)) / angle**3)
+    k = hat(omega)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def step_of_tangent(tangent: FloatArray, columns: Columns) -> FloatArray:
+    """(S, D) steps of :meth:`SharedState.retract` from deviations with registrations in GTSAM's tangent."""
+    step = tangent.copy()
+    for k in range(columns.epochs):
+        omega = tangent[:, 6 * k : 6 * k + 3]
+        step[:, 6 * k + 3 : 6 * k + 6] = (_expmap_gain(omega) @ tangent[:, 6 * k + 3 : 6 * k + 6, None])[..., 0]
+    return step
+
+
+def tangent_of_step(step: FloatArray, columns: Columns) -> FloatArray:
+    """Inverse of :func:`step_of_tangent`."""
+    tangent = step.copy()
+    for k in range(columns.epochs):
+        omega = step[:, 6 * k : 6 * k + 3]
+        shift = step[:, 6 * k + 3 : 6 * k + 6, None]
+        tangent[:, 6 * k + 3 : 6 * k + 6] = np.linalg.solve(_expmap_gain(omega), shift)[..., 0]
+    return tangent
+
+
+def _log_volume(tangent: FloatArray, columns: Columns) -> FloatArray:
+    """(S,) log of the volume (Haar measure times translation) of the tangent's unit cell: 2 log(2 (1 - cos a) / a^2).
+
+    Once for the rotation, once for the translation's gain.
+    """
+    total = np.zeros(len(tangent))
+    for k in range(columns.epochs):
+        angle2 = np.sum(tangent[:, 6 * k : 6 * k + 3] ** 2, axis=1)
+        half2 = np.maximum(0.25 * angle2, 1e-12)
+        total += 4.0 * np.log(np.abs(np.sinc(np.sqrt(half2) / np.pi)) + 1e-30)
+    return total
 
 
 def _repeat(state: SharedState, count: int) -> SharedState:
     return state.take(np.zeros(count, dtype=np.int64))
 
 
-def _log_density(problem: PackedProblem, optimum: Optimum, step: FloatArray) -> FloatArray:
-    """(S,) log marginal density at right-tangent deviations (S, D) from the optimum."""
+def log_density(mode: Mode, step: FloatArray) -> FloatArray:
+    """(S,) log density at steps (S, D) from a mode's optimum, up to a constant common to a session's modes."""
+    problem, optimum = mode.problem, mode.optimum
     state = _repeat(optimum.state, len(step)).retract(step, problem.columns)
     at = optimum.evaluation
     points = at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0]
     private = replace(at.private.take(np.zeros(len(step), dtype=np.int64)), trus_p_pm=points)
-    _, private = refine(problem, state, private)
-    log_density = log_marginal(problem, state, private)
-    return np.where(np.isfinite(log_density), log_density, -np.inf)
+    with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
+        if len(problem.pms) < REFINED_PMS:
+            _, private = refine(problem, state, private)
+        log = log_posterior(problem, state, private)
+    return np.where(np.isfinite(log), log, -np.inf)
 
 
-def _student(rng: np.random.Generator, mean: FloatArray, root: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Samples (S, D) of a multivariate Student density, and their log density up to a constant."""
-    size = len(mean)
-    normal = rng.standard_normal((count, size))
-    stretch = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
-    standard = normal * stretch[:, None]
-    square = np.sum(standard**2, axis=1)
-    log_density = -0.5 * (DEGREES_OF_FREEDOM + size) * np.log1p(square / DEGREES_OF_FREEDOM)
-    return mean + standard @ root.T, log_density - np.log(np.diag(root)).sum()
+@dataclass(frozen=True, slots=True, eq=False)
+class _Students:
+    """Mixture of multivariate Student densities of one shape each: centres (K, D), roots (K, D, D), shares (K,)."""
+
+    centre: FloatArray
+    root: FloatArray
+    share: FloatArray
+
+    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
+        which = rng.choice(len(self.share), count, p=self.share)
+        normal = rng.standard_normal((count, self.centre.shape[1]))
+        stretch = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
+        return np.asarray(self.centre[which] + (self.root[which] @ (normal * stretch[:, None])[..., None])[..., 0])
+
+    def log(self, x: FloatArray) -> FloatArray:
+        """(S,) log density up to a constant common to all mixtures."""
+        size = x.shape[1]
+        out = np.empty((len(self.share), len(x)))
+        for k in range(len(self.share)):
+            whitened = np.linalg.solve(self.root[k], (x - self.centre[k]).T)
+            log = -0.5 * (DEGREES_OF_FREEDOM + size) * np.log1p(np.sum(whitened**2, axis=0) / DEGREES_OF_FREEDOM)
+            out[k] = log - np.log(np.diag(self.root[k])).sum() + np.log(self.share[k])
+        return np.asarray(logsumexp(out, axis=0))
 
 
-def sample_posterior(
-    problem: PackedProblem, optimum: Optimum, covariance: FloatArray, count: int, seed: int
-) -> Posterior:
-    """Weighted samples of the posterior around an optimum of one hypothesis.
+def _root(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+
+
+def _effective(log_weight: FloatArray) -> float:
+    return float(np.exp(2.0 * logsumexp(log_weight) - logsumexp(2.0 * log_weight)))
+
+
+def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
+    """Weights (S,), flattened by a power where they would be worth fewer than ``least`` samples."""
+    power = 1.0
+    while _effective(power * log_weight) < min(least, 0.5 * len(log_weight)) and power > 1e-3:
+        power *= 0.8
+    return np.asarray(np.exp(power * log_weight - logsumexp(power * log_weight)))
+
+
+def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: np.random.Generator) -> _Students:
+    """A proposal for the next round: about the samples' mean, and about some of the samples themselves."""
+    size = x.shape[1]
+    weight = _tempered(log_weight, 3.0 * size)
+    effective = 1.0 / float(np.sum(weight**2))
+    centre = weight @ x
+    spread = x - centre
+    trust = effective / (effective + size)
+    moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * fallback
+    root = _root(moment)
+    # Kernels as wide as a density estimate from so many samples would have them.
+    width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
+    at = x[rng.choice(len(x), KERNELS, p=weight)]
+    centres = np.concatenate([centre[None], at])
+    roots = np.concatenate([root[None], np.repeat(width * root[None], KERNELS, axis=0)])
+    share = np.concatenate([[0.5], np.full(KERNELS, 0.5 / KERNELS)])
+    return _Students(centres, roots, share)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Target:
+    """The density to sample, over tangents about the first mode."""
+
+    modes: tuple[Mode, ...]
+
+    @property
+    def columns(self) -> Columns:
+        return self.modes[0].problem.columns
+
+    def nearest(self, tangent: FloatArray) -> FloatArray:
+        """(S,) the mode nearest each sample, by its own covariance."""
+        if len(self.modes) == 1:
+            return np.zeros(len(tangent), dtype=np.int64)
+        state = self.state(tangent)
+        far = []
+        for mode in self.modes:
+            step = step_between(mode.optimum.state, state, self.columns)
+            whitened = np.linalg.solve(_root(mode.covariance), step.T)
+            far.append(np.sum(whitened**2, axis=0))
+        return np.asarray(np.argmin(far, axis=0))
+
+    def state(self, tangent: FloatArray) -> SharedState:
+        base = self.modes[0].optimum.state
+        return _repeat(base, len(tangent)).retract(step_of_tangent(tangent, self.columns), self.columns)
+
+    def log(self, tangent: FloatArray) -> FloatArray:
+        out = np.empty(len(tangent))
+        columns = self.columns
+        which = self.nearest(tangent)
+        for index, mode in enumerate(self.modes):
+            rows = np.flatnonzero(which == index)
+            for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
+                if not len(part):
+                    continue
+                if index == 0:
+                    step = step_of_tangent(tangent[part], columns)
+                else:
+                    step = step_between(mode.optimum.state, self.state(tangent[part]), columns)
+                out[part] = log_density(mode, step)
+        return out + _log_volume(tangent, columns)
+
+
+def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: int) -> Posterior:
+    """Weighted samples of the posterior, about its mean (of the part that is nearest to the weightiest mode).
 
     Args:
-        problem: the packed measurements.
-        optimum: of :func:`fgreg.graph.reduced_solver.optimize`.
-        covariance: (D, D) of the shared variables at the optimum (inverse Hessian).
-        count: samples of the second round; the first takes half as many.
+        modes: minima of one session, the best first.
+        goal: effective samples to go for.
+        most: draws after which to be content with less.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
-    mean = np.zeros(len(covariance))
-    root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-    for draws in (count // 2, count):
-        step, log_proposal = _student(rng, mean, root, draws)
-        log_weight = _log_density(problem, optimum, step) - log_proposal
-        weight = np.exp(log_weight - log_weight.max())
-        weight /= weight.sum()
-        centre = weight @ step
-        spread = step - centre
-        # Shrink towards the Gaussian at the optimum by what few effective samples cannot tell.
-        effective = 1.0 / float(np.sum(weight**2))
-        trust = effective / (effective + 2.0 * len(mean))
-        mean = trust * centre
-        moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * covariance
-        root = np.asarray(np.linalg.cholesky(moment), dtype=np.float64)
-    return Posterior(
-        columns=problem.columns,
-        mean=optimum.state,
-        step=step,
-        weight=weight,
-        effective=effective,
-        covariance=np.asarray((step * weight[:, None]).T @ step),
-    )
+    columns, target = modes[0].problem.columns, _Target(modes)
+    fallback = modes[0].covariance
+    starts = [np.zeros((1, columns.size))]
+    starts += [
+        tangent_of_step(step_between(modes[0].optimum.state, mode.optimum.state, columns), columns)
+        for mode in modes[1:]
+    ]
+    proposals = [
+        _Students(
+            np.concatenate(starts),
+            np.stack([_root(mode.covariance) for mode in modes]),
+            np.full(len(modes), 1.0 / len(modes)),
+        )
+    ]
+    x, log_target = np.zeros((0, columns.size)), np.zeros(0)
+    counts: list[int] = []
+    log_proposal = np.zeros((0, 0))
+    draws = 300
+    while True:
+        fresh = proposals[-1].draw(rng, draws)
+        old_under_new = proposals[-1].log(x) if len(x) else np.zeros(0)
+        new_under_all = np.stack([proposal.log(fresh) for proposal in proposals])
+        if len(x):
+            log_proposal = np.concatenate([np.concatenate([log_proposal, old_under_new[None]]), new_under_all], axis=1)
+        else:
+            log_proposal = new_under_all
+        x, log_target = np.concatenate([x, fresh]), np.concatenate([log_target, target.log(fresh)])
+        counts.append(draws)
+        share = np.log(np.array(counts) / sum(counts))
+        log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
+        if _effective(log_weight) >= goal or len(x) >= most:
+            break
+        proposals.append(_refitted(x, log_weight, fallback, rng))
+        draws = min(max(300, len(x) // 2), max(most - len(x), 100))
+    weight = np.exp(log_weight - logsumexp(log_weight))
+    which = target.nearest(x)
+    mass = np.bincount(which, weight, minlength=len(modes))
+    main = np.where(which == int(np.argmax(mass)), weight, 0.0)
+    return _about_mean(target, x, weight, main / main.sum(), log_target, _effective(log_weight))
+
+
+def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
+    """Samples of the Gaussian at a mode: what the posterior is with many pairs."""
+    x = np.random.default_rng(seed).standard_normal((count, len(mode.covariance)))
+    x = np.concatenate([x, -x])  # in pairs about the mode, which so stays the mean
+    weight = np.full(len(x), 1.0 / len(x))
+    # Stretched to have the mode's covariance exactly.
+    x = np.linalg.solve(_root(x.T @ x / len(x)), x.T).T @ _root(mode.covariance).T
+    log = -0.5 * np.sum(np.linalg.solve(_root(mode.covariance), x.T) ** 2, axis=0)
+    return _about_mean(_Target((mode,)), x, weight, weight, log, float(count))
+
+
+def _about_mean(
+    target: _Target, x: FloatArray, weight: FloatArray, main: FloatArray, log: FloatArray, effective: float
+) -> Posterior:
+    columns = target.columns
+    centre = main @ x
+    spread = x - centre
+    moment = (spread * main[:, None]).T @ spread
+    # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
+    # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
+    square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
+    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12))
+    shift = step_of_tangent(keep * centre[None], columns)
+    mean = target.modes[0].optimum.state.retract(shift, columns)
+    step = step_between(mean, target.state(x), columns)
+    tangent = tangent_of_step(step, columns)
+    covariance = np.asarray((tangent * weight[:, None]).T @ tangent)
+    return Posterior(columns, mean, step, tangent, weight, log, effective, covariance)
+
+
+def region_contains(posterior: Posterior, trus_T_camera: FloatArray, epoch: int = 0) -> bool:
+    """Whether a registration (4, 4) lies in the posterior's 95 % region of that epoch.
+
+    The region: an ellipsoid of the posterior's covariance in GTSAM's tangent about the estimate, as large as it takes
+    to hold 95 % of the posterior (which is not Gaussian at few pairs).
+    """
+    at = slice(6 * epoch, 6 * epoch + 6)
+    information = np.linalg.inv(posterior.covariance[at, at])
+    tangent = pose_tangent(posterior.mean.trus_T_camera(epoch)[0], trus_T_camera)
+    square = np.einsum("si,ij,sj->s", posterior.tangent[:, at], information, posterior.tangent[:, at])
+    limit = weighted_quantile(square[:, None], posterior.weight, QUANTILE)[0]
+    return bool(tangent @ information @ tangent <= limit)
+
+
+def pose_tangent(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(6,) ``Logmap(first^-1 second)`` of transforms (4, 4), GTSAM's: rotation rad, then translation mm."""
+    back = first[:3, :3].T
+    omega = log_so3(back @ second[:3, :3])
+    shift = back @ (second[:3, 3] - first[:3, 3])
+    return np.concatenate([omega, np.linalg.solve(_expmap_gain(omega), shift)])
 
 
 def weighted_quantile(values: FloatArray, weight: FloatArray, quantile: float) -> FloatArray:

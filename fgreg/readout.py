@@ -57,7 +57,10 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
 
 
 def read_pairs(
-    measurements: Measurements, registration: Registration, model: SessionModel, origin_shift_mm: float
+    measurements: Measurements,
+    registration: Registration,
+    model: SessionModel,
+    origin_shift_mm: float,
 ) -> tuple[PairEstimate, ...]:
     """One estimate per pair of ``measurements``, in order; those left out say why."""
     shots = registration.shots

@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,6 +58,14 @@ __all__ = [
 ]
 
 
+@dataclass(frozen=True, slots=True)
+class SoundSpeedPrior:
+    """What is known beforehand of the ratio of true to assumed sound speed."""
+
+    mean: float
+    sigma: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Shots:
     """All shots of the epochs solved, at the optimum of those kept.
@@ -104,6 +113,8 @@ class Registration:
     shots: Shots
 
 
+Pack = Callable[[Measurements], PackedProblem]
+
 FEW = 0.05
 """So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
 
@@ -117,7 +128,7 @@ def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> 
     return sorted(known)
 
 
-def _joint_start(
+def joint_start(
     measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
 ) -> SharedState:
     """All solvable epochs in one state: from their own minima, else carried over by the measured motions."""
@@ -143,6 +154,22 @@ def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measuremen
     starts = tuple(measurements.epochs[k] if k - 1 in place else EpochStart(measurements.epochs[k].t) for k in epochs)
     pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
     return Measurements(measurements.aims, pairs, starts)
+
+
+def pack_session(
+    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+) -> PackedProblem:
+    """The measurements as arrays, with the variables and shapes that the configuration asks for."""
+    prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+    return pack(
+        measurements,
+        model,
+        sound_speed_sigma=prior.sigma if config.estimate_sound_speed else None,
+        sound_speed_mean=prior.mean if config.estimate_sound_speed else 1.0,
+        radius_sigma_mm=config.radius_sigma_mm if config.estimate_radius else None,
+        shapes=config.window_shape,
+        amplitude_sigma=config.amplitude_sigma,
+    )
 
 
 def _keep(measurements: Measurements, pms: tuple[int, ...], pm_kept: BoolArray, aim_kept: BoolArray) -> Measurements:
@@ -173,7 +200,7 @@ def _split_looks(
     whole: PackedProblem,
     kept: tuple[BoolArray, BoolArray],
     judged: Sorted,
-    model: SessionModel,
+    packed: Pack,
 ) -> tuple[Measurements, BoolArray] | None:
     """Several looks at a PM of which one is junk: that one becomes a PM of its own, and the others are kept.
 
@@ -198,7 +225,7 @@ def _split_looks(
         for index in looks[pm]
         if index != left
     ]
-    fits = predicted_pms(pack(replace(measurements, pairs=tuple(variants)), model), whole, judged)
+    fits = predicted_pms(packed(replace(measurements, pairs=tuple(variants))), whole, judged)
     single: dict[int, list[int]] = {}
     for (pm, left), good in zip(trials, fits, strict=True):
         if good:
@@ -217,18 +244,18 @@ def _split_looks(
 
 
 def _solve_jointly(
-    measurements: Measurements, model: SessionModel, start: SharedState, aim_kept: BoolArray, *, clean: bool
+    measurements: Measurements, packed: Pack, start: SharedState, aim_kept: BoolArray, *, clean: bool
 ) -> tuple[Measurements, PackedProblem, Optimum, Shots]:
     """What is kept, packed, its optimum, and all shots judged by it.
 
     Args:
         measurements: of the epochs to be solved.
-        model: the session's set-up.
+        packed: lays measurements out as arrays.
         start: one hypothesis.
         aim_kept: (A,) aims that fitted when looked at alone.
         clean: whether no PM has deviated so far.
     """
-    whole = pack(measurements, model)
+    whole = packed(measurements)
     everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
     if clean and aim_kept.all():
         optimum = optimize(whole, start, tolerance=1e-9)
@@ -248,14 +275,14 @@ def _solve_jointly(
         first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
     judged = sort_shots(whole, start, *first)
     kept = _enough(whole, judged.pm_kept, judged.aim_kept)
-    apart = _split_looks(measurements, whole, kept, judged, model)
+    apart = _split_looks(measurements, whole, kept, judged, packed)
     if apart is not None:
         measurements, pm_kept = apart
-        whole = pack(measurements, model)
+        whole = packed(measurements)
         judged = sort_shots(whole, judged.state, pm_kept, kept[1])
         kept = _enough(whole, judged.pm_kept, judged.aim_kept)
     chosen = _keep(measurements, whole.pms, *kept)
-    problem = pack(chosen, model)
+    problem = packed(chosen)
     optimum = optimize(problem, judged.state, tolerance=1e-9)
     found = innovations_at(whole, optimum.state, *kept)
     deviants = deviant(whole, found)
@@ -266,8 +293,12 @@ def _solve_jointly(
     return chosen, problem, optimum, Shots(whole, at, *kept, found, deviants.pm, deviants.aim)
 
 
-def register(measurements: Measurements, model: SessionModel, config: SolveConfig) -> Registration:
+def register(
+    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+) -> Registration:
     """Calibrate and register: the joint optimum over all epochs that can be solved.
+
+    ``sound_speed`` is what is known of the ratio where it is estimated; the configuration's prior where None.
 
     Raises:
         EstimationError: no beam to start from, or no epoch with three PMs.
@@ -285,10 +316,14 @@ def register(measurements: Measurements, model: SessionModel, config: SolveConfi
         )
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
-    start = _joint_start(measurements, chosen, solvable, model)
+    start = joint_start(measurements, chosen, solvable, model)
     clean = all(search.clean for search in searches)
+
+    def packed(of: Measurements) -> PackedProblem:
+        return pack_session(of, model, config, sound_speed)
+
     kept, problem, optimum, shots = _solve_jointly(
-        restrict_epochs(measurements, solvable), model, start, beam.aim_kept, clean=clean
+        restrict_epochs(measurements, solvable), packed, start, beam.aim_kept, clean=clean
     )
     hessian = optimum.evaluation.hessian[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))

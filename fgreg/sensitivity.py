@@ -12,17 +12,22 @@ Everything here is pure and works on arrays as well as on numbers; millimetres a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import log_ndtr
 
 from fgreg.frames import FloatArray
 from fgreg.measurements import Look
 from fgreg.models import ProbeModel, SensitivityModel
 
 _Angles = npt.ArrayLike
+
+MIN_SOFTNESS_RAD = 1e-3
+"""Least softness of a window's edge (0.06 deg): no probe's window ends like a step."""
 
 
 def wrap_angle(angle_rad: _Angles) -> FloatArray:
@@ -61,6 +66,12 @@ def arc_of_rotation(rotation_rad: _Angles, range_mm: _Angles, radius_mm: float) 
     widest = np.where(r < radius_mm, np.arcsin(np.minimum(r / radius_mm, 1.0)), np.pi)
     rotation = np.clip(rotation, -widest, widest)
     return np.asarray(rotation + np.arcsin(np.clip(radius_mm * np.sin(rotation) / r, -1.0, 1.0)))
+
+
+AMPLITUDE_SIGMA = 0.05
+"""Relative noise of amplitudes."""
+TABLE_SIZE, TABLE_MARGIN_RAD = 241, math.radians(3.0)
+"""Plane angles at which amplitudes are compared with the curve, and how far beyond the window they reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,3 +141,103 @@ def sensitivity_prior(look: Look, probe: ProbeModel, step_rad: float) -> Sensiti
     """The prior of one look; see :func:`window_priors`."""
     priors = sensitivity_priors([look], probe, step_rad)
     return SensitivityPrior(float(priors.centre_rad[0]), float(priors.edge_gain[0]), float(priors.sigma_rad[0]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowShapes:
+    """In which interval of stage rotation n looks put their PM, arrays (n,): the window as it is, not as a Gaussian.
+
+    The likelihood of a rotation is one inside ``(low + low_gain * window_edge, high + high_gain * window_edge)`` and
+    zero outside, softened by the stage reading's noise.
+
+    Attributes:
+        low_rad, high_rad: the interval's ends.
+        low_gain, high_gain: how the error of the known half width moves them: -1, +1 for the window itself, both the
+            sweep's sign for a first hit.
+        soft_rad: standard deviation of the ends' softness.
+    """
+
+    low_rad: FloatArray
+    high_rad: FloatArray
+    low_gain: FloatArray
+    high_gain: FloatArray
+    soft_rad: FloatArray
+
+
+def window_shapes(looks: Sequence[Look], probe: ProbeModel, step_rad: float) -> WindowShapes:
+    """The intervals of n looks; the cases are those of :func:`window_priors`."""
+    s = np.array([look.sweep for look in looks], dtype=np.float64)
+    w = probe.sensitivity.half_width_at(np.array([look.range_mm for look in looks], dtype=np.float64))
+    informed = (s != 0.0) & (step_rad < 2.0 * w)
+    near = w - step_rad
+    return WindowShapes(
+        low_rad=np.where(informed & (s > 0), near, -w),
+        high_rad=np.where(informed & (s < 0), -near, w),
+        low_gain=np.where(informed, s, -1.0),
+        high_gain=np.where(informed, s, 1.0),
+        soft_rad=np.maximum([look.scan_sigma_rad for look in looks], MIN_SOFTNESS_RAD).reshape(len(looks)),
+    )
+
+
+def log_interval(low: _Angles, high: _Angles, sigma: _Angles) -> FloatArray:
+    """Log of the probability that a Gaussian of mean 0 and ``sigma`` lies between ``low`` and ``high``; any shapes.
+
+    Exact far out in either tail, where the difference of the two distribution functions would be 0.
+    """
+    per_sigma = 1.0 / np.asarray(sigma, dtype=np.float64)
+    a, b = np.asarray(low, dtype=np.float64) * per_sigma, np.asarray(high, dtype=np.float64) * per_sigma
+    flip = a + b > 0.0  # on the side where the distribution function is small
+    lower, upper = np.where(flip, -b, a), np.where(flip, -a, b)
+    log_upper = log_ndtr(upper)
+    return np.asarray(log_upper + np.log(-np.expm1(np.minimum(log_ndtr(lower) - log_upper, -1e-16))))
+
+
+def interval_moments(low: _Angles, high: _Angles, sigma: _Angles) -> tuple[FloatArray, FloatArray]:
+    """First and minus second derivative of :func:`log_interval` by a common shift of the Gaussian's mean.
+
+    With ``low`` and ``high`` counted from the mean, densities p at the ends and the probability Z between:
+    g = (p(low) - p(high)) / Z, and g^2 - (low p(low) - high p(high)) / (sigma^2 Z).
+    """
+    a, b = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    sigma = np.asarray(sigma, dtype=np.float64)
+    scale = -0.5 * np.log(2.0 * np.pi) - np.log(sigma) - log_interval(a, b, sigma)
+    at_low, at_high = np.exp(scale - 0.5 * (a / sigma) ** 2), np.exp(scale - 0.5 * (b / sigma) ** 2)
+    slope = at_low - at_high
+    return slope, slope * slope - (a * at_low - b * at_high) / sigma**2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AmplitudeTable:
+    """Log likelihood (G,) of a PM's amplitudes at plane angles (G,), 0 at its best; ``used``: whether it says anything.
+
+    The plane angle is that at which the image plane passes through the PM: scan angle plus rotation.
+    """
+
+    plane_rad: FloatArray
+    log_likelihood: FloatArray
+    used: bool
+
+
+def amplitude_table(looks: Sequence[Look], sensitivity: SensitivityModel, amplitude_sigma: float) -> AmplitudeTable:
+    """What the amplitudes of the looks at one PM say about its plane angle, its unknown peak eliminated.
+
+    ``log amplitude = log peak + log curve(rotation) + noise``: at a plane angle each look gives one estimate of the
+    peak, and with a flat prior on its logarithm what counts is how far they scatter about their weighted mean. The
+    stage reading's noise adds by the curve's slope. Needs two looks with amplitudes and a curve.
+    """
+    scan = np.array([look.scan_rad for look in looks])
+    heard = [(look.scan_rad, look.scan_sigma_rad, look.amplitude) for look in looks if look.amplitude]
+    reach = float(sensitivity.half_width_rad.max()) + TABLE_MARGIN_RAD
+    plane = np.linspace(scan.min() - reach, scan.max() + reach, TABLE_SIZE)
+    rotations, curve = sensitivity.curve_rotation_rad, sensitivity.curve_amplitude
+    if len(heard) < 2 or rotations is None or curve is None:
+        return AmplitudeTable(plane, np.zeros(TABLE_SIZE), False)
+    at, at_sigma, amplitude = np.array(heard, dtype=np.float64).T[:, :, None]
+    log_curve = np.log(np.maximum(curve, 1e-3 * float(np.max(curve))))
+    rotation = plane - at
+    peak = np.log(amplitude) - np.interp(rotation, rotations, log_curve)
+    slope = np.interp(rotation, rotations, np.gradient(log_curve, rotations))
+    weight = 1.0 / (amplitude_sigma**2 + (slope * at_sigma) ** 2)
+    mean = np.sum(weight * peak, axis=0) / np.sum(weight, axis=0)
+    log = -0.5 * np.sum(weight * (peak - mean) ** 2 - np.log(weight), axis=0) - 0.5 * np.log(np.sum(weight, axis=0))
+    return AmplitudeTable(plane, log - log.max(), True)

@@ -9,22 +9,23 @@ the tissue surface that the PMs so far trace.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fgreg.config import SolveConfig
 from fgreg.estimate import TrackEstimate
 from fgreg.frames import FloatArray, exp_so3
-from fgreg.graph.packing import pack
-from fgreg.graph.reduced import Evaluation, evaluate
-from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.packing import Anchor
+from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import SharedState
+from fgreg.graph.sites import propagate
 from fgreg.measurements import EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior
+from fgreg.registration import pack_session
 from fgreg.surface import GRAZING, TissueSurface
 
-ITERATIONS = 6
 SAMPLES = 400
 
 
@@ -39,6 +40,7 @@ class TrackContext:
         surface: the tissue surface, where the PMs trace one.
         origin_shift_mm: lambda of the laser frame's origin in the beam chart.
         causal: whether only what was known at the query's time entered.
+        config: that of the session's solve.
     """
 
     model: SessionModel
@@ -49,6 +51,7 @@ class TrackContext:
     surface: TissueSurface | None
     origin_shift_mm: float
     causal: bool = False
+    config: SolveConfig = field(default_factory=SolveConfig)
 
 
 def track(query: Track, context: TrackContext) -> TrackEstimate:
@@ -83,30 +86,22 @@ def _angle(trus_p: FloatArray) -> tuple[float, FloatArray]:
 
 
 def _from_looks(query: Track, context: TrackContext) -> tuple[float, float, float]:
-    """Gauss-Newton on the one PM with the session's estimate as prior: (scan angle, sigma, lambda in the chart)."""
+    """The one PM's angle with the session's estimate as prior: (scan angle, sigma, lambda in the chart)."""
     epoch = context.epochs.index(query.epoch)
     count = context.state.rotation.shape[1]
-    pairs = tuple(Pair(query.t, 0, epoch, query.marker, look) for look in query.looks)
-    problem = pack(Measurements((), pairs, tuple(EpochStart(0.0) for _ in range(count))), context.model)
+    markers = query.look_markers or (query.marker,) * len(query.looks)
+    pairs = tuple(Pair(query.t, 0, epoch, marker, look) for marker, look in zip(markers, query.looks, strict=True))
+    once = Measurements((), pairs, tuple(EpochStart(0.0) for _ in range(count)))
+    problem = pack_session(once, context.model, context.config)
+    if problem.columns.size != len(context.covariance):
+        raise ValueError("the context's variables are not those of its configuration")
     # The priors on the shared variables are in the session's estimate already.
-    problem = replace(problem, prior_information=np.zeros(problem.columns.size))
-    information = np.linalg.inv(context.covariance)
-    deviation = np.zeros(problem.columns.size)
-    state, private = context.state, initial_private(problem, context.state)
-    at: Evaluation | None = None
-    for _ in range(ITERATIONS):
-        at = evaluate(problem, state, private)
-        hessian = information + at.hessian[0]
-        step = -np.linalg.solve(hessian, information @ deviation + at.gradient[0])
-        deviation = deviation + step
-        state = context.state.retract(deviation[None], problem.columns)
-        private = replace(
-            at.private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[None, None, :, None])[..., 0]
-        )
-        if float(step @ hessian @ step) < 1e-8:
-            break
-    at = evaluate(problem, state, private)
-    shared = np.linalg.inv(information + at.hessian[0])
+    anchor = Anchor(context.state, np.asarray(np.linalg.inv(context.covariance)))
+    problem = replace(problem, anchor=anchor, prior_information=np.zeros(problem.columns.size))
+    optimum = optimize(problem, context.state)
+    _, optimum = propagate(problem, optimum) or (problem, optimum)
+    at = optimum.evaluation
+    shared = np.linalg.inv(at.hessian[0])
     gain = at.point_gain[0, 0]
     covariance = at.point_covariance[0, 0] + gain @ shared @ gain.T
     angle, by_point = _angle(at.private.trus_p_pm[0, 0])

@@ -39,6 +39,9 @@ SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
 """Share of the error's variance from which a cause is named."""
+LEAST_EFFECTIVE = 60.0
+"""Independent samples of the posterior below which its 95 % quantiles are not worth much."""
+SUSPICIOUS_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +239,26 @@ def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
             "probe and marker in session.yaml",
         )
     ]
+
+
+def estimated(name: str, value: float, sigma: float, prior: float, prior_sigma: float, unit: str) -> Condition:
+    """What a session-wide variable came out as; a warning where it left its prior."""
+    far = abs(value - prior) > SUSPICIOUS_SIGMAS * prior_sigma
+    text = f"estimated {name} {value:.4g} +- {sigma:.2g}{unit} (given {prior:.4g} +- {prior_sigma:.2g}{unit})"
+    if far:
+        return Condition(Verdict.WARNING, f"{text}: farther than its prior allows; correct it in session.yaml")
+    return Condition(Verdict.OK, text)
+
+
+def sampling(effective: float) -> list[Condition]:
+    """Too few independent samples of the posterior for the figures that rest on them."""
+    if effective >= LEAST_EFFECTIVE:
+        return []
+    text = (
+        f"the posterior is hard to sample (worth {effective:.0f} independent samples, {LEAST_EFFECTIVE:.0f} needed), "
+        "so predicted errors are rough: take more pairs"
+    )
+    return [Condition(Verdict.WARNING, text)]
 
 
 @dataclass(frozen=True, slots=True)

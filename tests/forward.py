@@ -79,12 +79,19 @@ def make_session(
     half_width_deg: tuple[float, ...] = (6.0, 6.0, 6.0),
     edge_sigma_deg: float = 0.3,
     step_deg: float = 2.0,
+    curve: bool = False,
 ) -> SessionModel:
-    """A session with the defaults of the session format, and no camera, marker or board models."""
+    """A session with the defaults of the session format, and no camera, marker or board models.
+
+    ``curve``: with amplitudes against rotation, halved at the (first) half width.
+    """
+    rotation = np.linspace(-1.5, 1.5, 61) * math.radians(half_width_deg[0])
     sensitivity = SensitivityModel(
         depth_mm=as_float_array(depth_mm, -1),
         half_width_rad=as_float_array(np.radians(half_width_deg), -1),
         edge_sigma_rad=math.radians(edge_sigma_deg),
+        curve_rotation_rad=as_float_array(rotation) if curve else None,
+        curve_amplitude=as_float_array(_loudness(rotation, math.radians(half_width_deg[0]))) if curve else None,
     )
     return SessionModel(
         name="test",
@@ -100,6 +107,11 @@ def make_session(
         noise=noise_model or NoiseModel(),
         targets_mm=default_targets_mm(radius_mm),
     )
+
+
+def _loudness(rotation_rad: FloatArray | float, half_width_rad: float) -> FloatArray:
+    """Amplitude of a PM of peak 1 at rotation offsets: a bell that is down to a half at the half width."""
+    return np.asarray(np.exp(-math.log(2.0) * np.square(rotation_rad) / half_width_rad**2))
 
 
 def random_trus_T_camera(rng: np.random.Generator) -> FloatArray:
@@ -197,6 +209,8 @@ def make_measurements(
     noise: bool = True,
     looks_per_pm: int = 1,
     share_marker: bool = False,
+    look_spacing_deg: float | None = None,
+    amplitude_noise: float | None = None,
     epochs: int = 1,
     known_motion: bool = False,
     spread_deg: float = 20.0,
@@ -218,6 +232,9 @@ def make_measurements(
             no bias, no edge error), so that the truth costs nothing.
         looks_per_pm: looks at each PM, at stage angles of their own.
         share_marker: the looks of one PM share one marker observation; else the marker moves between them.
+        look_spacing_deg: looks after the first are so far on each, in the sweep's direction (towards the middle of the
+            window where there is none), with ``sweep`` 0; None: each is a sweep, or a place in the window, of its own.
+        amplitude_noise: looks have amplitudes with this relative noise, of a peak that differs from PM to PM.
         epochs: camera epochs.
         known_motion: epochs start with a measured camera motion (sigmas ``MOTION_SIGMA``).
         spread_deg: largest angle between beam and line of sight.
@@ -274,6 +291,8 @@ def make_measurements(
         reach = probe.radius_mm + depth
         trus_p_pm = np.array([rng.uniform(-20.0, 20.0), reach * math.sin(bearing), reach * math.cos(bearing)])
         pms[pm] = trus_p_pm
+        loudest = math.exp(rng.uniform(-0.7, 0.7)) if amplitude_noise is not None else 1.0
+        first_scan, onward = 0.0, 1.0
         camera_p_pm = (inverse(registrations[epoch]) @ np.array([*trus_p_pm, 1.0]))[:3]
         for look_index in range(looks_per_pm):
             t += 1.0
@@ -284,8 +303,17 @@ def make_measurements(
             sweep = 0
             if first_hit:
                 sweep = 1 if one_way or (pm + look_index) % 2 == 0 else -1
-            scan = _stage_angle(rng, trus_p_pm, session, sweep, edge, sound_speed_ratio, centred=not noise)
+            if look_index == 0 or look_spacing_deg is None:
+                scan = _stage_angle(rng, trus_p_pm, session, sweep, edge, sound_speed_ratio, centred=not noise)
+                first_scan = scan
+                onward = float(sweep or math.copysign(1.0, hear(trus_p_pm, scan, probe.radius_mm)[2]))
+            else:
+                scan, sweep = first_scan + onward * look_index * math.radians(look_spacing_deg), 0
             distance, theta, rotation = hear(trus_p_pm, scan, probe.radius_mm)
+            amplitude = None
+            if amplitude_noise is not None:
+                loudness = float(_loudness(rotation, float(probe.sensitivity.half_width_rad[0])))
+                amplitude = loudest * loudness * math.exp(amplitude_noise * float(rng.normal()))
             scatter = rng.normal(size=3) * (model.lateral_mm, model.range_mm, model.scan_rad) if noise else np.zeros(3)
             look = Look(
                 scan_rad=scan + float(scatter[2]),
@@ -294,6 +322,7 @@ def make_measurements(
                 range_mm=float(distance / sound_speed_ratio + scatter[1]),
                 covariance=look_covariance,
                 sweep=sweep,
+                amplitude=amplitude,
             )
             pair_list.append(Pair(t, pm, epoch, marker, look))
             pair_poses.append(pose)

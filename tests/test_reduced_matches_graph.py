@@ -14,7 +14,7 @@ from fgreg.graph.explicit_solver import GraphCovariance, GraphOptimum
 from fgreg.graph.explicit_solver import optimize as optimize_graph
 from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
 from fgreg.graph.packing import PackedProblem, pack
-from fgreg.graph.reduced import contributions, evaluate, log_marginal, refine
+from fgreg.graph.reduced import contributions, evaluate, log_posterior, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference
@@ -135,7 +135,7 @@ def test_hypotheses_side_by_side_do_not_touch_each_other() -> None:
     good = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
     steps: FloatArray = np.random.default_rng(6).normal(size=(3, problem.columns.size)) * 0.02
     many = good.take([0, 0, 0]).retract(steps, problem.columns)
-    together = log_marginal(problem, many, initial_private(problem, many))
+    together = log_posterior(problem, many, initial_private(problem, many))
     for i in range(3):
         one = many.take([i])
-        assert log_marginal(problem, one, initial_private(problem, one))[0] == pytest.approx(together[i], rel=1e-12)
+        assert log_posterior(problem, one, initial_private(problem, one))[0] == pytest.approx(together[i], rel=1e-12)

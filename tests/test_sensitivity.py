@@ -6,15 +6,20 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from fgreg.measurements import Look
 from fgreg.sensitivity import (
+    amplitude_table,
     arc_of_rotation,
+    interval_moments,
+    log_interval,
     rotation_of_arc,
     rotation_of_arc_derivatives,
     sensitivity_prior,
     sensitivity_priors,
     window_priors,
+    window_shapes,
     wrap_angle,
 )
 from tests.forward import hear, make_measurements, make_session
@@ -153,3 +158,66 @@ def test_wrap_angle() -> None:
         [0.0, np.pi, np.pi, np.pi, 0.1, -4.0 + 2 * np.pi],
         atol=1e-12,
     )
+
+
+def test_interval_probabilities_hold_far_out_in_both_tails() -> None:
+    low, high = np.array([-1.0, 3.0, -60.0, 40.0]), np.array([0.5, 4.0, -50.0, 1e9])
+    expected = [np.log(stats.norm.cdf(0.5) - stats.norm.cdf(-1.0)), np.log(stats.norm.sf(3.0) - stats.norm.sf(4.0))]
+    expected += [stats.norm.logcdf(-50.0), stats.norm.logsf(40.0)]
+    np.testing.assert_allclose(log_interval(low, high, 1.0), expected, rtol=1e-12)
+    assert log_interval(-0.2, 0.3, 0.1) == pytest.approx(float(log_interval(-2.0, 3.0, 1.0)))
+
+
+@pytest.mark.parametrize("mean", [-9.0, -1.0, 0.2, 3.0, 40.0])
+def test_moments_are_derivatives_of_the_probability(mean: float) -> None:
+    def log(shift: float) -> float:
+        return float(log_interval(-1.3 - mean - shift, 0.8 - mean - shift, 0.6))
+
+    slope, curvature = interval_moments(-1.3 - mean, 0.8 - mean, 0.6)
+    assert slope == pytest.approx((log(1e-5) - log(-1e-5)) / 2e-5, rel=1e-6)
+    assert curvature == pytest.approx(-(log(1e-3) - 2.0 * log(0.0) + log(-1e-3)) / 1e-6, rel=1e-4)
+
+
+def test_intervals_are_those_of_the_sweeps() -> None:
+    probe = make_session().probe
+    shapes = window_shapes([look(30.0, 1), look(30.0, -1), look(30.0, 0)], probe, 2.0 * DEG)
+    np.testing.assert_allclose(np.degrees(shapes.low_rad), [4.0, -6.0, -6.0])
+    np.testing.assert_allclose(np.degrees(shapes.high_rad), [6.0, -4.0, 6.0])
+    np.testing.assert_array_equal(shapes.low_gain, [1.0, -1.0, -1.0])
+    np.testing.assert_array_equal(shapes.high_gain, [1.0, -1.0, 1.0])
+    wide = window_shapes([look(30.0, 1)], probe, 13.0 * DEG)
+    assert (wide.low_gain[0], wide.high_gain[0]) == (-1.0, 1.0)
+
+
+def _ladder(plane_deg: float, scans_deg: list[float], peak: float) -> list[Look]:
+    """Looks whose amplitudes are exactly a bell's that is halved at 6 deg."""
+    covariance = np.diag([0.09, 0.04])
+    return [
+        Look(s * DEG, 0.1 * DEG, 0.0, 30.0, covariance, amplitude=peak * 0.5 ** (((plane_deg - s) / 6.0) ** 2))
+        for s in scans_deg
+    ]
+
+
+@pytest.mark.parametrize("peak", [0.01, 1.0, 300.0])
+def test_amplitudes_find_the_plane_whatever_the_peak(peak: float) -> None:
+    sensitivity = make_session(curve=True).probe.sensitivity
+    # No look is at the peak itself: all three are on one flank of the curve.
+    table = amplitude_table(_ladder(4.3, [-0.5, 1.5, 3.0], peak), sensitivity, 0.05)
+    assert table.used
+    best = table.plane_rad[np.argmax(table.log_likelihood)]
+    assert math.degrees(best) == pytest.approx(4.3, abs=0.15)
+    weight = np.exp(table.log_likelihood)
+    weight /= weight.sum()
+    mean = weight @ table.plane_rad
+    sigma = math.degrees(math.sqrt(weight @ (table.plane_rad - mean) ** 2))
+    # log a_i = log p - ln 2 (phi - t_i)^2 / 36: linear in phi but for what the peak takes up, slope 2 ln 2 t_i / 36.
+    times = np.array([-0.5, 1.5, 3.0])
+    slope = 2.0 * math.log(2.0) / 36.0 * (times - times.mean())
+    assert sigma == pytest.approx(0.05 / np.linalg.norm(slope), rel=0.15)
+
+
+def test_amplitudes_say_nothing_alone_or_without_a_curve() -> None:
+    with_curve, without = make_session(curve=True).probe.sensitivity, make_session().probe.sensitivity
+    assert not amplitude_table(_ladder(1.0, [0.0], 1.0), with_curve, 0.05).used
+    assert not amplitude_table(_ladder(1.0, [0.0, 2.0], 1.0), without, 0.05).used
+    assert not amplitude_table([look(30.0, 0), look(30.0, 0)], with_curve, 0.05).used

@@ -17,11 +17,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from fgreg.answer import answer
 from fgreg.batch import distance_to_explicit, solve
 from fgreg.config import SolveConfig
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
-from fgreg.posterior import sample_posterior
 from fgreg.recognition import recognise
 from fgreg.registration import register
 from fgreg.session.reading import read_session
@@ -66,7 +66,7 @@ def main() -> None:
         out["register 15 pairs, ms"] = median_ms(lambda: register(measurements, model, config), args.repeats)
         out["explicit graph from there, ms"] = median_ms(lambda: distance_to_explicit(found), args.repeats)
         out["posterior samples, ms"] = median_ms(
-            lambda: sample_posterior(found.problem, found.optimum, found.covariance, config.posterior_samples, 1),
+            lambda: answer(found, config),
             args.repeats,
         )
         out["solve 15 pairs, all of it, ms"] = median_ms(lambda: solve(measurements, [], model, config), args.repeats)

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.answer import answer
 from fgreg.baselines.alternating import LinesAndArcs, register_alternating
 from fgreg.baselines.point_based import register_points
+from fgreg.batch import track_context
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.evaluation.bound import FullTruth, beam_covariance, truth_covariance
@@ -26,7 +28,6 @@ from fgreg.graph.shared_state import make_state, nominal_frame
 from fgreg.initialization import beam_starts
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
-from fgreg.posterior import sample_posterior
 from fgreg.readout import read_laser
 from fgreg.recognition import recognise
 from fgreg.registration import calibrate_beam, register
@@ -38,7 +39,7 @@ from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
 from fgreg.targets import expected_tre_mm, tre_mm
-from fgreg.tracking import TrackContext, track
+from fgreg.tracking import track
 
 HELD = 10
 """PMs of every session that no registration sees: pair residuals are theirs."""
@@ -176,7 +177,7 @@ def calibration(job: Job) -> dict[Any, Row]:
     along = np.linspace(20.0, 60.0, 9)
     for size in job.sizes:
         some = replace(sim.measurements, aims=sim.measurements.aims[:size])
-        frame = calibrate_beam(some, sim.model)[0]
+        frame = calibrate_beam(some, sim.model).frames[0]
         lines = {"fgreg": (frame[:3, 3], frame[:3, 2]), "a": calibrated(some)}
         row: Row = {}
         for name, (origin, direction) in lines.items():
@@ -260,9 +261,9 @@ def tracking(job: Job) -> dict[Any, Row]:
     """Answers to queries whose PM is heard, with 10 pairs."""
     sim = simulated(replace(job.config, pairs=10, tracks_heard=6, tracks_silent=0), job.seed)
     found = register(sim.measurements, sim.model, SETTINGS)
-    posterior = sample_posterior(found.problem, found.optimum, found.covariance, SETTINGS.posterior_samples, 1)
-    shift = read_laser(found, sim.model).origin_shift_mm
-    context = TrackContext(sim.model, found.epochs, found.optimum.state, found.covariance, posterior, None, shift)
+    answered = answer(found, SETTINGS)
+    shift = read_laser(answered.registration, sim.model).origin_shift_mm
+    context = track_context(answered.registration, answered.posterior, sim.model, SETTINGS, shift)
     answers = [track(query, context) for query in sim.tracks]
     errors = [
         abs(math.degrees(answer.stage_rad - right))

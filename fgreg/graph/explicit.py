@@ -132,13 +132,15 @@ class GraphOptions:
     Attributes:
         marker_T_nominal: (4, 4) fixed frame of the beam's chart; None: the session's initial ``marker_T_laser``, else
             the marker's own frame. The beam has to be within some 60 deg of its z axis.
-        sound_speed_sigma: prior sigma of ``sound_speed_ratio`` about 1, None where it is not a variable.
+        sound_speed_sigma: prior sigma of ``sound_speed_ratio``, None where it is not a variable.
+        sound_speed_mean: its prior mean.
         unknown_motion_sigma: sigmas (rad, mm) of a camera motion of which nothing is known, about no motion: too wide
             to matter where there are pairs, and keeps an epoch without any from being singular. None: no factor.
     """
 
     marker_T_nominal: FloatArray | None = None
     sound_speed_sigma: float | None = None
+    sound_speed_mean: float = 1.0
     unknown_motion_sigma: tuple[float, float] | None = (3.0, 1000.0)
 
 
@@ -303,7 +305,7 @@ def _add_shared_priors(
         graph.add(gtsam.PriorFactorVector(keys.marker_bias, np.zeros(3), bias_noise))
     if keys.sound_speed_ratio is not None and options.sound_speed_sigma is not None:
         ratio_noise = gtsam.noiseModel.Isotropic.Sigma(1, options.sound_speed_sigma)
-        graph.add(gtsam.PriorFactorDouble(keys.sound_speed_ratio, 1.0, ratio_noise))
+        graph.add(gtsam.PriorFactorDouble(keys.sound_speed_ratio, options.sound_speed_mean, ratio_noise))
 
 
 def _add_epoch_changes(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +24,10 @@ from fgreg.measurements import (
     usable_covariance,
 )
 from fgreg.models import SessionModel
-from fgreg.sensitivity import sensitivity_priors
+from fgreg.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
+
+if TYPE_CHECKING:
+    from fgreg.graph.shared_state import SharedState
 
 LINE_SIGMA_MM = 1e-3
 """Width of the beam itself: point on line is an equality; this keeps its covariance invertible (as in the factors)."""
@@ -88,11 +92,36 @@ class LookArrays:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class RotationShapes:
+    """What looks say about the rotation, not made Gaussian: the density that the posterior is sampled from.
+
+    Attributes:
+        windows: interval of each look.
+        plane_rad: (J, G) plane angles at which each PM's amplitudes were compared with the sensitivity curve, or None.
+        amplitude_log: (J, G) log likelihood of the amplitudes there, 0 at its best; zero for PMs without.
+        amplitude_look: (J,) the look that stands for the amplitudes of its PM, -1 for PMs without.
+    """
+
+    windows: WindowShapes
+    plane_rad: FloatArray
+    amplitude_log: FloatArray
+    amplitude_look: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class EpochLink:
     """Prior between epochs: ``trus_T_camera[k+1] = trus_T_camera[k] * old_T_new``, information over the tangent."""
 
     index: int
     old_T_new: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchor:
+    """A Gaussian prior of all shared variables: about a state (one hypothesis), information (D, D) of steps from it."""
+
+    state: SharedState
     information: FloatArray
 
 
@@ -114,6 +143,9 @@ class PackedProblem:
     links: tuple[EpochLink, ...]
     radius_mm: float
     prior_information: FloatArray
+    shapes: RotationShapes | None = None
+    sound_speed_mean: float = 1.0
+    anchor: Anchor | None = None
 
 
 def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
@@ -143,15 +175,21 @@ def pack(
     model: SessionModel,
     *,
     sound_speed_sigma: float | None = None,
+    sound_speed_mean: float = 1.0,
     radius_sigma_mm: float | None = None,
+    shapes: bool = False,
+    amplitude_sigma: float = AMPLITUDE_SIGMA,
 ) -> PackedProblem:
     """Lay measurements out as arrays.
 
     Args:
         measurements: aims, pairs and epochs.
         model: the session's set-up.
-        sound_speed_sigma: prior sigma of the sound speed ratio (1 is the mean); None: not estimated.
+        sound_speed_sigma: prior sigma of the sound speed ratio; None: not estimated.
+        sound_speed_mean: its prior mean.
         radius_sigma_mm: prior sigma of the probe's radius; None: not estimated.
+        shapes: keep the windows' own shape, and the amplitudes, for the posterior beside the Gaussian priors.
+        amplitude_sigma: relative noise of amplitudes.
     """
     pairs = measurements.pairs
     columns = make_columns(
@@ -210,4 +248,27 @@ def pack(
         links=_links(measurements.epochs),
         radius_mm=model.probe.radius_mm,
         prior_information=prior_information,
+        shapes=_rotation_shapes(pairs, pm_index, model, amplitude_sigma) if shapes else None,
+        sound_speed_mean=sound_speed_mean,
+    )
+
+
+def _rotation_shapes(
+    pairs: Sequence[Pair], pm_index: dict[int, int], model: SessionModel, amplitude_sigma: float
+) -> RotationShapes:
+    looks = [pair.look for pair in pairs]
+    plane, log, look_of = [], [], []
+    for pm in pm_index:
+        mine = [i for i, pair in enumerate(pairs) if pair.pm == pm]
+        table = amplitude_table([looks[i] for i in mine], model.probe.sensitivity, amplitude_sigma)
+        plane.append(table.plane_rad)
+        log.append(table.log_likelihood)
+        # Best a look that knows only the window: its interval does not hang on the window's edge.
+        free = [i for i in mine if looks[i].sweep == 0] or mine
+        look_of.append(free[0] if table.used else -1)
+    return RotationShapes(
+        window_shapes(looks, model.probe, model.stage.step_rad),
+        np.array(plane).reshape(len(pm_index), -1),
+        np.array(log).reshape(len(pm_index), -1),
+        np.array(look_of, dtype=np.int64),
     )

@@ -28,7 +28,6 @@ from fgreg.graph.reduced_blocks import (
     LookBlock,
     PrivateState,
     beam_columns,
-    determinant2,
     inverse2,
     inverse3,
     line_block,
@@ -37,7 +36,8 @@ from fgreg.graph.reduced_blocks import (
     times,
     transposed,
 )
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.windows import log_shape_ratio
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,19 +150,27 @@ def refine(problem: PackedProblem, state: SharedState, private: PrivateState) ->
     return system.cost, system.private
 
 
-def log_marginal(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
-    """Log density (S,) of the shared variables with the private ones integrated out (Laplace), up to a constant.
+def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
+    """Log density (S,) of the shared variables, up to a constant.
 
-    ``-cost / 2`` less half the log determinants that the Gaussian integrals over marker errors and PMs leave:
-    of each line residual's covariance, of each PM's information, of each aim residual's covariance.
+    Private variables: at their optimum, ``-cost / 2``. Not integrated out with flat priors, which would multiply the
+    density by the volume they are free in, and so by how steeply beams happen to cross arcs: as in straight line fits
+    with errors in both coordinates that estimate is inconsistent (Neyman and Scott, 1948; Kendall and Stuart, vol. 2,
+    ch. 29), the one with the private variables at their optimum is not. Where the problem keeps the windows' own
+    shapes, the PMs' rotations are integrated over them (fgreg.graph.windows).
     """
     system = _system(problem, state, private)
-    return np.asarray(
-        -0.5 * system.cost
-        - 0.5 * np.sum(np.log(determinant2(system.line.covariance)), axis=1)
-        - 0.5 * np.sum(np.log(np.linalg.det(system.h_pp)), axis=1)
-        - 0.5 * np.sum(np.log(determinant2(system.aim_covariance)), axis=1)
-    )
+    return np.asarray(_log_shapes(problem, state, system) - 0.5 * system.cost)
+
+
+def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
+    """(S,) log of what the windows' own shapes make of the Gaussian stand-ins' density."""
+    if problem.shapes is None:
+        return np.zeros(state.count)
+    by_point = system.look.by_point[..., 2, :]
+    offset = system.look.residual[..., 2] + np.sum(by_point * system.point_step[:, problem.look_pm], axis=-1)
+    variance = np.sum(by_point * times(system.point_covariance[:, problem.look_pm], by_point), axis=-1)
+    return log_shape_ratio(problem, state.edge_rad, offset, variance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,6 +255,12 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
     )
 
 
+def pm_contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Contributions:
+    """What each PM adds, for a state of one hypothesis: cost (J,), gradient (J, D), hessian (J, D, D)."""
+    parts = contributions(problem, state, private).pm
+    return Contributions(parts.cost[0], parts.gradient[0], parts.hessian[0])
+
+
 def evaluate(problem: PackedProblem, state: SharedState, private: PrivateState) -> Evaluation:
     """Cost, gradient and Gauss-Newton Hessian on the shared variables, private ones eliminated.
 
@@ -299,7 +313,7 @@ def _prior_deviation(problem: PackedProblem, state: SharedState) -> FloatArray:
     if columns.bias is not None:
         deviation[:, columns.bias : columns.bias + 3] = state.bias_mm
     if columns.sound_speed is not None:
-        deviation[:, columns.sound_speed] = state.sound_speed_ratio - 1.0
+        deviation[:, columns.sound_speed] = state.sound_speed_ratio - problem.sound_speed_mean
     if columns.radius is not None:
         deviation[:, columns.radius] = state.radius_mm - problem.radius_mm
     return deviation
@@ -310,6 +324,9 @@ def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
     for link in problem.links:
         residual, _ = _link_residual(link, state)
         cost = cost + np.sum(residual * (residual @ link.information), axis=1)
+    if problem.anchor is not None:
+        step = step_between(problem.anchor.state, state, problem.columns)
+        cost = cost + np.sum(step * (step @ problem.anchor.information), axis=1)
     return np.asarray(cost)
 
 
@@ -324,6 +341,9 @@ def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray
         columns = slice(6 * link.index, 6 * link.index + 12)
         hessian[:, columns, columns] += transposed(jacobian) @ weighted
         gradient[:, columns] += times(transposed(weighted), residual)
+    if problem.anchor is not None:
+        hessian += problem.anchor.information
+        gradient += step_between(problem.anchor.state, state, problem.columns) @ problem.anchor.information
 
 
 def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:

@@ -76,11 +76,6 @@ def inverse2(matrix: FloatArray) -> FloatArray:
     return out
 
 
-def determinant2(matrix: FloatArray) -> FloatArray:
-    """Determinants of (..., 2, 2) matrices."""
-    return np.asarray(matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0])
-
-
 def inverse3(matrix: FloatArray) -> FloatArray:
     """Inverses of (..., 3, 3) matrices by cofactors: many times faster than LAPACK one by one."""
     m = matrix

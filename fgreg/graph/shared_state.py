@@ -108,3 +108,22 @@ def pose_difference(first: SharedState, second: SharedState, epoch: int = 0) -> 
     omega = log_so3(first_R_trus @ second.rotation[:, epoch])
     shift = first_R_trus @ (second.translation_mm[:, epoch] - first.translation_mm[:, epoch])[..., None]
     return np.concatenate([omega, shift[..., 0]], axis=1)
+
+
+def step_between(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
+    """(S, D) such that ``first.retract(step) = second``; both with the same beam chart."""
+    out = np.zeros((second.count, columns.size))
+    for k in range(columns.epochs):
+        back = np.swapaxes(first.rotation[:, k], -1, -2)
+        out[:, 6 * k : 6 * k + 3] = log_so3(back @ second.rotation[:, k])
+        shift = second.translation_mm[:, k] - first.translation_mm[:, k]
+        out[:, 6 * k + 3 : 6 * k + 6] = (back @ shift[..., None])[..., 0]
+    out[:, columns.beam : columns.beam + 4] = second.beam - first.beam
+    out[:, columns.edge] = second.edge_rad - first.edge_rad
+    if columns.bias is not None:
+        out[:, columns.bias : columns.bias + 3] = second.bias_mm - first.bias_mm
+    if columns.sound_speed is not None:
+        out[:, columns.sound_speed] = second.sound_speed_ratio - first.sound_speed_ratio
+    if columns.radius is not None:
+        out[:, columns.radius] = second.radius_mm - first.radius_mm
+    return out

@@ -1,0 +1,144 @@
+"""From the optimum to the answer: the posterior around it, and the session's estimate at the posterior's mean.
+
+The optimum of the graph with Gaussian windows (fgreg.registration) is where the search ends, what the explicit graph is
+compared with and what residuals are judged at. What is reported is the mean of the posterior, in which windows have
+their own shape and the geometry its nonlinearity: a smaller expected error, and the point its moments are about.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.frames import FloatArray
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced import evaluate, refine
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.graph.sites import inverse_hessian, propagate
+from fgreg.posterior import Mode, Posterior, gaussian_posterior, sample_posterior
+from fgreg.registration import Registration, Shots
+from fgreg.search import targets_moved
+
+RIVALS = 3
+"""At most so many other minima enter the posterior."""
+RIVAL_CHI2 = 14.0
+"""Minima whose chi square is larger by more than this hold too little of the posterior to matter."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """The session's estimate: ``registration`` with its optimum moved to the posterior's mean, and the posterior.
+
+    ``registration.problem`` has the windows' Gaussian sites where they settled, ``registration.covariance`` is the
+    posterior's second moment about the estimate.
+    """
+
+    registration: Registration
+    posterior: Posterior
+
+
+def answer(registration: Registration, config: SolveConfig) -> Answer:
+    """Sample the posterior of a registration and centre the estimate on it."""
+    modes = _modes(registration)
+    if len(registration.problem.look_pm) > config.posterior_looks:
+        posterior = gaussian_posterior(modes[0], count=round(config.posterior_effective), seed=config.seed)
+    else:
+        posterior = sample_posterior(
+            modes, goal=config.posterior_effective, most=config.posterior_samples, seed=config.seed
+        )
+    problem = modes[0].problem
+    moved = _evaluated(problem, posterior.mean, modes[0].optimum)
+    shots = _moved_shots(registration.shots, problem, moved)
+    return Answer(
+        replace(registration, problem=problem, optimum=moved, covariance=posterior.covariance, shots=shots),
+        posterior,
+    )
+
+
+def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
+    """All shots at the moved estimate, those kept with the stand-ins of ``problem``; innovations stay as judged."""
+    if shots.pm_kept.all() and shots.aim_kept.all():
+        return replace(shots, problem=problem, evaluation=moved.evaluation)
+    looks, kept = shots.problem.looks, shots.pm_kept[shots.problem.look_pm]
+    weight, centre = looks.weight.copy(), looks.centre_rad.copy()
+    weight[kept], centre[kept] = problem.looks.weight, problem.looks.centre_rad
+    whole = replace(shots.problem, looks=replace(looks, weight=weight, centre_rad=centre))
+    private = initial_private(whole, moved.state)
+    for _ in range(4):
+        _, private = refine(whole, moved.state, private)
+    return replace(shots, problem=whole, evaluation=evaluate(whole, moved.state, private))
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """A session-wide variable: value and standard deviation."""
+
+    value: float
+    sigma: float
+
+
+def estimated_sound_speed(found: Registration) -> Estimated | None:
+    """The ratio of true to assumed sound speed where it is a variable."""
+    at = found.problem.columns.sound_speed
+    value = float(found.optimum.state.sound_speed_ratio[0])
+    return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
+
+
+def estimated_radius(found: Registration) -> Estimated | None:
+    """The probe's radius (mm) where it is a variable."""
+    at = found.problem.columns.radius
+    value = float(found.optimum.state.radius_mm[0])
+    return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
+
+
+def _with_sites(problem: PackedProblem, optimum: Optimum, covariance: FloatArray) -> Mode:
+    """A mode of the posterior: the windows' sites where they settle, the Gaussian windows where not."""
+    found = propagate(problem, optimum)
+    if found is None:
+        return Mode(problem, optimum, covariance)
+    sites, there = found
+    inverse = inverse_hessian(there.evaluation.hessian[0])
+    return Mode(problem, optimum, covariance) if inverse is None else Mode(sites, there, inverse)
+
+
+def _modes(registration: Registration) -> tuple[Mode, ...]:
+    """The optimum's mode first, then those of other minima that hold a share of the posterior."""
+    problem, best = registration.problem, registration.optimum
+    modes = [_with_sites(problem, best, registration.covariance)]
+    targets = registration.model.targets_mm
+    for place, epoch in enumerate(registration.epochs):
+        minima = registration.searches[epoch].minima
+        for minimum in minima:
+            if len(modes) > RIVALS or minimum.cost > minima[0].cost + RIVAL_CHI2:
+                break
+            transform = minimum.state.trus_T_camera()[0]
+            if targets_moved(best.state.trus_T_camera(place)[0], transform, targets) < 1.0:
+                continue
+            transforms = np.stack([best.state.trus_T_camera(k) for k in range(problem.columns.epochs)], axis=1)
+            transforms[0, place] = transform
+            start = make_state(transforms, best.state.marker_T_nominal[0], problem.radius_mm, best.state.beam)
+            found = optimize(problem, start)
+            inverse = inverse_hessian(found.evaluation.hessian[0])
+            cost = float(found.evaluation.cost[0])
+            if inverse is None or not cost < float(best.evaluation.cost[0]) + RIVAL_CHI2:
+                continue
+            others = [mode.optimum.state.trus_T_camera(place)[0] for mode in modes]
+            if all(targets_moved(o, found.state.trus_T_camera(place)[0], targets) > 1.0 for o in others):
+                modes.append(_with_sites(problem, found, inverse))
+    return tuple(modes)
+
+
+def _evaluated(problem: PackedProblem, state: SharedState, near: Optimum) -> Optimum:
+    """The problem at a state, private variables at their optimum there."""
+    private = near.evaluation.private
+    for start in (private, initial_private(problem, state)):
+        private = start
+        for _ in range(4):
+            cost, private = refine(problem, state, private)
+        if np.isfinite(cost).all():
+            break
+    return Optimum(state, evaluate(problem, state, private), near.converged, near.iterations)

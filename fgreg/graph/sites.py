@@ -1,0 +1,147 @@
+"""Gaussian sites that stand for the windows' shapes: expectation propagation (Minka, 2001) on the reduced problem.
+
+A Gaussian as wide as the window treats a PM at its edge like one at its middle. Here each look's stand-in is chosen so
+that, together with all the rest of the session (its *cavity*), it has the mean and variance that the interval itself
+would give. The optimum with such sites is close to the posterior's mean, and its inverse Hessian to the posterior's
+covariance, where the optimum of the intervals themselves would be anywhere on a plateau.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.graph.packing import PackedProblem, RotationShapes
+from fgreg.graph.reduced import Evaluation, evaluate
+from fgreg.graph.reduced_blocks import look_block, times
+from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.shared_state import SharedState
+from fgreg.graph.windows import LEAST_PRECISION, NODES, REACH, WEIGHTS
+from fgreg.sensitivity import interval_moments, log_interval
+
+ROUNDS = 30
+SETTLED = 0.02
+"""Sites have settled when no look's rotation moves by more than this share of its own standard deviation."""
+DAMPING = 0.8
+"""Share of a site's change that is made at once."""
+LEAST_SITE = 1e-3
+"""Precision of a site that says nothing, rad^-2."""
+
+
+def with_sites(problem: PackedProblem, centre_rad: FloatArray, precision: FloatArray) -> PackedProblem:
+    """The problem with other Gaussian stand-ins of its looks' rotations, (L,) and (L,) rad^-2."""
+    weight = problem.looks.weight.copy()
+    weight[:, 2, 2] = precision
+    return replace(problem, looks=replace(problem.looks, weight=weight, centre_rad=centre_rad))
+
+
+def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, Optimum] | None:
+    """Sites for the windows' shapes, and the optimum with them; None where they do not settle.
+
+    Args:
+        problem: with shapes, and the Gaussian priors as first sites.
+        optimum: of that problem, one hypothesis.
+    """
+    shapes = problem.shapes
+    if shapes is None or not len(problem.look_pm):
+        return None
+    state, private = optimum.state, optimum.evaluation.private
+    precision = problem.looks.weight[:, 2, 2].copy()
+    centre = problem.looks.centre_rad.copy()
+    at = optimum.evaluation
+    before = np.full(len(precision), np.inf)
+    settled = False
+    for _ in range(ROUNDS):
+        covariance = inverse_hessian(at.hessian[0])
+        if covariance is None:
+            return None
+        mean, variance = _look_marginals(problem, state, at, covariance)
+        settled = bool((np.abs(mean - before) < SETTLED * np.sqrt(variance)).all())
+        if settled:
+            break
+        before = mean
+        new_centre, new_precision = _new_sites(problem, shapes, mean, variance, centre, precision)
+        pull = (1.0 - DAMPING) * precision * centre + DAMPING * new_precision * new_centre
+        precision = (1.0 - DAMPING) * precision + DAMPING * new_precision
+        centre = pull / precision
+        problem = with_sites(problem, centre, precision)
+        # One Gauss-Newton step with the sites as they are now; they are refitted before the next.
+        at = evaluate(problem, state, private)
+        step = -np.linalg.solve(at.hessian[0], at.gradient[0])
+        state = state.retract(step[None], problem.columns)
+        points = at.private.trus_p_pm + (at.point_gain @ step[None, None, :, None])[..., 0]
+        private = replace(at.private, trus_p_pm=points)
+        at = evaluate(problem, state, private)
+        private = at.private
+        if not np.isfinite(at.cost).all():
+            return None
+    if not settled:
+        return None
+    return problem, optimize(problem, state, private, tolerance=1e-9)
+
+
+def inverse_hessian(hessian: FloatArray) -> FloatArray | None:
+    """The inverse (D, D) of a Hessian whose units differ by orders of magnitude; None where it is not positive."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    try:
+        inverse = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+        np.linalg.cholesky(inverse)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(inverse, dtype=np.float64)
+
+
+def _look_marginals(
+    problem: PackedProblem, state: SharedState, at: Evaluation, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance (L,) of ``rotation - edge_gain * window_edge``, all else integrated out."""
+    look = look_block(problem, state, at.private.trus_p_pm[:, problem.look_pm])
+    by_point = look.by_point[0, :, 2]
+    by_shared = look.by_shared[0, :, 2] + np.einsum("lp,lpd->ld", by_point, at.point_gain[0][problem.look_pm])
+    given_shared = np.sum(by_point * times(at.point_covariance[0][problem.look_pm], by_point), axis=-1)
+    variance = given_shared + np.sum((by_shared @ covariance) * by_shared, axis=-1)
+    return look.residual[0, :, 2] + problem.looks.centre_rad, variance
+
+
+def _new_sites(
+    problem: PackedProblem,
+    shapes: RotationShapes,
+    mean: FloatArray,
+    variance: FloatArray,
+    centre: FloatArray,
+    precision: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Sites (centre, precision) that give each look the moments that its interval gives."""
+    q = np.maximum(1.0 / variance - precision, LEAST_PRECISION)
+    cavity = (mean / variance - precision * centre) / q
+    windows = shapes.windows
+    # The half width's error moves a first hit's interval as a whole, which the site follows by its gain; of a window
+    # known as a whole it moves the ends apart, which counts as softness here.
+    edge = problem.columns.edge
+    held = problem.prior_information[edge] + (0.0 if problem.anchor is None else problem.anchor.information[edge, edge])
+    edge_variance = 1.0 / held
+    soft = np.sqrt(windows.soft_rad**2 + np.where(problem.looks.edge_gain == 0.0, edge_variance, 0.0))
+    low, high = windows.low_rad - cavity, windows.high_rad - cavity
+    slope, curvature = interval_moments(low, high, np.sqrt(soft**2 + 1.0 / q))
+    for pm, look in enumerate(shapes.amplitude_look):
+        if look >= 0:
+            sigma, around = 1.0 / np.sqrt(q[look]), cavity[look]
+            begin = max(-REACH * sigma, low[look] - REACH * soft[look])
+            end = min(REACH * sigma, high[look] + REACH * soft[look])
+            if end <= begin:
+                continue
+            d = 0.5 * (begin + end) + 0.5 * (end - begin) * NODES
+            log = log_interval(low[look] - d, high[look] - d, soft[look]) - 0.5 * q[look] * d * d
+            plane = around + d + problem.looks.scan_rad[look]
+            log = log + np.interp(plane, shapes.plane_rad[pm], shapes.amplitude_log[pm])
+            weight = np.exp(log - log.max()) * WEIGHTS
+            weight = weight / weight.sum()
+            first = float(weight @ d)
+            second = float(weight @ (d - first) ** 2)
+            slope[look], curvature[look] = q[look] * first, q[look] - q[look] ** 2 * second
+    left = np.maximum(1.0 - curvature / q, 1e-6)  # what share of the cavity's variance is left
+    site = np.maximum(curvature / left, LEAST_SITE)
+    # site * centre = (slope + cavity * curvature) / left
+    return np.where(site > LEAST_SITE, (slope + cavity * curvature) / left / site, cavity + slope / site), site
