@@ -38,8 +38,8 @@ SMOOTHINGS = (1.0, 1.4, 2.0, 3.0, 4.5, 7.0)
 ASYMMETRY = 0.12
 """By what share of its length a pulse's maximum may move under a matched filter, standard deviation: 0 for a symmetric
 pulse, 0.10 for one that falls 1.25 times as slowly as it rises, 0.19 for 1.5 times (measured without noise)."""
-LINEAR = 0.12
-"""Noise of the maximum, in lengths of the pulse, up to which it is near enough linear in the noise to be weighed in."""
+LINEAR = 0.3
+"""Curvature of the noise over the pulse's at its top, up to which the maximum is near enough linear in the noise."""
 MISMATCH = 0.07
 """Share of that movement that does not go as one over the filter's width."""
 FINE_RATE_MHZ = 100.0
@@ -242,7 +242,9 @@ def _envelope_maximum(
     times: list[float] = []
     sigmas: list[float] = []
     height = 0.0
-    for smoothing, signal, level in zip(SMOOTHINGS, signals, noise, strict=True):
+    # RMS angular frequency of the filtered noise's slope: times sigma, it is the noise's curvature over the pulse's.
+    rapidities = 2 * np.pi * np.sqrt((gains**2 @ offset**4) / (gains**2 @ offset**2))
+    for smoothing, signal, level, rapidity in zip(SMOOTHINGS, signals, noise, rapidities, strict=True):
         envelope = np.abs(signal[np.arange(middle - reach - width, middle + reach + width + 1) % size])
         at = width + int(np.argmax(envelope[width : envelope.size - width]))
         left, centre, right = (math.log(max(float(envelope[at + k]), 1e-300)) for k in (-width, 0, width))
@@ -253,7 +255,7 @@ def _envelope_maximum(
         # What a Gaussian pulse bends after this filter: noise may make a peak look sharper than the pulse is.
         expected = smoothing**2 / (1.0 + smoothing**2) / pulse_us**2
         sigma = float(level) / (math.exp(centre) * min(-bend * (rate / width) ** 2, expected))
-        if times and sigma > LINEAR * pulse_us:
+        if times and sigma * rapidity > LINEAR:
             break
         sigmas.append(sigma)
         times.append((middle + 0.5 * (left - right) / bend * width) / rate)
@@ -269,7 +271,10 @@ def _envelope_maximum(
     shift = ASYMMETRY * pulse_us / np.array(SMOOTHINGS[:count])
     covariance = np.outer(sigmas, sigmas) * correlation + np.outer(shift, shift) + np.diag((MISMATCH * shift) ** 2)
     weight = np.linalg.solve(covariance, np.ones(count))
-    return float(weight @ times / weight.sum()), float(1.0 / math.sqrt(weight.sum())), height
+    best = float(weight @ times / weight.sum())
+    rest = np.array(times) - best
+    contradiction = max(1.0, float(rest @ np.linalg.solve(covariance, rest)) / max(count - 1, 1))
+    return best, math.sqrt(contradiction / float(weight.sum())), height
 
 
 def _correlated_elements(residual: FloatArray) -> float:
