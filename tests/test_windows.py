@@ -94,7 +94,7 @@ def test_the_ratio_is_the_integral_it_stands_for(name: str) -> None:
     pms = rng.normal(size=len(problem.pms)) * 0.01
     offset = pms[problem.look_pm] + rng.normal(size=len(problem.look_pm)) * 1e-3
     precision = np.bincount(problem.look_pm, problem.looks.weight[:, 2, 2]) + 4000.0
-    variance = 1.0 / precision[problem.look_pm]
+    variance = np.asarray(1.0 / precision[problem.look_pm], dtype=np.float64)
     got = log_shape_ratio(problem, np.array([0.004]), offset[None], variance[None])[0]
     assert got == pytest.approx(_by_hand(problem, 0.004, offset, variance), abs=2e-3)
 
@@ -134,7 +134,8 @@ def test_without_noise_the_sites_leave_the_optimum_alone() -> None:
 
 def test_windows_as_intervals_tell_the_roll_better_than_gaussians() -> None:
     # Exact geometry, so that the window alone decides: the middle of 25 intervals against the mean of 25 offsets.
-    gaussian, interval = [], []
+    gaussian: list[float] = []
+    interval: list[float] = []
     noise = replace(make_session().noise, marker_rotation_rad=(5e-4,) * 3, marker_translation_mm=(0.02,) * 3)
     session = replace(make_session(), noise=noise)
     for seed in range(14):
