@@ -13,7 +13,7 @@ import numpy as np
 
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray
-from fgreg.graph.packing import PackedProblem
+from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced import evaluate, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
@@ -27,6 +27,9 @@ RIVALS = 3
 """At most so many other minima enter the posterior."""
 RIVAL_CHI2 = 14.0
 """Minima whose chi square is larger by more than this hold too little of the posterior to matter."""
+
+FREE_SOUND_SPEED = 0.1
+"""Prior sigma of a sound speed ratio that only the residuals are to determine."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +82,20 @@ class Estimated:
 
     value: float
     sigma: float
+
+
+def sound_speed_from_residuals(registration: Registration) -> Estimated:
+    """The ratio of true to assumed sound speed that the pairs ask for, next to no prior on it.
+
+    For a registration in which it is no variable: one Gauss-Newton step from its optimum with the ratio set free.
+    """
+    free = pack(registration.measurements, registration.model, sound_speed_sigma=FREE_SOUND_SPEED)
+    optimum, column = registration.optimum, free.columns.sound_speed
+    at = evaluate(free, optimum.state, optimum.evaluation.private)
+    inverse = inverse_hessian(at.hessian[0])
+    if inverse is None or column is None:
+        return Estimated(1.0, FREE_SOUND_SPEED)
+    return Estimated(1.0 - float(inverse[column] @ at.gradient[0]), float(np.sqrt(inverse[column, column])))
 
 
 def estimated_sound_speed(found: Registration) -> Estimated | None:

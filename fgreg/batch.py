@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.answer import answer, estimated_radius, estimated_sound_speed
+from fgreg.answer import answer, estimated_radius, estimated_sound_speed, sound_speed_from_residuals
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.estimate import (
@@ -43,6 +43,7 @@ from fgreg.verdict import (
     estimated,
     hypotheses,
     left_out,
+    repeated_markers,
     sampling,
     sound_speed_condition,
     spread,
@@ -173,6 +174,10 @@ def _common_conditions(
     lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
     lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]
     found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
+    if not registration.optimum.converged.all():
+        text = f"the solve had not settled after {registration.optimum.iterations} steps: take more pairs in each epoch"
+        found.append(Condition(Verdict.REFUSED, text))
+    found.extend(repeated_markers(registration.measurements.pairs))
     nis = shots.innovations
     if aims:
         found.extend(left_out(shots.aim_kept, nis.aim, "aims", SURE_OF_AIMS))
@@ -182,7 +187,8 @@ def _common_conditions(
     deviant = np.concatenate([shots.pm_deviant, shots.aim_deviant])
     found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
     if problem.columns.sound_speed is None:
-        found.extend(sound_speed_condition(registration))
+        asked = sound_speed_from_residuals(registration)
+        found.extend(sound_speed_condition(asked.value, asked.sigma))
     if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph knows its radius
         found.extend(_agreement(registration))
     return found

@@ -98,6 +98,11 @@ class EpochStart:
     camera_new_T_camera_old: FloatArray | None = None
     covariance: FloatArray | None = None
 
+    @property
+    def motion_known(self) -> bool:
+        """Whether the epoch is tied to the one before: a motion without a covariance says nothing to rely on."""
+        return self.camera_new_T_camera_old is not None and self.covariance is not None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from fgreg.frames import FloatArray, as_float_array
 
@@ -86,6 +87,15 @@ class ProbeModel:
     def __post_init__(self) -> None:
         _positive(elements=self.elements, pitch_mm=self.pitch_mm, radius_mm=self.radius_mm)
         _positive(sound_speed_m_s=self.sound_speed_m_s)
+
+    def is_channel_data(self, frame: npt.NDArray[np.generic]) -> bool:
+        """Whether a frame is channel data; of a probe with ``image``, too, all others are images."""
+        return self.holds_channels(frame.shape, frame.dtype)
+
+    def holds_channels(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> bool:
+        """Whether an array of this shape and type is channel data: (elements, samples), float32 or int16."""
+        is_type = (dtype.kind, dtype.itemsize) in (("f", 4), ("i", 2))
+        return self.channels is not None and is_type and len(shape) == 2 and shape[0] == self.elements
 
     @property
     def element_x_mm(self) -> FloatArray:

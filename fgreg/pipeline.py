@@ -100,6 +100,8 @@ def solve_session(
     start = time.perf_counter()
     config = config or SolveConfig()
     result_path = request.folder / RESULT_FILE if request.out is None else request.out
+    if request.rrd is not None and request.rrd.resolve() == result_path.resolve():
+        raise InputError("--rrd", f"{request.rrd}, where the result goes", "a file of its own")
     remove_older_result(request.folder, result_path)
     session = read_session(request.folder)
     truth = read_ground_truth(request.folder)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,8 +109,6 @@ def load_trus_frame(path: Path, line: int, key: str, model: SessionModel) -> npt
     frame = read_array(path)
     if frame is None:
         raise InputError(where, f"{path.name}, which cannot be read", "an NPY array")
-    if frame.dtype.kind == "f" and not np.isfinite(frame).all():
-        raise InputError(where, f"{path.name} with entries that are not finite", "finite numbers")
     return frame
 
 
@@ -126,6 +125,19 @@ def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Im
     both = record.right is not None and rig.right is not None
     right = load_picture(record.right, line, "marker.right", rig) if both and record.right is not None else None
     return left, right
+
+
+@contextmanager
+def refusing(where: str) -> Iterator[None]:
+    """Turns a detector's refusal of a frame into an input error that names the place.
+
+    Raises:
+        InputError: instead of ValueError, OverflowError or LinAlgError.
+    """
+    try:
+        yield
+    except (ValueError, OverflowError, np.linalg.LinAlgError) as error:
+        raise InputError(where, f"a frame that cannot be worked with ({error})", "one as session.yaml says") from error
 
 
 def looks_of(event: Event) -> tuple[TrusRecord, ...]:
@@ -205,17 +217,23 @@ def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progre
     jobs: list[Callable[[], None]] = []
 
     def optical(index: int, event: AimEvent | PairEvent | TrackEvent, wants_board: bool) -> None:
-        if rig is None or marker is None:
-            raise AssertionError("frames without camera or marker pass the reader")
+        wants_marker = needs_marker_frames(event.marker, redetect=redetect)
+        if rig is None:
+            raise InputError("session.yaml: camera", "nothing", f"the cameras, for line {event.line} of events.jsonl")
+        if wants_marker and marker is None:
+            raise InputError("session.yaml: marker", "nothing", f"the marker, for line {event.line} of events.jsonl")
         left, right = marker_pictures(event.marker, event.line, rig)
-        if needs_marker_frames(event.marker, redetect=redetect):
-            found.markers[index] = detect_marker(left, right, rig, marker)
-        if wants_board and board is not None:
-            found.boards[index] = detect_board(left, right, rig, board)
+        with refusing(f"events.jsonl: line {event.line}: marker"):
+            if wants_marker and marker is not None:
+                found.markers[index] = detect_marker(left, right, rig, marker)
+            if wants_board and board is not None:
+                found.boards[index] = detect_board(left, right, rig, board)
 
     def acoustic(index: int, number: int, event: PairEvent | TrackEvent, path: Path) -> None:
         key = "trus.frame" if len(looks_of(event)) == 1 else f"looks[{number}].frame"
-        found.finds[index, number] = locate_in_frame(load_trus_frame(path, event.line, key, model), model.probe)
+        frame = load_trus_frame(path, event.line, key, model)
+        with refusing(f"events.jsonl: line {event.line}: {key}"):
+            found.finds[index, number] = locate_in_frame(frame, model.probe)
 
     for index, event in enumerate(events):
         if isinstance(event, AimEvent | PairEvent | TrackEvent):

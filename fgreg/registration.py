@@ -122,7 +122,7 @@ FEW = 0.05
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
     """Epochs with minima of their own or tied to such a one by measured camera motions."""
     known = {k for k, search in enumerate(searches) if search.minima}
-    tied = {k for k, e in enumerate(measurements.epochs) if k and e.camera_new_T_camera_old is not None}
+    tied = {k for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
     for _ in range(len(searches)):
         known |= {k for k in tied if k - 1 in known} | {k - 1 for k in tied if k in known}
     return sorted(known)
@@ -135,10 +135,13 @@ def joint_start(
     transforms = {k: minimum.state.trus_T_camera()[0] for k, minimum in chosen.items()}
     while len(transforms) < len(solvable):
         for k in solvable:
-            motion = measurements.epochs[k].camera_new_T_camera_old
-            if k and motion is not None and k not in transforms and k - 1 in transforms:
+            epoch = measurements.epochs[k]
+            motion = epoch.camera_new_T_camera_old
+            if not k or motion is None or not epoch.motion_known:
+                continue
+            if k not in transforms and k - 1 in transforms:
                 transforms[k] = transforms[k - 1] @ inverse(motion)
-            if k and motion is not None and k in transforms and k - 1 in solvable and k - 1 not in transforms:
+            elif k in transforms and k - 1 in solvable and k - 1 not in transforms:
                 transforms[k - 1] = transforms[k] @ motion
     most = max(chosen, key=lambda k: sum(pair.epoch == k for pair in measurements.pairs))
     beam = chosen[most].state
@@ -146,6 +149,40 @@ def joint_start(
     frame = nominal_frame(beam.beam_origin()[0], beam.beam_direction()[0])
     stacked = np.stack([transforms[k] for k in solvable])[None]
     return make_state(stacked, frame, model.probe.radius_mm)
+
+
+def _best_start(
+    measurements: Measurements,
+    chosen: dict[int, Minimum],
+    solvable: list[int],
+    model: SessionModel,
+    config: SolveConfig,
+) -> SharedState:
+    """Each epoch from its own minimum, or all that are tied from the one with most pairs: which leads to less cost."""
+    own = joint_start(measurements, chosen, solvable, model)
+    count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
+    leaders: dict[int, Minimum] = {}
+    for chain in _chains(measurements, solvable):
+        among = [k for k in chain if k in chosen]
+        best = max(among, key=lambda k: count[k])
+        leaders[best] = chosen[best]
+    if len(leaders) == len(chosen):
+        return own
+    carried = joint_start(measurements, leaders, solvable, model)
+    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
+    found = [optimize(problem, start, max_iterations=30) for start in (own, carried)]
+    return min(found, key=lambda optimum: float(optimum.evaluation.cost[0])).state
+
+
+def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
+    """Solvable epochs, grouped by measured motions between neighbours."""
+    out: list[list[int]] = []
+    for k in solvable:
+        if out and out[-1][-1] == k - 1 and measurements.epochs[k].motion_known:
+            out[-1].append(k)
+        else:
+            out.append([k])
+    return out
 
 
 def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
@@ -316,7 +353,7 @@ def register(
         )
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
-    start = joint_start(measurements, chosen, solvable, model)
+    start = _best_start(measurements, chosen, solvable, model, config)
     clean = all(search.clean for search in searches)
 
     def packed(of: Measurements) -> PackedProblem:

@@ -68,7 +68,10 @@ def track(query: Track, context: TrackContext) -> TrackEstimate:
         scan_rad, sigma_rad, lambda_mm = answer
     device_rad = context.model.stage.device_from_scan(scan_rad)
     low, high = context.model.stage.limits_device_rad
-    if not low <= device_rad <= high:
+    turned = [a for a in (device_rad, device_rad - 2 * math.pi, device_rad + 2 * math.pi) if low <= a <= high]
+    if turned:
+        device_rad = turned[0]
+    else:
         reason = f"the stage would have to turn to {math.degrees(device_rad):.1f} deg, outside its limits"
         return _refused(query, context, f"{reason} {math.degrees(low):.0f} to {math.degrees(high):.0f} deg")
     return TrackEstimate(query.t, device_rad, sigma_rad, lambda_mm - context.origin_shift_mm, context.causal)

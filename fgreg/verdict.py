@@ -12,8 +12,6 @@ from scipy.stats import binom, chi2
 from fgreg.config import SolveConfig
 from fgreg.estimate import PredictedTre, Verdict, worst_verdict
 from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
-from fgreg.graph.packing import pack
-from fgreg.graph.reduced import evaluate
 from fgreg.measurements import Pair
 from fgreg.registration import EpochSearch, Registration
 from fgreg.robust import JUNK_P
@@ -30,11 +28,13 @@ JUNK_CAUTION = 2
 """Where shots were left out other hypotheses have more freedom to fit by chance: so many times the gap is needed."""
 CERTAIN_NIS = 30.0
 """Innovation of one shot that noise does not explain, nor a bad estimate from few others."""
+MIRROR_CHANCE = 2.0
+"""By no more than this a mirrored session fits better by chance: what is told wrongly here costs centimetres."""
 MILD_NIS = 60.0
 MILD_JUNK = 0.1
 """Junk is mostly farther off than this; so large a share is not."""
-SOUND_SPEED_SIGMA = 0.1
-"""Prior of the ratio in its score test: wide, so that the pairs speak. No medium is farther off than this."""
+MOST_SOUND_SPEED = 0.1
+"""No medium is farther off than this: the cause is another."""
 SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
@@ -83,7 +83,7 @@ def ambiguity(
     if search.mirrored_cost is not None and search.minima and search.mirrored_cost < search.minima[0].cost:
         costs = f"(chi square {search.mirrored_cost:.1f} against {search.minima[0].cost:.1f})"
         wiring = "the stage turns the other way (stage.direction) or the elements are counted from the other end"
-        certain = config.second_minimum_chi2 * (1 if search.clean else JUNK_CAUTION)
+        certain = MIRROR_CHANCE * (1 if search.clean else JUNK_CAUTION)
         if search.minima[0].cost - search.mirrored_cost > certain:
             text = (
                 f"the mirrored hypothesis fits better {costs}: {wiring} (probe.flip); check the wiring and correct "
@@ -224,6 +224,21 @@ def sweeps(pairs: Iterable[Pair], config: SolveConfig) -> list[Condition]:
     ]
 
 
+def repeated_markers(pairs: Iterable[Pair]) -> list[Condition]:
+    """One marker observation under several PM numbers: looks that count as independent and are not."""
+    pms: dict[int, set[int]] = {}
+    for pair in pairs:
+        pms.setdefault(pair.marker.id, set()).add(pair.pm)
+    shared = [sorted(names) for names in pms.values() if len(names) > 1]
+    if not shared:
+        return []
+    text = (
+        f"{len(shared)} marker observations serve several PMs (PM {', '.join(str(pm) for pm in shared[0])}): looks at "
+        "one spot have one pm; where the spots differ, the fibre moved and each needs a marker of its own"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
 def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
     """Residuals against the noise that was stated."""
     if degrees_of_freedom <= 0:
@@ -308,28 +323,16 @@ def causes_of_error(registration: Registration, place: int, targets_mm: FloatArr
     return Causes(beam=shares[0], edge=shares[1])
 
 
-def sound_speed_condition(registration: Registration) -> list[Condition]:
-    """Whether the pairs ask for another sound speed: one Gauss-Newton step with the ratio as an unknown."""
-    problem = pack(registration.measurements, registration.model, sound_speed_sigma=SOUND_SPEED_SIGMA)
-    column, optimum = problem.columns.sound_speed, registration.optimum
-    at = evaluate(problem, optimum.state, optimum.evaluation.private)
-    hessian, gradient = at.hessian[0], at.gradient[0]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    try:
-        covariance = np.linalg.inv(hessian * scale * scale[:, None]) * scale * scale[:, None]
-    except np.linalg.LinAlgError:
+def sound_speed_condition(ratio: float, sigma: float) -> list[Condition]:
+    """Whether the pairs ask for another sound speed than they were given, from the ratio that they ask for."""
+    if not max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE) < abs(ratio - 1.0) < MOST_SOUND_SPEED:
         return []
-    change = -float(covariance[column] @ gradient)
-    sigma = math.sqrt(max(float(covariance[column, column]), 0.0))
-    if not max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE) < abs(change) < SOUND_SPEED_SIGMA:
-        return []
-    return [
-        Condition(
-            Verdict.WARNING,
-            f"the pairs fit better with sound at {1.0 + change:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: measure "
-            "the medium's temperature or sound speed, and correct it in session.yaml (with ranges computed anew)",
-        )
-    ]
+    text = (
+        f"the pairs fit better with sound at {ratio:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: measure the medium's "
+        "temperature or sound speed and correct it in session.yaml (with ranges computed anew), or solve with "
+        "--estimate sound_speed"
+    )
+    return [Condition(Verdict.WARNING, text)]
 
 
 def beam_sides(lambda_mm: FloatArray) -> list[Condition]:

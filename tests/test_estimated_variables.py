@@ -38,12 +38,15 @@ def test_a_wrong_sound_speed_is_found_where_the_noise_lets_it() -> None:
         np.random.default_rng(1), pairs=30, session=make_session(noise_model=QUIET), sound_speed_ratio=1.05
     )
     config = SolveConfig()
-    asked = sound_speed_from_residuals(register(measurements, model, config), model)
+    asked = sound_speed_from_residuals(register(measurements, model, config))
     assert asked.value == pytest.approx(1.05, abs=3.5 * asked.sigma)
     assert asked.sigma < 0.012
     solution = solve(measurements, [], model, config)
     assert solution.verdict is not Verdict.OK
-    assert any("pairs fit better with sound at 1.0" in reason and "--estimate sound_speed" in reason for reason in solution.reasons)
+    assert any(
+        "pairs fit better with sound at 1.0" in reason and "--estimate sound_speed" in reason
+        for reason in solution.reasons
+    )
 
 
 def test_estimating_the_sound_speed_takes_its_error_out() -> None:
@@ -99,7 +102,7 @@ def test_what_the_frames_say_is_the_prior() -> None:
 def test_with_default_noise_a_right_sound_speed_is_not_suspected() -> None:
     for seed in range(6):
         model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=15)
-        asked = sound_speed_from_residuals(register(measurements, model, SolveConfig()), model)
+        asked = sound_speed_from_residuals(register(measurements, model, SolveConfig()))
         assert abs(asked.value - 1.0) < 3.0 * asked.sigma
 
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgreg.answer import sound_speed_from_residuals
 from fgreg.batch import solve
 from fgreg.config import SolveConfig
 from fgreg.estimate import PredictedTre, Verdict
 from fgreg.frames import as_float_array, exp_so3, make_transform
-from fgreg.registration import register
-from fgreg.verdict import Causes, accuracy, causes_of_error, sound_speed_condition, understated_noise
+from fgreg.registration import Registration, register
+from fgreg.verdict import Causes, Condition, accuracy, causes_of_error, sound_speed_condition, understated_noise
 from tests.forward import make_measurements
 
 
@@ -55,11 +56,16 @@ def test_noise_of_three_times_what_is_stated_is_told() -> None:
         assert any("larger than the stated noise explains" in reason for reason in solution.reasons)
 
 
+def _sound_speed(registration: Registration) -> list[Condition]:
+    asked = sound_speed_from_residuals(registration)
+    return sound_speed_condition(asked.value, asked.sigma)
+
+
 def test_a_wrong_sound_speed_shows_where_pairs_are_many() -> None:
     model, right, _ = make_measurements(np.random.default_rng(0), pairs=400)
-    assert sound_speed_condition(register(right, model, SolveConfig())) == []
+    assert _sound_speed(register(right, model, SolveConfig())) == []
     model, wrong, _ = make_measurements(np.random.default_rng(0), pairs=400, sound_speed_ratio=1.02)
-    found = sound_speed_condition(register(wrong, model, SolveConfig()))
+    found = _sound_speed(register(wrong, model, SolveConfig()))
     assert len(found) == 1
     assert "probe.sound_speed_m_s" in found[0].text
     ratio, sigma = (float(found[0].text.split("sound at ")[1].split()[i]) for i in (0, 2))

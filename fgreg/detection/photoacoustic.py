@@ -119,14 +119,13 @@ def locate_in_channels(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | N
 def locate_in_frame(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
     """Find the photoacoustic source in a frame of either kind.
 
-    A frame with as many rows as the probe has elements is channel data, where the probe has ``channels``; any other is
-    an envelope image, where it has ``image``.
+    Of a probe with both ``channels`` and ``image``, what :meth:`ProbeModel.is_channel_data` says is channel data.
 
     Raises:
         ValueError: the probe has neither, or the frame fits neither.
     """
     data = check_frame(frame)
-    if probe.channels is not None and (data.shape[0] == probe.elements or probe.image is None):
+    if probe.channels is not None and (probe.image is None or probe.is_channel_data(frame)):
         return locate_in_channels(data, probe)
     if probe.image is not None:
         return locate_in_image(data, probe)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.answer import answer
 from fgreg.errors import EstimationError
 from fgreg.evaluation.case import Case, EvaluationConfig
 from fgreg.evaluation.pair_residual import line_to_arc
@@ -82,7 +83,8 @@ def resolve(case: Case, kept: Sequence[int], config: EvaluationConfig, held: Seq
         return Resolved(tuple(kept), failure=str(error))
     count = len(measurements.epochs)
     place = {epoch: index for index, epoch in enumerate(registration.epochs)}
-    state = registration.optimum.state
+    centred = answer(registration, config.solve).registration
+    state = centred.optimum.state
     transforms = tuple(state.trus_T_camera(place[k])[0] if k in place else None for k in range(count))
     expected: list[float | None] = []
     errors: list[FloatArray | None] = []
@@ -92,7 +94,7 @@ def resolve(case: Case, kept: Sequence[int], config: EvaluationConfig, held: Seq
             errors.append(None)
             continue
         block = slice(6 * place[k], 6 * place[k] + 6)
-        covariance = registration.covariance[block, block]
+        covariance = centred.covariance[block, block]
         expected.append(float(expected_tre_mm(covariance, transform, case.model.targets_mm).mean()))
         known = case.truth is not None and k < len(case.truth.trus_T_camera)
         errors.append(

@@ -109,6 +109,10 @@ def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
         at += 12 + length
         if at > end:
             return None
+        # Checksums here, or a damaged file would be a complaint of the image library's own.
+        body = file.read(length + 4)
+        if zlib.crc32(body[:-4], zlib.crc32(kind)) != int.from_bytes(body[-4:], "big"):
+            return None
         if kind == b"IEND":
             return (width, height) if data else None
         data = data or kind == b"IDAT"
@@ -120,7 +124,7 @@ def trus_frame_problem(
     """What keeps an array from being a TRUS frame of this probe, and what was expected, or None."""
     if len(shape) != 2 or min(shape) < 2 or dtype.kind not in "iuf":
         found = f"an array of {dtype} with shape {list(shape)}"
-    elif probe.image is not None or is_channel_frame(shape, dtype, probe):
+    elif probe.image is not None or probe.holds_channels(shape, dtype):
         return None
     else:
         found = f"an array of {dtype} with shape {list(shape)}"
@@ -130,12 +134,6 @@ def trus_frame_problem(
     if probe.image is not None:
         ways.append("an image of numbers, [depth, lateral]")
     return found, " or ".join(ways)
-
-
-def is_channel_frame(shape: tuple[int, ...], dtype: np.dtype[np.generic], probe: ProbeModel) -> bool:
-    """Whether an array is channel data of this probe; where ``probe.image`` is there too, it is an image otherwise."""
-    is_type = (dtype.kind, dtype.itemsize) in (("f", 4), ("i", 2))
-    return probe.channels is not None and is_type and len(shape) == 2 and shape[0] == probe.elements
 
 
 def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None) -> None:
@@ -164,6 +162,8 @@ def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None
         problem = None if probe is None else trus_frame_problem(shape, dtype, probe)
         if problem is not None:
             raise InputError(where, f"{shown(name)} with {problem[0]}", problem[1])
+        if dtype.kind == "f" and not np.isfinite(np.frombuffer(file.read(needed - file.tell()), dtype)).all():
+            raise InputError(where, f"{shown(name)} with entries that are not finite", "finite numbers")
 
 
 def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[np.generic]] | None:

@@ -61,11 +61,15 @@ _PAIR = (
 _TRACK = ("t", "stage_deg", "sigma_deg", "lambda_mm", "causal", "reason")
 
 
+_FORMAT_LINE = b"format: fgreg-result/"
+RESULT_NAME = "result.yaml"
+
+
 def remove_result(path: Path) -> None:
     """Removes an older result before work starts, so that no failure leaves one behind.
 
     Raises:
-        InputError: the folder is absent or cannot be written to, or the path is a folder or a file of a session.
+        InputError: the folder is absent or cannot be written to, or the path is anything but an older result.
     """
     if path.name in _SESSION_FILES:
         raise InputError(str(path), "the name of a session's own file", "another name for the result")
@@ -76,9 +80,21 @@ def remove_result(path: Path) -> None:
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(str(path.parent), "a folder that cannot be written to", f"one to write {path.name} to")
     try:
+        if os.path.lexists(path) and not _is_result(path):
+            raise InputError(str(path), "a file that is no result", "a new name, or that of an older result")
         path.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
         raise InputError(str(path), f"a file that cannot be removed ({_reason(error)})", "an older result") from None
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a file is a result, by its name in a session's folder or by its first line: nothing else is removed."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    if path.name == RESULT_NAME:
+        return True
+    with path.open("rb") as file:
+        return file.read(len(_FORMAT_LINE)) == _FORMAT_LINE
 
 
 def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, version: str) -> None:

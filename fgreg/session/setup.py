@@ -180,7 +180,7 @@ def _probe(top: Fields) -> ProbeModel | None:
     if fields is None:
         return None
     elements = fields.integer("elements", 1, 65536)
-    pitch_mm = fields.number("pitch_mm", POSITIVE_MM)
+    pitch_mm = fields.number("pitch_mm", Bounds(1e-3, 100.0, unit="mm"))
     flip = fields.boolean("flip")
     radius_mm = fields.number("radius_mm", POSITIVE_MM)
     sound_speed = fields.number("sound_speed_m_s", Bounds(0.0, 1e5, above=True, unit="m/s"))
@@ -236,7 +236,7 @@ def _channels(probe: Fields) -> ChannelModel | None:
     fields = probe.child("channels", ("sampling_mhz", "t0_us", "pulse_delay_us"))
     if fields is None:
         return None
-    sampling_mhz = fields.number("sampling_mhz", _POSITIVE)
+    sampling_mhz = fields.number("sampling_mhz", Bounds(0.1, 1e4, unit="MHz"))
     t0_us = fields.number("t0_us", _MICROSECONDS, default=0.0)
     pulse_delay_us = fields.number("pulse_delay_us", _MICROSECONDS, default=0.0)
     return fields.build(lambda: ChannelModel(sampling_mhz, t0_us, pulse_delay_us))

@@ -36,15 +36,19 @@ def write_session(
     Raises:
         InputError: the folder is not empty and ``overwrite`` is not set, or it holds something else than a session.
     """
-    folder = Path(folder)
+    folder = Path(folder).resolve()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         if not overwrite:
             raise InputError(str(folder), "a folder that is not empty", "a new or empty folder, or --overwrite")
         if not (folder / "session.yaml").is_file():
             raise InputError(str(folder), "no session to overwrite", "a folder with a session.yaml")
-    partial = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
+    partial, older = folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".older")
+    try:
+        if partial.exists() or older.exists():
+            raise InputError(str(folder), f"{partial.name} or {older.name} beside it", "neither: remove them first")
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(str(folder), f"a place that refuses folders ({error.strerror})", "a writable one") from error
     try:
         (partial / "session.yaml").write_text(_yaml(simulated.session), encoding="utf-8")
         lines = [json.dumps(event, separators=(", ", ": ")) + "\n" for event in simulated.events]
@@ -57,8 +61,16 @@ def write_session(
             if progress is not None:
                 progress(done, len(simulated.frames))
         if folder.exists():
-            shutil.rmtree(folder)
-        partial.rename(folder)
+            folder.rename(older)
+        try:
+            partial.rename(folder)
+        except OSError:
+            if older.exists():
+                older.rename(folder)
+            raise
+        shutil.rmtree(older, ignore_errors=True)
+    except OSError as error:
+        raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 

@@ -52,13 +52,6 @@ class PaPicture:
         )
 
 
-def is_channel_data(frame: npt.NDArray[np.generic], probe: ProbeModel) -> bool:
-    """Whether a frame is (elements, samples) channel data rather than a (depth, lateral) envelope image."""
-    if probe.channels is None:
-        return False
-    return probe.image is None or frame.shape[0] == probe.elements
-
-
 def sample_ranges_mm(samples: int, probe: ProbeModel) -> FloatArray:
     """(samples,) range that a wave arriving at each sample of channel data has come from: c (t0 + s / fs - delay)."""
     if probe.channels is None:
@@ -78,7 +71,7 @@ def pa_picture(frame: npt.NDArray[np.generic], probe: ProbeModel, largest_side: 
     ranges: FloatArray
     values: FloatArray
     x: FloatArray
-    if is_channel_data(frame, probe):
+    if probe.channels is not None and (probe.image is None or probe.is_channel_data(frame)):
         x, ranges = probe.element_x_mm, sample_ranges_mm(data.shape[1], probe)
         if data.shape[0] != len(x):
             return None

@@ -89,6 +89,14 @@ class NullViewer:
         """Nothing is drawn."""
 
 
+def _is_recording(path: Path) -> bool:
+    """Whether a file is a Rerun recording: nothing else is ever written over."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(3) == b"RRF"
+
+
 class Viewer:
     """Writes a recording while a session is worked on. Use as a context manager: the file appears at its end.
 
@@ -106,15 +114,20 @@ class Viewer:
     def __init__(self, rrd: Path, session_name: str) -> None:
         if not rrd.parent.is_dir():
             raise InputError(str(rrd), "a folder that does not exist", "an existing folder for the recording")
-        if rrd.is_dir():
-            raise InputError(str(rrd), "a folder", "the name of a file to write")
+        if os.path.lexists(rrd) and not _is_recording(rrd):
+            found = "a folder" if rrd.is_dir() else "a file that is no recording"
+            raise InputError(str(rrd), found, "a new name, or that of an older recording")
         self._rrd = rrd
         self._part = rrd.with_name(f".{rrd.name}.{os.getpid()}.part")
         try:
             self._part.touch()
         except OSError as error:
             raise InputError(str(rrd), f"a place that refuses files ({error.strerror})", "a writable one") from error
-        self._rec = shapes.Recorder(self._part, session_name)
+        try:
+            self._rec = shapes.Recorder(self._part, session_name)
+        except BaseException:
+            self._part.unlink(missing_ok=True)
+            raise
         self._shown: set[str] = set()
         self._pa_size: tuple[int, int] | None = None
         self._textured: set[int] = set()
