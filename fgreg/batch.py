@@ -189,6 +189,8 @@ def _common_conditions(
     if problem.columns.sound_speed is None:
         asked = sound_speed_from_residuals(registration)
         found.extend(sound_speed_condition(asked.value, asked.sigma))
+    if found and verdict_of(found) is Verdict.REFUSED:
+        return found  # what is inconsistent anyway says nothing about the two forms of the graph
     if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph knows its radius
         found.extend(_agreement(registration))
     return found

@@ -34,6 +34,8 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
         rotation, shift = rotation_to_direction(direction), float(-start @ direction)
     else:
         # The nominal frame turned by the least that brings its z onto the beam: its roll stays.
+        if initial[:3, 2] @ direction < 0:  # given the wrong way round
+            initial = initial @ np.diag([1.0, -1.0, -1.0, 1.0])
         axis = np.cross(initial[:3, 2], direction)
         sine, cosine = float(np.linalg.norm(axis)), float(initial[:3, 2] @ direction)
         turn = axis / max(sine, 1e-12) * np.arctan2(sine, cosine)

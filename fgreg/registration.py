@@ -151,6 +151,19 @@ def joint_start(
     return make_state(stacked, frame, model.probe.radius_mm)
 
 
+def _points_backwards(optimum: Optimum) -> bool:
+    """Whether most spots lie behind the beam's origin."""
+    at = optimum.evaluation
+    return bool(np.median(np.concatenate([at.lambda_mm[0], at.aim_lambda_mm[0]])) < 0)
+
+
+def _turned(state: SharedState, model: SessionModel) -> SharedState:
+    """The same hypothesis with the beam's chart pointing the other way."""
+    frame = nominal_frame(state.beam_origin()[0], -state.beam_direction()[0])
+    count = state.rotation.shape[1]
+    return make_state(np.stack([state.trus_T_camera(k) for k in range(count)], axis=1), frame, model.probe.radius_mm)
+
+
 def _best_start(
     measurements: Measurements,
     chosen: dict[int, Minimum],
@@ -359,9 +372,12 @@ def register(
     def packed(of: Measurements) -> PackedProblem:
         return pack_session(of, model, config, sound_speed)
 
-    kept, problem, optimum, shots = _solve_jointly(
-        restrict_epochs(measurements, solvable), packed, start, beam.aim_kept, clean=clean
-    )
+    epochs = restrict_epochs(measurements, solvable)
+    kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+    if _points_backwards(optimum):
+        # A nominal beam given the wrong way round, and no aim to tell: +z is where the spots are.
+        start = _turned(optimum.state, model)
+        kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
     hessian = optimum.evaluation.hessian[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     try:

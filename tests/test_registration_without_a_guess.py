@@ -135,3 +135,27 @@ def test_a_few_aims_start_the_beam_and_the_pairs_do_the_rest(aims: int) -> None:
     moved = targets_moved(truth.trus_T_camera[0], found.optimum.state.trus_T_camera()[0], model.targets_mm)
     assert moved < 8.0
     assert found.optimum.state.beam_direction()[0] @ truth.marker_T_laser[:3, 2] > np.cos(np.radians(5.0))
+
+
+def test_a_nominal_beam_the_wrong_way_round_is_turned_to_where_the_spots_are() -> None:
+    from dataclasses import replace
+
+    model, measurements, truth = make_measurements(np.random.default_rng(5), aims=0, pairs=25)
+    wrong = truth.marker_T_laser @ np.diag([1.0, -1.0, -1.0, 1.0])
+    solution = solve(measurements, [], replace(model, initial_marker_T_laser=wrong), SolveConfig())
+    assert solution.laser is not None
+    assert solution.laser.marker_T_laser[:3, 2] @ truth.marker_T_laser[:3, 2] > 0.99
+    assert all(pair.lambda_mm is not None and pair.lambda_mm > 0 for pair in solution.pairs)
+    assert np.linalg.det(solution.laser.marker_T_laser[:3, :3]) == pytest.approx(1.0)
+
+
+def test_a_motion_without_a_covariance_ties_nothing() -> None:
+    from dataclasses import replace
+
+    model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=24, epochs=2, known_motion=True)
+    starts = (measurements.epochs[0], replace(measurements.epochs[1], covariance=None))
+    first = tuple(pair for pair in measurements.pairs if pair.epoch == 0)
+    solution = solve(replace(measurements, epochs=starts, pairs=first), [], model, SolveConfig())
+    assert solution.epochs[0].trus_T_camera is not None
+    assert solution.epochs[0].verdict is not Verdict.REFUSED
+    assert solution.epochs[1].trus_T_camera is None
