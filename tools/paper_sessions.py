@@ -161,6 +161,7 @@ class Job:
     guess: tuple[float, float] = (5.0, 5.0)
     max_rounds: int = 4000
     key: Any = None
+    posterior: bool = False
 
 
 def run_job(job: Job) -> dict[Any, Row]:
@@ -214,6 +215,11 @@ def registration(job: Job) -> dict[Any, Row]:
             row["best"] = sim.tre(best.trus_T_camera()[0])
             row["best_residual"] = pair_residuals(best, (0,), held.measurements.pairs)
             row["ambiguous"] = bool(found.ambiguous)
+            if job.posterior:
+                count, covariance = SETTINGS.posterior_samples, found.covariance
+                drawn = sample_posterior(found.problem, found.optimum, covariance, count, job.seed)
+                mean = found.optimum.state.retract((drawn.weight @ drawn.step)[None], found.problem.columns)
+                row["mean_tre"] = sim.tre(mean.trus_T_camera()[0])
             row["residual"] = np.array([pm.pair_residual_mm for pm in predict(found, held.measurements.pairs)])
         except EstimationError:
             row["failed"] = True
