@@ -259,10 +259,17 @@ class _Descent:
 
     def __init__(self, problem: PackedProblem, state: SharedState, private: PrivateState | None = None) -> None:
         self.problem, self.state = problem, state
-        private = initial_private(problem, state) if private is None else private
+        self.settle(initial_private(problem, state) if private is None else private)
+
+    def settle(self, private: PrivateState | None = None) -> None:
+        """Find the private variables at the present state, from the arcs where none are given.
+
+        On the way from a far start a PM may end up on the far side of its arc, where it seems to fit.
+        """
+        private = initial_private(self.problem, self.state) if private is None else private
         for _ in range(3):
-            _, private = refine(problem, state, private)
-        self.parts = contributions(problem, state, private)
+            _, private = refine(self.problem, self.state, private)
+        self.parts = contributions(self.problem, self.state, private)
 
     def run(self, loss: Loss, steps: int, tolerance: float = 1e-4) -> _Weights:
         """At most so many steps under one loss; until the Newton decrement (chi square) is below the tolerance."""
@@ -304,7 +311,9 @@ def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool =
     limit, aim_limit = pm_limits(problem), AIM_LIMIT if robust_aims else np.inf
     for scale in CAUCHY_SCALES:
         descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
-    weights = descent.run(partial(_truncated, limit=limit, aim_limit=aim_limit), MAX_STEPS)
+    for _ in range(2):
+        descent.settle()
+        weights = descent.run(partial(_truncated, limit=limit, aim_limit=aim_limit), MAX_STEPS)
     return RobustOptimum(
         descent.state, descent.parts.private, descent.parts, weights.cost, weights.pm > 0.5, weights.aim > 0.5
     )
@@ -385,7 +394,7 @@ def deviant(problem: PackedProblem, found: Innovations) -> Deviants:
 class Sorted:
     """Which shots are kept, PMs (J,) and aims (A,), at the least squares optimum of those kept (one hypothesis).
 
-    ``settled``: every shot kept, and none of the others, is within its limit.
+    ``settled``: every shot kept, and none of the others, is within its limit; False with borderline shots kept.
     """
 
     state: SharedState
@@ -410,19 +419,26 @@ def sort_shots(
         pm_kept (J,), aim_kept (A,): where to begin.
         doubt_aims: False leaves ``aim_kept`` as it is.
     """
-    private: PrivateState | None = None
+    seen: set[bytes] = set()
+    settled = False
     for _ in range(SETTLE_ROUNDS):
-        descent = _Descent(problem, state, private)
+        descent = _Descent(problem, state)
         descent.run(partial(_fixed, pm_kept=pm_kept, aim_kept=aim_kept), MAX_STEPS)
-        state, private = descent.state, descent.parts.private
+        descent.settle()
+        state = descent.state
         found = innovations(descent.parts, pm_kept, aim_kept)
         beyond = deviant(problem, found)
         pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
         aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
-        if (pm_next == pm_kept).all() and (aim_next == aim_kept).all():
-            return Sorted(state, pm_kept, aim_kept, settled=True)
+        settled = bool((pm_next == pm_kept).all() and (aim_next == aim_kept).all())
+        if settled:
+            break
+        seen.add(pm_kept.tobytes() + aim_kept.tobytes())
+        if pm_next.tobytes() + aim_next.tobytes() in seen:  # a borderline shot: in when out, out when in
+            pm_kept, aim_kept = pm_kept | pm_next, aim_kept | aim_next
+            break
         pm_kept, aim_kept = pm_next, aim_next
-    return Sorted(state, pm_kept, aim_kept, settled=False)
+    return Sorted(state, pm_kept, aim_kept, settled)
 
 
 def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted) -> BoolArray:
