@@ -283,6 +283,10 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
     return _about_mean(target, x, weight, main / main.sum(), log_target, _effective(log_weight))
 
 
+ENOUGH_SAMPLES = 60.0
+"""Independent samples from which moments stand on their own."""
+
+
 def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
     """Samples of the Gaussian at a mode: what the posterior is with many pairs."""
     x = np.random.default_rng(seed).standard_normal((count, len(mode.covariance)))
@@ -301,6 +305,9 @@ def _about_mean(
     centre = main @ x
     spread = x - centre
     moment = (spread * main[:, None]).T @ spread
+    # A few heavy samples span no volume: the optimum's own covariance stands in for what they cannot tell.
+    missing = max(0.0, 1.0 - effective / ENOUGH_SAMPLES) + 1e-9
+    moment = moment + missing * target.modes[0].covariance
     # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
     # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
     square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
@@ -309,7 +316,7 @@ def _about_mean(
     mean = target.modes[0].optimum.state.retract(shift, columns)
     step = step_between(mean, target.state(x), columns)
     tangent = tangent_of_step(step, columns)
-    covariance = np.asarray((tangent * weight[:, None]).T @ tangent)
+    covariance = np.asarray((tangent * weight[:, None]).T @ tangent) + missing * target.modes[0].covariance
     return Posterior(columns, mean, step, tangent, weight, log, effective, covariance)
 
 

@@ -63,6 +63,8 @@ class EpochSearch:
     Attributes:
         minima: best first, with the chi square of the shots that fit.
         mirrored_cost: best cost of the mirrored hypothesis, comparable with that of the first minimum.
+        mirrored_outside_cost: likewise of those of its minima whose beams come from outside the probe; None without.
+        outside: whether the first minimum's beams do.
         other_way_cost: likewise with every sweep's sign turned round; None where all fitted and that was not tried.
         own_beam_cost: likewise with a beam of the pairs' own, whatever the aims say; None where not tried.
         clean: whether every shot fits.
@@ -73,6 +75,8 @@ class EpochSearch:
     other_way_cost: float | None = None
     own_beam_cost: float | None = None
     clean: bool = True
+    mirrored_outside_cost: float | None = None
+    outside: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,7 +225,30 @@ def search_epoch(
         return _search_among_junk(subset, problem, model, frames, minima, keep_within)
     mirrored_problem = _mirrored(problem)
     mirrored = optimize(mirrored_problem, _starts(mirrored_problem, frames, model), keep_within=keep_within)
-    return EpochSearch(minima, float(mirrored.evaluation.cost.min()))
+    cost = mirrored.evaluation.cost
+    return EpochSearch(
+        minima,
+        float(cost.min()),
+        mirrored_outside_cost=_least(cost, from_outside(mirrored_problem, mirrored.state)),
+        outside=bool(from_outside(problem, minima[0].state)[0]),
+    )
+
+
+def _least(cost: FloatArray, among: BoolArray) -> float | None:
+    return float(cost[among].min()) if among.any() else None
+
+
+def from_outside(problem: PackedProblem, state: SharedState) -> BoolArray:
+    """(S,) whether most beams of a one-epoch problem run towards the probe: the fibre is outside, the probe inside.
+
+    PMs on a nearly flat surface fit their mirror image as well, with the beams coming from behind it: from where the
+    probe is.
+    """
+    points = arc_points(problem, np.zeros(1))[0]
+    radial = points[:, 1:] / np.linalg.norm(points[:, 1:], axis=1, keepdims=True)
+    camera_d = np.einsum("bij,sj->sbi", problem.beams.rotation, state.beam_direction())
+    trus_d = np.einsum("sij,sbj->sbi", state.rotation[:, 0], camera_d)[:, problem.look_beam]
+    return np.asarray(np.mean(np.sum(trus_d[..., 1:] * radial, axis=-1), axis=1) < 0.0)
 
 
 def _search_among_junk(
@@ -264,7 +291,13 @@ def _search_among_junk(
         None if other_way is None else level + float(other_way.cost.min()) - base,
         level + float(free.cost.min()) + aims_cost - base,
         clean=False,
+        mirrored_outside_cost=_shifted(_least(mirrored.cost, from_outside(problem, mirrored.state)), level - base),
+        outside=bool(from_outside(problem, robust.state.take([order[0]]))[0]),
     )
+
+
+def _shifted(cost: float | None, by: float) -> float | None:
+    return None if cost is None else cost + by
 
 
 def _robust_minima(

@@ -80,23 +80,36 @@ def ambiguity(
                 f"take {config.min_pairs - pairs} more",
             )
         )
-    if search.mirrored_cost is not None and search.minima and search.mirrored_cost < search.minima[0].cost:
-        costs = f"(chi square {search.mirrored_cost:.1f} against {search.minima[0].cost:.1f})"
-        wiring = "the stage turns the other way (stage.direction) or the elements are counted from the other end"
-        certain = MIRROR_CHANCE * (1 if search.clean else JUNK_CAUTION)
-        if search.minima[0].cost - search.mirrored_cost > certain:
-            text = (
-                f"the mirrored hypothesis fits better {costs}: {wiring} (probe.flip); check the wiring and correct "
-                "session.yaml"
-            )
-            found.append(Condition(Verdict.REFUSED, text))
-        else:
-            text = (
-                f"the mirrored hypothesis fits as well {costs}, that {wiring} (probe.flip): take more pairs at other "
-                "spots and beam directions, which will tell"
-            )
-            found.append(Condition(Verdict.WARNING, text))
-    return found
+    return [*found, *mirrored(search, config)]
+
+
+def mirrored(search: EpochSearch, config: SolveConfig) -> list[Condition]:
+    """The mirrored hypothesis: a stage or probe wired the other way round.
+
+    A mirror image whose beams come from the probe's side is no rival unless it fits far better; where the session as it
+    stands has them come from there, the mirror image is the likelier one already where it fits as well.
+    """
+    if search.mirrored_cost is None or not search.minima:
+        return []
+    cost, rival = search.minima[0].cost, search.mirrored_cost
+    caution = 1 if search.clean else JUNK_CAUTION
+    needed = MIRROR_CHANCE * caution if search.outside else -config.second_minimum_chi2
+    if search.mirrored_outside_cost is not None and search.mirrored_outside_cost < cost - needed:
+        rival = search.mirrored_outside_cost
+    elif rival >= cost - config.second_minimum_chi2 * caution:
+        if search.outside:
+            return []
+        text = (
+            "the beams run away from the probe, as if the fibre were on its side of the tissue: check stage.direction, "
+            "probe.flip and the marker's tags"
+        )
+        return [Condition(Verdict.WARNING, text)]
+    text = (
+        f"the mirrored hypothesis fits {'better' if rival < cost else 'as well'} (chi square {rival:.1f} against "
+        f"{cost:.1f}): the stage turns the other way (stage.direction) or the elements are counted from the other end "
+        "(probe.flip); check the wiring and correct session.yaml"
+    )
+    return [Condition(Verdict.REFUSED, text)]
 
 
 def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:

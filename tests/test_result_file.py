@@ -265,9 +265,16 @@ def test_an_older_result_is_removed_and_nothing_else(tmp_path: Path) -> None:
     target = tmp_path / "target"
     target.write_text("kept")
     path.symlink_to(target)
-    remove_result(path)
-    assert not path.is_symlink()
-    assert target.read_text() == "kept"
+    other = tmp_path / "thesis.tex"
+    other.write_text("kept")
+    for not_ours in (path, other):
+        with pytest.raises(InputError, match="a file that is no result"):
+            remove_result(not_ours)
+        assert not_ours.read_text() == "kept"
+    named = tmp_path / "mine.yaml"
+    named.write_text("format: fgreg-result/1\n")
+    remove_result(named)
+    assert not named.exists()
 
 
 def test_places_where_no_result_can_be(tmp_path: Path) -> None:

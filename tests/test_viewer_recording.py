@@ -389,7 +389,7 @@ def test_a_session_without_shots_makes_a_recording(tmp_path: Path) -> None:
 
 def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None:
     path = tmp_path / "phantom.rrd"
-    path.write_bytes(b"an older one")
+    path.write_bytes(b"RRF2 an older one")
 
     def crash() -> None:
         with open_viewer(path, "phantom") as viewer:
@@ -398,13 +398,13 @@ def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None
 
     with pytest.raises(ZeroDivisionError):
         crash()
-    assert path.read_bytes() == b"an older one"
+    assert path.read_bytes() == b"RRF2 an older one"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_recording_takes_the_place_of_an_older_one_and_leaves_no_other_file(tmp_path: Path) -> None:
     path = tmp_path / "phantom.rrd"
-    path.write_bytes(b"an older one")
+    path.write_bytes(b"RRF2 an older one")
     with open_viewer(path, "phantom") as viewer:
         viewer.session(make_session())
     assert "/world/probe" in read_recording(path)
@@ -417,6 +417,14 @@ def test_a_folder_that_does_not_exist_is_bad_input(tmp_path: Path) -> None:
         open_viewer(tmp_path / "nowhere" / "a.rrd", "a")
     with pytest.raises(InputError, match="found a folder"):
         open_viewer(tmp_path, "a")
+
+
+def test_nothing_but_a_recording_is_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "events.jsonl"
+    path.write_text("{}")
+    with pytest.raises(InputError, match="a file that is no recording"):
+        open_viewer(path, "a")
+    assert path.read_text() == "{}"
 
 
 def test_the_null_viewer_takes_every_call_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -217,10 +217,7 @@ def registration(job: Job) -> dict[Any, Row]:
             row["best_residual"] = pair_residuals(best, (0,), held.measurements.pairs)
             row["ambiguous"] = bool(found.ambiguous)
             if job.posterior:
-                count, covariance = SETTINGS.posterior_samples, found.covariance
-                drawn = sample_posterior(found.problem, found.optimum, covariance, count, job.seed)
-                mean = found.optimum.state.retract((drawn.weight @ drawn.step)[None], found.problem.columns)
-                row["mean_tre"] = sim.tre(mean.trus_T_camera()[0])
+                row["mean_tre"] = sim.tre(answer(found, SETTINGS).posterior.mean.trus_T_camera()[0])
             row["residual"] = np.array([pm.pair_residual_mm for pm in predict(found, held.measurements.pairs)])
         except EstimationError:
             row["failed"] = True
@@ -301,8 +298,8 @@ def same_cost(sim: Sim, direction: FloatArray, origin: FloatArray) -> tuple[Pack
 def timing(job: Job) -> dict[Any, Row]:
     """Processor seconds of (a), theta' free, and of fgreg from the same guess, 10 pairs.
 
-    fgreg twice: on its own cost (chi square with the priors), and on (a)'s, with the beam fixed and theta' free, down to
-    where (a) got.
+    fgreg twice: on its own cost (chi square with the priors), and on (a)'s, with the beam fixed and theta' free, down
+    to where (a) got.
     """
     sim = simulated(replace(job.config, pairs=10, tracks_heard=0, tracks_silent=0), job.seed)
     rng = np.random.default_rng([job.seed, 9])
