@@ -32,8 +32,11 @@ def test_an_outlier_has_the_largest_influence() -> None:
     for seed in (3, 4):
         model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=14)
         pairs = list(measurements.pairs)
-        pairs[4] = replace(pairs[4], look=replace(pairs[4].look, x_mm=pairs[4].look.x_mm + 2.5))
-        found = register(replace(measurements, pairs=tuple(pairs)), model, SolveConfig())
+        pairs[4] = replace(pairs[4], look=replace(pairs[4].look, x_mm=pairs[4].look.x_mm + 10.0))
+        # Solved with it kept: registering would leave it out as junk.
+        clean, moved = register(measurements, model, SolveConfig()), replace(measurements, pairs=tuple(pairs))
+        problem = pack(moved, model)
+        found = replace(clean, measurements=moved, problem=problem, optimum=optimize(problem, clean.optimum.state))
         items = sorted(influences(found, model.targets_mm), key=lambda item: -item.moved_mm)
         assert items[0].pm == 4
         assert items[0].moved_mm > 1.5 * items[1].moved_mm
