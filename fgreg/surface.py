@@ -17,6 +17,8 @@ LENGTH_MM = 15.0
 MIN_RELIEF_MM = 0.5
 """Least sigma of those deviations: no tissue is flatter."""
 MIN_POINTS = 5
+MOST_POINTS = 150
+"""As many PMs trace a field of some 40 mm every 3 mm; more cost their number cubed and tell nothing new."""
 MIN_SPREAD_MM = 1.0
 """Least root mean square distance of the PMs from their best line."""
 GRAZING = 0.2
@@ -117,6 +119,9 @@ def fit_surface(trus_p_pm: FloatArray, covariance: FloatArray, trus_d_beam: Floa
     """The surface through PMs (n, 3) with covariances (n, 3, 3), seen along beams (n, 3); None below 5 PMs."""
     if len(trus_p_pm) < MIN_POINTS:
         return None
+    if len(trus_p_pm) > MOST_POINTS:
+        some = np.linspace(0, len(trus_p_pm) - 1, MOST_POINTS).round().astype(np.int64)
+        trus_p_pm, covariance, trus_d_beam = trus_p_pm[some], covariance[some], trus_d_beam[some]
     centre = trus_p_pm.mean(axis=0)
     _, spread, directions = np.linalg.svd(trus_p_pm - centre)
     if spread[1] < MIN_SPREAD_MM * np.sqrt(len(trus_p_pm)):

@@ -258,8 +258,11 @@ def _rotation_shapes(
 ) -> RotationShapes:
     looks = [pair.look for pair in pairs]
     plane, log, look_of = [], [], []
+    of_pm: dict[int, list[int]] = {}
+    for i, pair in enumerate(pairs):
+        of_pm.setdefault(pair.pm, []).append(i)
     for pm in pm_index:
-        mine = [i for i, pair in enumerate(pairs) if pair.pm == pm]
+        mine = of_pm[pm]
         table = amplitude_table([looks[i] for i in mine], model.probe.sensitivity, amplitude_sigma)
         plane.append(table.plane_rad)
         log.append(table.log_likelihood)
