@@ -23,11 +23,13 @@ from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
 from fgreg.robust import (
+    FEW,
     Innovations,
     Sorted,
     deviant,
     graduated,
     innovations_at,
+    junk_p,
     plausible_cost,
     predicted_pms,
     sort_shots,
@@ -102,10 +104,6 @@ class Registration:
     ambiguous: tuple[int, ...]
     covariance: FloatArray
     shots: Shots
-
-
-FEW = 0.05
-"""So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
 
 
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
@@ -258,7 +256,7 @@ def _solve_jointly(
     problem = pack(chosen, model)
     optimum = optimize(problem, judged.state, tolerance=1e-9)
     found = innovations_at(whole, optimum.state, *kept)
-    deviants = deviant(whole, found)
+    deviants = deviant(whole, found, junk_p(kept[0]))
     private = initial_private(whole, optimum.state)
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)
