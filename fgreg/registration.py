@@ -24,11 +24,13 @@ from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
 from fgreg.robust import (
+    FEW,
     Innovations,
     Sorted,
     deviant,
     graduated,
     innovations_at,
+    junk_p,
     plausible_cost,
     predicted_pms,
     sort_shots,
@@ -114,9 +116,6 @@ class Registration:
 
 
 Pack = Callable[[Measurements], PackedProblem]
-
-FEW = 0.05
-"""So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
 
 
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
@@ -335,7 +334,7 @@ def _solve_jointly(
     problem = packed(chosen)
     optimum = optimize(problem, judged.state, tolerance=1e-9)
     found = innovations_at(whole, optimum.state, *kept)
-    deviants = deviant(whole, found)
+    deviants = deviant(whole, found, junk_p(kept[0]))
     private = initial_private(whole, optimum.state)
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)

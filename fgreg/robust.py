@@ -33,6 +33,9 @@ from fgreg.measurements import Aim
 
 JUNK_P = 1e-3
 """A shot is junk where a good one would deviate as much this rarely."""
+JUNK_P_AMONG = 8e-3
+FEW = 0.05
+"""Where more than this share is junk a shot less far off is likelier junk than chance, and counts as such."""
 IMPLAUSIBLE_P = 1e-4
 TRIPLES = 160
 """Random triples of the consensus: at 60 % junk still ten of good pairs only."""
@@ -55,12 +58,17 @@ def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
     return np.asarray(2 * beams + 3 * np.bincount(problem.look_pm, minlength=pms) - 3)
 
 
-def pm_limits(problem: PackedProblem) -> FloatArray:
+def pm_limits(problem: PackedProblem, p: float = JUNK_P) -> FloatArray:
     """(J,) chi square beyond which a PM is junk."""
-    return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), JUNK_P))
+    return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), p))
 
 
 AIM_LIMIT = float(chdtri(2, JUNK_P))
+
+
+def junk_p(pm_kept: BoolArray) -> float:
+    """How rare a good shot's deviation has to be for junk, given which PMs (J,) are kept."""
+    return JUNK_P if np.sum(~pm_kept) <= FEW * len(pm_kept) else JUNK_P_AMONG
 
 
 def plausible_cost(problem: PackedProblem) -> float:
@@ -308,7 +316,7 @@ def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool =
         robust_aims: doubt the aims, too; else they count in full.
     """
     descent = _Descent(problem, state)
-    limit, aim_limit = pm_limits(problem), AIM_LIMIT if robust_aims else np.inf
+    limit, aim_limit = pm_limits(problem, JUNK_P_AMONG), AIM_LIMIT if robust_aims else np.inf
     for scale in CAUCHY_SCALES:
         descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
     for _ in range(2):
@@ -384,9 +392,9 @@ class Deviants:
     aim: BoolArray
 
 
-def deviant(problem: PackedProblem, found: Innovations) -> Deviants:
+def deviant(problem: PackedProblem, found: Innovations, p: float = JUNK_P) -> Deviants:
     """Shots that deviate more than a good one may. Infinite innovations say nothing: the rest predicted nothing."""
-    pm, aim = found.pm > pm_limits(problem), found.aim > AIM_LIMIT
+    pm, aim = found.pm > pm_limits(problem, p), found.aim > AIM_LIMIT
     return Deviants(pm & np.isfinite(found.pm), aim & np.isfinite(found.aim))
 
 
@@ -427,7 +435,7 @@ def sort_shots(
         descent.settle()
         state = descent.state
         found = innovations(descent.parts, pm_kept, aim_kept)
-        beyond = deviant(problem, found)
+        beyond = deviant(problem, found, junk_p(pm_kept))
         pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
         aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
         settled = bool((pm_next == pm_kept).all() and (aim_next == aim_kept).all())
@@ -447,4 +455,4 @@ def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted)
     _, hessian = _weighted(kept, _repeated(judged.pm_kept, kept.pm), _repeated(judged.aim_kept, kept.aim))
     none = np.zeros(len(others.pms), dtype=bool)
     innovation = _innovation(_Descent(others, judged.state).parts.pm, hessian[0], none)
-    return np.asarray(innovation < pm_limits(others))
+    return np.asarray(innovation < pm_limits(others, junk_p(judged.pm_kept)))
