@@ -37,11 +37,12 @@ class Answer:
     """The session's estimate: ``registration`` with its optimum moved to the posterior's mean, and the posterior.
 
     ``registration.problem`` has the windows' Gaussian sites where they settled, ``registration.covariance`` is the
-    posterior's second moment about the estimate.
+    posterior's second moment about the estimate. ``modes`` are what the posterior was sampled from.
     """
 
     registration: Registration
     posterior: Posterior
+    modes: tuple[Mode, ...]
 
 
 def answer(registration: Registration, config: SolveConfig) -> Answer:
@@ -59,6 +60,7 @@ def answer(registration: Registration, config: SolveConfig) -> Answer:
     return Answer(
         replace(registration, problem=problem, optimum=moved, covariance=posterior.covariance, shots=shots),
         posterior,
+        modes,
     )
 
 

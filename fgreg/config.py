@@ -44,8 +44,8 @@ class SolveConfig:
     estimate_radius: bool = False
     sound_speed_sigma: float = 0.01
     radius_sigma_mm: float = 0.3
-    posterior_effective: float = 250.0
-    posterior_samples: int = 3000
+    posterior_effective: float = 300.0
+    posterior_samples: int = 6000
     posterior_looks: int = 80
     seed: int = 1
 

@@ -18,8 +18,8 @@ from scipy.special import logsumexp
 
 from fgreg.estimate import PredictedTre
 from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_points
-from fgreg.graph.packing import Columns, PackedProblem
-from fgreg.graph.reduced import log_posterior, refine
+from fgreg.graph.packing import Anchor, Columns, PackedProblem, only_aims, without_aims
+from fgreg.graph.reduced import evaluate, log_posterior, refine
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import SharedState, step_between
 
@@ -30,8 +30,12 @@ CHUNK = 100
 """Samples evaluated at once: what stays in the cache."""
 REFINED_PMS = 8
 """With fewer PMs the samples reach so far that the private variables are refined once more for each."""
+FITTING, TAILS = 0.4, 4.0
+"""Share of effective samples in the first round below which the posterior has tails that take more samples to find."""
 KERNELS = 40
 """Proposals of a later round that sit on samples of the earlier ones."""
+WIDE, SHARES = 1.8, (0.4, 0.1, 0.5)
+"""Scale of a wide proposal that looks for arms; shares of draws about the mean, as wide as that, and on samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +115,26 @@ def _log_volume(tangent: FloatArray, columns: Columns) -> FloatArray:
     return total
 
 
+def light(mode: Mode) -> Mode:
+    """The mode with its calibration shots summed up: a Gaussian of the beam (and bias), on which alone they depend.
+
+    In the beam's chart they are next to quadratic, and leaving them out of every sample saves most of its time at few
+    pairs.
+    """
+    problem, at = mode.problem, mode.optimum.evaluation
+    if not len(problem.aims.rotation) or problem.anchor is not None:
+        return mode
+    aims = only_aims(problem)
+    private = replace(at.private, trus_p_pm=at.private.trus_p_pm[:, :0], beam_error=at.private.beam_error[:, :0])
+    there = evaluate(aims, mode.optimum.state, private)
+    centre = -np.linalg.pinv(there.hessian[0], rcond=1e-12, hermitian=True) @ there.gradient[0]
+    anchor = Anchor(mode.optimum.state.retract(centre[None], problem.columns), there.hessian[0])
+    lighter = without_aims(problem, anchor)
+    private = replace(at.private, aim_error=at.private.aim_error[:, :0], aim_shift=at.private.aim_shift[:, :0])
+    evaluation = replace(at, private=private)
+    return Mode(lighter, replace(mode.optimum, evaluation=evaluation), mode.covariance)
+
+
 def _repeat(state: SharedState, count: int) -> SharedState:
     return state.take(np.zeros(count, dtype=np.int64))
 
@@ -183,9 +207,9 @@ def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: 
     # Kernels as wide as a density estimate from so many samples would have them.
     width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
     at = x[rng.choice(len(x), KERNELS, p=weight)]
-    centres = np.concatenate([centre[None], at])
-    roots = np.concatenate([root[None], np.repeat(width * root[None], KERNELS, axis=0)])
-    share = np.concatenate([[0.5], np.full(KERNELS, 0.5 / KERNELS)])
+    centres = np.concatenate([centre[None], centre[None], at])
+    roots = np.concatenate([root[None], WIDE * root[None], np.repeat(width * root[None], KERNELS, axis=0)])
+    share = np.concatenate([SHARES[:2], np.full(KERNELS, SHARES[2] / KERNELS)])
     return _Students(centres, roots, share)
 
 
@@ -242,6 +266,7 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
+    modes = tuple(light(mode) for mode in modes)
     columns, target = modes[0].problem.columns, _Target(modes)
     fallback = modes[0].covariance
     starts = [np.zeros((1, columns.size))]
@@ -272,6 +297,8 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         counts.append(draws)
         share = np.log(np.array(counts) / sum(counts))
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
+        if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
+            goal = TAILS * goal  # far from Gaussian: what has not been drawn does not lower the count
         if _effective(log_weight) >= goal or len(x) >= most:
             break
         proposals.append(_refitted(x, log_weight, fallback, rng))

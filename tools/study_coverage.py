@@ -36,6 +36,7 @@ from fgreg.errors import EstimationError
 from fgreg.frames import inverse, transform_points
 from fgreg.models import NoiseModel
 from fgreg.posterior import pose_tangent, region_contains, target_errors, weighted_quantile
+from fgreg.region import credible_region
 from fgreg.registration import register
 
 sys.path.insert(0, os.fspath(__import__("pathlib").Path(__file__).resolve().parent.parent))
@@ -65,6 +66,7 @@ class Outcome:
     """One session's figures; squares in mm^2, roll in rad."""
 
     in_region: bool
+    in_ellipsoid: bool
     targets_in: float
     nees: float
     predicted2: float
@@ -101,7 +103,8 @@ def run(cell: Cell, seed: int) -> Outcome | None:
     xi = pose_tangent(estimate, real)
     turn = np.arctan2(moved[:, 1], moved[:, 2]) - np.arctan2(targets[:, 1], targets[:, 2])
     return Outcome(
-        in_region=region_contains(posterior, real),
+        in_region=credible_region(found.modes, posterior).contains(real[None]),
+        in_ellipsoid=region_contains(posterior, real),
         targets_in=float(np.mean(error <= weighted_quantile(samples, posterior.weight, 0.95))),
         nees=float(xi @ np.linalg.solve(posterior.covariance[:6, :6], xi)),
         predicted2=float(np.mean(posterior.weight @ samples**2)),
@@ -118,6 +121,7 @@ def figures(outcomes: list[Outcome]) -> dict[str, float]:
     return {
         "sessions": len(outcomes),
         "region": float(of["in_region"].mean()),
+        "ellipsoid": float(of["in_ellipsoid"].mean()),
         "per_target": float(of["targets_in"].mean()),
         "nees_mean": float(of["nees"].mean()),
         "nees_median": float(np.median(of["nees"])),

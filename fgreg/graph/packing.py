@@ -8,7 +8,7 @@ problem perturbs the pose by a twist (w, n): the right tangent of GTSAM's Pose3,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -274,4 +274,36 @@ def _rotation_shapes(
         np.array(plane).reshape(len(pm_index), -1),
         np.array(log).reshape(len(pm_index), -1),
         np.array(look_of, dtype=np.int64),
+    )
+
+
+def only_aims(problem: PackedProblem) -> PackedProblem:
+    """The calibration shots alone: no pairs, no links, no priors."""
+    none = np.zeros(0, dtype=np.int64)
+    looks, beams = problem.looks, problem.beams
+    return replace(
+        problem,
+        pms=(),
+        beam_pm=none,
+        beam_epoch=none,
+        beams=BeamArrays(beams.rotation[:0], beams.translation_mm[:0], beams.covariance[:0]),
+        look_pm=none,
+        look_beam=none,
+        looks=LookArrays(*(getattr(looks, name)[:0] for name in LookArrays.__slots__)),
+        links=(),
+        prior_information=np.zeros_like(problem.prior_information),
+        shapes=None,
+        anchor=None,
+    )
+
+
+def without_aims(problem: PackedProblem, anchor: Anchor) -> PackedProblem:
+    """The problem with a Gaussian of the shared variables in place of its calibration shots."""
+    aims = problem.aims
+    return replace(
+        problem,
+        aims=BeamArrays(aims.rotation[:0], aims.translation_mm[:0], aims.covariance[:0]),
+        aim_spot_mm=problem.aim_spot_mm[:0],
+        aim_spot_covariance=problem.aim_spot_covariance[:0],
+        anchor=anchor,
     )

@@ -1,0 +1,80 @@
+"""The 95 % region of a registration: all poses that are likelier than those that hold the last 5 % of the posterior.
+
+At few pairs the posterior has arms that no ellipsoid follows. So a pose is judged by its density, with the other shared
+variables (beam, window edge, ...) at the values that suit it best, against the same figure of the posterior's samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.graph.reduced import evaluate, log_posterior, refine
+from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.posterior import Mode, Posterior, light, pose_tangent, step_of_tangent, weighted_quantile
+
+SAMPLES = 400
+ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """The region: modes to measure densities from, the estimate, and the least log density inside."""
+
+    modes: tuple[Mode, ...]
+    mean: SharedState
+    least: float
+
+    def contains(self, trus_T_camera: FloatArray) -> bool:
+        """Whether registrations (E, 4, 4), one per solved epoch, lie inside."""
+        tangent = [pose_tangent(self.mean.trus_T_camera(k)[0], pose) for k, pose in enumerate(trus_T_camera)]
+        columns = self.modes[0].problem.columns
+        step = np.zeros((1, columns.size))
+        step[0, : 6 * columns.epochs] = np.concatenate(tangent)
+        state = self.mean.retract(step_of_tangent(step, columns), columns)
+        return bool(pose_log_density(self.modes, state)[0] >= self.least)
+
+
+def credible_region(modes: tuple[Mode, ...], posterior: Posterior, probability: float = 0.95) -> Region:
+    """The region that holds ``probability`` of the posterior sampled from these modes."""
+    lighter = tuple(light(mode) for mode in modes)
+    # Equal steps through the cumulated weights: a sample of the posterior with the least noise of its own.
+    at = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    pick = np.minimum(np.searchsorted(np.cumsum(posterior.weight), at), len(posterior.weight) - 1)
+    state = posterior.mean.take(np.zeros(SAMPLES, dtype=np.int64)).retract(posterior.step[pick], posterior.columns)
+    log = pose_log_density(lighter, state)
+    least = weighted_quantile(log[:, None], np.full(SAMPLES, 1.0 / SAMPLES), 1.0 - probability)[0]
+    return Region(lighter, posterior.mean, float(least))
+
+
+def pose_log_density(modes: tuple[Mode, ...], state: SharedState) -> FloatArray:
+    """(S,) log density of the registrations of states, the other shared variables at their best for each."""
+    return np.asarray(np.max([_from_mode(mode, state) for mode in modes], axis=0))
+
+
+def _from_mode(mode: Mode, state: SharedState) -> FloatArray:
+    problem, at = mode.problem, mode.optimum.evaluation
+    columns, count = problem.columns, state.count
+    step = step_between(mode.optimum.state, state, columns)
+    poses = 6 * columns.epochs
+    # The others start where the mode's Gaussian has them for these poses.
+    inverse = np.linalg.inv(at.hessian[0][poses:, poses:])
+    step[:, poses:] = -step[:, :poses] @ at.hessian[0][:poses, poses:] @ inverse
+    start = mode.optimum.state.take(np.zeros(count, dtype=np.int64))
+    private = at.private.take(np.zeros(count, dtype=np.int64))
+    private = replace(private, trus_p_pm=private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
+    moved = start.retract(step, columns)
+    # Gauss-Newton is held to the mode's own spread: far out its steps may be anything.
+    hold = 0.01 * np.diag(np.diag(at.hessian[0]))[poses:, poses:]
+    with np.errstate(all="ignore"):
+        for _ in range(ROUNDS):
+            there = evaluate(problem, moved, private)
+            change = np.zeros_like(step)
+            hessian = np.nan_to_num(there.hessian[:, poses:, poses:]) + hold
+            change[:, poses:] = -np.linalg.solve(hessian, np.nan_to_num(there.gradient[:, poses:, None]))[..., 0]
+            moved, private = moved.retract(change, columns), there.private
+        _, private = refine(problem, moved, private)
+        log = log_posterior(problem, moved, private)
+    return np.where(np.isfinite(log), log, -np.inf)
