@@ -33,9 +33,11 @@ from fgreg.measurements import Aim
 
 JUNK_P = 1e-3
 """A shot is junk where a good one would deviate as much this rarely."""
-JUNK_P_AMONG = 8e-3
+JUNK_DENSITY = 0.012
+"""Density of junk, over that of good shots at their middle: false PMs are everywhere in the image."""
 FEW = 0.05
-"""Where more than this share is junk a shot less far off is likelier junk than chance, and counts as such."""
+"""So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
+TYPICAL_P = 3e-3
 IMPLAUSIBLE_P = 1e-4
 TRIPLES = 160
 """Random triples of the consensus: at 60 % junk still ten of good pairs only."""
@@ -67,8 +69,13 @@ AIM_LIMIT = float(chdtri(2, JUNK_P))
 
 
 def junk_p(pm_kept: BoolArray) -> float:
-    """How rare a good shot's deviation has to be for junk, given which PMs (J,) are kept."""
-    return JUNK_P if np.sum(~pm_kept) <= FEW * len(pm_kept) else JUNK_P_AMONG
+    """How rare a good shot's deviation has to be for junk, given which PMs (J,) are kept.
+
+    Of two degrees of freedom a good shot's density falls as exp(-d / 2), and so does the share p that deviates by more
+    than d: junk and good are equally likely where p is junk's density times the odds of junk.
+    """
+    kept = int(pm_kept.sum())
+    return max(JUNK_P, JUNK_DENSITY * min((len(pm_kept) - kept) / max(kept, 1), 1.0))
 
 
 def plausible_cost(problem: PackedProblem) -> float:
@@ -316,7 +323,7 @@ def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool =
         robust_aims: doubt the aims, too; else they count in full.
     """
     descent = _Descent(problem, state)
-    limit, aim_limit = pm_limits(problem, JUNK_P_AMONG), AIM_LIMIT if robust_aims else np.inf
+    limit, aim_limit = pm_limits(problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
     for scale in CAUCHY_SCALES:
         descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
     for _ in range(2):
