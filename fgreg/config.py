@@ -45,7 +45,7 @@ class SolveConfig:
     sound_speed_sigma: float = 0.01
     radius_sigma_mm: float = 0.3
     posterior_effective: float = 300.0
-    posterior_samples: int = 6000
+    posterior_samples: int = 4500
     posterior_looks: int = 80
     seed: int = 1
 
