@@ -34,7 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Register a stereo endoscope to a rotating transrectal ultrasound probe by photoacoustic markers.\n\n"
     "A session is a folder with session.yaml, events.jsonl and frames/ (sessions/README.md describes it). Try: "
-    "fgreg simulate /tmp/demo --preset phantom && fgreg solve /tmp/demo --rrd /tmp/demo.rrd",
+    "fgreg simulate demo --preset phantom && fgreg solve demo --rrd demo.rrd",
 )
 
 UsageError: type[Exception] = cast("type[Exception]", typer.BadParameter.__mro__[1])
