@@ -18,11 +18,16 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from fgreg.answer import answer
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, transform_points
 from fgreg.graph.packing import pack
@@ -32,6 +37,8 @@ from fgreg.graph.shared_state import make_state
 from fgreg.measurements import Aim, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.registration import Registration, register
+
+sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from tests.forward import Truth, make_measurements
 
 KINDS = ("false PM", "marker flip", "wrong marker")
@@ -81,6 +88,12 @@ def truth_state_cost(measurements: Measurements, model: SessionModel, truth: Tru
     return np.asarray(contributions(problem, state, private).pm.cost[0])
 
 
+def solved(measurements: Measurements, model: SessionModel) -> Registration:
+    """The registration as it is reported: at the mean of the posterior."""
+    config = SolveConfig()
+    return answer(register(measurements, model, config), config).registration
+
+
 def tre_mm(found: Registration, truth: Truth, model: SessionModel) -> FloatArray:
     """(n,) true errors at the targets."""
     camera_p = transform_points(inverse(truth.trus_T_camera[0]), model.targets_mm)
@@ -90,6 +103,8 @@ def tre_mm(found: Registration, truth: Truth, model: SessionModel) -> FloatArray
 
 @dataclass
 class Figures:
+    """What is collected over sessions; ``rms`` values are of the mean errors (mm) of each."""
+
     with_mm: list[float] = field(default_factory=list)
     without_mm: list[float] = field(default_factory=list)
     junk: int = 0
@@ -100,9 +115,19 @@ class Figures:
     good_lost: int = 0
     by_kind: dict[str, list[int]] = field(default_factory=lambda: {kind: [0, 0] for kind in KINDS})
 
+    def add(self, other: Figures) -> None:
+        """Take in another's."""
+        self.with_mm += other.with_mm
+        self.without_mm += other.without_mm
+        for name in ("junk", "junk_named", "gross", "gross_named", "good", "good_lost"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for kind, (named, all_of_it) in other.by_kind.items():
+            self.by_kind[kind] = [self.by_kind[kind][0] + named, self.by_kind[kind][1] + all_of_it]
 
-def one(figures: Figures, seed: int, share: float, aim_share: float, args: argparse.Namespace) -> str:
-    """Add one session; a line about it."""
+
+def one(seed: int, share: float, args: argparse.Namespace) -> Figures:
+    """The figures of one session."""
+    figures = Figures()
     rng = np.random.default_rng(seed)
     model, clean, truth = make_measurements(rng, pairs=args.pairs, first_hit=not args.window)
     where = np.random.default_rng([seed, 1])
@@ -113,7 +138,7 @@ def one(figures: Figures, seed: int, share: float, aim_share: float, args: argpa
     for number, index in enumerate(order):
         kind_of[int(index)] = kinds[number % len(kinds)]
         pairs[index] = spoil(pairs[index], kind_of[int(index)], where)
-    bad_aims = {int(i) for i in where.permutation(len(clean.aims))[: round(aim_share * len(clean.aims))]}
+    bad_aims = {int(i) for i in where.permutation(len(clean.aims))[: round(args.aim_share * len(clean.aims))]}
     aims = tuple(spoil_aim(aim) if i in bad_aims else aim for i, aim in enumerate(clean.aims))
     spoiled = replace(clean, pairs=tuple(pairs), aims=aims)
     rest = replace(
@@ -121,11 +146,9 @@ def one(figures: Figures, seed: int, share: float, aim_share: float, args: argpa
         pairs=tuple(p for i, p in enumerate(pairs) if i not in kind_of),
         aims=tuple(aim for i, aim in enumerate(aims) if i not in bad_aims),
     )
-    config = SolveConfig()
-    found, reference = register(spoiled, model, config), register(rest, model, config)
-    here, there = (float(np.mean(tre_mm(r, truth, model))) for r in (found, reference))
-    figures.with_mm.append(here)
-    figures.without_mm.append(there)
+    found, reference = solved(spoiled, model), solved(rest, model)
+    figures.with_mm.append(float(np.mean(tre_mm(found, truth, model))))
+    figures.without_mm.append(float(np.mean(tre_mm(reference, truth, model))))
     misfit = truth_state_cost(spoiled, model, truth)
     named = ~found.shots.pm_kept
     for i in range(args.pairs):
@@ -135,12 +158,12 @@ def one(figures: Figures, seed: int, share: float, aim_share: float, args: argpa
             continue
         figures.junk += 1
         figures.junk_named += bool(named[i])
-        figures.by_kind[kind_of[i]][0] += 1
-        figures.by_kind[kind_of[i]][1] += bool(named[i])
+        figures.by_kind[kind_of[i]][0] += bool(named[i])
+        figures.by_kind[kind_of[i]][1] += 1
         if misfit[i] > GROSS:
             figures.gross += 1
             figures.gross_named += bool(named[i])
-    return f"seed {seed}: {here:.2f} against {there:.2f} mm, {named.sum()} left out of {len(kind_of)} junk"
+    return figures
 
 
 def rms(values: list[float]) -> float:
@@ -156,17 +179,21 @@ def main() -> None:
     parser.add_argument("--kind", choices=("all", *KINDS), default="all")
     parser.add_argument("--window", action="store_true", help="no first hits: only the window is known")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--verbose", action="store_true", help="a line for each session that junk made worse by 30 %%")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     out = {}
+    seeds = range(args.seed, args.seed + args.sessions)
     for share in args.share:
         figures = Figures()
-        for i in range(args.sessions):
-            line = one(figures, args.seed + i, share, args.aim_share, args)
-            if args.verbose and figures.with_mm[-1] > 1.3 * figures.without_mm[-1]:
-                print(line)
-            print(f"\r{i + 1} of {args.sessions}", end="", file=sys.stderr)
+        with ProcessPoolExecutor(args.jobs) as pool:
+            for seed, found in zip(seeds, pool.map(partial(one, share=share, args=args), seeds), strict=True):
+                figures.add(found)
+                here, there = found.with_mm[0], found.without_mm[0]
+                if args.verbose and here > 1.3 * there:
+                    print(f"seed {seed}: {here:.2f} against {there:.2f} mm")
+                print(f"\r{len(figures.with_mm)} of {args.sessions}", end="", file=sys.stderr)
         print(file=sys.stderr)
         ratio = rms(figures.with_mm) / rms(figures.without_mm)
         limit = {0.2: 1.08, 0.4: 1.15}.get(share)
@@ -180,7 +207,7 @@ def main() -> None:
             "gross_of_junk": figures.gross / max(figures.junk, 1),
             "good_lost": figures.good_lost / max(figures.good, 1),
         }
-        result |= {f"named, {kind}": named / n for kind, (n, named) in figures.by_kind.items() if n}
+        result |= {f"named, {kind}": named / n for kind, (named, n) in figures.by_kind.items() if n}
         out[str(share)] = result
         print(f"{share:.0%} junk" + (f" (ratio at most {limit})" if limit else ""))
         for key, value in result.items():
