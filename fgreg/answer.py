@@ -15,12 +15,13 @@ from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced import evaluate, refine
-from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.sites import inverse_hessian, propagate
-from fgreg.posterior import Mode, Posterior, gaussian_posterior, sample_posterior
+from fgreg.posterior import Doubted, Mode, Posterior, gaussian_posterior, sample_posterior
 from fgreg.registration import Registration, Shots
+from fgreg.robust import log_junk
 from fgreg.search import targets_moved
 
 RIVALS = 3
@@ -68,14 +69,39 @@ def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
     """All shots at the moved estimate, those kept with the stand-ins of ``problem``; innovations stay as judged."""
     if shots.pm_kept.all() and shots.aim_kept.all():
         return replace(shots, problem=problem, evaluation=moved.evaluation)
+    whole = _with_all_pms(shots, problem)
+    return replace(shots, problem=whole, evaluation=evaluate(whole, moved.state, _settled(whole, moved.state)))
+
+
+def _with_all_pms(shots: Shots, problem: PackedProblem) -> PackedProblem:
+    """All shots, those kept with the stand-ins of ``problem``."""
     looks, kept = shots.problem.looks, shots.pm_kept[shots.problem.look_pm]
     weight, centre = looks.weight.copy(), looks.centre_rad.copy()
     weight[kept], centre[kept] = problem.looks.weight, problem.looks.centre_rad
-    whole = replace(shots.problem, looks=replace(looks, weight=weight, centre_rad=centre))
-    private = initial_private(whole, moved.state)
+    return replace(shots.problem, looks=replace(looks, weight=weight, centre_rad=centre))
+
+
+def _settled(problem: PackedProblem, state: SharedState) -> PrivateState:
+    private = initial_private(problem, state)
     for _ in range(4):
-        _, private = refine(whole, moved.state, private)
-    return replace(shots, problem=whole, evaluation=evaluate(whole, moved.state, private))
+        _, private = refine(problem, state, private)
+    return private
+
+
+def _with_doubts(shots: Shots, mode: Mode) -> Mode:
+    """The mode with all PMs in its density, each good or junk: which they are is not known for certain."""
+    if shots.pm_kept.all():
+        return mode
+    problem, state = mode.problem, mode.optimum.state
+    whole = replace(
+        _with_all_pms(shots, problem),
+        aims=problem.aims,
+        aim_spot_mm=problem.aim_spot_mm,
+        aim_spot_covariance=problem.aim_spot_covariance,
+    )
+    whole = replace(whole, log_junk=log_junk(whole, shots.pm_kept))
+    at = evaluate(whole, state, _settled(whole, state))
+    return replace(mode, doubted=Doubted(whole, at.private, at.point_gain))
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +174,7 @@ def _modes(registration: Registration) -> tuple[Mode, ...]:
             others = [mode.optimum.state.trus_T_camera(place)[0] for mode in modes]
             if all(targets_moved(o, found.state.trus_T_camera(place)[0], targets) > 1.0 for o in others):
                 modes.append(_with_sites(problem, found, inverse))
-    return tuple(modes)
+    return tuple(_with_doubts(registration.shots, mode) for mode in modes)
 
 
 def _evaluated(problem: PackedProblem, state: SharedState, near: Optimum) -> Optimum:

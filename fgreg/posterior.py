@@ -20,6 +20,7 @@ from fgreg.estimate import PredictedTre
 from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.packing import Anchor, Columns, PackedProblem, only_aims, without_aims
 from fgreg.graph.reduced import evaluate, log_posterior, refine
+from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import SharedState, step_between
 
@@ -64,12 +65,28 @@ class Posterior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Doubted:
+    """The problem with all PMs, those left out and those kept, each good or junk (``problem.log_junk``).
+
+    ``private`` and ``point_gain`` (1, J, 3, D) are at the optimum of a mode.
+    """
+
+    problem: PackedProblem
+    private: PrivateState
+    point_gain: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Mode:
-    """Where to look for probability: an optimum of a problem (one hypothesis) and the covariance (D, D) about it."""
+    """Where to look for probability: an optimum of a problem (one hypothesis) and the covariance (D, D) about it.
+
+    ``doubted``: the density to sample where shots were left out; the problem's own where None.
+    """
 
     problem: PackedProblem
     optimum: Optimum
     covariance: FloatArray
+    doubted: Doubted | None = None
 
 
 def _expmap_gain(omega: FloatArray) -> FloatArray:
@@ -132,7 +149,11 @@ def light(mode: Mode) -> Mode:
     lighter = without_aims(problem, anchor)
     private = replace(at.private, aim_error=at.private.aim_error[:, :0], aim_shift=at.private.aim_shift[:, :0])
     evaluation = replace(at, private=private)
-    return Mode(lighter, replace(mode.optimum, evaluation=evaluation), mode.covariance)
+    doubted = mode.doubted
+    if doubted is not None:
+        private = replace(doubted.private, aim_error=private.aim_error, aim_shift=private.aim_shift)
+        doubted = replace(doubted, problem=without_aims(doubted.problem, anchor), private=private)
+    return Mode(lighter, replace(mode.optimum, evaluation=evaluation), mode.covariance, doubted)
 
 
 def _repeat(state: SharedState, count: int) -> SharedState:
@@ -141,16 +162,21 @@ def _repeat(state: SharedState, count: int) -> SharedState:
 
 def log_density(mode: Mode, step: FloatArray) -> FloatArray:
     """(S,) log density at steps (S, D) from a mode's optimum, up to a constant common to a session's modes."""
-    problem, optimum = mode.problem, mode.optimum
-    state = _repeat(optimum.state, len(step)).retract(step, problem.columns)
-    at = optimum.evaluation
-    points = at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0]
-    private = replace(at.private.take(np.zeros(len(step), dtype=np.int64)), trus_p_pm=points)
+    problem = mode.problem if mode.doubted is None else mode.doubted.problem
+    state = _repeat(mode.optimum.state, len(step)).retract(step, problem.columns)
+    private = moved_private(mode, step)
     with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
-        if len(problem.pms) < REFINED_PMS:
+        if len(problem.pms) < REFINED_PMS or mode.doubted is not None:
             _, private = refine(problem, state, private)
         log = log_posterior(problem, state, private)
     return np.where(np.isfinite(log), log, -np.inf)
+
+
+def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
+    """Private variables of the density's problem at steps (S, D) from the mode's optimum, to first order."""
+    at = mode.optimum.evaluation if mode.doubted is None else mode.doubted
+    private = at.private.take(np.zeros(len(step), dtype=np.int64))
+    return replace(private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,15 @@ import numpy as np
 from fgreg.frames import FloatArray
 from fgreg.graph.reduced import evaluate, log_posterior, refine
 from fgreg.graph.shared_state import SharedState, step_between
-from fgreg.posterior import Mode, Posterior, light, pose_tangent, step_of_tangent, weighted_quantile
+from fgreg.posterior import (
+    Mode,
+    Posterior,
+    light,
+    moved_private,
+    pose_tangent,
+    step_of_tangent,
+    weighted_quantile,
+)
 
 SAMPLES = 400
 ROUNDS = 3
@@ -75,6 +83,12 @@ def _from_mode(mode: Mode, state: SharedState) -> FloatArray:
             hessian = np.nan_to_num(there.hessian[:, poses:, poses:]) + hold
             change[:, poses:] = -np.linalg.solve(hessian, np.nan_to_num(there.gradient[:, poses:, None]))[..., 0]
             moved, private = moved.retract(change, columns), there.private
+        if mode.doubted is not None:
+            problem, private = (
+                mode.doubted.problem,
+                moved_private(mode, step_between(mode.optimum.state, moved, columns)),
+            )
+            _, private = refine(problem, moved, private)
         _, private = refine(problem, moved, private)
         log = log_posterior(problem, moved, private)
     return np.where(np.isfinite(log), log, -np.inf)

@@ -49,6 +49,8 @@ STEPS_PER_SCALE = 3
 MAX_STEPS = 30
 SETTLE_ROUNDS = 8
 WEIGHT_FLOOR = 1e-12
+WANDERS_MM, WANDERING_CHI2 = 1.0, 1e4
+"""A PM that moves by more in one step, after several, has no place that fits; it counts as so far off."""
 UNKNOWN = 1e-9
 """Correlation eigenvalue below which the rest of the shots leaves a direction open."""
 
@@ -76,6 +78,22 @@ def junk_p(pm_kept: BoolArray) -> float:
     """
     kept = int(pm_kept.sum())
     return max(JUNK_P, JUNK_DENSITY * min((len(pm_kept) - kept) / max(kept, 1), 1.0))
+
+
+def log_junk(problem: PackedProblem, pm_kept: BoolArray) -> FloatArray:
+    """(J,) log density of junk over that of a good PM at its best, times the odds of junk; see :func:`log_posterior`.
+
+    Windows in their own shape are densities of the rotation, one over their width inside: so is what they are beside.
+    """
+    kept = int(pm_kept.sum())
+    odds = (len(pm_kept) - kept + 0.5) / (kept + 0.5)
+    log = 0.5 * pm_degrees_of_freedom(problem) * np.log(JUNK_DENSITY) + np.log(odds)
+    if problem.shapes is None:
+        return np.asarray(log)
+    windows = problem.shapes.windows
+    first = np.zeros(len(problem.pms), dtype=np.int64)
+    first[problem.look_pm[::-1]] = np.arange(len(problem.look_pm))[::-1]
+    return np.asarray(log - np.log(windows.high_rad - windows.low_rad)[first])
 
 
 def plausible_cost(problem: PackedProblem) -> float:
@@ -269,6 +287,15 @@ def _select(good: BoolArray, new: Any, old: Any) -> Any:
     return type(new)(*(_select(good, getattr(new, name), getattr(old, name)) for name in new.__slots__))
 
 
+def _honest(parts: Parts, before: PrivateState) -> Parts:
+    """Parts in which a PM that still wanders counts as far off, whatever it passes on its way."""
+    wanders = np.linalg.norm(parts.private.trus_p_pm - before.trus_p_pm, axis=-1) > WANDERS_MM
+    if not wanders.any():
+        return parts
+    cost = np.where(wanders, np.maximum(parts.pm.cost, WANDERING_CHI2), parts.pm.cost)
+    return replace(parts, pm=replace(parts.pm, cost=cost))
+
+
 class _Descent:
     """Levenberg-Marquardt with weights that follow the costs (iteratively reweighted least squares)."""
 
@@ -284,7 +311,7 @@ class _Descent:
         private = initial_private(self.problem, self.state) if private is None else private
         for _ in range(3):
             _, private = refine(self.problem, self.state, private)
-        self.parts = contributions(self.problem, self.state, private)
+        self.parts = _honest(contributions(self.problem, self.state, private), private)
 
     def run(self, loss: Loss, steps: int, tolerance: float = 1e-4) -> _Weights:
         """At most so many steps under one loss; until the Newton decrement (chi square) is below the tolerance."""
@@ -387,7 +414,7 @@ def innovations_at(
 
     ``private`` where its private variables are known, else they are found.
     """
-    parts = _Descent(problem, state).parts if private is None else contributions(problem, state, private)
+    parts = _Descent(problem, state, private).parts
     return innovations(parts, pm_kept, aim_kept)
 
 

@@ -16,7 +16,7 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.sites import propagate, with_sites
-from fgreg.graph.windows import log_shape_ratio
+from fgreg.graph.windows import log_shape_ratios
 from tests.forward import make_measurements, make_session
 
 CASES: dict[str, dict[str, Any]] = {
@@ -95,7 +95,7 @@ def test_the_ratio_is_the_integral_it_stands_for(name: str) -> None:
     offset = pms[problem.look_pm] + rng.normal(size=len(problem.look_pm)) * 1e-3
     precision = np.bincount(problem.look_pm, problem.looks.weight[:, 2, 2]) + 4000.0
     variance = np.asarray(1.0 / precision[problem.look_pm], dtype=np.float64)
-    got = log_shape_ratio(problem, np.array([0.004]), offset[None], variance[None])[0]
+    got = log_shape_ratios(problem, np.array([0.004]), offset[None], variance[None])[0]
     assert got == pytest.approx(_by_hand(problem, 0.004, offset, variance), abs=2e-3)
 
 

@@ -127,7 +127,10 @@ class Anchor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedProblem:
-    """All measurements of a session as arrays; indices say which PM and epoch each belongs to."""
+    """All measurements of a session as arrays; indices say which PM and epoch each belongs to.
+
+    ``log_junk`` (J,): where PMs are doubted, the log density of what is junk there, over that of a good PM at its best.
+    """
 
     columns: Columns
     pms: tuple[int, ...]
@@ -146,6 +149,7 @@ class PackedProblem:
     shapes: RotationShapes | None = None
     sound_speed_mean: float = 1.0
     anchor: Anchor | None = None
+    log_junk: FloatArray | None = None
 
 
 def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
@@ -294,6 +298,7 @@ def only_aims(problem: PackedProblem) -> PackedProblem:
         prior_information=np.zeros_like(problem.prior_information),
         shapes=None,
         anchor=None,
+        log_junk=None,
     )
 
 

@@ -37,7 +37,7 @@ from fgreg.graph.reduced_blocks import (
     transposed,
 )
 from fgreg.graph.shared_state import SharedState, step_between
-from fgreg.graph.windows import log_shape_ratio
+from fgreg.graph.windows import log_shape_ratios
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +84,15 @@ class _System:
     b_p: FloatArray
     point_covariance: FloatArray
     point_step: FloatArray
-    cost: FloatArray
+    pm_cost: FloatArray
+    aim_cost: FloatArray
+    prior_cost: FloatArray
     private: PrivateState
+
+    @property
+    def cost(self) -> FloatArray:
+        """(S,) chi square of everything."""
+        return np.asarray(self.pm_cost.sum(axis=1) + self.aim_cost.sum(axis=1) + self.prior_cost)
 
 
 def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -> _System:
@@ -119,9 +126,9 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
     aim_weight = inverse2(aim_covariance)
     aim_weighted = times(aim_weight, aim.residual)
 
-    cost = np.sum(line.residual * line_weighted, axis=(1, 2)) + np.sum(look.residual * look_weighted, axis=(1, 2))
-    cost += np.sum(b_p * point_step, axis=(1, 2)) + np.sum(aim.residual * aim_weighted, axis=(1, 2))
-    cost += _prior_cost(problem, state)
+    pm_cost = sum_by(np.sum(line.residual * line_weighted, axis=-1), problem.beam_pm, pms)
+    pm_cost = pm_cost + sum_by(np.sum(look.residual * look_weighted, axis=-1), problem.look_pm, pms)
+    pm_cost = pm_cost + np.sum(b_p * point_step, axis=-1)
 
     # The private variables' optimum at these shared ones, as linearised here.
     line_update = line.residual + times(transposed(line.across), point_step[:, problem.beam_pm])
@@ -139,7 +146,9 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
         b_p=b_p,
         point_covariance=point_covariance,
         point_step=point_step,
-        cost=cost,
+        pm_cost=pm_cost,
+        aim_cost=np.sum(aim.residual * aim_weighted, axis=-1),
+        prior_cost=_prior_cost(problem, state),
         private=PrivateState(private.trus_p_pm + point_step, beam_error, aim_error, aim_shift),
     )
 
@@ -157,20 +166,24 @@ def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateSt
     density by the volume they are free in, and so by how steeply beams happen to cross arcs: as in straight line fits
     with errors in both coordinates that estimate is inconsistent (Neyman and Scott, 1948; Kendall and Stuart, vol. 2,
     ch. 29), the one with the private variables at their optimum is not. Where the problem keeps the windows' own
-    shapes, the PMs' rotations are integrated over them (fgreg.graph.windows).
+    shapes, the PMs' rotations are integrated over them (fgreg.graph.windows). Where it doubts PMs, each is either good,
+    or junk of the density given: the sum of both.
     """
     system = _system(problem, state, private)
-    return np.asarray(_log_shapes(problem, state, system) - 0.5 * system.cost)
+    pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost
+    if problem.log_junk is not None:
+        pms = np.logaddexp(pms, problem.log_junk)
+    return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=1) + system.prior_cost))
 
 
 def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
-    """(S,) log of what the windows' own shapes make of the Gaussian stand-ins' density."""
+    """(S, J) log of what the windows' own shapes make of the Gaussian stand-ins' density of each PM."""
     if problem.shapes is None:
-        return np.zeros(state.count)
+        return np.zeros((state.count, len(problem.pms)))
     by_point = system.look.by_point[..., 2, :]
     offset = system.look.residual[..., 2] + np.sum(by_point * system.point_step[:, problem.look_pm], axis=-1)
     variance = np.sum(by_point * times(system.point_covariance[:, problem.look_pm], by_point), axis=-1)
-    return log_shape_ratio(problem, state.edge_rad, offset, variance)
+    return log_shape_ratios(problem, state.edge_rad, offset, variance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,19 +250,14 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
     gradient = sum_by(times(line_t, line.residual), problem.beam_pm, pms)
     gradient = gradient + sum_by(times(look_t, look.residual), problem.look_pm, pms)
     gradient = gradient + times(transposed(by.h_ps), system.point_step)
-    cost = sum_by(np.sum(line.residual * times(system.line_weight, line.residual), axis=-1), problem.beam_pm, pms)
-    look_cost = np.sum(look.residual * times(problem.looks.weight, look.residual), axis=-1)
-    cost = cost + sum_by(look_cost, problem.look_pm, pms) + np.sum(system.b_p * system.point_step, axis=-1)
     aim_weighted = times(system.aim_weight, aim.residual)
     aim_t = transposed(by.aim)
     prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
     _add_priors(problem, state, prior_gradient, prior_hessian)
     return Parts(
-        pm=Contributions(cost, gradient, hessian),
-        aim=Contributions(
-            np.sum(aim.residual * aim_weighted, axis=-1), times(aim_t, aim_weighted), aim_t @ system.aim_weight @ by.aim
-        ),
-        prior=Contributions(_prior_cost(problem, state)[:, None], prior_gradient[:, None], prior_hessian[:, None]),
+        pm=Contributions(system.pm_cost, gradient, hessian),
+        aim=Contributions(system.aim_cost, times(aim_t, aim_weighted), aim_t @ system.aim_weight @ by.aim),
+        prior=Contributions(system.prior_cost[:, None], prior_gradient[:, None], prior_hessian[:, None]),
         private=system.private,
         point_gain=by.point_gain,
     )

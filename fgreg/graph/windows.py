@@ -60,10 +60,10 @@ def interval_at(shapes: RotationShapes, edge_rad: FloatArray) -> tuple[FloatArra
     return low, np.maximum(high, low + 1e-6)
 
 
-def log_shape_ratio(
+def log_shape_ratios(
     problem: PackedProblem, edge_rad: FloatArray, offset: FloatArray, variance: FloatArray
 ) -> FloatArray:
-    """(S,) log of what the intervals make of the density with Gaussian sites.
+    """(S, J) log of what the intervals make of each PM's density with Gaussian sites.
 
     Args:
         problem: with shapes; its sites are ``looks.weight[:, 2, 2]``, ``looks.centre_rad`` and ``looks.edge_gain``.
@@ -73,13 +73,13 @@ def log_shape_ratio(
     """
     shapes = problem.shapes
     if shapes is None or not len(problem.look_pm):
-        return np.zeros(len(edge_rad))
+        return np.zeros((len(edge_rad), len(problem.pms)))
     groups = group_looks(problem, shapes)
     site = problem.looks.weight[:, 2, 2]
     rotation = offset + problem.looks.centre_rad + problem.looks.edge_gain * edge_rad[:, None]
     low, high = interval_at(shapes, edge_rad)
     soft = shapes.windows.soft_rad
-    total = np.zeros(len(edge_rad))
+    out = np.zeros((len(edge_rad), len(problem.pms)))
     if len(groups.single):
         i = groups.single
         q = np.maximum(1.0 / variance[:, i] - site[i], LEAST_PRECISION)
@@ -88,10 +88,10 @@ def log_shape_ratio(
         log = log_interval(low[:, i] - mean, high[:, i] - mean, np.sqrt(1.0 / q + soft[i] ** 2))
         log = log - np.log(high[:, i] - low[:, i])
         log = log + 0.5 * np.log1p(site[i] / q) + 0.5 * (offset[:, i] + shift) ** 2 * site[i] * q / (site[i] + q)
-        total += log.sum(axis=1)
+        out[:, problem.look_pm[i]] = log
     if len(groups.pm):
-        total += _group_ratio(problem, shapes, groups, offset, rotation, variance, low, high).sum(axis=1)
-    return total
+        out[:, groups.pm] = _group_ratio(problem, shapes, groups, offset, rotation, variance, low, high)
+    return out
 
 
 def _group_ratio(
@@ -104,7 +104,7 @@ def _group_ratio(
     low: FloatArray,
     high: FloatArray,
 ) -> FloatArray:
-    """:func:`log_shape_ratio` of PMs with several looks or amplitudes, (S, m)."""
+    """:func:`log_shape_ratios` of PMs with several looks or amplitudes, (S, m)."""
     looks, there = groups.looks, groups.there
     site = np.where(there, problem.looks.weight[looks, 2, 2], 0.0)
     total = site.sum(axis=1)
