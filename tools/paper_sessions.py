@@ -44,6 +44,8 @@ from fgreg.tracking import track
 HELD = 10
 """PMs of every session that no registration sees: pair residuals are theirs."""
 SETTINGS = SolveConfig()
+GAUSSIAN = replace(SETTINGS, window_shape=False)
+"""Windows as Gaussians of the same mean and variance: the model that the bound is of."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +164,7 @@ class Job:
     guess: tuple[float, float] = (5.0, 5.0)
     max_rounds: int = 4000
     key: Any = None
-    posterior: bool = False
+    gaussian: bool = False
 
 
 def run_job(job: Job) -> dict[Any, Row]:
@@ -210,15 +212,19 @@ def registration(job: Job) -> dict[Any, Row]:
         row: Row = {"bound2": float(np.mean(bound**2))}
         try:
             found = register(some.measurements, some.model, SETTINGS)
-            row["tre"] = sim.tre(found.optimum.state.trus_T_camera()[0])
+            answered = answer(found, SETTINGS)
+            row["tre"] = sim.tre(answered.posterior.mean.trus_T_camera()[0])
             states = [found.optimum.state, *(minimum.state for minimum in found.searches[0].minima)]
             best = min(states, key=lambda state: float(np.mean(sim.tre(state.trus_T_camera()[0]) ** 2)))
             row["best"] = sim.tre(best.trus_T_camera()[0])
             row["best_residual"] = pair_residuals(best, (0,), held.measurements.pairs)
             row["ambiguous"] = bool(found.ambiguous)
-            if job.posterior:
-                row["mean_tre"] = sim.tre(answer(found, SETTINGS).posterior.mean.trus_T_camera()[0])
-            row["residual"] = np.array([pm.pair_residual_mm for pm in predict(found, held.measurements.pairs)])
+            if job.gaussian:
+                row["optimum_tre"] = sim.tre(found.optimum.state.trus_T_camera()[0])
+                like = answer(register(some.measurements, some.model, GAUSSIAN), GAUSSIAN)
+                row["gaussian_tre"] = sim.tre(like.posterior.mean.trus_T_camera()[0])
+            held_out = predict(answered.registration, held.measurements.pairs)
+            row["residual"] = np.array([pm.pair_residual_mm for pm in held_out])
         except EstimationError:
             row["failed"] = True
         row["b_tre"] = sim.tre(by_points(sim, range(size), rng)[0])
@@ -244,9 +250,8 @@ def one_out(job: Job) -> dict[Any, Row]:
     for left in range(15):
         pairs = sim.measurements.pairs
         kept = replace(sim.measurements, pairs=pairs[:left] + pairs[left + 1 :])
-        residuals += [
-            pm.pair_residual_mm for pm in predict(register(kept, sim.model, SETTINGS), pairs[left : left + 1])
-        ]
+        answered = answer(register(kept, sim.model, SETTINGS), SETTINGS).registration
+        residuals += [pm.pair_residual_mm for pm in predict(answered, pairs[left : left + 1])]
         rest = np.arange(15) != left
         points.append(
             float(
@@ -255,8 +260,8 @@ def one_out(job: Job) -> dict[Any, Row]:
                 )
             )
         )
-    whole = register(sim.measurements, sim.model, SETTINGS)
-    tre = sim.tre(whole.optimum.state.trus_T_camera()[0])
+    whole = answer(register(sim.measurements, sim.model, SETTINGS), SETTINGS)
+    tre = sim.tre(whole.posterior.mean.trus_T_camera()[0])
     return {15: {"residual": np.array(residuals), "b_point": np.array(points), "tre": tre}}
 
 
