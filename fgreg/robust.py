@@ -41,6 +41,8 @@ TYPICAL_P = 3e-3
 IMPLAUSIBLE_P = 1e-4
 TRIPLES = 160
 """Random triples of the consensus: at 60 % junk still ten of good pairs only."""
+STARTS = 24
+"""Distinct ones of their solutions to descend from: fewer miss the deepest minimum where only the window is known."""
 SEED = 40961
 SCORE_LIMIT = 13.8
 CAUCHY_SCALES = (100.0, 20.0, 4.0)
@@ -107,7 +109,9 @@ def plausible_cost(problem: PackedProblem) -> float:
 # --- 1. consensus ---------------------------------------------------------------------------------------------------
 
 
-def consensus_starts(problem: PackedProblem, marker_T_beam: FloatArray, lambda_mm: float, keep: int = 8) -> FloatArray:
+def consensus_starts(
+    problem: PackedProblem, marker_T_beam: FloatArray, lambda_mm: float, keep: int = STARTS
+) -> FloatArray:
     """Registrations that most PMs of a one-epoch problem agree on, best first.
 
     Args:
