@@ -354,9 +354,23 @@ def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool =
         robust_aims: doubt the aims, too; else they count in full.
     """
     descent = _Descent(problem, state)
-    limit, aim_limit = pm_limits(problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
     for scale in CAUCHY_SCALES:
         descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
+    return _truncated_minima(descent, robust_aims=robust_aims)
+
+
+def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
+    """The better of :func:`graduated` and of the descent on the truncated cost alone, from one start.
+
+    The wide losses may lead away from a start that is good already, and into another minimum.
+    """
+    far = graduated(problem, state, robust_aims=robust_aims)
+    near = _truncated_minima(_Descent(problem, state), robust_aims=robust_aims)
+    return near if near.cost[0] < far.cost[0] else far
+
+
+def _truncated_minima(descent: _Descent, *, robust_aims: bool) -> RobustOptimum:
+    limit, aim_limit = pm_limits(descent.problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
     for _ in range(2):
         descent.settle()
         weights = descent.run(partial(_truncated, limit=limit, aim_limit=aim_limit), MAX_STEPS)
