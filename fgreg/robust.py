@@ -78,8 +78,12 @@ def junk_p(pm_kept: BoolArray) -> float:
     Of two degrees of freedom a good shot's density falls as exp(-d / 2), and so does the share p that deviates by more
     than d: junk and good are equally likely where p is junk's density times the odds of junk.
     """
-    kept = int(pm_kept.sum())
-    return max(JUNK_P, JUNK_DENSITY * min((len(pm_kept) - kept) / max(kept, 1), 1.0))
+    return junk_p_of(int(pm_kept.sum()), len(pm_kept))
+
+
+def junk_p_of(kept: int, count: int) -> float:
+    """:func:`junk_p` where so many of ``count`` PMs are kept."""
+    return max(JUNK_P, JUNK_DENSITY * min((count - kept) / max(kept, 1), 1.0))
 
 
 def log_junk(problem: PackedProblem, pm_kept: BoolArray) -> FloatArray:
@@ -419,6 +423,11 @@ def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> Fl
     moved = np.sum(along**2 / np.maximum(eigenvalue, 1e-12), axis=1)
     out[good] = np.where(eigenvalue[:, 0] > UNKNOWN, cost[good] - sign[good] * moved, np.inf)
     return out
+
+
+def innovations_of(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
+    """Innovations (n,) of shots, one hypothesis, at an optimum whose Hessian (D, D) holds those kept (n,)."""
+    return _innovation(part, hessian, kept)
 
 
 def innovations_at(
