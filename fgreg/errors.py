@@ -57,3 +57,11 @@ class JournalError(FgregError):
         self.found = one_line(found)
         self.remedy = one_line(remedy)
         super().__init__(f"{self.where}: {self.found}; {self.remedy}")
+
+
+class EventRefused(FgregError):  # noqa: N818 (not a mistake of the program's: the event is left out)
+    """An event could not be taken into the estimate, which is as it was before."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = one_line(reason)
+        super().__init__(self.reason)

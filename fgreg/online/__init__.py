@@ -1,0 +1,1 @@
+"""While a session runs: events in, estimates out."""
