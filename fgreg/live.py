@@ -24,6 +24,7 @@ from fgreg.events import (
     TrackEvent,
     refused_lines,
 )
+from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
@@ -47,6 +48,7 @@ class Engine(Protocol):
     def track(self, query: Track) -> TrackEstimate: ...
     def settle(self) -> OnlineEstimate: ...
     def measurements(self) -> Measurements: ...
+    def marker_T_laser(self) -> FloatArray | None: ...
 
 
 MakeEngine = Callable[[SessionModel, SolveConfig], Engine]

@@ -8,6 +8,7 @@ from fgreg.batch import Solution, solve
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError, EventRefused
 from fgreg.estimate import TrackEstimate, Verdict
+from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
@@ -95,6 +96,10 @@ class BatchEngine:
             None,
             True,
         )
+
+    def marker_T_laser(self) -> FloatArray | None:
+        laser = self.solution().laser
+        return None if laser is None else laser.marker_T_laser
 
     def solution(self) -> Solution:
         return solve(self.all, (), self.model, self.config)

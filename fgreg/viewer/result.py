@@ -52,8 +52,6 @@ class ResultPainter:
 
     def paint(self) -> None:
         """Draw everything."""
-        if self.estimate.verdict is Verdict.REFUSED:
-            shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
         looks = measured_pairs(self.estimate.pairs, self.measurements)
         markers_of_aims = {aim.t: aim.marker for aim in self.measurements.aims}
         epoch, plane_is_plain = -1, False
@@ -77,6 +75,12 @@ class ResultPainter:
                 self._pair(self.estimate.pairs[shot.position], looks[shot.position])
             else:
                 self._track(shot.position, epoch)
+        self.paint_end()
+
+    def paint_end(self) -> None:
+        """Draw what does not belong to a shot: plots, summary, the true PMs."""
+        if self.estimate.verdict is Verdict.REFUSED:
+            shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
         self._plots()
         self._static()
 
