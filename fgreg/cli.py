@@ -1,4 +1,4 @@
-"""The command line: ``fgreg solve``, ``check``, ``simulate``; the others are in fgreg.cli_evaluate and fgreg.cli_replay.
+"""The command line: ``fgreg solve``, ``check``, ``simulate``; others are in fgreg.cli_evaluate and fgreg.cli_replay.
 
 Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
 starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command

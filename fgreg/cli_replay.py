@@ -157,7 +157,10 @@ def step_line(step: ReplayStep) -> Text:
         nis = known.nis if isinstance(step.event, PairEvent) else None
         worst = None if known.predicted_tre is None else known.predicted_tre.worst_mm
         line.append(f" {known.epoch:5d} {known.pairs:5d} {_figure(nis, 1)} {_figure(worst, 2)}  ")
-        line.append(known.verdict.value, style=STYLES[known.verdict])
+        if known.trus_T_camera is None:
+            line.append("none yet", style="dim")
+        else:
+            line.append(known.verdict.value, style=STYLES[known.verdict])
         if step.noticed:
             line.append("\n           the camera has moved: a new epoch begins", style="bold")
     return line

@@ -14,7 +14,6 @@ from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, OnlineEvent
 from fgreg.registration import register
-from fgreg.tracking import track
 
 
 class BatchEngine:
@@ -75,10 +74,7 @@ class BatchEngine:
         )
 
     def track(self, query: Track) -> TrackEstimate:
-        context = self.solution().context
-        if context is None:
-            return TrackEstimate(query.t, None, None, None, True, "no registration")
-        return replace(track(query, context), causal=True)
+        return replace(solve(self.all, (query,), self.model, self.config).tracks[0], causal=True)
 
     def settle(self) -> OnlineEstimate:
         epoch = self.solution().epochs[-1]

@@ -59,12 +59,14 @@ class LivePainter:
     def __init__(self, rec: shapes.Recorder, model: SessionModel) -> None:
         self._rec, self._model = rec, model
         self._plane_is_plain = False
+        self._last = (0.0, 0)
         beyond = float(np.linalg.norm(model.targets_mm[:, 1:], axis=1).max()) - model.probe.radius_mm
         self._depth_mm = beyond + 5.0
 
     def draw(self, moment: Moment, *, textured: bool) -> None:
         """Draw one; ``textured``: its frame is on the image plane already."""
-        self._rec.at(moment.t, moment.number)
+        self._last = (moment.t, moment.number)
+        self._rec.at(*self._last)
         self._registration(moment)
         shot = moment.shot
         if shot is not None:
@@ -164,13 +166,28 @@ class LivePainter:
         import rerun as rr
 
         rec = self._rec
-        worst = math.inf if moment.tre is None else moment.tre.worst_mm
-        rec.log("online/predicted_worst_mm/worst", rr.Scalars(min(worst, LARGEST_PLOTTED_MM)))
+        if moment.tre is not None and math.isfinite(moment.tre.worst_mm):
+            rec.log("online/predicted_worst_mm/worst", rr.Scalars(min(moment.tre.worst_mm, LARGEST_PLOTTED_MM)))
         rec.log("online/pairs/used", rr.Scalars(float(moment.pairs)))
         if moment.nis is not None and math.isfinite(moment.nis):
             rec.log("online/nis/pair", rr.Scalars(moment.nis))
         level = {Verdict.OK: "INFO", Verdict.WARNING: "WARN", Verdict.REFUSED: "ERROR"}[moment.verdict]
         rec.log("log", rr.TextLog(f"{moment.note} [{moment.verdict.value}]", level=level))
+        rec.log("summary", rr.TextDocument(moment_markdown(moment), media_type="text/markdown"))
+
+    def to_end(self) -> None:
+        """What is logged next belongs to the last moment."""
+        self._rec.at(*self._last)
+
+
+def moment_markdown(moment: Moment) -> str:
+    """The summary page of a moment: what was known then."""
+    tre = moment.tre
+    worst = "not known" if tre is None else f"{tre.worst_mm:.2f} mm"
+    state = "No registration yet" if moment.trus_T_camera is None else f"At {moment.t:.1f} s: {moment.verdict.value}"
+    lines = [f"# {state}", "", f"After {moment.note}.", "", f"Pairs used in this camera epoch: {moment.pairs}.", ""]
+    lines += [f"Predicted 95 % error at the worst target: {worst}.", ""]
+    return "\n".join([*lines, *(f"- {reason}" for reason in moment.reasons)])
 
 
 def nearest_on(strip_mm: FloatArray) -> Reach:

@@ -330,7 +330,8 @@ class Viewer:
         if self._live is None:
             painter.paint()
         else:
-            painter.paint_end()
+            self._live.to_end()
+            painter.paint_end(judged_last=True)
         eye = scene.best_eye(painter.eye_points(), trus_view=painter.trus_view())
         self._rec.blueprint(make_blueprint(self._contents(result=True), estimate.verdict, eye))
         self._finished = True
