@@ -1,7 +1,7 @@
 """Kills a recording process again and again, and looks at what it left on disk.
 
 A mother process has everything imported and forks a recorder for each life: it opens the session, goes on where the
-file ends, and says which event is taken in only after ``add`` (or ``append``) has returned. Nothing else is between the two.
+file ends, and says which event is taken in only after ``add`` (or ``append``) has returned. Nothing else is between.
 """
 
 from __future__ import annotations
@@ -101,14 +101,23 @@ def mother() -> None:
 
 @dataclass(slots=True)
 class Toll:
-    """What became of all lives."""
+    """What became of all lives.
+
+    Attributes:
+        lives: how many were ended. taken: events acknowledged.
+        missing: acknowledged events that are not on disk. damaged: lines (but an unfinished last one) that are not,
+            byte by byte, what was given; events that nobody gave count too.
+        unasked: whole events on disk whose acknowledgement the kill came before. torn: last lines cut short.
+        sessions: the folders.
+    """
 
     lives: int = 0
     taken: int = 0
-    torn: int = 0
+    missing: int = 0
+    damaged: int = 0
     unasked: int = 0
+    torn: int = 0
     sessions: list[Path] = field(default_factory=list)
-    longest_s: float = 0.0
 
 
 def expected(source: Path, folder: Path, index: int) -> bytes:
@@ -116,25 +125,15 @@ def expected(source: Path, folder: Path, index: int) -> bytes:
 
 
 def check(folder: Path, source: Path, acknowledged: int, toll: Toll) -> None:
-    """No acknowledged event is missing, and no line but an unfinished last one is anything but what was given.
-
-    Raises:
-        AssertionError: one is.
-    """
+    """Compare what is on disk with what was given and acknowledged."""
     path = folder / "events.jsonl"
-    data = path.read_bytes() if path.exists() else b""
-    *lines, tail = data.split(b"\n")
-    for index, line in enumerate(lines):
-        if line + b"\n" != expected(source, folder, index):
-            raise AssertionError(f"line {index + 1} is damaged: {line[:80]!r}")
-    if len(lines) < acknowledged:
-        raise AssertionError(f"{acknowledged} events were acknowledged, {len(lines)} are there")
-    if len(lines) > acknowledged + 1:
-        raise AssertionError(f"{acknowledged} events were acknowledged, and {len(lines)} are there")
-    if tail and not expected(source, folder, len(lines)).startswith(tail):
-        raise AssertionError(f"the last line is damaged: {tail[:80]!r}")
+    *lines, tail = (path.read_bytes() if path.exists() else b"").split(b"\n")
+    toll.damaged += sum(line + b"\n" != expected(source, folder, index) for index, line in enumerate(lines))
+    toll.damaged += max(0, len(lines) - acknowledged - 1)  # one event at most was on its way
+    toll.damaged += bool(tail) and not expected(source, folder, len(lines)).startswith(tail)
+    toll.missing += max(0, acknowledged - len(lines))
     toll.torn += bool(tail)
-    toll.unasked += len(lines) - acknowledged
+    toll.unasked += max(0, len(lines) - acknowledged)
 
 
 def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: int, most_s: float) -> Toll:
@@ -147,7 +146,7 @@ def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: 
         most_s: the latest moment, from birth.
 
     Raises:
-        AssertionError: something was lost or damaged, or a recorder failed by itself.
+        AssertionError: a recorder failed by itself.
     """
     source = make_template(scratch / "template", seed)
     rng, toll, acknowledged = random.Random(seed), Toll(), 0
@@ -167,7 +166,6 @@ def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: 
             word, number = child.stdout.readline().split()
             if word != "born":
                 raise AssertionError(f"{word} {number}")
-            born = time.monotonic()
             time.sleep(rng.uniform(0.0, most_s))
             os.kill(int(number), signal.SIGKILL)
             while (said := child.stdout.readline().strip()) != f"dead {number}":
@@ -175,7 +173,6 @@ def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: 
                     raise AssertionError(said or "the mother is dead")
                 acknowledged = int(said.split()[1]) + 1
                 toll.taken += 1
-            toll.longest_s = max(toll.longest_s, time.monotonic() - born)
             toll.lives += 1
             check(folder, source, acknowledged, toll)
             acknowledged = _whole_lines(folder)  # the next life goes on behind what is there
