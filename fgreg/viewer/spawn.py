@@ -83,7 +83,10 @@ def spawn_viewer(executable: Path | None = None) -> str:
 
 
 def _why(log: bytes, status: int) -> str:
-    """The telling line of a viewer's last words."""
-    lines = [line.strip() for line in log.decode("utf-8", errors="replace").splitlines() if line.strip()]
-    telling = [line for line in lines if "error" in line.lower() or "display" in line.lower()]
+    """What a viewer's last words say."""
+    text = log.decode("utf-8", errors="replace")
+    if "DISPLAY" in text:
+        return "there is no screen: neither DISPLAY nor WAYLAND_DISPLAY is set"
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    telling = [line for line in lines if "error" in line.lower()]
     return (telling or lines or [f"status {status}"])[-1][-160:]
