@@ -43,25 +43,13 @@ class EstimationError(FgregError):
     """The estimate could not be formed from these measurements (not a defect of the file)."""
 
 
-class JournalError(FgregError):
-    """An event or a frame could not be put on disk: it is not recorded, and what was recorded before is whole.
+class EventRefused(FgregError):  # noqa: N818: it is the event that is refused; nothing is in error
+    """An event that was not taken in; the state is what it was before, and later events work.
 
     Args:
-        where: the file.
-        found: what happened.
-        remedy: what to do about it.
+        reason: in one line, what was wrong with it or what failed.
     """
 
-    def __init__(self, where: str, found: str, remedy: str) -> None:
-        self.where = one_line(where)
-        self.found = one_line(found)
-        self.remedy = one_line(remedy)
-        super().__init__(f"{self.where}: {self.found}; {self.remedy}")
-
-
-class EventRefused(FgregError):  # noqa: N818 (not a mistake of the program's: the event is left out)
-    """An event could not be taken into the estimate, which is as it was before."""
-
     def __init__(self, reason: str) -> None:
-        self.reason = one_line(reason)
-        super().__init__(self.reason)
+        self.reason = one_line(reason, 500)
+        super().__init__(f"event refused: {self.reason}")

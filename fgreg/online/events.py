@@ -1,4 +1,4 @@
-"""What the online engine takes in: measurements, and that the camera moved."""
+"""What the online registration takes in, beside the measurement types. Millimetres, radians, seconds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from fgreg.measurements import Aim, Pair
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMoved:
-    """A new camera epoch; the motion (4, 4) and its (6, 6) covariance (right tangent) where kinematics gave them."""
+    """The camera moved: what follows belongs to a new epoch.
+
+    Attributes:
+        t: when it was told, or found out.
+        camera_new_T_camera_old: (4, 4), where kinematics gave it.
+        covariance: (6, 6) over its right tangent; a motion without one says nothing to rely on.
+        detected: found out by the program itself.
+        since_t: where found out: pairs from this time on belong to the new epoch.
+    """
 
     t: float
     camera_new_T_camera_old: FloatArray | None = None
@@ -22,7 +30,13 @@ class CameraMoved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StaticTags:
-    """Tags that stand still, by id: ``camera_T_tag`` (4, 4) and covariance (6, 6), right tangent."""
+    """Tags fixed in the room as the camera sees them now.
+
+    Attributes:
+        t: time.
+        camera_T_tag: (4, 4) by tag.
+        covariance: (6, 6) over the right tangent, by tag.
+    """
 
     t: float
     camera_T_tag: Mapping[int, FloatArray]
