@@ -1,4 +1,4 @@
-"""The command line: ``fgreg solve``, ``check``, ``simulate``; ``evaluate`` and ``advise`` are in fgreg.cli_evaluate.
+"""The command line: ``fgreg solve``, ``check``, ``simulate``; others are in fgreg.cli_evaluate and fgreg.cli_replay.
 
 Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
 starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command
@@ -19,6 +19,7 @@ import typer
 
 from fgreg import __version__
 from fgreg.cli_evaluate import add_commands
+from fgreg.cli_replay import add_replay
 from fgreg.errors import FgregError, InputError
 
 if TYPE_CHECKING:
@@ -278,6 +279,7 @@ def simulate(
 
 
 add_commands(app, _progress)
+add_replay(app, _summary_extras)
 
 
 if __name__ == "__main__":

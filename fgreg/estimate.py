@@ -111,9 +111,29 @@ class AimEstimate:
     nis: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Of how long something took, ms: median, 99 % quantile, longest."""
+
+    p50: float
+    p99: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long taking in an event (``add``) and answering a query (``track``) took; None where there was none."""
+
+    add: Quantiles | None
+    track: Quantiles | None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionEstimate:
-    """The whole answer for a session; what ``result.yaml`` holds, and the calibration shots besides."""
+    """The whole answer for a session; what ``result.yaml`` holds, and the calibration shots besides.
+
+    ``timing``: where events were taken in one by one.
+    """
 
     session: str
     verdict: Verdict
@@ -123,3 +143,4 @@ class SessionEstimate:
     pairs: tuple[PairEstimate, ...]
     tracks: tuple[TrackEstimate, ...]
     aims: tuple[AimEstimate, ...] = ()
+    timing: Timing | None = None

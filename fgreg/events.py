@@ -6,6 +6,7 @@ still the *device's*, in degrees, as the file has them: measurements.py holds wh
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,14 +82,52 @@ class CameraMovedEvent:
     since_t: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class OtherEvent:
-    """``refused``, ``stage`` or ``note``: kept for the record, of no effect on an estimate."""
+@dataclass(frozen=True, slots=True, eq=False)
+class RefusedEvent:
+    """An event that was not taken in: ``event`` as recorded (a mapping as a rule), and why.
+
+    Where the event itself is in the file, on an earlier line, ``event`` names that line: it does not count.
+    """
 
     t: float
     line: int
-    type: str
+    event: object
+    reason: str
+
+    @property
+    def refused_line(self) -> int | None:
+        """Line of the refused event, where it was recorded before it was refused."""
+        line = self.event.get("line") if isinstance(self.event, Mapping) else None
+        return line if type(line) is int else None
+
+
+@dataclass(frozen=True, slots=True)
+class StageEvent:
+    """What the stage was told: of no effect on an estimate."""
+
+    t: float
+    line: int
+    command: str
+    scan_deg: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NoteEvent:
+    """Somebody's words: of no effect on an estimate."""
+
+    t: float
+    line: int
     text: str
 
 
-Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | OtherEvent
+Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | RefusedEvent | StageEvent | NoteEvent
+
+
+def refused_lines(events: Iterable[Event]) -> dict[int, str]:
+    """Lines of recorded events that were refused afterwards, each with the reason."""
+    found = {}
+    for event in events:
+        if isinstance(event, RefusedEvent) and (line := event.refused_line) is not None:
+            found[line] = event.reason
+    return found

@@ -228,37 +228,51 @@ def show(
     viewer.session(model)
     shot = 0
     for index, event in enumerate(session.events):
-        if not isinstance(event, AimEvent | PairEvent | TrackEvent):
-            continue
-        kind: ShotKind = "aim" if isinstance(event, AimEvent) else "pair" if isinstance(event, PairEvent) else "track"
-        if event.marker.left is not None and model.camera is not None:
-            left, right = marker_pictures(event.marker, event.line, model.camera)
-            viewer.shot_images(
-                event.t,
-                kind,
-                shot,
-                left,
-                right,
-                _outlines(recognised, index, model),
-                _corner(recognised, index, event, model),
-            )
-        for number, look in enumerate(looks_of(event)):
-            if look.frame is None:
-                continue
-            frame = load_trus_frame(look.frame, event.line, "trus.frame", model)
-            find = recognised.finds.get((index, number), NoSignal(""))
-            heard = find if isinstance(find, PaFind) else None
-            viewer.pa_frame(
-                event.t,
-                shot,
-                frame,
-                heard.x_mm if heard else look.x_mm,
-                heard.range_mm if heard else look.range_mm,
-                heard.covariance if heard else look.covariance,
-                model.probe,
-            )
-        shot += 1
+        if isinstance(event, AimEvent | PairEvent | TrackEvent):
+            show_frames(viewer, session, recognised, index, event, shot)
+            shot += 1
     viewer.result(model, recognised.measurements, estimate, truth, recognised.tracks)
+
+
+def show_frames(
+    viewer: Viewer | NullViewer,
+    session: Session,
+    recognised: Recognised,
+    index: int,
+    event: AimEvent | PairEvent | TrackEvent,
+    shot: int,
+) -> None:
+    """The frames of one event with what was found in them; ``shot`` is its number among aims, pairs and tracks."""
+    if isinstance(viewer, NullViewer):
+        return  # spares reading the frames again
+    model = session.model
+    kind: ShotKind = "aim" if isinstance(event, AimEvent) else "pair" if isinstance(event, PairEvent) else "track"
+    if event.marker.left is not None and model.camera is not None:
+        left, right = marker_pictures(event.marker, event.line, model.camera)
+        viewer.shot_images(
+            event.t,
+            kind,
+            shot,
+            left,
+            right,
+            _outlines(recognised, index, model),
+            _corner(recognised, index, event, model),
+        )
+    for number, look in enumerate(looks_of(event)):
+        if look.frame is None:
+            continue
+        frame = load_trus_frame(look.frame, event.line, "trus.frame", model)
+        find = recognised.finds.get((index, number), NoSignal(""))
+        heard = find if isinstance(find, PaFind) else None
+        viewer.pa_frame(
+            event.t,
+            shot,
+            frame,
+            heard.x_mm if heard else look.x_mm,
+            heard.range_mm if heard else look.range_mm,
+            heard.covariance if heard else look.covariance,
+            model.probe,
+        )
 
 
 def _outlines(recognised: Recognised, index: int, model: SessionModel) -> list[FloatArray] | None:

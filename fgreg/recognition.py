@@ -26,7 +26,16 @@ from fgreg.detection.noise import CornerNoise, pool_corner_noise
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.drivers.frame_files import read_array, read_picture
 from fgreg.errors import InputError
-from fgreg.events import AimEvent, CameraMovedEvent, Event, MarkerRecord, PairEvent, TrackEvent, TrusRecord
+from fgreg.events import (
+    AimEvent,
+    CameraMovedEvent,
+    Event,
+    MarkerRecord,
+    PairEvent,
+    TrackEvent,
+    TrusRecord,
+    refused_lines,
+)
 from fgreg.frames import FloatArray, as_float_array
 from fgreg.measurements import (
     Aim,
@@ -172,8 +181,12 @@ def recognise(
         redetect,
     )
     starts, epoch_of = number_epochs(events)
+    refused = refused_lines(events)
     for index, event in enumerate(events):
-        builder.add(index, event, epoch_of[index])
+        if event.line not in refused:
+            builder.add(index, event, epoch_of[index])
+        elif isinstance(event, AimEvent | PairEvent | TrackEvent):
+            builder.unused[index] = f"it was refused when it was taken: {refused[event.line]}"
     return Recognised(
         measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts),
         tracks=tuple(builder.tracks),
@@ -194,14 +207,15 @@ def recognise(
 def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tuple[int, ...]]:
     """Camera epochs, and the epoch of every event.
 
-    An epoch starts with its ``camera_moved``; where the program found the move out by itself, with the first event at
-    or after ``since_t``.
+    An epoch starts with its ``camera_moved`` (unless that was refused); where the program found the move out by itself,
+    with the first event at or after ``since_t``.
     """
+    refused = refused_lines(events)
     first = events[0].t if events else 0.0
     starts = [EpochStart(min(0.0, first))]
     places: list[int] = []
     for index, event in enumerate(events):
-        if not isinstance(event, CameraMovedEvent):
+        if not isinstance(event, CameraMovedEvent) or event.line in refused:
             continue
         since = event.since_t if event.detected and event.since_t is not None else event.t
         back = [i for i in range(index) if events[i].t >= since]
@@ -374,3 +388,40 @@ class _Builder:
             sweep=stage.direction * record.sweep,
             amplitude=amplitude,
         )
+
+
+class EventRecogniser:
+    """Recognises events one after another, as they come: corner noise is pooled over the frames so far.
+
+    What it makes of an event depends on the events before it alone, so that the same events give the same measurements
+    however often a session is interrupted.
+    """
+
+    def __init__(self, model: SessionModel) -> None:
+        nothing = pool_corner_noise(())
+        self._builder = _Builder(model, _Found(), nothing, nothing, redetect=False)
+        self._marker_fits: list[MarkerFit] = []
+        self._board_fits: list[BoardFit] = []
+
+    def add(self, event: AimEvent | PairEvent | TrackEvent, epoch: int) -> Aim | Pair | Track | str:
+        """The event as a measurement in camera epoch ``epoch``, or why there is none.
+
+        Raises:
+            InputError: a frame that is missing or not what it should be.
+        """
+        builder = self._builder
+        found = builder.found = _detect([event], builder.model, redetect=False, progress=None)
+        self._marker_fits += [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
+        self._board_fits += [fit for fit in found.boards.values() if isinstance(fit, BoardFit)]
+        if found.markers or found.boards:
+            builder.marker_noise = pool_corner_noise(fit.pose for fit in self._marker_fits)
+            builder.board_noise = pool_corner_noise(fit.pose for fit in self._board_fits)
+        builder.add(0, event, epoch)
+        made: list[Aim | Pair | Track] = [*builder.aims, *builder.pairs, *builder.tracks]
+        reason = builder.unused.get(0, "")
+        for shots in (builder.aims, builder.pairs, builder.tracks):
+            shots.clear()
+        for numbers in (builder.aim_events, builder.pair_events, builder.track_events):
+            numbers.clear()
+        builder.unused.clear()
+        return made[0] if made else reason

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from fgreg.estimate import AimEstimate, EpochEstimate, LaserEstimate, PairEstimate, SessionEstimate, Verdict
+from fgreg.estimate import AimEstimate, EpochEstimate, LaserEstimate, PairEstimate, SessionEstimate, Timing, Verdict
 from fgreg.frames import FloatArray, log_so3
 from fgreg.measurements import Look
 from fgreg.models import SessionModel
@@ -120,7 +120,7 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
         parts += ["", *_pairs(model, estimate, extra)]
     if estimate.tracks:
         parts += ["", *_tracks(estimate, truth)]
-    closing = [*_aims(estimate.aims), *_closing(extra)]
+    closing = [*_aims(estimate.aims), *_timing(estimate.timing), *_closing(extra)]
     if closing:
         parts += ["", *closing]
     return Group(*(Text(part) if isinstance(part, str) else part for part in parts))
@@ -150,6 +150,14 @@ def _bullet(text: str) -> RenderableType:
 
 def _heading(text: str) -> Text:
     return Text(text, style="bold")
+
+
+def _timing(timing: Timing | None) -> Iterator[str]:
+    if timing is None:
+        return
+    for name, found in (("Taking in an event", timing.add), ("Answering a query", timing.track)):
+        if found is not None:
+            yield f"{name}: median {found.p50:.2f}, 99 % {found.p99:.2f}, longest {found.max:.2f} ms"
 
 
 def _vector(values: Sequence[float] | FloatArray, decimals: int) -> str:
@@ -383,6 +391,8 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
         ],
         "targets": len(model.targets_mm),
     }
+    if estimate.timing is not None:
+        out["timing_ms"] = asdict(estimate.timing)
     if extra.truth is not None:
         out["truth"] = {
             "tre_mean_mm": [_plain(value) for value in extra.truth.tre_mean_mm],

@@ -20,7 +20,9 @@ from fgreg.estimate import (
     LaserEstimate,
     PairEstimate,
     PredictedTre,
+    Quantiles,
     SessionEstimate,
+    Timing,
     TrackEstimate,
     Verdict,
 )
@@ -165,6 +167,22 @@ def test_reads_back_as_it_was(tmp_path: Path, model: SessionModel, seed: int) ->
     assert [track.reason for track in read.tracks] == ["", "no registration yet"]
     assert read.tracks[0].stage_rad == pytest.approx(math.radians(12.4), abs=1e-8)
     assert read.tracks[1].stage_rad is None
+
+
+@pytest.mark.parametrize("tracked", [Quantiles(0.125, 0.3, 1.0), None])
+def test_how_long_things_took_is_written_where_they_came_one_by_one(
+    tracked: Quantiles | None, tmp_path: Path, model: SessionModel
+) -> None:
+    path, timing = tmp_path / "result.yaml", Timing(Quantiles(0.75, 4.5, 20.0), tracked)
+    write_result(replace(an_estimate(), timing=timing), model, path, "1.0")
+    assert read_result(path).timing == timing
+    other = yaml.safe_load(path.read_text())["timing_ms"]
+    assert other["add"] == {"p50": 0.75, "p99": 4.5, "max": 20.0}
+    path.write_text(path.read_text().replace("p99: 4.5", "p99: -4.5"))
+    with pytest.raises(InputError, match=r"timing_ms\.add\.p99"):
+        read_result(path)
+    write_result(an_estimate(), model, path, "1.0")
+    assert "timing" not in path.read_text()
 
 
 def test_rotations_stay_rigid_to_1e_8_and_covariances_positive(tmp_path: Path, model: SessionModel) -> None:

@@ -12,7 +12,7 @@ import yaml
 from numpy.testing import assert_allclose
 
 from fgreg.errors import InputError
-from fgreg.events import AimEvent, CameraMovedEvent, OtherEvent, PairEvent, TrackEvent
+from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent, StageEvent, TrackEvent
 from fgreg.models import NoiseModel, default_targets_mm
 from fgreg.session.reading import read_ground_truth, read_session
 from tests import session_files
@@ -97,8 +97,8 @@ def test_every_event(tmp_path: Path) -> None:
     events = session.events
     assert [event.line for event in events] == list(range(1, 15))
     assert [event.t for event in events[3:6]] == [3.0, 3.0, 4.0]
-    kinds = [OtherEvent, AimEvent, AimEvent, *[PairEvent] * 4, *[TrackEvent] * 3, *[CameraMovedEvent] * 2]
-    assert [type(event) for event in events] == [*kinds, OtherEvent, OtherEvent]
+    kinds = [NoteEvent, AimEvent, AimEvent, *[PairEvent] * 4, *[TrackEvent] * 3, *[CameraMovedEvent] * 2]
+    assert [type(event) for event in events] == [*kinds, RefusedEvent, StageEvent]
     frames = tmp_path.resolve() / "frames"
 
     _, spot, corner, posed, framed, both, own = events[:7]
@@ -141,10 +141,11 @@ def test_every_event(tmp_path: Path) -> None:
     assert isinstance(noticed, CameraMovedEvent)
     assert (noticed.detected, noticed.since_t, noticed.covariance) == (True, 8.5, None)
     refused, stage = events[12:]
-    assert isinstance(refused, OtherEvent)
-    assert (refused.type, refused.text) == ("refused", "earlier than the last")
-    assert isinstance(stage, OtherEvent)
-    assert (stage.type, stage.text) == ("stage", "turn 12 deg: track")
+    assert isinstance(refused, RefusedEvent)
+    assert (refused.event, refused.reason) == ({"type": "pair", "t": 1.0}, "earlier than the last")
+    assert refused.refused_line is None
+    assert isinstance(stage, StageEvent)
+    assert (stage.command, stage.scan_deg, stage.reason) == ("turn", 12.0, "track")
 
 
 def test_names_that_start_with_x_are_the_users_own_at_every_level(tmp_path: Path) -> None:

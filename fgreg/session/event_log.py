@@ -14,8 +14,10 @@ from fgreg.events import (
     CameraMovedEvent,
     Event,
     MarkerRecord,
-    OtherEvent,
+    NoteEvent,
     PairEvent,
+    RefusedEvent,
+    StageEvent,
     TrackEvent,
     TrusRecord,
 )
@@ -86,6 +88,39 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
             if event is not None:
                 log.events.append(event)
     return log
+
+
+@dataclass(frozen=True, slots=True)
+class LineRead:
+    """One line by itself: its event, the frames that it names, and what is wrong with it (then there is no event)."""
+
+    event: Event | None
+    frames: tuple[FrameUse, ...]
+    problems: tuple[InputError, ...]
+
+
+def read_line(
+    line: bytes, number: int, file: str, folder: Path, setup: Setup | None, last: tuple[float, int] | None
+) -> LineRead:
+    """Reads one whole line as :func:`read_events` does.
+
+    Args:
+        line: with its line break.
+        number: of the line, from 1.
+        file, folder, setup: as there.
+        last: time and line of the event before, None for the first.
+    """
+    log, problems = EventLog(), list[InputError]()
+    place = Place(file, line=number, line_first=True)
+    if len(line) > MAX_LINE_BYTES:
+        problems.append(InputError(str(place), f"{len(line)} bytes", f"at most {MAX_LINE_BYTES}"))
+        return LineRead(None, (), tuple(problems))
+    event = None
+    value = _parse(line, place, problems, log)
+    if value is not None:
+        reader = _EventReader(value, place, folder, setup, log, problems)
+        event = reader.event(reader.time(last), number)
+    return LineRead(None if problems else event, tuple(log.frames), tuple(problems))
 
 
 def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator[tuple[int, bytes]]:
@@ -203,10 +238,14 @@ class _EventReader:
                 return self._track(time, line)
             case "camera_moved":
                 return self._camera_moved(time, line)
-            case None:
+            case "refused":
+                return self._refused(time, line)
+            case "stage":
+                return self._stage(time, line)
+            case "note":
+                return self._note(time, line)
+            case _:
                 return None
-            case other:
-                return self._other(other, time, line)
 
     def _aim(self, t: float, line: int) -> AimEvent | None:
         fields = self._fields
@@ -301,21 +340,26 @@ class _EventReader:
                 fields.fail("since_t", shown(since_t), f"at most t, {t:.17g}")
         return fields.build(lambda: CameraMovedEvent(t, line, transform, covariance, detected, since_t))
 
-    def _other(self, kind: str, t: float, line: int) -> OtherEvent | None:
+    def _refused(self, t: float, line: int) -> RefusedEvent | None:
         fields = self._fields
-        if kind == "refused":
-            if not fields.has("event"):
-                fields.fail("event", "nothing", "the event that was not taken in")
-            text = fields.text("reason")
-        elif kind == "stage":
-            text = fields.text("command")
-            if fields.has("scan_deg"):
-                text += f" {fields.number('scan_deg', SCAN_DEG):g} deg"
-            if fields.has("reason"):
-                text += f": {fields.text('reason')}"
-        else:
-            text = fields.text("text")
-        return fields.build(lambda: OtherEvent(t, line, kind, text))
+        if not fields.has("event"):
+            fields.fail("event", "nothing", "the event that was not taken in")
+        reason, value = fields.text("reason"), fields.raw("event")
+        found = RefusedEvent(t, line, value, reason)
+        if (of_line := found.refused_line) is not None and not 0 < of_line < line:
+            fields.fail("event", f"line {of_line}", "an earlier line of this file")
+        return fields.build(lambda: found)
+
+    def _stage(self, t: float, line: int) -> StageEvent | None:
+        fields = self._fields
+        command = fields.text("command")
+        scan_deg = fields.number("scan_deg", SCAN_DEG) if fields.has("scan_deg") else None
+        reason = fields.text("reason") if fields.has("reason") else ""
+        return fields.build(lambda: StageEvent(t, line, command, scan_deg, reason))
+
+    def _note(self, t: float, line: int) -> NoteEvent | None:
+        text = self._fields.text("text")
+        return self._fields.build(lambda: NoteEvent(t, line, text))
 
     def _marker(self, event: Fields, board: str | None = None) -> MarkerRecord | None:
         """``marker``; ``board`` names the key that asks for a board in the same frames, pose or not."""

@@ -22,7 +22,9 @@ from fgreg.estimate import (
     LaserEstimate,
     PairEstimate,
     PredictedTre,
+    Quantiles,
     SessionEstimate,
+    Timing,
     TrackEstimate,
     Verdict,
 )
@@ -43,7 +45,7 @@ _ANY_LENGTH = math.inf  # a best estimate of a refused session may be anywhere
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _NOT_PLAIN = frozenset({"null", "true", "false", "yes", "no", "on", "off", "y", "n"})
 
-_TOP = ("format", "fgreg", "session", "verdict", "reasons", "laser", "epochs", "pairs", "tracks")
+_TOP = ("format", "fgreg", "session", "verdict", "reasons", "laser", "epochs", "pairs", "tracks", "timing_ms")
 _EPOCH = ("index", "start_s", "trus_T_camera", "covariance", "pairs", "verdict", "predicted_tre_mm")
 _PAIR = (
     "pm",
@@ -58,6 +60,7 @@ _PAIR = (
     "residual_mm",
     "nis",
 )
+_QUANTILES = ("p50", "p99", "max")
 _TRACK = ("t", "stage_deg", "sigma_deg", "lambda_mm", "causal", "reason")
 
 
@@ -160,6 +163,10 @@ def _document(estimate: SessionEstimate, session: str, version: str) -> Iterable
     yield from _block("epochs", [line for epoch in estimate.epochs for line in _epoch(epoch)])
     yield from _block("pairs", [f"  - {{{_pair(pair)}}}" for pair in estimate.pairs])
     yield from _block("tracks", [f"  - {{{_track(track)}}}" for track in estimate.tracks])
+    if estimate.timing is not None:
+        yield "timing_ms:"
+        yield f"  add: {_quantiles(estimate.timing.add)}"
+        yield f"  track: {_quantiles(estimate.timing.track)}"
 
 
 def _block(key: str, lines: list[str]) -> Iterable[str]:
@@ -221,6 +228,12 @@ def _track(track: TrackEstimate) -> str:
     if track.reason:
         parts.append(f"reason: {_text(track.reason, quote=True)}")
     return ", ".join(parts)
+
+
+def _quantiles(found: Quantiles | None) -> str:
+    if found is None:
+        return "null"
+    return f"{{p50: {_rounded(found.p50)}, p99: {_rounded(found.p99)}, max: {_rounded(found.max)}}}"
 
 
 def _transform(key: str, transform: FloatArray | None) -> Iterable[str]:
@@ -336,9 +349,14 @@ def read_result(path: Path) -> SessionEstimate:
     epochs = [_read_epoch(fields, i) for i, fields in enumerate(top.children("epochs", _EPOCH, empty=True))]
     pairs = [_read_pair(fields, len(epochs)) for fields in top.children("pairs", _PAIR, empty=True)]
     tracks = [_read_track(fields) for fields in top.children("tracks", _TRACK, empty=True)]
+    timing = None
+    if top.has("timing_ms") and (fields := top.child("timing_ms", ("add", "track"))) is not None:
+        timing = Timing(_read_quantiles(fields, "add"), _read_quantiles(fields, "track"))
     if problems:
         raise problems[0]
-    return SessionEstimate(session, verdict, tuple(reasons), laser, tuple(epochs), tuple(pairs), tuple(tracks))
+    return SessionEstimate(
+        session, verdict, tuple(reasons), laser, tuple(epochs), tuple(pairs), tuple(tracks), timing=timing
+    )
 
 
 def _read_verdict(fields: Fields) -> Verdict:
@@ -407,6 +425,12 @@ def _read_pair(fields: Fields, epochs: int) -> PairEstimate:
         residual_mm=figure("residual_mm", _FIGURE),
         nis=figure("nis", _FIGURE),
     )
+
+
+def _read_quantiles(fields: Fields, key: str) -> Quantiles | None:
+    if _is_null(fields, key) or (found := fields.child(key, _QUANTILES)) is None:
+        return None
+    return Quantiles(*(found.number(name, _FIGURE) for name in _QUANTILES))
 
 
 def _read_track(fields: Fields) -> TrackEstimate:

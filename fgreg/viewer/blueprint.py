@@ -35,6 +35,7 @@ class Contents:
     right: bool = False
     pa_size: tuple[int, int] | None = None
     result: bool = False
+    online: bool = False
 
 
 def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None) -> rrb.Blueprint:
@@ -91,7 +92,18 @@ def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None)
         shares.append(1.0)
     rows_right.append(rrb.Tabs(*text, active_tab=0))
     shares.append(1.1)
-    if contents.result:
+    if contents.online:
+        rows_right.append(
+            rrb.Horizontal(
+                rrb.TimeSeriesView(
+                    origin="online/predicted_worst_mm", name="Predicted worst TRE, mm", plot_legend=hidden
+                ),
+                rrb.TimeSeriesView(origin="online/nis", name="NIS as it came", plot_legend=hidden),
+                rrb.TimeSeriesView(origin="online/pairs", name="Pairs in the epoch", plot_legend=hidden),
+            )
+        )
+        shares.append(0.8)
+    elif contents.result:
         rows_right.append(
             rrb.Horizontal(
                 rrb.TimeSeriesView(origin="plots/residual_mm", name="Residual, mm", plot_legend=hidden),

@@ -33,6 +33,7 @@ from fgreg.models import ProbeModel, SessionModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
+from fgreg.viewer.live import LivePainter, Moment
 from fgreg.viewer.pa import pa_picture, texture
 from fgreg.viewer.result import ResultPainter, Truth
 from fgreg.viewer.shapes import Image8
@@ -78,6 +79,9 @@ class NullViewer:
     ) -> None:
         """Nothing is drawn."""
 
+    def moment(self, moment: Moment) -> None:
+        """Nothing is drawn."""
+
     def result(
         self,
         model: SessionModel,
@@ -97,6 +101,25 @@ def _is_recording(path: Path) -> bool:
         return file.read(3) == b"RRF"
 
 
+def _part_of(rrd: Path) -> Path:
+    """The temporary file that becomes ``rrd``, made.
+
+    Raises:
+        InputError: ``rrd`` cannot be written.
+    """
+    if not rrd.parent.is_dir():
+        raise InputError(str(rrd), "a folder that does not exist", "an existing folder for the recording")
+    if os.path.lexists(rrd) and not _is_recording(rrd):
+        found = "a folder" if rrd.is_dir() else "a file that is no recording"
+        raise InputError(str(rrd), found, "a new name, or that of an older recording")
+    part = rrd.with_name(f".{rrd.name}.{os.getpid()}.part")
+    try:
+        part.touch()
+    except OSError as error:
+        raise InputError(str(rrd), f"a place that refuses files ({error.strerror})", "a writable one") from error
+    return part
+
+
 class Viewer:
     """Writes a recording while a session is worked on. Use as a context manager: the file appears at its end.
 
@@ -104,30 +127,24 @@ class Viewer:
     an older one there as it was.
 
     Args:
-        rrd: the file to write; its folder has to exist.
+        rrd: the file to write; its folder has to exist. None: no file.
         session_name: shown as the recording's name.
+        url: of a running viewer to show it in as well.
 
     Raises:
         InputError: the folder does not exist or cannot be written to, or ``rrd`` is a folder.
     """
 
-    def __init__(self, rrd: Path, session_name: str) -> None:
-        if not rrd.parent.is_dir():
-            raise InputError(str(rrd), "a folder that does not exist", "an existing folder for the recording")
-        if os.path.lexists(rrd) and not _is_recording(rrd):
-            found = "a folder" if rrd.is_dir() else "a file that is no recording"
-            raise InputError(str(rrd), found, "a new name, or that of an older recording")
+    def __init__(self, rrd: Path | None, session_name: str, url: str | None = None) -> None:
         self._rrd = rrd
-        self._part = rrd.with_name(f".{rrd.name}.{os.getpid()}.part")
+        self._part = None if rrd is None else _part_of(rrd)
         try:
-            self._part.touch()
-        except OSError as error:
-            raise InputError(str(rrd), f"a place that refuses files ({error.strerror})", "a writable one") from error
-        try:
-            self._rec = shapes.Recorder(self._part, session_name)
+            self._rec = shapes.Recorder(self._part, session_name, url)
         except BaseException:
-            self._part.unlink(missing_ok=True)
+            self._drop_part()
             raise
+        self._live: LivePainter | None = None
+        self._model: SessionModel | None = None
         self._shown: set[str] = set()
         self._pa_size: tuple[int, int] | None = None
         self._textured: set[int] = set()
@@ -144,15 +161,20 @@ class Viewer:
             if not self._finished:
                 self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
             self._rec.close()
-            if kind is None:
+            if kind is None and self._part is not None and self._rrd is not None:
                 self._part.replace(self._rrd)
         finally:
+            self._drop_part()
+
+    def _drop_part(self) -> None:
+        if self._part is not None:
             self._part.unlink(missing_ok=True)
 
     def session(self, model: SessionModel) -> None:
         """Draw what does not change: probe, array, axes, cameras, the marker's outline, the plots' styles."""
         import rerun as rr
 
+        self._model = model
         rec, probe = self._rec, model.probe
         length = scene.array_length_mm(probe)
         rec.static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -287,6 +309,8 @@ class Viewer:
     ) -> None:
         """Draw the answer: registration, beams, arcs, PMs, targets, tracks, plots and text.
 
+        Where moments were drawn before, the shots stay as they were then, and only plots and text are added.
+
         Args:
             model: the session's set-up.
             measurements: what entered the estimate.
@@ -303,22 +327,38 @@ class Viewer:
             tracks=tuple(tracks),
             textured=frozenset(self._textured),
         )
-        painter.paint()
+        if self._live is None:
+            painter.paint()
+        else:
+            self._live.to_end()
+            painter.paint_end(judged_last=True)
         eye = scene.best_eye(painter.eye_points(), trus_view=painter.trus_view())
         self._rec.blueprint(make_blueprint(self._contents(result=True), estimate.verdict, eye))
         self._finished = True
 
     def _contents(self, *, result: bool) -> Contents:
-        return Contents("left" in self._shown, "right" in self._shown, self._pa_size, result)
+        return Contents("left" in self._shown, "right" in self._shown, self._pa_size, result, self._live is not None)
+
+    def moment(self, moment: Moment) -> None:
+        """Draw a shot with what is known at its time: the recording then shows the registration as it moves.
+
+        To be called after :meth:`session` and the shot's images.
+        """
+        if self._live is None:
+            if self._model is None:
+                raise AssertionError("the session comes first")
+            self._live = LivePainter(self._rec, self._model)
+            self._rec.blueprint(make_blueprint(self._contents(result=True), None, None))
+        self._live.draw(moment, textured=moment.number in self._textured)
 
 
-def open_viewer(rrd: Path | None, session_name: str) -> Viewer | NullViewer:
-    """A viewer that records to ``rrd``, or its null twin where that is None.
+def open_viewer(rrd: Path | None, session_name: str, url: str | None = None) -> Viewer | NullViewer:
+    """A viewer that records to ``rrd``, shows in the running viewer at ``url``, or its null twin where both are None.
 
     Raises:
         InputError: the folder of ``rrd`` does not exist or cannot be written to, or ``rrd`` is a folder.
     """
-    return NullViewer() if rrd is None else Viewer(rrd, session_name)
+    return NullViewer() if rrd is None and url is None else Viewer(rrd, session_name, url)
 
 
-__all__ = ["NullViewer", "ShotKind", "Truth", "Viewer", "open_viewer"]
+__all__ = ["Moment", "NullViewer", "ShotKind", "Truth", "Viewer", "open_viewer"]

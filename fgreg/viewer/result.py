@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -52,8 +52,6 @@ class ResultPainter:
 
     def paint(self) -> None:
         """Draw everything."""
-        if self.estimate.verdict is Verdict.REFUSED:
-            shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
         looks = measured_pairs(self.estimate.pairs, self.measurements)
         markers_of_aims = {aim.t: aim.marker for aim in self.measurements.aims}
         epoch, plane_is_plain = -1, False
@@ -77,8 +75,17 @@ class ResultPainter:
                 self._pair(self.estimate.pairs[shot.position], looks[shot.position])
             else:
                 self._track(shot.position, epoch)
+        self.paint_end()
+
+    def paint_end(self, *, judged_last: bool = False) -> None:
+        """Draw what does not belong to a shot: plots, summary, the true PMs.
+
+        ``judged_last``: the judgement belongs to the present moment and those after it only, not to all.
+        """
+        if self.estimate.verdict is Verdict.REFUSED:
+            shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
         self._plots()
-        self._static()
+        self._static(self.rec.log if judged_last else self.rec.static)
 
     def eye_points(self) -> FloatArray:
         """(n, 3) what the opening picture has to hold: probe, planes, cameras and markers."""
@@ -243,7 +250,7 @@ class ResultPainter:
             limits = [scene.CHI2_95_2] * 2
             self.rec.series("plots/nis/limit_95", (first[0], last[0]), (first[1], last[1]), limits)
 
-    def _static(self) -> None:
+    def _static(self, judge: Callable[..., None]) -> None:
         import rerun as rr
 
         if self.truth is not None and self.truth.trus_p_pm_mm:
@@ -253,12 +260,12 @@ class ResultPainter:
         if self.estimate.laser is not None:
             fibre = np.array([np.zeros(3), self.estimate.laser.marker_T_laser[:3, 3]])
             self.rec.static("world/camera/marker/fibre", shapes.strips([fibre], shapes.MARKER, 1.0))
-        self.rec.static("summary", rr.TextDocument(page, media_type="text/markdown"))
+        judge("summary", rr.TextDocument(page, media_type="text/markdown"))
         if self.estimate.verdict is Verdict.REFUSED:
             points = self.eye_points()
             above = (points.min(axis=0) + points.max(axis=0)) / 2.0
             above[2] = points[:, 2].max() + 5.0
-            self.rec.static("world/verdict", shapes.point(above, shapes.REFUSED, 9.0, "REFUSED: do not use"))
+            judge("world/verdict", shapes.point(above, shapes.REFUSED, 9.0, "REFUSED: do not use"))
 
     def _camera_errors(self) -> list[tuple[float, float]]:
         """Per epoch with a known truth: how far off the camera is, mm and rad."""

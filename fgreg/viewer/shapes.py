@@ -45,13 +45,22 @@ JPEG_QUALITY = 80
 
 
 class Recorder:
-    """A recording stream into a file, with the timelines ``shot`` and ``time``."""
+    """A recording stream into a file, a running viewer, or both, with the timelines ``shot`` and ``time``.
 
-    def __init__(self, path: Path, name: str) -> None:
+    Args:
+        path: of the file. name: of the recording. url: of the viewer.
+    """
+
+    def __init__(self, path: Path | None, name: str, url: str | None = None) -> None:
         import rerun as rr
 
         self._stream = rr.RecordingStream("fgreg")
-        self._stream.save(path)
+        sinks: list[rr.FileSink | rr.GrpcSink] = []
+        if path is not None:
+            sinks.append(rr.FileSink(path))
+        if url is not None:
+            sinks.append(rr.GrpcSink(url))
+        self._stream.set_sinks(*sinks)
         self._stream.send_recording_name(name)
 
     def at(self, t: float, shot: int) -> None:

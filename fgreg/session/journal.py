@@ -1,0 +1,225 @@
+"""The journal of a session while it is recorded: every event on disk before anybody is told that it is taken in.
+
+What is written is what :func:`fgreg.session.reading.read_session` reads back: each line is read by the same code before
+it goes out, and :meth:`Journal.append` hands back the event as it was read. Work on with that one, and a session that
+is opened again goes on from the very same numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from types import TracebackType
+from typing import Self
+
+from fgreg.errors import InputError, JournalError
+from fgreg.events import Event
+from fgreg.models import SessionModel
+from fgreg.session.append_file import AppendFile, sync_path
+from fgreg.session.event_document import event_document, event_line, frame_name, type_of
+from fgreg.session.event_log import read_line
+from fgreg.session.frames_named import check_frames, locate_frame
+from fgreg.session.reading import EVENTS_FILE, SETUP_FILE, Session, read_session
+from fgreg.session.safe_yaml import load_yaml
+from fgreg.session.setup import Setup, read_setup
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Appended:
+    """An event that is on disk: the offset of its line, and the event as a reader of the file has it."""
+
+    offset: int
+    event: Event
+
+
+class Journal:
+    """An open session, locked against other recorders. Use as a context manager, or close it.
+
+    Attributes:
+        folder: the session's, resolved.
+        model: how things are set up.
+        warnings: of reading, and of a last line that had been cut short and was dropped.
+    """
+
+    def __init__(
+        self, folder: Path, model: SessionModel, setup: Setup, file: AppendFile, recorded: Session, warnings: list[str]
+    ) -> None:
+        self.folder, self.model, self.warnings = folder, model, tuple(warnings)
+        self._setup, self._file, self._recorded = setup, file, recorded.events
+        self._last = (recorded.events[-1].t, recorded.events[-1].line) if recorded.events else None
+        self._fresh: set[Path] = set()
+        self._lock = Lock()
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Open a session to record to it; its ``events.jsonl`` is made where there is none.
+
+        A last line that was cut short (power was lost while it was written) is dropped with a warning: nobody was ever
+        told that it had been taken in. One that lacks nothing but its line break gets that.
+
+        Raises:
+            InputError: the session's files are not as they should be.
+            JournalError: another program records to it, or the disk refuses.
+        """
+        resolved = _resolved(folder)
+        setup = _setup(resolved)
+        file = AppendFile.open(resolved / EVENTS_FILE, EVENTS_FILE)
+        try:
+            warnings = _mend_tail(file, resolved, setup)
+            recorded = read_session(resolved)
+            return cls(resolved, recorded.model, setup, file, recorded, [*warnings, *recorded.warnings])
+        except BaseException:
+            file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def last_t(self) -> float | None:
+        """Time of the last event, s; None where there is none."""
+        return None if self._last is None else self._last[0]
+
+    @property
+    def lines(self) -> int:
+        """Events on disk."""
+        return 0 if self._last is None else self._last[1]
+
+    def take_recorded(self) -> tuple[Event, ...]:
+        """The events that the file held when it was opened; the journal forgets them."""
+        events, self._recorded = self._recorded, ()
+        return events
+
+    def append(self, event: Event) -> Appended:
+        """Put an event on disk, behind all others; its ``line`` is given to it here.
+
+        Frames that it names have to be there: they are checked, and put on disk first.
+
+        Raises:
+            InputError: it goes back in time, has a number that is not finite, or is otherwise not what a reader takes.
+            JournalError: the disk refuses; nothing is recorded, and the file is as it was.
+        """
+        with self._lock:
+            number = self.lines + 1
+            place = f"{type_of(event)} event"
+            line = event_line(event_document(event, self.folder), place)
+            read = read_line(line, number, place, self.folder, self._setup, self._last)
+            problems = [*read.problems]
+            if not problems:
+                camera, probe = self._setup.camera, self._setup.probe
+                size = None if camera is None else camera.left.image_size
+                problems = check_frames(list(read.frames), probe, size)
+            if problems:
+                raise problems[0]
+            if read.event is None:
+                raise AssertionError("no event and no problem")
+            self._sync_frames({use.path for use in read.frames})
+            offset = self._file.append(line)
+            self._last = (read.event.t, number)
+            return Appended(offset, read.event)
+
+    def write_frame(self, name: str, data: bytes) -> Path:
+        """Put a raw frame on disk; an event that names it comes after.
+
+        Args:
+            name: relative to the session's folder, such as ``frames/a.png``.
+            data: the file's bytes (PNG, NPY).
+
+        Returns:
+            Its path, for the event.
+
+        Raises:
+            InputError: a name that leads out of the folder, or of a file that is there: frames are never written over.
+            JournalError: the disk refuses; no file is left.
+        """
+        path = locate_frame(self.folder, name, "frame")
+        if os.path.lexists(path):
+            raise InputError(f"frame {frame_name(path, self.folder, 'frame')}", "a file of this name", "a new name")
+        part = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
+        try:
+            made = not path.parent.is_dir()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with part.open("xb") as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+                part.rename(path)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    part.unlink(missing_ok=True)
+                raise
+            sync_path(path.parent)
+            if made:
+                sync_path(path.parent.parent)
+        except OSError as error:
+            raise JournalError(name, f"the frame could not be written ({error.strerror})", "mend that first") from None
+        self._fresh.add(path)
+        return path
+
+    def _sync_frames(self, frames: set[Path]) -> None:
+        """Frames (and their names in their folders) on disk: those that others wrote may still be on their way."""
+        try:
+            others = frames - self._fresh
+            for path in [*sorted(others), *sorted({path.parent for path in others})]:
+                sync_path(path)
+        except OSError as error:
+            raise JournalError(path.name, f"the frame is not on disk ({error.strerror})", "mend that first") from None
+        self._fresh -= frames
+
+    def close(self) -> None:
+        """Unlock the session; twice does no harm."""
+        self._file.close()
+
+
+def _resolved(folder: Path) -> Path:
+    try:
+        resolved = folder.resolve(strict=True)
+    except (OSError, RuntimeError, ValueError):
+        raise InputError(str(folder), "nothing", "a session's folder") from None
+    if not resolved.is_dir():
+        raise InputError(str(folder), "a file", "a session's folder")
+    return resolved
+
+
+def _setup(folder: Path) -> Setup:
+    """What the session has, before anything is made in its folder."""
+    problems: list[InputError] = []
+    setup = read_setup(load_yaml(folder / SETUP_FILE, SETUP_FILE), SETUP_FILE, folder.name or "session", problems)
+    if problems:
+        raise problems[0]
+    return setup
+
+
+def _mend_tail(file: AppendFile, folder: Path, setup: Setup) -> list[str]:
+    """Drop a last line that was cut short, or give a whole one the line break it lacks; warnings."""
+    tail = file.tail()
+    if not tail:
+        return []
+    # The number and time of the line do not matter here: all is read again afterwards.
+    if read_line(tail + b"\n", 2**31, EVENTS_FILE, folder, setup, None).problems:
+        if not _is_cut_short(tail):
+            return []  # a whole line that is wrong: the reader says so
+        file.cut(file.size - len(tail))
+        return [f"{EVENTS_FILE}: the last line was cut short ({len(tail)} bytes) and is dropped"]
+    file.append(b"\n")
+    return []
+
+
+def _is_cut_short(tail: bytes) -> bool:
+    """Whether a line without its break is no whole JSON text, as the reader has it."""
+    try:
+        json.loads(tail.decode("utf-8"))
+    except (ValueError, RecursionError):
+        return True
+    return False

@@ -1,0 +1,201 @@
+"""Draws shots with what is known at their time: the registration moves as pairs come in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.estimate import PredictedTre, TrackEstimate, Verdict
+from fgreg.frames import FloatArray
+from fgreg.measurements import Aim, Look, Pair, Track
+from fgreg.models import SessionModel
+from fgreg.viewer import scene as scene
+from fgreg.viewer import shapes as shapes
+
+LARGEST_PLOTTED_MM = 30.0
+"""A predicted error beyond this says no more than that nothing is known yet."""
+
+
+Reach = Callable[[FloatArray, FloatArray], float | None]
+"""Length of a beam (mm), or None, from its origin (3,) and unit direction (3,) in TRUS."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One shot, and what was known right after it.
+
+    Attributes:
+        t: seconds. number: of the shot among all aims, pairs and tracks, from 0.
+        shot: the measurement; None where nothing was recognised, and where it is a move of the camera.
+        note: a line for the log.
+        trus_T_camera: (4, 4), None where there is none yet. covariance: (6, 6) over its right tangent.
+        marker_T_laser: (4, 4) the beam.
+        tre, verdict, reasons, pairs, nis, used: as in an online estimate.
+        answer: to a track.
+    """
+
+    t: float
+    number: int
+    shot: Aim | Pair | Track | None
+    note: str
+    trus_T_camera: FloatArray | None
+    covariance: FloatArray | None
+    marker_T_laser: FloatArray | None
+    tre: PredictedTre | None
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    pairs: int
+    nis: float | None
+    used: bool
+    answer: TrackEstimate | None = None
+
+
+class LivePainter:
+    """Draws moments, one after another, into a recording that :meth:`fgreg.viewer.recording.Viewer.session` began."""
+
+    def __init__(self, rec: shapes.Recorder, model: SessionModel) -> None:
+        self._rec, self._model = rec, model
+        self._plane_is_plain = False
+        self._last = (0.0, 0)
+        beyond = float(np.linalg.norm(model.targets_mm[:, 1:], axis=1).max()) - model.probe.radius_mm
+        self._depth_mm = beyond + 5.0
+
+    def draw(self, moment: Moment, *, textured: bool) -> None:
+        """Draw one; ``textured``: its frame is on the image plane already."""
+        self._last = (moment.t, moment.number)
+        self._rec.at(*self._last)
+        self._registration(moment)
+        shot = moment.shot
+        if shot is not None:
+            self._rec.log("world/camera/marker", shapes.transform(shot.marker.camera_T_marker))
+        if not isinstance(shot, Pair | Track) or not (isinstance(shot, Pair) or shot.looks):
+            self._rec.clear("world/shot/arc", "world/shot/sound")
+        if not isinstance(shot, Aim):
+            self._plane(textured)
+        match shot:
+            case Pair():
+                self._pair(moment, shot)
+            case Track():
+                self._track(moment, shot)
+            case _:
+                self._rec.clear("world/shot/pm", "world/shot/beam")
+        self._figures(moment)
+
+    def _registration(self, moment: Moment) -> None:
+        transform, covariance = moment.trus_T_camera, moment.covariance
+        self._rec.log("world/camera", shapes.transform(transform))
+        if transform is None or covariance is None or moment.verdict is Verdict.REFUSED:
+            self._rec.clear("world/targets")
+            return
+        targets = self._model.targets_mm
+        spread = scene.target_covariances(transform, covariance, targets)
+        centres = shapes.small_points(targets, shapes.TARGET, 1.2)
+        self._rec.log("world/targets", shapes.ellipsoids(targets, spread, shapes.TARGET), centres)
+
+    def _plane(self, textured: bool) -> None:
+        if textured:
+            self._plane_is_plain = False
+        elif not self._plane_is_plain:
+            corners = scene.plane_corners_mm(self._model.probe, self._depth_mm)
+            self._rec.log("world/stage/plane", shapes.plane_mesh(corners, None))
+            self._rec.log("world/stage/outline", shapes.plane_outline(corners))
+            self._plane_is_plain = True
+
+    def _pair(self, moment: Moment, pair: Pair) -> None:
+        strip = self._arc(pair.look, keep=True)
+        used = moment.used
+        spot = self._beam(moment, pair, nearest_on(strip), keep=used)
+        if spot is None:
+            self._rec.clear("world/shot/pm")
+            return
+        color = shapes.PM if used else shapes.UNUSED
+        self._rec.log("world/looks/pm", shapes.small_points(spot[None], color, 3.5))
+        self._rec.log(
+            "world/shot/pm", shapes.point(spot, color, 5.0, f"PM {pair.pm}" + ("" if used else " (not used)"))
+        )
+
+    def _track(self, moment: Moment, query: Track) -> None:
+        answer = moment.answer
+        if query.looks:
+            self._arc(query.looks[-1], keep=False)
+        lambda_mm = None if answer is None else answer.lambda_mm
+        spot = self._beam(moment, query, lambda _origin, _direction: lambda_mm, keep=False)
+        if spot is None:
+            self._rec.clear("world/shot/pm")
+        else:
+            self._rec.log("world/shot/pm", shapes.point(spot, shapes.PM, 5.0, "predicted spot"))
+        if answer is not None and answer.stage_rad is not None:
+            label = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°"
+            self._stage(self._model.stage.scan_from_device(answer.stage_rad), label)
+
+    def _arc(self, look: Look, *, keep: bool) -> FloatArray:
+        strip = scene.arc_strip_mm(look, self._model.probe)
+        if keep:
+            self._rec.log("world/looks/arc", shapes.strips([strip], shapes.SOUND, 1.0))
+        self._rec.log("world/shot/arc", shapes.strips([strip], shapes.SOUND, 3.0))
+        device_deg = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
+        self._stage(look.scan_rad, f"image plane, stage {device_deg:.1f}°")
+        return strip
+
+    def _stage(self, scan_rad: float, label: str) -> None:
+        self._rec.log("world/stage", shapes.transform(scene.trus_T_plane(scan_rad)))
+        corner = scene.plane_corners_mm(self._model.probe, self._depth_mm)[2]
+        self._rec.log("world/stage/label", shapes.point(corner, shapes.SOUND, 1.0, label))
+
+    def _beam(self, moment: Moment, shot: Pair | Track, reach: Reach, *, keep: bool) -> FloatArray | None:
+        """The shot's beam to its end, which it returns: ``reach`` gives its length in TRUS."""
+        transform, laser = moment.trus_T_camera, moment.marker_T_laser
+        if transform is None or laser is None:
+            self._rec.clear("world/shot/beam")
+            return None
+        trus_T_laser = transform @ shot.marker.camera_T_marker @ laser
+        lambda_mm = reach(trus_T_laser[:3, 3], trus_T_laser[:3, 2])
+        if lambda_mm is None:
+            self._rec.clear("world/shot/beam")
+            return None
+        origin, tip = scene.laser_origin_and_tip(trus_T_laser, lambda_mm)
+        if keep:
+            self._rec.log("world/looks/beam", shapes.arrow(origin, tip, shapes.BEAM, 0.7))
+        self._rec.log("world/shot/beam", shapes.arrow(origin, tip, shapes.BEAM, 2.5, "laser beam"))
+        return tip
+
+    def _figures(self, moment: Moment) -> None:
+        import rerun as rr
+
+        rec = self._rec
+        if moment.tre is not None and math.isfinite(moment.tre.worst_mm):
+            rec.log("online/predicted_worst_mm/worst", rr.Scalars(min(moment.tre.worst_mm, LARGEST_PLOTTED_MM)))
+        rec.log("online/pairs/used", rr.Scalars(float(moment.pairs)))
+        if moment.nis is not None and math.isfinite(moment.nis):
+            rec.log("online/nis/pair", rr.Scalars(moment.nis))
+        level = {Verdict.OK: "INFO", Verdict.WARNING: "WARN", Verdict.REFUSED: "ERROR"}[moment.verdict]
+        rec.log("log", rr.TextLog(f"{moment.note} [{moment.verdict.value}]", level=level))
+        rec.log("summary", rr.TextDocument(moment_markdown(moment), media_type="text/markdown"))
+
+    def to_end(self) -> None:
+        """What is logged next belongs to the last moment."""
+        self._rec.at(*self._last)
+
+
+def moment_markdown(moment: Moment) -> str:
+    """The summary page of a moment: what was known then."""
+    tre = moment.tre
+    worst = "not known" if tre is None else f"{tre.worst_mm:.2f} mm"
+    state = "No registration yet" if moment.trus_T_camera is None else f"At {moment.t:.1f} s: {moment.verdict.value}"
+    lines = [f"# {state}", "", f"After {moment.note}.", "", f"Pairs used in this camera epoch: {moment.pairs}.", ""]
+    lines += [f"Predicted 95 % error at the worst target: {worst}.", ""]
+    return "\n".join([*lines, *(f"- {reason}" for reason in moment.reasons)])
+
+
+def nearest_on(strip_mm: FloatArray) -> Reach:
+    """How far along a beam (origin (3,), unit direction (3,)) it comes nearest to a curve (n, 3), mm."""
+
+    def reach(origin: FloatArray, direction: FloatArray) -> float | None:
+        along = (strip_mm - origin) @ direction
+        apart = np.linalg.norm(strip_mm - origin - along[:, None] * direction, axis=1)
+        return float(along[np.argmin(apart)])
+
+    return reach

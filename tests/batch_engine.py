@@ -1,0 +1,104 @@
+"""An engine that registers anew after every event: what recording and replay are tested with, slow and simple."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fgreg.batch import Solution, solve
+from fgreg.config import SolveConfig
+from fgreg.errors import EstimationError, EventRefused
+from fgreg.estimate import TrackEstimate, Verdict
+from fgreg.frames import FloatArray
+from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
+from fgreg.models import SessionModel
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.events import CameraMoved, OnlineEvent
+from fgreg.registration import register
+
+
+class BatchEngine:
+    """Attributes:
+    refuse_t: times of events that it refuses once. notice: at the pair of this time the camera had moved at that of
+    the value.
+    """
+
+    def __init__(self, model: SessionModel, config: SolveConfig) -> None:
+        self.model, self.config = model, config
+        self.all = Measurements((), (), (EpochStart(0.0),))
+        self.refuse_t: set[float] = set()
+        self.notice: dict[float, float] = {}
+
+    def add(self, event: OnlineEvent) -> OnlineEstimate:
+        if event.t in self.refuse_t:
+            self.refuse_t.remove(event.t)
+            raise EventRefused("an indeterminate system")
+        before = self.all
+        match event:
+            case Aim():
+                self.all = replace(before, aims=(*before.aims, event))
+            case Pair():
+                if event.epoch != len(before.epochs) - 1:
+                    raise AssertionError("a pair in another epoch than the present one")
+                self.all = replace(before, pairs=(*before.pairs, event))
+                if event.t in self.notice:
+                    self._move(CameraMoved(event.t, detected=True, since_t=self.notice[event.t]))
+            case CameraMoved():
+                self._move(event)
+            case _:
+                raise AssertionError("not an event of a session")
+        return self._estimate(event)
+
+    def _move(self, moved: CameraMoved) -> None:
+        since, epoch = moved.t if moved.since_t is None else moved.since_t, len(self.all.epochs)
+        pairs = tuple(replace(p, epoch=epoch) if moved.detected and p.t >= since else p for p in self.all.pairs)
+        start = EpochStart(since, moved.camera_new_T_camera_old, moved.covariance)
+        self.all = replace(self.all, pairs=pairs, epochs=(*self.all.epochs, start))
+
+    def _estimate(self, event: OnlineEvent) -> OnlineEstimate:
+        epoch = len(self.all.epochs) - 1
+        count = sum(pair.epoch == epoch for pair in self.all.pairs)
+        transform = covariance = None
+        if count >= 5:
+            try:
+                found = register(self.all, self.model, self.config)
+                if epoch in found.epochs:
+                    place = found.epochs.index(epoch)
+                    transform = found.optimum.state.trus_T_camera(place)[0]
+                    covariance = found.covariance[6 * place : 6 * place + 6, 6 * place : 6 * place + 6]
+            except EstimationError:
+                pass
+        verdict = Verdict.REFUSED if transform is None else Verdict.WARNING
+        used = isinstance(event, Pair)
+        return OnlineEstimate(
+            event.t, epoch, transform, covariance, None, None, used, verdict, (), count, transform, False
+        )
+
+    def track(self, query: Track) -> TrackEstimate:
+        return replace(solve(self.all, (query,), self.model, self.config).tracks[0], causal=True)
+
+    def settle(self) -> OnlineEstimate:
+        epoch = self.solution().epochs[-1]
+        return OnlineEstimate(
+            self.all.pairs[-1].t if self.all.pairs else 0.0,
+            epoch.index,
+            epoch.trus_T_camera,
+            epoch.covariance,
+            epoch.predicted_tre,
+            None,
+            True,
+            epoch.verdict,
+            (),
+            epoch.pairs,
+            None,
+            True,
+        )
+
+    def marker_T_laser(self) -> FloatArray | None:
+        laser = self.solution().laser
+        return None if laser is None else laser.marker_T_laser
+
+    def solution(self) -> Solution:
+        return solve(self.all, (), self.model, self.config)
+
+    def measurements(self) -> Measurements:
+        return self.all
