@@ -57,30 +57,41 @@ class Beam:
     _direction: tuple[float, float, float]
     _marker: tuple[float, float, float]
     _chart: list[list[float]]
-    _counter_turn: list[list[float]]
+    _tangent: FloatArray | None
 
     def moves(self, lambda_mm: float) -> FloatArray:
         """How the beam's point at ``lambda_mm`` moves, in *camera* axes: (3, SHARED + MARKER), mm per unit."""
         o, d, m = self._origin, self._direction, self._marker
         f0, f1, f2 = o[0] + lambda_mm * d[0], o[1] + lambda_mm * d[1], o[2] + lambda_mm * d[2]
         c0, c1, c2 = f0 + m[0], f1 + m[1], f2 + m[2]
-        g0, g1, g2 = self._counter_turn
         n0, n1, n2 = self._chart
         k = lambda_mm
-        return np.array(
+        out = np.array(
             [
-                [0.0, c2, -c1, *g0, n0[0], n0[1], k * n0[2], k * n0[3], 0, -1.0, 0, 0, 0, 0, 0, f2, -f1, 1.0, 0, 0],
-                [-c2, 0.0, c0, *g1, n1[0], n1[1], k * n1[2], k * n1[3], 0, 0, -1.0, 0, 0, 0, -f2, 0, f0, 0, 1.0, 0],
-                [c1, -c0, 0.0, *g2, n2[0], n2[1], k * n2[2], k * n2[3], 0, 0, 0, -1.0, 0, 0, f1, -f0, 0, 0, 0, 1.0],
+                [0.0, c2, -c1, 1.0, 0, 0, n0[0], n0[1], k * n0[2], k * n0[3], 0, -1.0, 0, 0, 0, 0, 0, f2, -f1, 1.0, 0, 0],
+                [-c2, 0.0, c0, 0, 1.0, 0, n1[0], n1[1], k * n1[2], k * n1[3], 0, 0, -1.0, 0, 0, 0, -f2, 0, f0, 0, 1.0, 0],
+                [c1, -c0, 0.0, 0, 0, 1.0, n2[0], n2[1], k * n2[2], k * n2[3], 0, 0, 0, -1.0, 0, 0, f1, -f0, 0, 0, 0, 1.0],
             ]
         )
+        if self._tangent is not None:
+            out[:, :6] = out[:, :6] @ self._tangent
+        return out
 
-    def turns(self) -> FloatArray:
-        """How its direction moves, likewise: (3, SHARED + MARKER), per unit."""
-        return self.moves(1.0) - self.moves(0.0)
 
-
-_IDENTITY = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+def _tangent_gain(w: list[float], v: list[float]) -> FloatArray:
+    """(6, 6) right Jacobian of SE(3) at a tangent (w, v), to first order: ``I - ad / 2``."""
+    x, y, z = 0.5 * w[0], 0.5 * w[1], 0.5 * w[2]
+    p, q, r = 0.5 * v[0], 0.5 * v[1], 0.5 * v[2]
+    return np.array(
+        [
+            [1.0, z, -y, 0.0, 0.0, 0.0],
+            [-z, 1.0, x, 0.0, 0.0, 0.0],
+            [y, -x, 1.0, 0.0, 0.0, 0.0],
+            [0.0, r, -q, 1.0, z, -y],
+            [-r, 0.0, p, -z, 1.0, x],
+            [q, -p, 0.0, y, -x, 1.0],
+        ]
+    )
 
 
 def place_beam(at: Prepared, marker: BeamMarker, shared: list[float], error: list[float]) -> Beam:
@@ -112,13 +123,21 @@ def place_beam(at: Prepared, marker: BeamMarker, shared: list[float], error: lis
     )
     omega = turn((shared[0], shared[1], shared[2]))
     rotation = at.rotation if omega is None else at.rotation @ omega
-    counter = _IDENTITY if omega is None else omega.T.tolist()
     (a0, s0), (a1, s1), (a2, s2) = (
         rotation @ np.array([[d, o + m] for d, o, m in zip(direction, origin, position, strict=True)])
     ).tolist()
     t0, t1, t2 = at.translation
-    if omega is not None:
-        v0, v1, v2 = (at.rotation @ shared[3:6]).tolist()
+    if omega is not None:  # GTSAM's tangent: the translation moves by V(w) v, here to second order in w
+        x, y, z = shared[:3]
+        p, q, r = shared[3:6]
+        a, b, c = 0.5 * (y * r - z * q), 0.5 * (z * p - x * r), 0.5 * (x * q - y * p)
+        k = 1.0 / 3.0
+        moved = (
+            p + a + k * (y * c - z * b),
+            q + b + k * (z * a - x * c),
+            r + c + k * (x * b - y * a),
+        )
+        v0, v1, v2 = (at.rotation @ moved).tolist()
         t0, t1, t2 = t0 + v0, t1 + v1, t2 + v2
     return Beam(
         start=(s0 + t0, s1 + t1, s2 + t2),
@@ -128,7 +147,7 @@ def place_beam(at: Prepared, marker: BeamMarker, shared: list[float], error: lis
         _direction=direction,
         _marker=position,
         _chart=[c0[2:], c1[2:], c2[2:]],
-        _counter_turn=counter,
+        _tangent=None if omega is None else _tangent_gain(shared[:3], shared[3:6]),
     )
 
 
