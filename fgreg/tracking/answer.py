@@ -17,12 +17,12 @@ import numpy as np
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.measurements import Track
 from fgreg.surface import GRAZING
-from fgreg.tracking.beam import joint_covariance, place_beam, read_marker
+from fgreg.tracking.beam import MARKER, joint_covariance, place_beam, read_marker
 from fgreg.tracking.looks import Placed, place_pm
 from fgreg.tracking.prepared import Prepared, prepare
-from fgreg.tracking.snapshot import SHARED, Snapshot
+from fgreg.tracking.snapshot import Snapshot
 
-_NOTHING = [0.0] * SHARED
+_NOTHING = [0.0] * MARKER
 
 
 def fast_track(query: Track, snapshot: Snapshot) -> TrackEstimate:
@@ -57,7 +57,7 @@ def _from_surface(query: Track, snapshot: Snapshot, at: Prepared) -> Placed | st
     if snapshot.surface is None:
         return "no PM is heard and the session's PMs trace no surface yet (at least 5, not in a row)"
     marker = read_marker(query.marker, floor=False)
-    beam = place_beam(at, marker, _NOTHING, _NOTHING)
+    beam = place_beam(at.place, marker, _NOTHING)
     along = np.array(beam.along)
     met = snapshot.surface.meet(np.array(beam.start), along)
     if met is None:

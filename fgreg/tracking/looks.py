@@ -20,7 +20,7 @@ from fgreg.graph.packing import LINE_SIGMA_MM
 from fgreg.measurements import FLOOR_MM, Look, MarkerObservation, Track
 from fgreg.sensitivity import amplitude_table, log_interval
 from fgreg.tracking.beam import MARKER, Beam, BeamMarker, joint_covariance, place_beam, read_marker
-from fgreg.tracking.prepared import Prepared
+from fgreg.tracking.prepared import Prepared, SharedPlace
 from fgreg.tracking.sites import AmplitudeShape, Sites, gaussian_sites, settle_sites
 from fgreg.tracking.snapshot import EDGE, RADIUS, SHARED, SPEED, Snapshot
 from fgreg.tracking.windows import LookWindow, interpolated, look_window
@@ -53,7 +53,7 @@ def place_pm(query: Track, snapshot: Snapshot, at: Prepared) -> Placed | str:
         )
         for look in looks
     ]
-    shape = _amplitude_shape(looks, windows, snapshot) if snapshot.window_shape else None
+    shape = _amplitude_shape(looks, windows, at, snapshot) if snapshot.window_shape else None
     found = _update(looks, beams, windows, shape, at, shaped=snapshot.window_shape)
     if found is None and snapshot.window_shape:  # sites that do not settle: the windows as Gaussians
         found = _update(looks, beams, windows, None, at, shaped=False)
@@ -67,10 +67,12 @@ def _distinct(query: Track) -> list[MarkerObservation]:
     return list({marker.id: marker for marker in reversed(query.look_markers)}.values())[::-1]
 
 
-def _amplitude_shape(looks: tuple[Look, ...], windows: list[LookWindow], snapshot: Snapshot) -> AmplitudeShape | None:
-    if snapshot.sensitivity.curve_rotation_rad is None or sum(1 for look in looks if look.amplitude) < 2:
+def _amplitude_shape(
+    looks: tuple[Look, ...], windows: list[LookWindow], at: Prepared, snapshot: Snapshot
+) -> AmplitudeShape | None:
+    if at.curve is None or sum(1 for look in looks if look.amplitude) < 2:
         return None
-    table = amplitude_table(looks, snapshot.sensitivity, snapshot.amplitude_sigma)
+    table = amplitude_table(looks, snapshot.sensitivity, snapshot.amplitude_sigma, at.curve)
     # Best a look that knows only the window: its interval does not hang on the window's edge.
     index = next((i for i, look in enumerate(looks) if look.sweep == 0), 0)
     window = windows[index]
@@ -104,16 +106,17 @@ def _update(
     point: list[float] | None = None
     for _ in range(ROUNDS):
         values = x.tolist()
+        place = at.place if point is None else at.moved(values)
         placed = [
-            place_beam(at, marker, values, values[SHARED + MARKER * k : SHARED + MARKER * (k + 1)])
+            place_beam(place, marker, values[SHARED + MARKER * k : SHARED + MARKER * (k + 1)])
             for k, marker in enumerate(markers)
         ]
         if point is None:
-            point = _start(placed[0], looks[0], windows[0], at)
+            point = _start(placed[0], looks[0], windows[0], place)
         for k, beam in enumerate(placed):
             _line_rows(beam, k, point, residual, by_point, by_state)
         for i, look in enumerate(looks):
-            _look_rows(look, windows[i], sites.centre[i], at, values, point, lines + 2 * i, first_rotation + i,
+            _look_rows(look, windows[i], sites.centre[i], place, point, lines + 2 * i, first_rotation + i,
                        residual, by_point, by_state)  # fmt: skip
         right[:, 3] = residual - by_state @ x
         gain = by_state @ prior
@@ -212,7 +215,7 @@ def _noise(looks: tuple[Look, ...], lines: int, rows: int) -> FloatArray:
     return noise
 
 
-def _start(beam: Beam, look: Look, window: LookWindow, at: Prepared) -> list[float]:
+def _start(beam: Beam, look: Look, window: LookWindow, at: SharedPlace) -> list[float]:
     """Where the beam is at the look's range from its element: of two such places, the likelier one."""
     (sx, sy, sz), (ax, ay, az) = beam.start, beam.along
     sine, cosine = math.sin(look.scan_rad), math.cos(look.scan_rad)
@@ -264,8 +267,7 @@ def _look_rows(
     look: Look,
     window: LookWindow,
     centre: float,
-    at: Prepared,
-    values: list[float],
+    at: SharedPlace,
     point: list[float],
     row: int,
     rotation_row: int,
@@ -274,7 +276,7 @@ def _look_rows(
     by_state: FloatArray,
 ) -> None:
     """Lateral position and range (rows ``row``, ``row + 1``) and rotation; see fgreg.graph.reduced_blocks.look_block."""
-    radius, ratio = at.radius + values[RADIUS], at.speed + values[SPEED]
+    radius, ratio = at.radius, at.speed
     sine, cosine = math.sin(look.scan_rad), math.cos(look.scan_rad)
     dy, dz = point[1] - radius * sine, point[2] - radius * cosine
     distance = max(math.hypot(dy, dz), 1e-9)
@@ -287,7 +289,7 @@ def _look_rows(
     rotation = math.atan2(heard * sin_delta, radius + heard * cos_delta)
     residual[row] = point[0] - look.x_mm
     residual[row + 1] = distance - heard
-    residual[rotation_row] = rotation - centre - window.gain * (at.edge + values[EDGE])
+    residual[rotation_row] = rotation - centre - window.gain * at.edge
     by_point[row, 0] = 1.0
     by_point[row + 1, 1], by_point[row + 1, 2] = sin_theta, cos_theta
     by_point[rotation_row, 1] = per_delta * cos_theta / distance
