@@ -29,6 +29,9 @@ def fast_track(query: Track, snapshot: Snapshot) -> TrackEstimate:
     """Answer one query; ``stage_rad`` None with a reason where it cannot be answered."""
     epoch = snapshot.epoch(query.epoch)
     if epoch is None:
+        if query.epoch < snapshot.oldest:
+            text = f"camera epoch {query.epoch} is over: queries are answered from epoch {snapshot.oldest} on"
+            return _refused(query, snapshot, text)
         return _refused(query, snapshot, f"camera epoch {query.epoch} has no registration")
     if epoch.verdict is Verdict.REFUSED:
         why = f": {epoch.reason}" if epoch.reason else ""
@@ -68,6 +71,12 @@ def _from_surface(query: Track, snapshot: Snapshot, at: Prepared) -> Placed | st
     towards = max(float(along @ met.normal), 0.5 * GRAZING)
     slide = float(by_point @ along) / towards
     by_end = (by_point - slide * met.normal) @ beam.rotation
-    response = by_end @ beam.moves(met.distance_mm)
-    variance = float(response @ joint_covariance(at, [marker]) @ response) + (slide * met.sigma_mm) ** 2
+    moves = beam.moves(met.distance_mm)
+    turns = moves - beam.moves(met.distance_mm - 1.0)
+    # How the angle, the way along the beam and (by how far the beam turns) the angle per way respond to the variables.
+    response = np.stack([by_end @ moves, (met.normal / -towards) @ beam.rotation @ moves, by_end @ turns])
+    spread = response @ joint_covariance(at, [marker]) @ response.T
+    way = float(spread[1, 1]) + (met.sigma_mm / towards) ** 2
+    # The product of the last two is what is left of second order: its variance, for Gaussians.
+    variance = float(spread[0, 0] + way * spread[2, 2] + 2.0 * spread[1, 2] ** 2) + (slide * met.sigma_mm) ** 2
     return Placed(math.atan2(y, z), math.sqrt(variance), met.distance_mm)

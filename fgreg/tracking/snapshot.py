@@ -56,6 +56,7 @@ class Snapshot:
         edge_variance: of the window's edge given all other shared variables, rad^2.
         sensitivity, stage: of the session. amplitude_sigma, window_shape: of its configuration.
         surface: where the PMs trace one.
+        oldest: epochs of lower numbers are not kept any more.
     """
 
     t: float
@@ -75,6 +76,7 @@ class Snapshot:
     amplitude_sigma: float
     window_shape: bool
     surface: SurfaceMap | None
+    oldest: int = 0
     prepared: dict[int, Prepared] = field(default_factory=dict, repr=False)
     """What queries of an epoch have in common, kept from the first one."""
 

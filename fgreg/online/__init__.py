@@ -1,0 +1,1 @@
+"""Registration while the session goes on, and answers to tracking queries meanwhile."""
