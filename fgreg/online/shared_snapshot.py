@@ -14,6 +14,7 @@ they can still tell the last estimate and its age.
 from __future__ import annotations
 
 import _posixshmem
+import copy
 import mmap
 import os
 import secrets
@@ -170,8 +171,18 @@ class SnapshotReader:
         self._header = cells[:header]
         self._slots = cells[header : header + SLOTS * words].reshape(SLOTS, words)
         self._payload = self._type.itemsize // _WORD
+        self._forget()
+
+    def _forget(self) -> None:
         self._decoder = SnapshotDecoder()
-        self._version, self._published, self._snapshot = 0, 0, None  # type: tuple[int, int, Snapshot | None]
+        self._version, self._published = 0, 0
+        self._snapshot: Snapshot | None = None
+
+    def clone(self) -> SnapshotReader:
+        """Another reader of the same memory, for another thread; possible also when its name is gone."""
+        other = copy.copy(self)
+        other._forget()
+        return other
 
     def snapshot(self) -> Snapshot:
         """The latest snapshot; the same object until there is a newer one.
@@ -216,5 +227,4 @@ class SnapshotReader:
 
     def close(self) -> None:
         """Let go of the memory; snapshots read before stay valid."""
-        del self._header, self._slots
-        self._memory.close()
+        del self._header, self._slots, self._memory  # unmapped with the last reader of it
