@@ -67,7 +67,9 @@ def test_a_newer_snapshot_is_answered_from_at_once(running: _Running) -> None:
     query = running.queries[0]
     with running.server.client() as client:
         for reason in ("first", "second"):
-            epoch = replace(running.snapshot.epochs[0], verdict=running.snapshot.epochs[0].verdict.REFUSED, reason=reason)
+            epoch = replace(
+                running.snapshot.epochs[0], verdict=running.snapshot.epochs[0].verdict.REFUSED, reason=reason
+            )
             running.shared.publish(replace(running.snapshot, epochs=(epoch,), prepared={}))
             assert client.track(query).reason.endswith(f"is refused: {reason}")
         running.shared.publish(running.snapshot)
@@ -140,13 +142,11 @@ def test_the_process_ends_with_the_one_that_started_it() -> None:
         " s = SharedSnapshot(Layout.of(make_session())); q = QueryServer(s.name)\n"
         " print(q.pid, q.address.path, flush=True); time.sleep(60)\n"
     )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    assert process.stdout is not None
-    pid, path = process.stdout.readline().split()
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        pid, path = process.stdout.readline().split()
+        process.send_signal(signal.SIGKILL)
     end = time.monotonic() + 10.0
     while time.monotonic() < end and Path(path).parent.exists():
         time.sleep(0.05)

@@ -11,11 +11,11 @@ import pytest
 
 import fgreg.graph.sites
 from fgreg.config import SolveConfig
-from fgreg.estimate import TrackEstimate, Verdict
+from fgreg.estimate import TrackEstimate
 from fgreg.measurements import Track
 from fgreg.sensitivity import interval_moments, sensitivity_priors, window_shapes
 from fgreg.tracking import Snapshot, TrackContext, fast_track
-from fgreg.tracking.windows import interval_derivatives, interpolated, look_window
+from fgreg.tracking.windows import interpolated, interval_derivatives, look_window
 from tests import tracking_reference
 from tests.forward import make_measurements, make_session
 from tests.track_cases import held_out, query_of, solved_context
@@ -186,5 +186,3 @@ def test_interval_derivatives_far_out_stay_finite(sign: float) -> None:
     # Nearly all of what is left sits at the nearer end: the mean is pulled there.
     assert slope == pytest.approx(sign * 500.0, rel=1e-4)
     assert 0.0 <= curvature <= 1.0 + 1e-6
-
-

@@ -41,8 +41,8 @@ def test_rays_end_where_the_surface_is(count: int) -> None:
     for trus_p, trus_d in _rays(count, 60):
         slow, fast = tracking_reference.meet(surface, trus_p, trus_d), table.meet(trus_p, trus_d)
         if slow is None or fast is None:
-            missed += slow is fast
-            torn += slow is not fast
+            missed += slow is None and fast is None
+            torn += (slow is None) != (fast is None)
             continue
         met += 1
         assert fast.distance_mm == pytest.approx(slow.distance_mm, abs=0.01 + 0.01 * slow.sigma_mm)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,8 @@ __all__ = [
     "make_surface_map",
 ]
 
+Record = np.ndarray[Any, np.dtype[Any]]
+"""A structured array of shape ()."""
 EPOCHS_KEPT = 8
 """The newest epochs (and refusals) that a record holds: queries concern where the camera is now."""
 REASON_BYTES = 240
@@ -113,7 +116,7 @@ _SCALARS = ("t", "pairs", "origin_shift_mm", "edge_rad", "sound_speed_ratio", "r
 _ARRAYS = ("marker_T_nominal", "beam", "bias_mm")
 
 
-def encode_snapshot(snapshot: Snapshot, record: np.ndarray[tuple[()], np.dtype[np.void]]) -> None:
+def encode_snapshot(snapshot: Snapshot, record: Record) -> None:
     """Write a snapshot into a record ``()`` of its layout's type; of more epochs than it holds, the newest.
 
     Raises:
@@ -144,16 +147,16 @@ def encode_snapshot(snapshot: Snapshot, record: np.ndarray[tuple[()], np.dtype[n
         record["place"][: len(surface.place)] = surface.place
 
 
-def _encode_session(snapshot: Snapshot, record: np.void) -> None:
+def _encode_session(snapshot: Snapshot, record: Record) -> None:
     sensitivity, stage = snapshot.sensitivity, snapshot.stage
-    curve = 0 if sensitivity.curve_rotation_rad is None else sensitivity.curve_rotation_rad.size
+    rotation, amplitude = sensitivity.curve_rotation_rad, sensitivity.curve_amplitude
+    curve = 0 if rotation is None else rotation.size
     if record["depth_mm"].size != sensitivity.depth_mm.size or record["curve_rotation_rad"].size != curve:
         raise ValueError("the snapshot is of a session with another sensitivity table")
     record["depth_mm"], record["half_width_rad"] = sensitivity.depth_mm, sensitivity.half_width_rad
     record["edge_sigma_rad"] = sensitivity.edge_sigma_rad
-    if curve:
-        record["curve_rotation_rad"] = sensitivity.curve_rotation_rad
-        record["curve_amplitude"] = sensitivity.curve_amplitude
+    if rotation is not None and amplitude is not None:
+        record["curve_rotation_rad"], record["curve_amplitude"] = rotation, amplitude
     record["step_rad"], record["limits_device_rad"] = stage.step_rad, stage.limits_device_rad
     record["direction"], record["zero_device_rad"] = stage.direction, stage.zero_device_rad
     record["amplitude_sigma"], record["window_shape"] = snapshot.amplitude_sigma, snapshot.window_shape
@@ -166,7 +169,7 @@ class SnapshotDecoder:
         self._session_bytes = b""
         self._session: tuple[SensitivityModel, StageModel] | None = None
 
-    def decode(self, record: np.ndarray[tuple[()], np.dtype[np.void]]) -> Snapshot:
+    def decode(self, record: Record) -> Snapshot:
         """The snapshot in a record ``()``. Its arrays are views of the record, which must not change any more."""
         session = record["session"]
         sensitivity, stage = self._models(session)
@@ -208,7 +211,7 @@ class SnapshotDecoder:
             surface=surface,
         )
 
-    def _models(self, record: np.ndarray[tuple[()], np.dtype[np.void]]) -> tuple[SensitivityModel, StageModel]:
+    def _models(self, record: Record) -> tuple[SensitivityModel, StageModel]:
         same = record.tobytes()
         if self._session is None or same != self._session_bytes:
             has_curve = record["curve_rotation_rad"].size > 0

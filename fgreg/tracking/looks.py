@@ -151,9 +151,7 @@ def _update(
     return None
 
 
-def _solve(
-    total: FloatArray, right: FloatArray, by_point: FloatArray
-) -> tuple[FloatArray | None, FloatArray | None]:
+def _solve(total: FloatArray, right: FloatArray, by_point: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     """S^-1 times ``right`` (rows, n), and the PM's response (3, n - 3) to its columns from 3 on."""
     _, weighted, failed = dposv(total, right)
     if failed:

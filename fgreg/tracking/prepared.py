@@ -68,7 +68,12 @@ class Prepared:
             rotation=rotation,
             translation=translation,
             chart=_chart(
-                self.nominal, self.nominal_origin, x + shared[BEAM], y + shared[BEAM + 1], a + shared[BEAM + 2], b + shared[BEAM + 3]
+                self.nominal,
+                self.nominal_origin,
+                x + shared[BEAM],
+                y + shared[BEAM + 1],
+                a + shared[BEAM + 2],
+                b + shared[BEAM + 3],
             ),
             bias=(b0 + shared[BIAS], b1 + shared[BIAS + 1], b2 + shared[BIAS + 2]),
             edge=place.edge + shared[EDGE],
@@ -123,7 +128,7 @@ def _chart(nominal: FloatArray, origin: FloatArray, x: float, y: float, a: float
         ]
     )
     chart[:, 0] += origin
-    return chart
+    return np.asarray(chart)
 
 
 def _expmap_shift(w: list[float], v: list[float]) -> FloatArray:

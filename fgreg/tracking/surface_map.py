@@ -21,9 +21,12 @@ MARGIN_MM = 30.0
 ALONG = np.linspace(1.0, 200.0, 81)
 """Distances (mm) along a ray at which it is compared with the surface; cubic interpolation in between."""
 _SPACING = float(ALONG[1] - ALONG[0])
-_CUBIC = np.array(
-    [[0.0, 6.0, 0.0, 0.0], [-2.0, -3.0, 6.0, -1.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]], dtype=np.float64
-) / 6.0
+_CUBIC = (
+    np.array(
+        [[0.0, 6.0, 0.0, 0.0], [-2.0, -3.0, 6.0, -1.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]], dtype=np.float64
+    )
+    / 6.0
+)
 """Row k: what t^k adds to the weights of the nodes -1, 0, 1, 2 for a place t in [0, 1) (Lagrange)."""
 _STENCIL = (np.arange(4)[:, None] * NODES + np.arange(4)).ravel()
 
