@@ -30,7 +30,7 @@ from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, SoundSpeedPrior, register
 from fgreg.surface import fit_surface
-from fgreg.tracking import TrackContext, track
+from fgreg.tracking import Snapshot, TrackContext, fast_track
 from fgreg.verdict import (
     SURE_OF_AIMS,
     SURE_OF_PAIRS,
@@ -120,13 +120,9 @@ def solve(
     ]
     epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
     context = track_context(centred, posterior, model, config, readout.origin_shift_mm)
-    refused = {epoch.index for epoch in epochs if epoch.verdict is Verdict.REFUSED}
-    tracked = tuple(
-        TrackEstimate(query.t, None, None, None, False, f"the registration of camera epoch {query.epoch} is refused")
-        if query.epoch in refused
-        else track(query, context)
-        for query in tracks
-    )
+    refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
+    snapshot = Snapshot.from_context(context, refused=refused) if tracks else None
+    tracked = tuple(fast_track(query, snapshot) for query in tracks) if snapshot is not None else ()
     # The last epoch is where the camera stands; an earlier one that failed is told, and no more than a warning.
     verdict = max(epochs[-1].verdict, verdict_of(common), key=lambda v: v.severity)
     if verdict is Verdict.OK and any(epoch.verdict is not Verdict.OK for epoch in epochs):

@@ -218,25 +218,48 @@ class AmplitudeTable:
     used: bool
 
 
-def amplitude_table(looks: Sequence[Look], sensitivity: SensitivityModel, amplitude_sigma: float) -> AmplitudeTable:
+@dataclass(frozen=True, slots=True, eq=False)
+class AmplitudeCurve:
+    """Log amplitude (m,) against stage rotation (m,), and its slope (m,) per rad."""
+
+    rotation_rad: FloatArray
+    log_amplitude: FloatArray
+    slope: FloatArray
+
+
+def amplitude_curve(sensitivity: SensitivityModel) -> AmplitudeCurve | None:
+    """The logarithm of a session's amplitude curve, where it has one."""
+    rotations, curve = sensitivity.curve_rotation_rad, sensitivity.curve_amplitude
+    if rotations is None or curve is None:
+        return None
+    log = np.asarray(np.log(np.maximum(curve, 1e-3 * float(np.max(curve)))))
+    return AmplitudeCurve(rotations, log, np.asarray(np.gradient(log, rotations)))
+
+
+def amplitude_table(
+    looks: Sequence[Look],
+    sensitivity: SensitivityModel,
+    amplitude_sigma: float,
+    curve: AmplitudeCurve | None = None,
+) -> AmplitudeTable:
     """What the amplitudes of the looks at one PM say about its plane angle, its unknown peak eliminated.
 
     ``log amplitude = log peak + log curve(rotation) + noise``: at a plane angle each look gives one estimate of the
     peak, and with a flat prior on its logarithm what counts is how far they scatter about their weighted mean. The
-    stage reading's noise adds by the curve's slope. Needs two looks with amplitudes and a curve.
+    stage reading's noise adds by the curve's slope. Needs two looks with amplitudes and a curve; ``curve``: the
+    sensitivity's, where it is at hand.
     """
     scan = np.array([look.scan_rad for look in looks])
     heard = [(look.scan_rad, look.scan_sigma_rad, look.amplitude) for look in looks if look.amplitude]
     reach = float(sensitivity.half_width_rad.max()) + TABLE_MARGIN_RAD
     plane = np.linspace(scan.min() - reach, scan.max() + reach, TABLE_SIZE)
-    rotations, curve = sensitivity.curve_rotation_rad, sensitivity.curve_amplitude
-    if len(heard) < 2 or rotations is None or curve is None:
+    curve = amplitude_curve(sensitivity) if curve is None else curve
+    if len(heard) < 2 or curve is None:
         return AmplitudeTable(plane, np.zeros(TABLE_SIZE), False)
     at, at_sigma, amplitude = np.array(heard, dtype=np.float64).T[:, :, None]
-    log_curve = np.log(np.maximum(curve, 1e-3 * float(np.max(curve))))
     rotation = plane - at
-    peak = np.log(amplitude) - np.interp(rotation, rotations, log_curve)
-    slope = np.interp(rotation, rotations, np.gradient(log_curve, rotations))
+    peak = np.log(amplitude) - np.interp(rotation, curve.rotation_rad, curve.log_amplitude)
+    slope = np.interp(rotation, curve.rotation_rad, curve.slope)
     weight = 1.0 / (amplitude_sigma**2 + (slope * at_sigma) ** 2)
     mean = np.sum(weight * peak, axis=0) / np.sum(weight, axis=0)
     log = -0.5 * np.sum(weight * (peak - mean) ** 2 - np.log(weight), axis=0) - 0.5 * np.log(np.sum(weight, axis=0))

@@ -30,16 +30,6 @@ LONGEST_MM = 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Meeting:
-    """A ray's end: distance along it (mm), point (3,) in TRUS, unit normal (3,), sigma of ``normal @ point``."""
-
-    distance_mm: float
-    trus_p: FloatArray
-    normal: FloatArray
-    sigma_mm: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class TissueSurface:
     """Heights over a plane in TRUS: ``axes`` (3, 3) columns u, v, height (away from the fibre); all mm.
 
@@ -71,39 +61,6 @@ class TissueSurface:
         variance = self.relief_mm**2 - np.sum(weights * near, axis=1)
         variance = np.maximum(variance, 0.0) + np.sum((left @ self.trend_covariance) * left, axis=1)
         return mean, self.inflation * np.sqrt(variance)
-
-    def meet(self, trus_p: FloatArray, trus_d: FloatArray) -> Meeting | None:
-        """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where that is not known.
-
-        It may miss the surface, graze it, or meet it farther than ``REACH_MM`` from all PMs.
-        """
-        along = np.linspace(1.0, 200.0, 400)
-        points = (trus_p + along[:, None] * trus_d - self.centre) @ self.axes
-        height, sigma = self.height(points[:, :2])
-        gap = points[:, 2] - height
-        crossing = np.flatnonzero((gap[:-1] < 0) & (gap[1:] >= 0))
-        begins, ends = np.flatnonzero(gap > -2.0 * sigma), np.flatnonzero(gap > 2.0 * sigma)
-        if crossing.size == 0 or ends.size == 0:
-            return None
-        i = int(crossing[0])
-        # From where it may have met the surface to where it must have: long where the ray grazes it or comes near it
-        # twice.
-        stretch = float(along[ends[0]] - along[begins[0]])
-        if ends[0] < i or stretch > LONGEST_MM:
-            return None
-        distance = float(along[i] - gap[i] * (along[i + 1] - along[i]) / (gap[i + 1] - gap[i]))
-        place = ((trus_p + distance * trus_d - self.centre) @ self.axes)[:2]
-        if np.linalg.norm(self.place - place, axis=1).min() > REACH_MM:
-            return None
-        around = place + np.array([[0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])
-        near, _ = self.height(around)
-        slope = np.array([near[0] - near[1], near[2] - near[3]]) / 0.2
-        normal = self.axes @ np.array([-slope[0], -slope[1], 1.0])
-        normal = normal / np.linalg.norm(normal)
-        towards = float(normal @ trus_d)
-        if towards < GRAZING:
-            return None
-        return Meeting(distance, trus_p + distance * trus_d, normal, stretch / 4.0 * towards)
 
 
 def _kernel(first: FloatArray, second: FloatArray, relief_mm: float) -> FloatArray:

@@ -23,11 +23,12 @@ from fgreg.frames import (
 from fgreg.measurements import Look, MarkerObservation, Track, default_marker_covariance
 from fgreg.models import SessionModel
 from fgreg.surface import fit_surface
+from fgreg.tracking import make_surface_map
 from tests.forward import Truth, hear, make_measurements
 
 
 @dataclass
-class _Case:
+class SurfaceCase:
     model: SessionModel
     truth: Truth
     solution: Solution
@@ -41,7 +42,7 @@ def _surface_point(x: float, bearing: float) -> FloatArray:
     return np.array([x, reach * math.sin(bearing), reach * math.cos(bearing)])
 
 
-def _case(seed: int, *, heard: bool, count: int = 4, noise: bool = True) -> _Case:
+def surface_case(seed: int, *, heard: bool, count: int = 4, noise: bool = True) -> SurfaceCase:
     """A session whose PMs lie on one surface, and queries at other places on it."""
     rng = np.random.default_rng(seed)
     model, measurements, truth = make_measurements(rng, pairs=25, noise=noise)
@@ -83,10 +84,10 @@ def _case(seed: int, *, heard: bool, count: int = 4, noise: bool = True) -> _Cas
         queries.append(Track(200.0 + i, 0, beam_to(trus_p), looks, 0.0))
         bearings.append(math.atan2(trus_p[1], trus_p[2]))
     solution = solve(replace(measurements, pairs=tuple(pairs)), queries, model, SolveConfig())
-    return _Case(model, truth, solution, queries, bearings)
+    return SurfaceCase(model, truth, solution, queries, bearings)
 
 
-def _scores(case: _Case) -> list[float]:
+def _scores(case: SurfaceCase) -> list[float]:
     out = []
     for track, bearing in zip(case.solution.tracks, case.bearings, strict=True):
         if track.stage_rad is not None:
@@ -97,23 +98,23 @@ def _scores(case: _Case) -> list[float]:
 
 @pytest.mark.parametrize("heard", [True, False])
 def test_answers_lie_within_their_sigmas(heard: bool) -> None:
-    scores = np.concatenate([_scores(_case(seed, heard=heard, count=6)) for seed in range(6)])
+    scores = np.concatenate([_scores(surface_case(seed, heard=heard, count=6)) for seed in range(6)])
     assert len(scores) > 24
     assert 0.4 < np.sqrt(np.mean(scores**2)) < 1.5
     assert np.abs(scores).max() < 4.5
 
 
 def test_without_a_pm_the_sigma_is_larger() -> None:
-    heard, silent = _case(1, heard=True), _case(1, heard=False)
+    heard, silent = surface_case(1, heard=True), surface_case(1, heard=False)
 
-    def mean_sigma(case: _Case) -> float:
+    def mean_sigma(case: SurfaceCase) -> float:
         return float(np.mean([t.sigma_rad for t in case.solution.tracks if t.sigma_rad is not None]))
 
     assert mean_sigma(silent) > mean_sigma(heard)
 
 
 def test_a_query_does_not_touch_the_estimate() -> None:
-    with_queries, without = _case(2, heard=True), _case(2, heard=True, count=0)
+    with_queries, without = surface_case(2, heard=True), surface_case(2, heard=True, count=0)
     first, second = with_queries.solution.epochs[0], without.solution.epochs[0]
     assert first.trus_T_camera is not None
     assert second.trus_T_camera is not None
@@ -121,7 +122,7 @@ def test_a_query_does_not_touch_the_estimate() -> None:
 
 
 def test_answers_are_device_angles() -> None:
-    case = _case(3, heard=True)
+    case = surface_case(3, heard=True)
     context = case.solution.context
     assert context is not None
     from fgreg.tracking import track
@@ -135,7 +136,7 @@ def test_answers_are_device_angles() -> None:
 
 
 def test_an_angle_beyond_the_stages_limits_is_not_given() -> None:
-    case = _case(3, heard=True)
+    case = surface_case(3, heard=True)
     context = case.solution.context
     assert context is not None
     from fgreg.tracking import track
@@ -155,7 +156,7 @@ def test_a_refused_registration_answers_nothing() -> None:
 
 
 def test_a_beam_that_misses_the_surface_is_not_answered() -> None:
-    case = _case(4, heard=False, count=1)
+    case = surface_case(4, heard=False, count=1)
     query = case.queries[0]
     away = query.marker.camera_T_marker.copy()
     away[:3, 3] += [80.0, 0.0, 0.0]
@@ -176,7 +177,7 @@ def test_a_plane_is_met_where_it_is() -> None:
     surface = fit_surface(points, covariance, np.tile([0.0, 0.0, 1.0], (12, 1)))
     assert surface is not None
     ray = np.array([0.1, 0.0, 1.0]) / math.hypot(0.1, 1.0)
-    met = surface.meet(np.array([1.0, 2.0, 0.0]), ray)
+    met = make_surface_map(surface).meet(np.array([1.0, 2.0, 0.0]), ray)
     assert met is not None
     # z = 40 + 0.2 x with x = 1 + 0.1 z: z = 40.2 / 0.98
     assert met.trus_p[2] == pytest.approx(40.2 / 0.98, abs=0.02)

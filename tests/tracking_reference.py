@@ -1,19 +1,16 @@
-"""Where to turn the stage for a beam: absolute angle with its sigma.
+"""Answers to tracking queries by the machinery of the session's own solve: slow, and what the fast ones are held to.
 
-With the PM heard now (the paper's Eq. 11): lambda and theta' given the registration. Here the registration and the
-beam enter with their covariance, the marker and the look with theirs, so the answer is the posterior of the PM's angle
-given the session and the query; the session's estimate itself is not touched. With nothing heard, lambda comes from
-the tissue surface that the PMs so far trace.
+A PM that is heard goes through the reduced problem as a session of one PM, the estimate as its prior; the end on the
+tissue surface is spread by sampling, on a fine grid of the Gaussian process itself.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
 from fgreg.estimate import TrackEstimate
 from fgreg.frames import FloatArray, exp_so3
 from fgreg.graph.packing import Anchor
@@ -21,37 +18,12 @@ from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.sites import propagate
 from fgreg.measurements import EpochStart, Measurements, Pair, Track
-from fgreg.models import SessionModel
-from fgreg.posterior import Posterior
 from fgreg.registration import pack_session
-from fgreg.surface import GRAZING, TissueSurface
+from fgreg.surface import GRAZING, LONGEST_MM, REACH_MM, TissueSurface
+from fgreg.tracking import TrackContext
 
-SAMPLES = 400
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackContext:
-    """What a query is answered from.
-
-    Attributes:
-        model: the session's set-up.
-        epochs: the session's numbers of the solved epochs, in the order of ``state``.
-        state: the estimate (one hypothesis). covariance: (D, D) of its shared variables. posterior: their samples.
-        surface: the tissue surface, where the PMs trace one.
-        origin_shift_mm: lambda of the laser frame's origin in the beam chart.
-        causal: whether only what was known at the query's time entered.
-        config: that of the session's solve.
-    """
-
-    model: SessionModel
-    epochs: tuple[int, ...]
-    state: SharedState
-    covariance: FloatArray
-    posterior: Posterior
-    surface: TissueSurface | None
-    origin_shift_mm: float
-    causal: bool = False
-    config: SolveConfig = field(default_factory=SolveConfig)
+SAMPLES = 40_000
+"""Of the Gaussian that a query takes the shared variables for."""
 
 
 def track(query: Track, context: TrackContext) -> TrackEstimate:
@@ -117,15 +89,15 @@ def _from_surface(query: Track, context: TrackContext) -> tuple[float, float, fl
         return "no PM is heard and the session's PMs trace no surface yet (at least 5, not in a row)"
     epoch = context.epochs.index(query.epoch)
     origin, direction = _beam_in_trus(query, context.state, epoch, np.zeros((1, 6)))
-    met = context.surface.meet(origin[0], direction[0])
+    met = meet(context.surface, origin[0], direction[0])
     if met is None:
         return "no PM is heard and the beam misses the part of the surface that the session's PMs trace"
     angle, _ = _angle(met.trus_p)
-    # Spread of the angle over the posterior, the marker's noise and the surface's height: nonlinear enough to sample.
     rng = np.random.default_rng(0)
-    pick = rng.choice(len(context.posterior.weight), SAMPLES, p=context.posterior.weight)
-    state = context.state.take(np.zeros(SAMPLES, dtype=np.int64))
-    state = state.retract(context.posterior.step[pick], context.posterior.columns)
+    columns = context.posterior.columns
+    root = np.linalg.cholesky(context.covariance)
+    step = rng.standard_normal((SAMPLES, columns.size)) @ root.T
+    state = context.state.take(np.zeros(SAMPLES, dtype=np.int64)).retract(step, columns)
     turn = np.kron(np.eye(2), query.marker.camera_T_marker[:3, :3])
     noise = rng.multivariate_normal(np.zeros(6), turn @ query.marker.covariance @ turn.T, SAMPLES)
     origin, direction = _beam_in_trus(query, state, epoch, noise)
@@ -145,3 +117,42 @@ def _beam_in_trus(query: Track, state: SharedState, epoch: int, error: FloatArra
     trus_R_camera = state.rotation[:, epoch]
     origin = np.einsum("sij,sj->si", trus_R_camera, camera_p) + state.translation_mm[:, epoch]
     return origin, np.einsum("sij,sj->si", trus_R_camera, camera_d)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Met:
+    """A ray's end: distance along it (mm), point (3,) in TRUS, unit normal (3,), sigma of ``normal @ point``."""
+
+    distance_mm: float
+    trus_p: FloatArray
+    normal: FloatArray
+    sigma_mm: float
+
+
+def meet(surface: TissueSurface, trus_p: FloatArray, trus_d: FloatArray) -> Met | None:
+    """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where that is not known."""
+    along = np.linspace(1.0, 200.0, 4001)
+    points = (trus_p + along[:, None] * trus_d - surface.centre) @ surface.axes
+    height, sigma = surface.height(points[:, :2])
+    gap = points[:, 2] - height
+    crossing = np.flatnonzero((gap[:-1] < 0) & (gap[1:] >= 0))
+    begins, ends = np.flatnonzero(gap > -2.0 * sigma), np.flatnonzero(gap > 2.0 * sigma)
+    if crossing.size == 0 or ends.size == 0:
+        return None
+    i = int(crossing[0])
+    stretch = float(along[ends[0]] - along[begins[0]])
+    if ends[0] < i or stretch > LONGEST_MM:
+        return None
+    distance = float(along[i] - gap[i] * (along[i + 1] - along[i]) / (gap[i + 1] - gap[i]))
+    place = ((trus_p + distance * trus_d - surface.centre) @ surface.axes)[:2]
+    if np.linalg.norm(surface.place - place, axis=1).min() > REACH_MM:
+        return None
+    around = place + np.array([[0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])
+    near, _ = surface.height(around)
+    slope = np.array([near[0] - near[1], near[2] - near[3]]) / 0.2
+    normal = surface.axes @ np.array([-slope[0], -slope[1], 1.0])
+    normal = normal / np.linalg.norm(normal)
+    towards = float(normal @ trus_d)
+    if towards < GRAZING:
+        return None
+    return Met(distance, trus_p + distance * trus_d, normal, stretch / 4.0 * towards)

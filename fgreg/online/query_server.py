@@ -1,0 +1,198 @@
+"""A process that answers tracking queries from the shared snapshot, whatever the estimate's process is busy with.
+
+Native calls of the estimate's updates hold their interpreter's lock, so a thread beside them waits. A client of this
+server waits for one round trip over a local socket. A camera loop that is a process of its own needs no server: it
+holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.fast_track` itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import secrets
+import shutil
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Client, Connection, Listener, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from fgreg.estimate import TrackEstimate
+from fgreg.measurements import Track
+from fgreg.online.query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
+from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
+from fgreg.tracking import fast_track
+
+START_S = 30.0
+"""How long the process may take to start."""
+_KEY_BYTES = 32
+
+
+@dataclass(frozen=True, slots=True)
+class QueryAddress:
+    """Where a server listens, and the key that it asks for: hand it to processes that may ask."""
+
+    path: str
+    key: bytes
+
+    def __repr__(self) -> str:
+        return f"QueryAddress({self.path!r})"
+
+
+class QueryClient:
+    """Asks a server; safe to share between threads, which then take turns: faster with one client each.
+
+    Raises:
+        OSError: there is no such server. multiprocessing.AuthenticationError: the key is wrong.
+    """
+
+    def __init__(self, address: QueryAddress) -> None:
+        self._connection = Client(address.path, family="AF_UNIX", authkey=address.key)
+        self._turn = threading.Lock()
+        self._age_s = float("nan")
+
+    @property
+    def age_s(self) -> float:
+        """Age of the snapshot that the last answer came from."""
+        return self._age_s
+
+    def track(self, query: Track) -> TrackEstimate:
+        """The answer to a query, as of :func:`fgreg.tracking.fast_track`.
+
+        Raises:
+            QueryError: the server could not work on it. EOFError, OSError: the server is gone.
+        """
+        message = encode_query(query)
+        with self._turn:
+            self._connection.send_bytes(message)
+            data = self._connection.recv_bytes()
+        answer, self._age_s = decode_answer(data)
+        return answer
+
+    def close(self) -> None:
+        """Leave."""
+        self._connection.close()
+
+    def __enter__(self) -> QueryClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class QueryServer:
+    """Starts the process; use it as a context manager, or call :meth:`close`.
+
+    It ends with the process that started it, also if that is killed.
+
+    Args:
+        name: of the shared snapshot.
+
+    Raises:
+        RuntimeError: the process did not start.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="fgreg-"))  # of mode 0700
+        self.address = QueryAddress(str(self._folder / "queries"), secrets.token_bytes(_KEY_BYTES))
+        context = multiprocessing.get_context("spawn")
+        self._control, theirs = context.Pipe()
+        self._process: SpawnProcess = context.Process(
+            target=_serve, args=(name, self.address.path, self.address.key, theirs), name="fgreg-queries", daemon=True
+        )
+        try:
+            self._process.start()
+            theirs.close()
+            if not self._control.poll(START_S):
+                raise RuntimeError(f"the query process has not started within {START_S:.0f} s")
+            try:
+                said = self._control.recv_bytes().decode()
+            except EOFError:
+                said = "it ended at once"
+            if said:
+                raise RuntimeError(f"the query process has not started: {said}")
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process."""
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.is_alive()
+
+    def client(self) -> QueryClient:
+        """A new client in this process; others make theirs of ``address``."""
+        return QueryClient(self.address)
+
+    def close(self) -> None:
+        """End the process; clients find their connection closed."""
+        self._control.close()  # which it takes for the signal to end
+        if self._process.pid is not None:
+            self._process.join(5.0)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def __enter__(self) -> QueryServer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _serve(name: str, path: str, key: bytes, control: Connection[Any, Any]) -> None:
+    """The process: one thread a client, which holds a reader of its own."""
+    try:
+        reader = SnapshotReader(name)
+        listener = Listener(path, family="AF_UNIX", backlog=16, authkey=key)
+    except (OSError, ValueError) as error:
+        control.send_bytes(str(error).encode())
+        return
+    threading.Thread(target=_accept, args=(listener, reader), daemon=True).start()
+    control.send_bytes(b"")
+    parent = multiprocessing.parent_process()
+    wait([control] if parent is None else [control, parent.sentinel])
+    shutil.rmtree(Path(path).parent, ignore_errors=True)
+    os._exit(0)  # clients' threads may be in the middle of waiting; there is nothing to save
+
+
+def _accept(listener: Listener, reader: SnapshotReader) -> None:
+    while True:
+        try:
+            connection = listener.accept()
+        except (OSError, EOFError, multiprocessing.AuthenticationError):
+            time.sleep(0.01)  # one that left in the middle of it, or has no key; or no more connections are to be had
+            continue
+        threading.Thread(target=_answer, args=(connection, reader.clone()), daemon=True).start()
+
+
+def _answer(connection: Connection[Any, Any], reader: SnapshotReader) -> None:
+    """Answer one client until it leaves."""
+    with connection, contextlib.suppress(OSError, EOFError):
+        while True:
+            connection.send_bytes(_reply(connection.recv_bytes(), reader))
+
+
+def _reply(message: bytes, reader: SnapshotReader) -> bytes:
+    try:
+        received = reader.read()
+        return encode_answer(fast_track(decode_query(message), received.snapshot), received.age_s)
+    except (QueryError, NoSnapshotError) as error:
+        return encode_error(str(error))
+    except Exception as error:  # a defect, or a query that nobody thought of: the next one is to be answered
+        return encode_error(f"{type(error).__name__}: {error}")

@@ -1,0 +1,17 @@
+"""Tracking queries: where to turn the stage for a beam, from a snapshot of the estimate."""
+
+from fgreg.tracking.answer import fast_track
+from fgreg.tracking.context import TrackContext, track
+from fgreg.tracking.snapshot import EpochSnapshot, Snapshot, make_snapshot
+from fgreg.tracking.surface_map import SurfaceMap, make_surface_map
+
+__all__ = [
+    "EpochSnapshot",
+    "Snapshot",
+    "SurfaceMap",
+    "TrackContext",
+    "fast_track",
+    "make_snapshot",
+    "make_surface_map",
+    "track",
+]

@@ -1,0 +1,191 @@
+"""All that a tracking query needs, as plain arrays: what queries are answered from while the estimate moves on.
+
+A query concerns one camera epoch and one PM, so of the joint covariance of the shared variables it needs the block of
+its epoch with what all epochs share: 16 variables in a fixed order, with zero variance where one is not estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.estimate import Verdict
+from fgreg.frames import FloatArray, IntArray
+from fgreg.graph.packing import Columns
+from fgreg.graph.shared_state import SharedState
+from fgreg.models import SensitivityModel, SessionModel, StageModel
+from fgreg.tracking.surface_map import SurfaceMap, make_surface_map
+
+if TYPE_CHECKING:
+    from fgreg.tracking.context import TrackContext
+    from fgreg.tracking.prepared import Prepared
+
+POSE, BEAM, EDGE, BIAS, SPEED, RADIUS, SHARED = 0, 6, 10, 11, 14, 15, 16
+"""Where the shared variables of one epoch sit: registration 6 (rotation rad, translation mm; right tangent), beam chart
+4, window edge 1 (rad), marker bias 3 (mm), sound speed ratio 1, probe radius 1 (mm); how many they are."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochSnapshot:
+    """One camera epoch: ``trus_T_camera`` as rotation (3, 3) and translation (3,) mm, covariance (SHARED, SHARED).
+
+    ``verdict`` and ``reason``: of a refused epoch no query is answered.
+    """
+
+    number: int
+    verdict: Verdict
+    rotation: FloatArray
+    translation_mm: FloatArray
+    covariance: FloatArray
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """The estimate at one moment.
+
+    Attributes:
+        t: session time of the last event that entered. pairs: how many did. causal: whether only what was known then.
+        epochs: those with a registration, and those refused.
+        marker_T_nominal: (4, 4) of the beam chart. beam: (4,). origin_shift_mm: lambda of the laser frame's origin.
+        edge_rad, bias_mm (3,), sound_speed_ratio, radius_mm: as in :class:`fgreg.graph.shared_state.SharedState`.
+        edge_variance: of the window's edge given all other shared variables, rad^2.
+        sensitivity, stage: of the session. amplitude_sigma, window_shape: of its configuration.
+        surface: where the PMs trace one.
+        oldest: epochs of lower numbers are not kept any more.
+    """
+
+    t: float
+    pairs: int
+    causal: bool
+    epochs: tuple[EpochSnapshot, ...]
+    marker_T_nominal: FloatArray
+    beam: FloatArray
+    origin_shift_mm: float
+    edge_rad: float
+    bias_mm: FloatArray
+    sound_speed_ratio: float
+    radius_mm: float
+    edge_variance: float
+    sensitivity: SensitivityModel
+    stage: StageModel
+    amplitude_sigma: float
+    window_shape: bool
+    surface: SurfaceMap | None
+    oldest: int = 0
+    prepared: dict[int, Prepared] = field(default_factory=dict, repr=False)
+    """What queries of an epoch have in common, kept from the first one."""
+
+    def epoch(self, number: int) -> EpochSnapshot | None:
+        """The epoch of that number."""
+        for epoch in self.epochs:
+            if epoch.number == number:
+                return epoch
+        return None
+
+    @classmethod
+    def from_context(
+        cls,
+        context: TrackContext,
+        *,
+        t: float = 0.0,
+        pairs: int = 0,
+        refused: Mapping[int, str] | None = None,
+    ) -> Snapshot:
+        """What a solved session's queries are answered from.
+
+        Args:
+            context: the session's estimate.
+            t: time of its last event. pairs: how many entered.
+            refused: the epochs refused, with the reason (which may be empty).
+        """
+        surface = None if context.surface is None else make_surface_map(context.surface)
+        return make_snapshot(
+            context.model,
+            context.config,
+            context.state,
+            context.covariance,
+            context.posterior.columns,
+            context.epochs,
+            origin_shift_mm=context.origin_shift_mm,
+            surface=surface,
+            t=t,
+            pairs=pairs,
+            causal=context.causal,
+            refused=refused,
+        )
+
+
+def epoch_columns(columns: Columns, place: int) -> tuple[IntArray, IntArray]:
+    """Columns of the whole covariance that concern an epoch, and where they go among the ``SHARED``."""
+    whole = [*range(6 * place, 6 * place + 6), *range(columns.beam, columns.beam + 4), columns.edge]
+    mine = [*range(EDGE + 1)]
+    for at, to, size in ((columns.bias, BIAS, 3), (columns.sound_speed, SPEED, 1), (columns.radius, RADIUS, 1)):
+        if at is not None:
+            whole += range(at, at + size)
+            mine += range(to, to + size)
+    return np.array(whole), np.array(mine)
+
+
+def make_snapshot(
+    model: SessionModel,
+    config: SolveConfig,
+    state: SharedState,
+    covariance: FloatArray,
+    columns: Columns,
+    epochs: Sequence[int],
+    *,
+    origin_shift_mm: float,
+    surface: SurfaceMap | None,
+    t: float,
+    pairs: int,
+    causal: bool,
+    refused: Mapping[int, str] | None = None,
+) -> Snapshot:
+    """A snapshot of an estimate.
+
+    Args:
+        model, config: of the session.
+        state: one hypothesis; its registrations are those of ``epochs``.
+        covariance: (D, D) of the shared variables, laid out by ``columns``.
+        epochs: the session's numbers of the epochs with a registration.
+        origin_shift_mm, surface, t, pairs, causal: as in :class:`Snapshot`.
+        refused: further epochs, or some of ``epochs``, of which no query may be answered, and why (may be empty).
+    """
+    refused = {} if refused is None else refused
+    found = []
+    for place, number in enumerate(epochs):
+        whole, mine = epoch_columns(columns, place)
+        block = np.zeros((SHARED, SHARED))
+        block[np.ix_(mine, mine)] = covariance[np.ix_(whole, whole)]
+        verdict = Verdict.REFUSED if number in refused else Verdict.OK
+        rotation, translation = state.rotation[0, place].copy(), state.translation_mm[0, place].copy()
+        found.append(EpochSnapshot(number, verdict, rotation, translation, block, refused.get(number, "")))
+    found += [
+        EpochSnapshot(number, Verdict.REFUSED, np.eye(3), np.zeros(3), np.zeros((SHARED, SHARED)), reason)
+        for number, reason in refused.items()
+        if number not in epochs
+    ]
+    return Snapshot(
+        t=t,
+        pairs=pairs,
+        causal=causal,
+        epochs=tuple(sorted(found, key=lambda epoch: epoch.number)),
+        marker_T_nominal=state.marker_T_nominal[0].copy(),
+        beam=state.beam[0].copy(),
+        origin_shift_mm=origin_shift_mm,
+        edge_rad=float(state.edge_rad[0]),
+        bias_mm=state.bias_mm[0].copy(),
+        sound_speed_ratio=float(state.sound_speed_ratio[0]),
+        radius_mm=float(state.radius_mm[0]),
+        edge_variance=1.0 / float(np.linalg.inv(covariance)[columns.edge, columns.edge]),
+        sensitivity=model.probe.sensitivity,
+        stage=model.stage,
+        amplitude_sigma=config.amplitude_sigma,
+        window_shape=config.window_shape,
+        surface=surface,
+    )

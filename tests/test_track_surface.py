@@ -1,0 +1,72 @@
+"""Queries with nothing heard: the table of the surface says what the surface says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fgreg.frames import FloatArray
+from fgreg.surface import TissueSurface, fit_surface
+from fgreg.tracking import Snapshot, fast_track, make_surface_map
+from tests import tracking_reference
+from tests.test_tracking import surface_case
+
+
+def some_surface(seed: int, count: int) -> TissueSurface:
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(-20.0, 20.0, (count, 2))
+    height = 42.0 + 0.1 * place[:, 0] + 4.0 * np.sin(place[:, 1] / 14.0) + 0.01 * place[:, 0] ** 2
+    points = np.column_stack([place, height]) + 0.3 * rng.standard_normal((count, 3))
+    surface = fit_surface(points, np.tile(0.09 * np.eye(3), (count, 1, 1)), np.tile([0.0, 0.0, 1.0], (count, 1)))
+    assert surface is not None
+    return surface
+
+
+def _rays(seed: int, count: int) -> list[tuple[FloatArray, FloatArray]]:
+    rng = np.random.default_rng(seed)
+    rays = []
+    for _ in range(count):
+        end = np.array([*rng.uniform(-35.0, 35.0, 2), 42.0])
+        direction = np.array([*rng.normal(size=2) * 0.5, 1.0])
+        direction = direction / np.linalg.norm(direction)
+        rays.append((end - rng.uniform(20.0, 90.0) * direction, direction))
+    return rays
+
+
+@pytest.mark.parametrize("count", [6, 25, 150])
+def test_rays_end_where_the_surface_is(count: int) -> None:
+    surface = some_surface(count, count)
+    table = make_surface_map(surface)
+    met = missed = torn = 0
+    for trus_p, trus_d in _rays(count, 60):
+        slow, fast = tracking_reference.meet(surface, trus_p, trus_d), table.meet(trus_p, trus_d)
+        if slow is None or fast is None:
+            missed += slow is None and fast is None
+            torn += (slow is None) != (fast is None)
+            continue
+        met += 1
+        assert fast.distance_mm == pytest.approx(slow.distance_mm, abs=0.01 + 0.01 * slow.sigma_mm)
+        np.testing.assert_allclose(fast.normal, slow.normal, atol=2e-3)
+        assert fast.sigma_mm == pytest.approx(slow.sigma_mm, rel=0.02, abs=0.03)
+    assert met > 15
+    assert missed > 2
+    assert torn <= 2  # rays at the very limit of what counts as known
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_answers_and_sigmas_are_those_of_sampling(seed: int) -> None:
+    case = surface_case(seed, heard=False, count=8)
+    context = case.solution.context
+    assert context is not None
+    snapshot = Snapshot.from_context(context)
+    compared = 0
+    for query in case.queries:
+        slow, fast = tracking_reference.track(query, context), fast_track(query, snapshot)
+        if slow.stage_rad is None or slow.sigma_rad is None:
+            assert fast.reason == slow.reason
+            continue
+        assert fast.stage_rad is not None
+        assert abs(fast.stage_rad - slow.stage_rad) < 0.02 * slow.sigma_rad
+        assert fast.sigma_rad == pytest.approx(slow.sigma_rad, rel=0.02)
+        compared += 1
+    assert compared >= 6

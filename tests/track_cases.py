@@ -1,0 +1,79 @@
+"""Snapshots and queries for tests of tracking at camera rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fgreg.batch import solve
+from fgreg.config import SolveConfig
+from fgreg.estimate import Verdict
+from fgreg.measurements import Measurements, Pair, Track
+from fgreg.models import SessionModel
+from fgreg.tracking import EpochSnapshot, Snapshot, SurfaceMap, TrackContext
+from fgreg.tracking.snapshot import SHARED
+
+
+def held_out(measurements: Measurements, count: int) -> tuple[Measurements, list[list[Pair]]]:
+    """The measurements without their last ``count`` PMs, and the looks at each of those."""
+    pms = sorted({pair.pm for pair in measurements.pairs})[-count:]
+    kept = tuple(pair for pair in measurements.pairs if pair.pm not in pms)
+    return replace(measurements, pairs=kept), [[p for p in measurements.pairs if p.pm == pm] for pm in pms]
+
+
+def solved_context(measurements: Measurements, model: SessionModel, config: SolveConfig | None = None) -> TrackContext:
+    """What queries about the measurements are answered from, on a stage that turns any way."""
+    context = solve(measurements, [], model, config or SolveConfig()).context
+    assert context is not None
+    return replace(context, model=replace(model, stage=replace(model.stage, limits_device_rad=(-4.0, 4.0))))
+
+
+def query_of(pairs: list[Pair], *, looks: int, sweeps: bool = True) -> Track:
+    """A query with the first looks of a PM; ``sweeps``: known as first hits where they were."""
+    first = pairs[:looks]
+    heard = tuple(pair.look if sweeps else replace(pair.look, sweep=0) for pair in first)
+    return Track(1.0, first[0].epoch, first[0].marker, heard, look_markers=tuple(pair.marker for pair in first))
+
+
+def marked_snapshot(base: Snapshot, value: int) -> Snapshot:
+    """A snapshot all of whose numbers tell its version: whole only if they agree."""
+    number = float(value)
+    epoch = EpochSnapshot(
+        0, base.epochs[0].verdict, np.eye(3) * number, np.full(3, number), np.full((SHARED, SHARED), number), str(value)
+    )
+    surface = base.surface
+    if surface is not None:
+        surface = replace(surface, table=np.full_like(surface.table, number), place=np.full_like(surface.place, number))
+    return replace(base, t=number, pairs=value, epochs=(epoch,), beam=np.full(4, number), surface=surface, prepared={})
+
+
+def is_whole(snapshot: Snapshot) -> bool:
+    """Whether all numbers of a marked snapshot are of one version."""
+    value, epoch, surface = snapshot.pairs, snapshot.epochs[0], snapshot.surface
+    whole = snapshot.t == value and epoch.reason == str(value) and bool((snapshot.beam == value).all())
+    whole = whole and bool((epoch.covariance == value).all() and (epoch.translation_mm == value).all())
+    return whole and (surface is None or bool((surface.table == value).all() and (surface.place == value).all()))
+
+
+def plain_snapshot(model: SessionModel, surface: SurfaceMap | None = None) -> Snapshot:
+    """A snapshot that no session was solved for."""
+    return Snapshot(
+        t=0.0,
+        pairs=0,
+        causal=True,
+        epochs=(EpochSnapshot(0, Verdict.OK, np.eye(3), np.zeros(3), np.eye(SHARED)),),
+        marker_T_nominal=np.eye(4),
+        beam=np.zeros(4),
+        origin_shift_mm=0.0,
+        edge_rad=0.0,
+        bias_mm=np.zeros(3),
+        sound_speed_ratio=1.0,
+        radius_mm=model.probe.radius_mm,
+        edge_variance=1e-5,
+        sensitivity=model.probe.sensitivity,
+        stage=model.stage,
+        amplitude_sigma=0.05,
+        window_shape=True,
+        surface=surface,
+    )
