@@ -1,0 +1,1 @@
+"""While a session runs: has the camera moved, does an earlier registration fit again."""
