@@ -12,13 +12,14 @@ import numpy as np
 
 from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.graph.packing import Anchor, BeamArrays, LookArrays, PackedProblem, only_aims, without_aims
+from fgreg.graph.packing import Anchor, BeamArrays, LookArrays, PackedProblem, RotationShapes, only_aims, without_aims
 from fgreg.graph.reduced import contributions, evaluate, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import SharedState
 from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, relinearisation
 from fgreg.online.white import Gaussian, WhiteTerms, add_terms, gaussian_of, pivot_scale, pose_columns, whiten
 from fgreg.robust import junk_p, pm_degrees_of_freedom, pm_limits
+from fgreg.sensitivity import WindowShapes
 
 MIN_BEFORE = 6
 """PMs that a registration takes; before so many there is nothing that could have moved."""
@@ -43,8 +44,19 @@ def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:
         look_pm=place[problem.look_pm[looks]],
         look_beam=beam_place[problem.look_beam[looks]],
         looks=LookArrays(*(getattr(problem.looks, name)[looks] for name in LookArrays.__slots__)),
-        shapes=None,
-        log_junk=None,
+        shapes=None if problem.shapes is None else _select_shapes(problem.shapes, index, looks),
+        log_junk=None if problem.log_junk is None else problem.log_junk[index],
+    )
+
+
+def _select_shapes(shapes: RotationShapes, index: IntArray, looks: BoolArray) -> RotationShapes:
+    look_place = np.cumsum(looks) - 1
+    stands = shapes.amplitude_look[index]
+    return RotationShapes(
+        WindowShapes(*(getattr(shapes.windows, name)[looks] for name in WindowShapes.__slots__)),
+        shapes.plane_rad[index],
+        shapes.amplitude_log[index],
+        np.where(stands >= 0, look_place[stands], -1),
     )
 
 
@@ -171,7 +183,7 @@ class EpochFollower:
         tail = select_pms(self.seen, last)
         closer = relinearisation(tail, self.state)
         return check_for_move(
-            before, self.here.terms.take(last), settings, pose=pose_columns(0), relinearise=closer
+            before, self.here.terms.take(last), settings.learned(self.kept[old]), pose=pose_columns(0), relinearise=closer
         )
 
     def everything(self) -> Gaussian:

@@ -23,12 +23,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
-from fgreg.frames import FloatArray, IntArray
+from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
 from fgreg.online.white import Gaussian, WhiteTerms, linearise
@@ -42,6 +42,11 @@ ROUNDS = 3
 """Times that moved hypotheses are linearised again."""
 SUSPICION = 2.0
 """Log of the score by the first linearisation from which large moves are linearised again."""
+
+JUNK_PRIOR, JUNK_PRIOR_PAIRS, JUNK_MEMORY = 0.04, 10.0, 50
+"""Share of junk expected at first, how many pairs that opinion is worth, and how many pairs back it is learned from."""
+LEAST_JUNK, MOST_JUNK = 0.01, 0.5
+"""However clean the stream: a single odd pair must never pass for a move."""
 
 Relinearise = Callable[[FloatArray], WhiteTerms]
 """From steps (S, D) off the base to the same PMs linearised there, steps counted from the base."""
@@ -83,17 +88,24 @@ class MoveSettings:
 
     Attributes:
         scales: prior of a move.
-        junk_probability: of each pair, before it is looked at.
+        junk_probability: of each pair, before it is looked at; :meth:`learned` from those before.
         threshold: log score from which it is an alarm.
     """
 
     scales: MoveScales
-    junk_probability: float = 0.05
+    junk_probability: float = JUNK_PRIOR
     threshold: float = math.log(2000.0)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.junk_probability < 1.0:
             raise ValueError(f"junk_probability is {self.junk_probability}, expected a number between 0 and 1")
+
+    def learned(self, kept: BoolArray) -> MoveSettings:
+        """With junk as probable as the pairs before (n,) say: two odd pairs in a row are a move where junk is rare."""
+        recent = kept[-JUNK_MEMORY:]
+        junk = JUNK_PRIOR_PAIRS * self.junk_probability + float(np.sum(~recent))
+        share = junk / (JUNK_PRIOR_PAIRS + len(recent))
+        return replace(self, junk_probability=min(max(share, LEAST_JUNK), MOST_JUNK))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
