@@ -61,7 +61,7 @@ def _select_shapes(shapes: RotationShapes, index: IntArray, looks: BoolArray) ->
 
 
 def summarise_aims(problem: PackedProblem, state: SharedState) -> PackedProblem:
-    """The problem with its calibration shots summed up as a Gaussian about ``state`` (their own optimum of the beam)."""
+    """The problem with its calibration shots summed up as a Gaussian about ``state`` (at their optimum of the beam)."""
     if not len(problem.aims.rotation):
         return problem
     aims = only_aims(problem)
@@ -183,7 +183,11 @@ class EpochFollower:
         tail = select_pms(self.seen, last)
         closer = relinearisation(tail, self.state)
         return check_for_move(
-            before, self.here.terms.take(last), settings.learned(self.kept[old]), pose=pose_columns(0), relinearise=closer
+            before,
+            self.here.terms.take(last),
+            settings.learned(self.kept[old]),
+            pose=pose_columns(0),
+            relinearise=closer,
         )
 
     def everything(self) -> Gaussian:

@@ -181,7 +181,7 @@ def _spread(innovation: FloatArray) -> tuple[FloatArray, FloatArray]:
         out[..., 0, 0], out[..., 1, 1], out[..., 0, 1] = d / det, a / det, -b / det
         out[..., 1, 0] = out[..., 0, 1]
         return out, np.log(det)
-    return np.linalg.inv(innovation), np.linalg.slogdet(innovation)[1]
+    return np.asarray(np.linalg.inv(innovation)), np.asarray(np.linalg.slogdet(innovation)[1])
 
 
 def _advance(
@@ -235,23 +235,23 @@ class _Run:
 
 
 def _run(
-    before: Gaussian, terms: WhiteTerms, moved: WhiteTerms | None, settings: MoveSettings, pose: slice, first: int
+    before: Gaussian, terms: WhiteTerms, moved: WhiteTerms | None, settings: MoveSettings, pose: slice, births: range
 ) -> _Run:
-    """Run all filters. ``moved``: terms as the candidates first..n-1 are linearised, (C, n, ...); None: as ``terms``."""
+    """Run all filters. ``moved``: terms as linearised at each candidate of ``births``, (C, n, ...); None: ``terms``."""
     scales = settings.scales.covariance
     kinds = len(scales)
     steady = _Groups.one(before, terms.count)
     alive: _Groups | None = None
     for j in range(terms.count):
         junk = _junk_logs(int(terms.equations[j]), settings.junk_probability)
-        if j >= first:
+        if j in births:
             born = steady.spawn(scales, pose)
             alive = born if alive is None else _joined([alive, born])
         if alive is not None:
             if moved is None:
                 line = terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j]
             else:
-                among = slice(0, j - first + 1)
+                among = slice(0, min(j + 1, births.stop) - births.start)
                 line = tuple(  # type: ignore[assignment]
                     np.repeat(part[among, j], kinds, axis=0) for part in (moved.residual, moved.jacobian, moved.rest)
                 )
@@ -275,6 +275,7 @@ def check_for_move(
     *,
     pose: slice,
     first: int = 0,
+    last: int | None = None,
     relinearise: Relinearise | None = None,
 ) -> MoveTest:
     """Test the last pairs for a move of the camera.
@@ -285,22 +286,24 @@ def check_for_move(
         settings: prior, junk and threshold.
         pose: columns of the current epoch's registration.
         first: the oldest pair before which a move is looked for; those before it only inform.
+        last: the newest such pair; the newest of all where None.
         relinearise: for large moves; without, they are judged by ``terms`` alone.
 
     Raises:
         ValueError: no pair to look at.
     """
-    if not 0 <= first < terms.count:
-        raise ValueError(f"first is {first}, expected one of {terms.count} pairs")
+    births = range(first, terms.count if last is None else last + 1)
+    if not 0 <= births.start < births.stop <= terms.count:
+        raise ValueError(f"first and last are {first} and {last}, expected pairs of {terms.count}")
     kinds = len(settings.scales.share)
-    run = _run(before, terms, None, settings, pose, first)
+    run = _run(before, terms, None, settings, pose, births)
     by_scale = run.log_bayes(kinds, settings.scales.share)
     if relinearise is not None and logsumexp(by_scale) > SUSPICION:
-        run = _closer(before, terms, settings, pose, first, relinearise, run)
+        run = _closer(before, terms, settings, pose, births, relinearise, run)
         by_scale = run.log_bayes(kinds, settings.scales.share)
     candidates = logsumexp(by_scale, axis=1)
     log_bayes = np.full(terms.count, -np.inf)
-    log_bayes[first:] = candidates
+    log_bayes[births.start : births.stop] = candidates
     best = int(np.argmax(candidates))
     moved, good = _best_sequence(run.moved, best * kinds + int(np.argmax(by_scale[best])))
     score = float(logsumexp(candidates))
@@ -313,13 +316,13 @@ def _closer(
     terms: WhiteTerms,
     settings: MoveSettings,
     pose: slice,
-    first: int,
+    births: range,
     relinearise: Relinearise,
     run: _Run,
 ) -> _Run:
     """The run with every candidate linearised about where it leads, if that is far."""
     kinds = len(settings.scales.share)
-    candidates = terms.count - first
+    candidates = len(births)
     for _ in range(ROUNDS):
         by_scale = run.log_bayes(kinds, settings.scales.share)
         best = np.argmax(by_scale, axis=1)
@@ -328,7 +331,7 @@ def _closer(
         far = (np.linalg.norm(moves[:, :3], axis=1) > REACH_RAD) | (np.linalg.norm(moves[:, 3:], axis=1) > REACH_MM)
         if not far.any():
             break
-        run = _run(before, terms, relinearise(np.where(far[:, None], steps, 0.0)), settings, pose, first)
+        run = _run(before, terms, relinearise(np.where(far[:, None], steps, 0.0)), settings, pose, births)
     return run
 
 

@@ -50,7 +50,7 @@ class WhiteTerms:
 
     @property
     def count(self) -> int:
-        return self.residual.shape[1]
+        return int(self.residual.shape[1])
 
     def last(self, count: int) -> WhiteTerms:
         """The last ``count`` PMs only."""
@@ -58,9 +58,7 @@ class WhiteTerms:
 
     def take(self, index: IntArray) -> WhiteTerms:
         """Some of the PMs."""
-        return WhiteTerms(
-            self.residual[:, index], self.jacobian[:, index], self.rest[:, index], self.equations[index]
-        )
+        return WhiteTerms(self.residual[:, index], self.jacobian[:, index], self.rest[:, index], self.equations[index])
 
 
 def pivot_scale(columns: Columns) -> FloatArray:
