@@ -137,6 +137,9 @@ def solve(
             "with a comma between.",
         ),
     ] = "",
+    detect_moves: Annotated[
+        bool, typer.Option("--detect-moves", help="Find camera moves that nobody told, by the pairs.")
+    ] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -162,7 +165,7 @@ def solve(
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
     with _progress(quiet or as_json) as progress:
-        report = solve_session(SolveRequest(session, out, rrd, redetect), config, progress)
+        report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves), config, progress)
     extras = _summary_extras(report)
     if as_json:
         typer.echo(json.dumps(summary_dict(report.session.model, report.estimate, extras), indent=2))

@@ -7,7 +7,7 @@ read the session -> recognise marker, board and PM in the frames -> calibrate an
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from fgreg.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEsti
 from fgreg.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.frames import FloatArray, transform_points
 from fgreg.models import SessionModel
+from fgreg.online.detect import DetectedMove, find_moves, renumbered, split_epochs
 from fgreg.recognition import Recognised, load_trus_frame, looks_of, marker_pictures, recognise
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.ground_truth import GroundTruth
@@ -50,12 +51,14 @@ class SolveRequest:
     Attributes:
         folder: the session. out: where the result goes; ``result.yaml`` in the session's folder where None.
         rrd: the recording to write, if any. redetect: look at frames even where poses are recorded.
+        detect_moves: look for camera moves that nobody told, and solve what lies between as epochs.
     """
 
     folder: Path
     out: Path | None = None
     rrd: Path | None = None
     redetect: bool = False
+    detect_moves: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,16 +115,20 @@ def solve_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
+        moves = find_moves(recognised.measurements, session.model, config) if request.detect_moves else ()
+        recognised = with_moves(recognised, moves)
+        conditions = [Condition(Verdict.WARNING, move.text) for move in moves]
         solution = solve(
             recognised.measurements,
             recognised.tracks,
             session.model,
             config,
-            detection_conditions(recognised, config),
+            [*conditions, *detection_conditions(recognised, config)],
             sound_speed_prior(recognised, config),
         )
         estimate = session_estimate(session, recognised, solution)
-        errors = None if truth is None else truth_errors(estimate, truth, session.model.targets_mm)
+        same_epochs = truth is not None and (not moves or len(truth.trus_T_camera) == len(estimate.epochs))
+        errors = truth_errors(estimate, truth, session.model.targets_mm) if truth is not None and same_epochs else None
         show(viewer, session, recognised, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -137,6 +144,20 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
     if not folder.is_dir():
         raise InputError(str(folder), "a file" if folder.exists() else "nothing", "a session's folder")
     remove_result(result_path)
+
+
+def with_moves(recognised: Recognised, moves: Sequence[DetectedMove]) -> Recognised:
+    """The session's events with camera moves in place that were found out: epochs of pairs and tracks follow."""
+    if not moves:
+        return recognised
+    epoch_of = renumbered(recognised.epoch_of, recognised.pair_events, moves)
+    tracks = zip(recognised.track_events, recognised.tracks, strict=True)
+    return replace(
+        recognised,
+        measurements=split_epochs(recognised.measurements, moves),
+        tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
+        epoch_of=epoch_of,
+    )
 
 
 def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:

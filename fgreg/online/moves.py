@@ -1,0 +1,345 @@
+"""Whether the camera moved among the last pairs, and since which: Bayes factors, in closed form per linearisation.
+
+Given the Gaussian of the shared variables from all that came before, the marginal likelihood of the last pairs (as
+whitened equations, fgreg.online.white) under a hypothesis is a product of predictive densities, as a Kalman filter
+runs through them. Hypotheses:
+
+- steady: nothing happened.
+- moved before the m-th last pair: the registration is ``trus_T_camera * Exp(xi)`` from there on, xi about the camera
+  with a zero-mean prior that mixes scales, from a nudge to a camera put back anywhere.
+
+Under each of them any pair may be junk: then it has a constant density (fgreg.robust.JUNK_DENSITY). So one gross
+outlier is junk, and several in a row that agree on one moved registration are a move. The likeliest few sequences of
+labels (good or junk, pair by pair) are carried along: a Gaussian sum, cut down to its heaviest terms.
+
+Large moves are not linear: moved hypotheses are linearised again about the registrations they lead to.
+
+Sequential use: the score is the log of the sum over m of the Bayes factors (Shiryaev, 1963; Roberts, 1966). While
+nothing happens that sum, less the number of pairs, is a martingale: if the model holds, a threshold A on it is passed
+at most once in A pairs on average.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from fgreg.frames import BoolArray, FloatArray, IntArray
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.shared_state import SharedState
+from fgreg.online.white import Gaussian, WhiteTerms, linearise
+from fgreg.robust import JUNK_DENSITY
+
+BRANCHES = 4
+"""Sequences of junk labels carried along per hypothesis."""
+REACH_RAD, REACH_MM = math.radians(1.5), 3.0
+"""Moves up to this are linear enough."""
+ROUNDS = 3
+"""Times that moved hypotheses are linearised again."""
+SUSPICION = 2.0
+"""Log of the score by the first linearisation from which large moves are linearised again."""
+
+JUNK_PRIOR, JUNK_PRIOR_PAIRS, JUNK_MEMORY = 0.04, 10.0, 50
+"""Share of junk expected at first, how many pairs that opinion is worth, and how many pairs back it is learned from."""
+LEAST_JUNK, MOST_JUNK = 0.01, 0.5
+"""However clean the stream: a single odd pair must never pass for a move."""
+
+Relinearise = Callable[[FloatArray], WhiteTerms]
+"""From steps (S, D) off the base to the same PMs linearised there, steps counted from the base."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MoveScales:
+    """Prior of the move: a mixture of zero-mean Gaussians about the camera, sigmas (K,) rad and mm, shares (K,)."""
+
+    rotation_rad: FloatArray
+    translation_mm: FloatArray
+    share: FloatArray
+
+    def __post_init__(self) -> None:
+        sizes = {len(self.rotation_rad), len(self.translation_mm), len(self.share)}
+        if len(sizes) != 1 or not len(self.share):
+            raise ValueError("scales need as many rotations as translations and shares, at least one")
+        if not (self.share > 0).all() or abs(float(self.share.sum()) - 1.0) > 1e-9:
+            raise ValueError("shares have to be positive and add up to 1")
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(K, 6, 6) of the move's right tangent."""
+        sigma = np.concatenate(
+            [np.repeat(self.rotation_rad[:, None], 3, axis=1), np.repeat(self.translation_mm[:, None], 3, axis=1)], 1
+        )
+        return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
+
+
+def default_scales() -> MoveScales:
+    """A nudge, a shift, a large move, and the camera put back anywhere."""
+    degrees, mm = [0.5, 1.0, 2.0, 10.0, 40.0], [1.0, 2.0, 4.0, 30.0, 120.0]
+    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.2, 0.25, 0.3, 0.15, 0.1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MoveSettings:
+    """How to test.
+
+    Attributes:
+        scales: prior of a move.
+        junk_probability: of each pair, before it is looked at; :meth:`learned` from those before.
+        threshold: log score from which it is an alarm.
+    """
+
+    scales: MoveScales
+    junk_probability: float = JUNK_PRIOR
+    threshold: float = math.log(2000.0)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.junk_probability < 1.0:
+            raise ValueError(f"junk_probability is {self.junk_probability}, expected a number between 0 and 1")
+
+    def learned(self, kept: BoolArray) -> MoveSettings:
+        """With junk as probable as the pairs before (n,) say: two odd pairs in a row are a move where junk is rare."""
+        recent = kept[-JUNK_MEMORY:]
+        junk = JUNK_PRIOR_PAIRS * self.junk_probability + float(np.sum(~recent))
+        share = junk / (JUNK_PRIOR_PAIRS + len(recent))
+        return replace(self, junk_probability=min(max(share, LEAST_JUNK), MOST_JUNK))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MoveTest:
+    """What the last M pairs say.
+
+    Attributes:
+        log_bayes: (M,) log Bayes factor of a move before pair j (0 the oldest of them) against none.
+        score: log of their sum.
+        since: index of the first pair after the likeliest move.
+        alarm: whether the score passes the threshold.
+        moved: the shared variables' step given all pairs, if the camera moved there (registration: the new one).
+        good: (M,) probability that a pair is not junk, if so.
+        steady_good: (M,) likewise if it did not move.
+    """
+
+    log_bayes: FloatArray
+    score: float
+    since: int
+    alarm: bool
+    moved: Gaussian
+    good: FloatArray
+    steady_good: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class _Groups:
+    """G hypotheses of B label sequences each: mean (G, B, D), covariance (G, B, D, D), log weight (G, B), labels."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    log_weight: FloatArray
+    good: FloatArray
+
+    @staticmethod
+    def one(gaussian: Gaussian, pairs: int) -> _Groups:
+        """A single hypothesis of a single sequence; the others do not weigh anything."""
+        log_weight = np.full((1, BRANCHES), -np.inf)
+        log_weight[0, 0] = 0.0
+        return _Groups(
+            np.repeat(gaussian.mean[None, None], BRANCHES, axis=1),
+            np.repeat(gaussian.covariance[None, None], BRANCHES, axis=1),
+            log_weight,
+            np.ones((1, BRANCHES, pairs)),
+        )
+
+    def spawn(self, move: FloatArray, pose: slice) -> _Groups:
+        """What a single hypothesis becomes when the registration moves by each of K priors (K, 6, 6)."""
+        count = len(move)
+        covariance = np.repeat(self.covariance, count, axis=0)
+        covariance[:, :, pose, pose] += move[:, None]
+        return _Groups(
+            np.repeat(self.mean, count, axis=0),
+            covariance,
+            np.repeat(self.log_weight, count, axis=0),
+            np.repeat(self.good, count, axis=0),
+        )
+
+    def take(self, index: IntArray) -> _Groups:
+        return _Groups(self.mean[index], self.covariance[index], self.log_weight[index], self.good[index])
+
+
+def _joined(parts: list[_Groups]) -> _Groups:
+    return _Groups(*(np.concatenate([getattr(p, name) for p in parts]) for name in _Groups.__slots__))
+
+
+def _spread(innovation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse and log determinant of covariances (..., q, q)."""
+    if innovation.shape[-1] == 2:
+        a, b, d = innovation[..., 0, 0], innovation[..., 0, 1], innovation[..., 1, 1]
+        det = a * d - b * b
+        out = np.empty_like(innovation)
+        out[..., 0, 0], out[..., 1, 1], out[..., 0, 1] = d / det, a / det, -b / det
+        out[..., 1, 0] = out[..., 0, 1]
+        return out, np.log(det)
+    return np.asarray(np.linalg.inv(innovation)), np.asarray(np.linalg.slogdet(innovation)[1])
+
+
+def _advance(
+    groups: _Groups, j: int, residual: FloatArray, jacobian: FloatArray, rest: FloatArray, junk: tuple[float, float]
+) -> _Groups:
+    """One pair more: residual (G or 1, q), jacobian (G or 1, q, D); ``junk``: its log probability times density, and
+    the log probability of a good one."""
+    log_junk, log_good = junk
+    jacobian = jacobian[:, None]
+    gain = groups.covariance @ np.swapaxes(jacobian, -1, -2)
+    spread = jacobian @ gain + np.eye(jacobian.shape[-2])
+    inverted, log_det = _spread(spread)
+    innovation = residual[:, None] + (jacobian @ groups.mean[..., None])[..., 0]
+    weighted = (inverted @ innovation[..., None])[..., 0]
+    log = log_good - 0.5 * (np.sum(innovation * weighted, axis=-1) + log_det + rest[:, None])
+    # Each sequence with this pair good, and with it junk; the heaviest go on.
+    both = np.concatenate([groups.log_weight + log, groups.log_weight + log_junk], axis=1)
+    keep = np.argpartition(-both, BRANCHES - 1, axis=1)[:, :BRANCHES]
+    log_weight = np.take_along_axis(both, keep, axis=1)
+    parent, is_good = keep % BRANCHES, keep < BRANCHES
+    rows = np.arange(len(both))[:, None]
+    # Sequences in which the pair is junk learn nothing from it.
+    taken = np.where(is_good, 1.0, 0.0)
+    gain, inverted = gain[rows, parent], inverted[rows, parent]
+    step = (gain @ weighted[rows, parent][..., None])[..., 0]
+    mean = groups.mean[rows, parent] - taken[..., None] * step
+    drop = gain @ inverted @ np.swapaxes(gain, -1, -2)
+    covariance = groups.covariance[rows, parent] - taken[..., None, None] * drop
+    good = groups.good[rows, parent]
+    good[..., j] = taken
+    return _Groups(mean, covariance, log_weight, good)
+
+
+def _junk_logs(equations: int, probability: float) -> tuple[float, float]:
+    """Log of junk's probability times its density over that of a good pair at its best, and of a good pair's."""
+    density = 0.5 * equations * math.log(JUNK_DENSITY)
+    return math.log(probability) + density, math.log1p(-probability)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """The filters' ends: the steady hypothesis (G = 1), and the moved ones in order of candidate and scale."""
+
+    steady: _Groups
+    moved: _Groups
+
+    def log_bayes(self, scales: int, share: FloatArray) -> FloatArray:
+        """(C, K) of each candidate and scale."""
+        moved = logsumexp(self.moved.log_weight, axis=1).reshape(-1, scales) + np.log(share)
+        return np.asarray(moved - logsumexp(self.steady.log_weight, axis=1))
+
+
+def _run(
+    before: Gaussian, terms: WhiteTerms, moved: WhiteTerms | None, settings: MoveSettings, pose: slice, births: range
+) -> _Run:
+    """Run all filters. ``moved``: terms as linearised at each candidate of ``births``, (C, n, ...); None: ``terms``."""
+    scales = settings.scales.covariance
+    kinds = len(scales)
+    steady = _Groups.one(before, terms.count)
+    alive: _Groups | None = None
+    for j in range(terms.count):
+        junk = _junk_logs(int(terms.equations[j]), settings.junk_probability)
+        if j in births:
+            born = steady.spawn(scales, pose)
+            alive = born if alive is None else _joined([alive, born])
+        if alive is not None:
+            if moved is None:
+                line = terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j]
+            else:
+                among = slice(0, min(j + 1, births.stop) - births.start)
+                line = tuple(  # type: ignore[assignment]
+                    np.repeat(part[among, j], kinds, axis=0) for part in (moved.residual, moved.jacobian, moved.rest)
+                )
+            alive = _advance(alive, j, *line, junk)
+        steady = _advance(steady, j, terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j], junk)
+    assert alive is not None
+    return _Run(steady, alive)
+
+
+def _best_sequence(groups: _Groups, row: int) -> tuple[Gaussian, FloatArray]:
+    """Step of the likeliest sequence of one hypothesis, and each pair's probability to be good over all of them."""
+    weight = np.exp(groups.log_weight[row] - logsumexp(groups.log_weight[row]))
+    best = int(np.argmax(weight))
+    return Gaussian(groups.mean[row, best], groups.covariance[row, best]), weight @ groups.good[row]
+
+
+def check_for_move(
+    before: Gaussian,
+    terms: WhiteTerms,
+    settings: MoveSettings,
+    *,
+    pose: slice,
+    first: int = 0,
+    last: int | None = None,
+    relinearise: Relinearise | None = None,
+) -> MoveTest:
+    """Test the last pairs for a move of the camera.
+
+    Args:
+        before: the shared variables' step given everything before these pairs.
+        terms: the last M pairs, oldest first, linearised once, at the base of the steps.
+        settings: prior, junk and threshold.
+        pose: columns of the current epoch's registration.
+        first: the oldest pair before which a move is looked for; those before it only inform.
+        last: the newest such pair; the newest of all where None.
+        relinearise: for large moves; without, they are judged by ``terms`` alone.
+
+    Raises:
+        ValueError: no pair to look at.
+    """
+    births = range(first, terms.count if last is None else last + 1)
+    if not 0 <= births.start < births.stop <= terms.count:
+        raise ValueError(f"first and last are {first} and {last}, expected pairs of {terms.count}")
+    kinds = len(settings.scales.share)
+    run = _run(before, terms, None, settings, pose, births)
+    by_scale = run.log_bayes(kinds, settings.scales.share)
+    if relinearise is not None and logsumexp(by_scale) > SUSPICION:
+        run = _closer(before, terms, settings, pose, births, relinearise, run)
+        by_scale = run.log_bayes(kinds, settings.scales.share)
+    candidates = logsumexp(by_scale, axis=1)
+    log_bayes = np.full(terms.count, -np.inf)
+    log_bayes[births.start : births.stop] = candidates
+    best = int(np.argmax(candidates))
+    moved, good = _best_sequence(run.moved, best * kinds + int(np.argmax(by_scale[best])))
+    score = float(logsumexp(candidates))
+    steady_good = _best_sequence(run.steady, 0)[1]
+    return MoveTest(log_bayes, score, first + best, score > settings.threshold, moved, good, steady_good)
+
+
+def _closer(
+    before: Gaussian,
+    terms: WhiteTerms,
+    settings: MoveSettings,
+    pose: slice,
+    births: range,
+    relinearise: Relinearise,
+    run: _Run,
+) -> _Run:
+    """The run with every candidate linearised about where it leads, if that is far."""
+    kinds = len(settings.scales.share)
+    candidates = len(births)
+    for _ in range(ROUNDS):
+        by_scale = run.log_bayes(kinds, settings.scales.share)
+        best = np.argmax(by_scale, axis=1)
+        steps = np.stack([_best_sequence(run.moved, c * kinds + int(best[c]))[0].mean for c in range(candidates)])
+        moves = steps[:, pose]
+        far = (np.linalg.norm(moves[:, :3], axis=1) > REACH_RAD) | (np.linalg.norm(moves[:, 3:], axis=1) > REACH_MM)
+        if not far.any():
+            break
+        run = _run(before, terms, relinearise(np.where(far[:, None], steps, 0.0)), settings, pose, births)
+    return run
+
+
+def relinearisation(problem: PackedProblem, base: SharedState) -> Relinearise:
+    """:data:`Relinearise` of the PMs of a problem about a base state (one hypothesis)."""
+
+    def about(steps: FloatArray) -> WhiteTerms:
+        many = base.take(np.zeros(len(steps), dtype=np.int64))
+        return linearise(problem, many.retract(steps, problem.columns), base)
+
+    return about

@@ -1,0 +1,118 @@
+"""Closing the loop: whether the camera went back to where an earlier epoch had it.
+
+The new epoch's pairs are judged under the earlier epoch's registration (with its uncertainty) against one that is off
+by a prior of scales that starts where re-use would do harm: a nudge below that is no reason to start anew, and the
+test for moves goes on after re-use anyway. Where static tags were seen in both epochs, they decide.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.online.moves import MoveScales, MoveSettings, Relinearise, check_for_move
+from fgreg.online.tags import TagMotion, log_bayes_of_motion
+from fgreg.online.white import Gaussian, WhiteTerms
+
+
+class Return(enum.Enum):
+    """What the evidence is good for."""
+
+    SAME = "same"
+    NEW = "new"
+    OPEN = "open"
+
+
+def elsewhere_scales() -> MoveScales:
+    """Where the camera is if it is not back: from just far enough to matter to anywhere."""
+    degrees, mm = [1.0, 2.0, 10.0, 40.0], [2.0, 4.0, 30.0, 120.0]
+    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.4, 0.3, 0.2, 0.1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReturnSettings:
+    """How to decide.
+
+    Attributes:
+        elsewhere: prior of the registration's difference where the camera is not back.
+        least_pairs: fewer never re-use an epoch.
+        accept, reject: log Bayes factors of the same place from which it is (or below minus which it is not) re-used.
+        junk_probability: of each pair.
+    """
+
+    elsewhere: MoveScales
+    least_pairs: int = 3
+    accept: float = math.log(100.0)
+    reject: float = math.log(100.0)
+    junk_probability: float = 0.04
+
+    def __post_init__(self) -> None:
+        if not (self.accept > 0 and self.reject > 0 and self.least_pairs >= 1):
+            raise ValueError("accept and reject have to be > 0, least_pairs >= 1")
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnTest:
+    """Log Bayes factor of the earlier epoch's registration against another one, and what follows."""
+
+    log_bayes: float
+    decision: Return
+
+
+def fits_again(
+    earlier: Gaussian,
+    terms: WhiteTerms,
+    settings: ReturnSettings,
+    *,
+    pose: slice,
+    relinearise: Relinearise | None = None,
+    tags: TagMotion | None = None,
+) -> ReturnTest:
+    """Whether a new epoch's pairs are of an earlier epoch's registration.
+
+    Args:
+        earlier: the shared variables' step given everything before these pairs; ``pose`` that of the earlier epoch.
+        terms: the new epoch's pairs so far, linearised at the earlier epoch's registration; may be none with tags.
+        settings: priors and limits.
+        pose: columns of the earlier epoch's registration.
+        relinearise: for large differences.
+        tags: motion of the static tags from the earlier epoch to now, where both saw them.
+    """
+    if tags is not None:
+        return _decided(-log_bayes_of_motion(tags, settings.elsewhere), settings, enough=True)
+    if terms.count == 0:
+        return ReturnTest(0.0, Return.OPEN)
+    moves = MoveSettings(settings.elsewhere, settings.junk_probability)
+    test = check_for_move(earlier, terms, moves, pose=pose, last=0, relinearise=relinearise)
+    return _decided(-float(test.log_bayes[0]), settings, enough=terms.count >= settings.least_pairs)
+
+
+def _decided(log_bayes: float, settings: ReturnSettings, *, enough: bool) -> ReturnTest:
+    if enough and log_bayes >= settings.accept:
+        return ReturnTest(log_bayes, Return.SAME)
+    return ReturnTest(log_bayes, Return.NEW if log_bayes <= -settings.reject else Return.OPEN)
+
+
+def which_epoch(tests: dict[int, ReturnTest]) -> int | None:
+    """The earlier epoch to re-use: of those that fit the one that fits best; None where none does."""
+    fitting = {k: t for k, t in tests.items() if t.decision is Return.SAME}
+    return max(fitting, key=lambda k: fitting[k].log_bayes) if fitting else None
+
+
+def default_return_settings() -> ReturnSettings:
+    """Settings that the figures in tools/study_moves.py are for."""
+    return ReturnSettings(elsewhere_scales())
+
+
+__all__ = [
+    "Return",
+    "ReturnSettings",
+    "ReturnTest",
+    "default_return_settings",
+    "elsewhere_scales",
+    "fits_again",
+    "which_epoch",
+]

@@ -1,0 +1,238 @@
+"""Static tags (board, markers fixed to the patient or table): whether, and how, the camera moved against them.
+
+All static tags move by one and the same rigid motion when the camera does: ``camera_new_T_tag =
+camera_new_T_camera_old * camera_old_T_tag``. A tag that goes its own way was bumped or misread. The motion is tested
+by its chi square of 6 degrees of freedom, given the covariance of the detections on both sides, averaged over frames.
+
+Detection errors are not independent from frame to frame: a share of their variance (lens, print, view) stays while
+nothing moves. Averaging n frames leaves ``share + (1 - share) / n`` of the variance, on either side of the comparison.
+Errors common to all tags look like a motion; nothing here can tell them from one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.special import chdtri, logsumexp
+
+from fgreg.frames import FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
+from fgreg.measurements import POSE_FLOOR, usable_covariance
+from fgreg.online.moves import MoveScales
+
+TAG_P = 1e-3
+"""A tag that fits a common motion worse than this goes its own way."""
+ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagPose:
+    """One tag, averaged over frames: camera_T_tag (4, 4), covariance (6, 6) right tangent, frames that saw it."""
+
+    camera_T_tag: FloatArray
+    covariance: FloatArray
+    frames: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagFrame:
+    """Static tags seen in one frame, by id: camera_T_tag (4, 4), and covariance (6, 6) of the right tangent."""
+
+    camera_T_tag: Mapping[int, FloatArray]
+    covariance: Mapping[int, FloatArray]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagMotion:
+    """The common rigid motion of tags.
+
+    Attributes:
+        camera_new_T_camera_old: (4, 4).
+        covariance: (6, 6) of its right tangent.
+        chi2: of no motion, 6 degrees of freedom.
+        tags: ids that share the motion; apart: those that do not.
+    """
+
+    camera_new_T_camera_old: FloatArray
+    covariance: FloatArray
+    chi2: float
+    tags: tuple[int, ...]
+    apart: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TagSettings:
+    """How to watch.
+
+    Attributes:
+        windows: numbers of last frames that are averaged, each tested.
+        reference_frames: frames at the epoch's start (those first seen later: from then) that it is compared with.
+        steady_share: of the detections' variance that stays from frame to frame.
+        p: probability of an alarm, per test, while nothing moves.
+    """
+
+    windows: tuple[int, ...] = (3, 10)
+    reference_frames: int = 50
+    steady_share: float = 0.2
+    p: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if not self.windows or min(self.windows) < 1 or self.reference_frames < 1:
+            raise ValueError("windows and reference_frames have to be numbers of frames >= 1")
+        if not 0.0 <= self.steady_share <= 1.0 or not 0.0 < self.p < 1.0:
+            raise ValueError("steady_share and p have to be between 0 and 1")
+
+    @property
+    def threshold(self) -> float:
+        """Chi square of an alarm."""
+        return float(chdtri(6, self.p))
+
+
+def _difference(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(6,) right tangent from one transform (4, 4) to another, rotation vector and translation apart."""
+    between = inverse(first) @ second
+    return np.concatenate([log_so3(between[:3, :3]), between[:3, 3]])
+
+
+def average_tags(frames: Sequence[TagFrame], steady_share: float) -> dict[int, TagPose]:
+    """Each tag's mean pose over the frames that saw it; a few misread ones are left out by their median."""
+    out = {}
+    for tag in sorted({tag for frame in frames for tag in frame.camera_T_tag}):
+        seen = [(f.camera_T_tag[tag], f.covariance[tag]) for f in frames if tag in f.camera_T_tag]
+        base = seen[0][0]
+        for _ in range(2):  # the second time about the median, where a flipped first frame no longer matters
+            steps = np.stack([_difference(base, pose) for pose, _ in seen])
+            middle = np.median(steps, axis=0)
+            base = _moved(base, middle)
+        steps = np.stack([_difference(base, pose) for pose, _ in seen])
+        covariance = np.stack([usable_covariance(c, POSE_FLOOR) for _, c in seen])
+        chi2 = np.einsum("na,nab,nb->n", steps, np.linalg.inv(covariance), steps)
+        good = chi2 <= chdtri(6, TAG_P * 0.1)
+        if 2 * good.sum() <= len(seen):
+            continue
+        count = int(good.sum())
+        mean = covariance[good].mean(axis=0) * (steady_share + (1.0 - steady_share) / count)
+        out[tag] = TagPose(_moved(base, steps[good].mean(axis=0)), mean, count)
+    return out
+
+
+def _moved(transform: FloatArray, step: FloatArray) -> FloatArray:
+    """A transform moved by a right tangent, rotation and translation apart as in :func:`_difference`."""
+    return np.asarray(transform @ make_transform(exp_so3(step[:3]), step[3:]))
+
+
+def _fit(
+    old: Mapping[int, TagPose], new: Mapping[int, TagPose], tags: Sequence[int], start: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Least squares motion (4, 4), its information (6, 6), and each tag's chi square (n,)."""
+    motion = start
+    weights = [np.linalg.inv(old[tag].covariance + new[tag].covariance) for tag in tags]
+    information = np.zeros((6, 6))
+    for _ in range(ROUNDS):
+        information, slope = np.zeros((6, 6)), np.zeros(6)
+        for tag, weight in zip(tags, weights, strict=True):
+            error = _difference(motion @ old[tag].camera_T_tag, new[tag].camera_T_tag)
+            turn = adjoint(inverse(old[tag].camera_T_tag))
+            information += turn.T @ weight @ turn
+            slope += turn.T @ weight @ error
+        motion = _moved(motion, np.asarray(np.linalg.solve(information, slope)))
+    return motion, information, _misfits(old, new, tags, motion)
+
+
+def _misfits(
+    old: Mapping[int, TagPose], new: Mapping[int, TagPose], tags: Sequence[int], motion: FloatArray
+) -> FloatArray:
+    out = []
+    for tag in tags:
+        error = _difference(motion @ old[tag].camera_T_tag, new[tag].camera_T_tag)
+        out.append(float(error @ np.linalg.solve(old[tag].covariance + new[tag].covariance, error)))
+    return np.array(out)
+
+
+def tag_motion(old: Mapping[int, TagPose], new: Mapping[int, TagPose]) -> TagMotion | None:
+    """The motion that most tags seen on both sides share; None where no majority of them agrees."""
+    tags = sorted(set(old) & set(new))
+    if not tags:
+        return None
+    starts = [np.eye(4), *(new[tag].camera_T_tag @ inverse(old[tag].camera_T_tag) for tag in tags)]
+    best: tuple[int, float, FloatArray] | None = None
+    limit = float(chdtri(6, TAG_P))
+    for start in starts:
+        inside = [t for t, c in zip(tags, _misfits(old, new, tags, start), strict=True) if c <= 2.0 * limit]
+        if not inside:
+            continue
+        motion, _, misfit = _fit(old, new, inside, start)
+        misfit = _misfits(old, new, tags, motion)
+        score = int(np.sum(misfit <= limit)), -float(np.minimum(misfit, limit).sum())
+        if best is None or score > best[:2]:
+            best = (*score, motion)
+    if best is None or 2 * best[0] <= len(tags):
+        return None
+    misfit = _misfits(old, new, tags, best[2])
+    together = [tag for tag, c in zip(tags, misfit, strict=True) if c <= limit]
+    motion, information, _ = _fit(old, new, together, best[2])
+    step = _difference(np.eye(4), motion)
+    return TagMotion(
+        motion,
+        np.asarray(np.linalg.inv(information)),
+        float(step @ information @ step),
+        tuple(together),
+        tuple(tag for tag in tags if tag not in together),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagWatch:
+    """State of the watch: frames of the reference, and those since."""
+
+    reference: tuple[TagFrame, ...] = ()
+    recent: tuple[TagFrame, ...] = ()
+    means: Mapping[int, TagPose] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagCheck:
+    """What one more frame says: whether the camera moved, by what, and how many of the last frames came after."""
+
+    alarm: bool
+    motion: TagMotion | None
+    frames: int
+
+
+def watch_tags(watch: TagWatch, frame: TagFrame, settings: TagSettings) -> tuple[TagWatch, TagCheck]:
+    """Take in a frame and test. After an alarm the caller goes on from :func:`restart_watch`."""
+    longest = max(settings.windows)
+    recent = (*watch.recent, frame)
+    reference, means = watch.reference, watch.means
+    if len(recent) > longest:
+        if len(reference) < settings.reference_frames:
+            reference = (*reference, recent[0])
+            means = average_tags(reference, settings.steady_share)
+        recent = recent[1:]
+    watch = TagWatch(reference, recent, means)
+    best: TagCheck = TagCheck(False, None, 0)
+    if not means:
+        return watch, best
+    for size in settings.windows:
+        if size > len(recent):
+            continue
+        motion = tag_motion(means, average_tags(recent[-size:], settings.steady_share))
+        if motion is None or (best.motion is not None and motion.chi2 <= best.motion.chi2):
+            continue
+        best = TagCheck(motion.chi2 > settings.threshold, motion, size)
+    return watch, best
+
+
+def restart_watch(watch: TagWatch, frames: int, settings: TagSettings) -> TagWatch:
+    """After an accepted move: the last ``frames`` frames become the reference of the new epoch."""
+    reference = watch.recent[-frames:] if frames else ()
+    return TagWatch(reference, (), average_tags(reference, settings.steady_share) if reference else {})
+
+
+def log_bayes_of_motion(motion: TagMotion, scales: MoveScales) -> float:
+    """Log Bayes factor of a move by the prior's scales against none, given the measured motion."""
+    step, noise = _difference(np.eye(4), motion.camera_new_T_camera_old), motion.covariance
+    spread = np.concatenate([noise[None], noise + scales.covariance])
+    log = -0.5 * (np.linalg.slogdet(spread)[1] + np.einsum("a,kab,b->k", step, np.linalg.inv(spread), step))
+    return float(logsumexp(log[1:] + np.log(scales.share)) - log[0])

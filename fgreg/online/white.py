@@ -1,0 +1,171 @@
+"""PMs as whitened linear equations on the shared variables, and the Gaussian of those variables.
+
+With everything private eliminated (fgreg.graph.reduced) a PM adds ``cost + 2 g' d + d' H d`` at a step d from the
+linearisation point, and H has the rank of the equations it leaves over (two for one look). So that is
+``|residual + jacobian d|^2 + rest`` with few rows, which is what a Kalman filter takes one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.frames import FloatArray, IntArray
+from fgreg.graph.packing import Columns, PackedProblem
+from fgreg.graph.reduced import Contributions, contributions, refine
+from fgreg.graph.reduced_blocks import initial_private, times, transposed
+from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.robust import pm_degrees_of_freedom
+
+TYPICAL_RAD, TYPICAL_MM = 1e-2, 1.0
+"""Steps at which rotations and lengths matter alike: scale of the pivots."""
+LEAST_PIVOT = 1e-14
+PRIVATE_ROUNDS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaussian:
+    """Of the shared variables' step (D,) from the linearisation point: mean (D,), covariance (D, D)."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteTerms:
+    """n PMs in time order, linearised at S places; steps are all counted from one base point.
+
+    Attributes:
+        residual: (S, n, q), zero in rows that a PM does not have.
+        jacobian: (S, n, q, D).
+        rest: (S, n) chi square that no step takes away (looks that contradict each other).
+        equations: (n,) rows that count.
+    """
+
+    residual: FloatArray
+    jacobian: FloatArray
+    rest: FloatArray
+    equations: IntArray
+
+    @property
+    def count(self) -> int:
+        return int(self.residual.shape[1])
+
+    def last(self, count: int) -> WhiteTerms:
+        """The last ``count`` PMs only."""
+        return self.take(np.arange(self.count)[max(self.count - count, 0) :])
+
+    def take(self, index: IntArray) -> WhiteTerms:
+        """Some of the PMs."""
+        return WhiteTerms(self.residual[:, index], self.jacobian[:, index], self.rest[:, index], self.equations[index])
+
+
+def pivot_scale(columns: Columns) -> FloatArray:
+    """(D,) typical size of each shared variable's step."""
+    scale = np.full(columns.size, TYPICAL_RAD)
+    for epoch in range(columns.epochs):
+        scale[6 * epoch + 3 : 6 * epoch + 6] = TYPICAL_MM
+    scale[columns.beam : columns.beam + 2] = TYPICAL_MM
+    if columns.bias is not None:
+        scale[columns.bias : columns.bias + 3] = TYPICAL_MM
+    if columns.radius is not None:
+        scale[columns.radius] = TYPICAL_MM
+    return scale
+
+
+def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: FloatArray | None = None) -> WhiteTerms:
+    """Whitened equations of PMs by Cholesky with pivots, as many rows as there are equations.
+
+    Args:
+        part: cost (S, n), gradient (S, n, D), hessian (S, n, D, D).
+        equations: (n,).
+        scale: (D,) typical steps.
+        at: (S, D) steps from the base to where ``part`` was linearised; None: there.
+    """
+    hessian, gradient = part.hessian.copy(), part.gradient.copy()
+    count, n, size = gradient.shape
+    rows = int(equations.max()) if n else 0
+    residual, jacobian = np.zeros((count, n, rows)), np.zeros((count, n, rows, size))
+    first = np.diagonal(hessian, axis1=-2, axis2=-1) * scale**2
+    least = LEAST_PIVOT * np.maximum(first.max(axis=-1, initial=0.0), 1e-30)
+    for row in range(rows):
+        diagonal = np.diagonal(hessian, axis1=-2, axis2=-1) * scale**2
+        pivot = np.argmax(diagonal, axis=-1)[..., None]
+        value = np.take_along_axis(diagonal / scale**2, pivot, axis=-1)[..., 0]
+        good = (np.take_along_axis(diagonal, pivot, axis=-1)[..., 0] > least) & (row < equations)
+        root = np.sqrt(np.where(good, value, 1.0))
+        line = np.take_along_axis(hessian, pivot[..., None], axis=-2)[..., 0, :] / root[..., None]
+        line = np.where(good[..., None], line, 0.0)
+        r = np.where(good, np.take_along_axis(gradient, pivot, axis=-1)[..., 0] / root, 0.0)
+        jacobian[:, :, row], residual[:, :, row] = line, r
+        hessian -= line[..., :, None] * line[..., None, :]
+        gradient -= line * r[..., None]
+    rest = np.maximum(part.cost - np.sum(residual**2, axis=-1), 0.0)
+    if at is not None:
+        residual = residual - times(jacobian, at[:, None, :])
+    return WhiteTerms(residual, jacobian, rest, equations)
+
+
+def linearise(problem: PackedProblem, state: SharedState, base: SharedState | None = None) -> WhiteTerms:
+    """The problem's PMs, whitened at S states; steps are counted from ``base`` (one hypothesis; ``state`` where None).
+
+    The private variables are found afresh at each state.
+    """
+    private = initial_private(problem, state)
+    for _ in range(PRIVATE_ROUNDS):
+        _, private = refine(problem, state, private)
+    part = contributions(problem, state, private).pm
+    at = None if base is None else step_between(_repeated(base, state.count), state, problem.columns)
+    return whiten(part, pm_degrees_of_freedom(problem), pivot_scale(problem.columns), at)
+
+
+def _repeated(state: SharedState, count: int) -> SharedState:
+    return state.take(np.zeros(count, dtype=np.int64)) if state.count != count else state
+
+
+def gaussian_of(hessian: FloatArray, gradient: FloatArray, scale: FloatArray) -> Gaussian | None:
+    """The Gaussian ``exp(-(d' H d) / 2 - g' d)``; None where H leaves a direction open."""
+    scaled = hessian * scale * scale[:, None]
+    root = np.sqrt(np.maximum(np.diag(scaled), 1e-300))
+    try:
+        lower = np.linalg.cholesky(scaled / root / root[:, None])
+    except np.linalg.LinAlgError:
+        return None
+    inverse_lower = np.linalg.inv(lower) / root
+    covariance = np.asarray(inverse_lower.T @ inverse_lower * scale * scale[:, None])
+    return Gaussian(-covariance @ gradient, covariance)
+
+
+def add_terms(gaussian: Gaussian, terms: WhiteTerms, weight: FloatArray | None = None) -> Gaussian:
+    """The Gaussian with PMs (linearised once) taken in, those of weight zero left out."""
+    mean, covariance = gaussian.mean, gaussian.covariance
+    for j in range(terms.count):
+        if weight is not None and weight[j] == 0.0:
+            continue
+        jacobian = terms.jacobian[0, j]
+        gain = covariance @ jacobian.T
+        spread = np.eye(len(jacobian)) + jacobian @ gain
+        gain = np.linalg.solve(spread, gain.T).T
+        mean = mean - gain @ (terms.residual[0, j] + jacobian @ mean)
+        covariance = covariance - gain @ jacobian @ covariance
+        covariance = 0.5 * (covariance + covariance.T)
+    return Gaussian(mean, covariance)
+
+
+def pose_columns(epoch: int) -> slice:
+    """Where an epoch's registration sits among the shared variables."""
+    return slice(6 * epoch, 6 * epoch + 6)
+
+
+__all__ = [
+    "Gaussian",
+    "WhiteTerms",
+    "add_terms",
+    "gaussian_of",
+    "linearise",
+    "pivot_scale",
+    "pose_columns",
+    "transposed",
+    "whiten",
+]
