@@ -27,6 +27,8 @@ from fgreg.graph.shared_state import SharedState, step_between
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
 QUANTILE = 0.95
+MOST_TRANSLATION_MM = 2000.0
+"""No camera is farther from a probe (the session format's bound): far out, rounding alone may look like a fit."""
 CHUNK = 100
 """Samples evaluated at once: what stays in the cache."""
 REFINED_PMS = 8
@@ -169,7 +171,8 @@ def log_density(mode: Mode, step: FloatArray) -> FloatArray:
         if len(problem.pms) < REFINED_PMS or mode.doubted is not None:
             _, private = refine(problem, state, private)
         log = log_posterior(problem, state, private)
-    return np.where(np.isfinite(log), log, -np.inf)
+        near = (np.linalg.norm(state.translation_mm, axis=-1) <= MOST_TRANSLATION_MM).all(axis=1)
+    return np.where(np.isfinite(log) & near, log, -np.inf)
 
 
 def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
@@ -323,6 +326,8 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         counts.append(draws)
         share = np.log(np.array(counts) / sum(counts))
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
+        if not np.isfinite(log_weight).any():  # the optimum itself is nowhere that a camera may be
+            return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=0.0)
         if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
             goal = TAILS * goal  # far from Gaussian: what has not been drawn does not lower the count
         if _effective(log_weight) >= goal or len(x) >= most:
@@ -338,6 +343,8 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
 
 ENOUGH_SAMPLES = 60.0
 """Independent samples from which moments stand on their own."""
+LEAST_SAMPLES = 5.0
+"""Fewer say nothing of the mean: the optimum it is, then."""
 
 
 def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
@@ -364,7 +371,7 @@ def _about_mean(
     # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
     # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
     square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
-    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12))
+    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12)) if effective >= LEAST_SAMPLES else 0.0
     shift = step_of_tangent(keep * centre[None], columns)
     mean = target.modes[0].optimum.state.retract(shift, columns)
     step = step_between(mean, target.state(x), columns)
