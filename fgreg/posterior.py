@@ -327,24 +327,27 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         share = np.log(np.array(counts) / sum(counts))
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
         if not np.isfinite(log_weight).any():  # the optimum itself is nowhere that a camera may be
-            return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=0.0)
+            break
         if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
             goal = TAILS * goal  # far from Gaussian: what has not been drawn does not lower the count
         if _effective(log_weight) >= goal or len(x) >= most:
             break
         proposals.append(_refitted(x, log_weight, fallback, rng))
         draws = min(max(300, len(x) // 2), max(most - len(x), 100))
+    effective = _effective(log_weight) if np.isfinite(log_weight).any() else 0.0
+    if effective < LEAST_SAMPLES:
+        return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=effective)
     weight = np.exp(log_weight - logsumexp(log_weight))
     which = target.nearest(x)
     mass = np.bincount(which, weight, minlength=len(modes))
     main = np.where(which == int(np.argmax(mass)), weight, 0.0)
-    return _about_mean(target, x, weight, main / main.sum(), log_target, _effective(log_weight))
+    return _about_mean(target, x, weight, main / main.sum(), log_target, effective)
 
 
 ENOUGH_SAMPLES = 60.0
 """Independent samples from which moments stand on their own."""
 LEAST_SAMPLES = 5.0
-"""Fewer say nothing of the mean: the optimum it is, then."""
+"""Fewer say nothing, and would seem certain of it: the Gaussian at the optimum stands in for them."""
 
 
 def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
@@ -371,7 +374,7 @@ def _about_mean(
     # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
     # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
     square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
-    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12)) if effective >= LEAST_SAMPLES else 0.0
+    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12))
     shift = step_of_tangent(keep * centre[None], columns)
     mean = target.modes[0].optimum.state.retract(shift, columns)
     step = step_between(mean, target.state(x), columns)

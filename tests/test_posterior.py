@@ -194,3 +194,4 @@ def test_a_posterior_that_runs_away_is_answered_by_the_optimum() -> None:
     found = sample_posterior((away,), goal=100.0, most=500, seed=1)
     assert found.effective == 0.0
     assert np.isfinite(found.covariance).all()
+    assert predicted_tre(found, 0, model.targets_mm).worst_mm > 0.1
