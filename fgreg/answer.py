@@ -19,7 +19,7 @@ from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.sites import inverse_hessian, propagate
-from fgreg.posterior import Doubted, Mode, Posterior, gaussian_posterior, sample_posterior
+from fgreg.posterior import MOST_TRANSLATION_MM, Doubted, Mode, Posterior, gaussian_posterior, sample_posterior
 from fgreg.registration import Registration, Shots
 from fgreg.robust import log_junk
 from fgreg.search import targets_moved
@@ -147,7 +147,10 @@ def _with_sites(problem: PackedProblem, optimum: Optimum, covariance: FloatArray
         return Mode(problem, optimum, covariance)
     sites, there = found
     inverse = inverse_hessian(there.evaluation.hessian[0])
-    return Mode(problem, optimum, covariance) if inverse is None else Mode(sites, there, inverse)
+    away = np.linalg.norm(there.state.translation_mm, axis=-1).max()
+    if inverse is None or not away <= MOST_TRANSLATION_MM:  # at few pairs the sites may let the optimum run away
+        return Mode(problem, optimum, covariance)
+    return Mode(sites, there, inverse)
 
 
 def _modes(registration: Registration) -> tuple[Mode, ...]:

@@ -27,6 +27,8 @@ from fgreg.graph.shared_state import SharedState, step_between
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
 QUANTILE = 0.95
+MOST_TRANSLATION_MM = 2000.0
+"""No camera is farther from a probe (the session format's bound): far out, rounding alone may look like a fit."""
 CHUNK = 100
 """Samples evaluated at once: what stays in the cache."""
 REFINED_PMS = 8
@@ -169,7 +171,8 @@ def log_density(mode: Mode, step: FloatArray) -> FloatArray:
         if len(problem.pms) < REFINED_PMS or mode.doubted is not None:
             _, private = refine(problem, state, private)
         log = log_posterior(problem, state, private)
-    return np.where(np.isfinite(log), log, -np.inf)
+        near = (np.linalg.norm(state.translation_mm, axis=-1) <= MOST_TRANSLATION_MM).all(axis=1)
+    return np.where(np.isfinite(log) & near, log, -np.inf)
 
 
 def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
@@ -323,21 +326,28 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         counts.append(draws)
         share = np.log(np.array(counts) / sum(counts))
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
+        if not np.isfinite(log_weight).any():  # the optimum itself is nowhere that a camera may be
+            break
         if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
             goal = TAILS * goal  # far from Gaussian: what has not been drawn does not lower the count
         if _effective(log_weight) >= goal or len(x) >= most:
             break
         proposals.append(_refitted(x, log_weight, fallback, rng))
         draws = min(max(300, len(x) // 2), max(most - len(x), 100))
+    effective = _effective(log_weight) if np.isfinite(log_weight).any() else 0.0
+    if effective < LEAST_SAMPLES:
+        return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=effective)
     weight = np.exp(log_weight - logsumexp(log_weight))
     which = target.nearest(x)
     mass = np.bincount(which, weight, minlength=len(modes))
     main = np.where(which == int(np.argmax(mass)), weight, 0.0)
-    return _about_mean(target, x, weight, main / main.sum(), log_target, _effective(log_weight))
+    return _about_mean(target, x, weight, main / main.sum(), log_target, effective)
 
 
 ENOUGH_SAMPLES = 60.0
 """Independent samples from which moments stand on their own."""
+LEAST_SAMPLES = 5.0
+"""Fewer say nothing, and would seem certain of it: the Gaussian at the optimum stands in for them."""
 
 
 def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:

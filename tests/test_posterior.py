@@ -18,6 +18,7 @@ from fgreg.posterior import (
     Mode,
     Posterior,
     gaussian_posterior,
+    log_density,
     pose_tangent,
     predicted_tre,
     region_contains,
@@ -176,3 +177,21 @@ def test_the_answer_keeps_the_optimum_apart_from_the_mean() -> None:
     gaussian = answer(register(measurements, model, SolveConfig(window_shape=False)), SolveConfig(window_shape=False))
     assert gaussian.registration.problem.shapes is None
     assert region_contains(found.posterior, truth.trus_T_camera[0])
+
+
+def test_a_posterior_that_runs_away_is_answered_by_the_optimum() -> None:
+    # The optimum with sites of five window-only pairs may be kilometres off; so may samples that rounding favours.
+    model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=8, first_hit=False)
+    registration = register(measurements, model, SolveConfig())
+    mode = Mode(registration.problem, registration.optimum, registration.covariance)
+    step = np.zeros((2, mode.problem.columns.size))
+    step[1, 3:6] = 1e12
+    log = log_density(mode, step)
+    assert np.isfinite(log[0])
+    assert log[1] == -np.inf
+    far = replace(mode.optimum.state, translation_mm=mode.optimum.state.translation_mm + 1e9)
+    away = replace(mode, optimum=replace(mode.optimum, state=far))
+    found = sample_posterior((away,), goal=100.0, most=500, seed=1)
+    assert found.effective == 0.0
+    assert np.isfinite(found.covariance).all()
+    assert predicted_tre(found, 0, model.targets_mm).worst_mm > 0.1
