@@ -32,7 +32,7 @@ from fgreg.measurements import Aim, EpochStart, Measurements
 from fgreg.models import SessionModel
 from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 from fgreg.online.moves import relinearisation
-from fgreg.online.returns import Return, ReturnSettings, default_return_settings, fits_again
+from fgreg.online.returns import default_return_settings, fits_again
 from fgreg.online.tags import TagFrame, TagSettings, TagWatch, watch_tags
 from fgreg.online.white import linearise, pose_columns
 from fgreg.registration import pack_session, register
@@ -172,29 +172,37 @@ def gone(
 
 
 def returns(count: int, seed: int, *, first_hit: bool) -> None:
-    settings = default_return_settings()
+    kind = "first-hit" if first_hit else "window only"
     rows = (("back", 0.0, 0.0), *SHIFTS[::-1], ("anywhere", 40.0, 20.0))
     for name, mm, degrees in rows:
-        same, new = [], []
+        found: list[FloatArray] = []
         for s in range(count):
             motion = shift_of(np.random.default_rng([seed, s, 7]), mm, degrees)
             try:
-                decided = _decisions(seed * 100000 + s, motion, settings, first_hit=first_hit)
+                found.append(_log_bayes(seed * 100000 + s, motion, first_hit=first_hit))
             except EstimationError:
                 continue
-            at = next((n for n, d in enumerate(decided, 1) if d is not Return.OPEN), AFTER + 1)
-            final = decided[at - 1] if at <= AFTER else Return.OPEN
-            same.append(at if final is Return.SAME else AFTER + 1)
-            new.append(at if final is Return.NEW else AFTER + 1)
-            if (s + 1) % max(count // 10, 1) == 0:
-                n = np.array(same)
-                by = ", ".join(f"{100 * np.mean(n <= k):.1f} % by {k}" for k in (3, 6, 10, 15))
-                print(f"returns ({'first-hit' if first_hit else 'window only'}), {name}: old epoch used again {by}; "
-                      f"known to be elsewhere by 15: {100 * np.mean(np.array(new) <= AFTER):.1f} % "
-                      f"({len(same)} sessions)", flush=True)  # fmt: skip
+            if (s + 1) % max(count // 4, 1) == 0:
+                _print_returns(f"returns ({kind}), {name}", np.array(found))
 
 
-def _decisions(seed: int, motion: FloatArray, settings: ReturnSettings, *, first_hit: bool) -> list[Return]:
+def _print_returns(name: str, log_bayes: FloatArray) -> None:
+    """First decisions of each session (rows), pair by pair, by the settings' limit and by others about it."""
+    settings = default_return_settings()
+    for accept in (settings.accept - 1.0, settings.accept, settings.accept + 1.0):
+        same = log_bayes >= accept
+        same[:, : settings.least_pairs - 1] = False
+        new = log_bayes <= -settings.reject
+        at_same = np.where(same.any(axis=1), same.argmax(axis=1) + 1, AFTER + 1)
+        at_new = np.where(new.any(axis=1), new.argmax(axis=1) + 1, AFTER + 1)
+        by = ", ".join(f"{100 * np.mean((at_same <= k) & (at_same < at_new)):.1f} % by {k}" for k in (3, 6, 10, 15))
+        elsewhere = 100 * np.mean((at_new <= AFTER) & (at_new < at_same))
+        print(f"{name}, limit {accept:.1f}: old epoch used again {by}; elsewhere by 15: {elsewhere:.1f} % "
+              f"({len(log_bayes)} sessions)", flush=True)  # fmt: skip
+
+
+def _log_bayes(seed: int, motion: FloatArray, *, first_hit: bool) -> FloatArray:
+    """(15,) log Bayes factors of the old registration after 1, 2, ... pairs."""
     model, measurements, _ = gone(seed, motion, STEADY, AFTER, first_hit=first_hit)
     together = replace(
         measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs), epochs=measurements.epochs[:1]
@@ -209,12 +217,12 @@ def _decisions(seed: int, motion: FloatArray, settings: ReturnSettings, *, first
         test = fits_again(
             earlier,
             linearise(tail, follower.state),
-            settings,
+            default_return_settings(),
             pose=pose_columns(0),
             relinearise=relinearisation(tail, follower.state),
         )
-        out.append(test.decision)
-    return out
+        out.append(test.log_bayes)
+    return np.array(out)
 
 
 def _rms(values: list[float]) -> float:

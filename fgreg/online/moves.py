@@ -36,10 +36,12 @@ from fgreg.robust import JUNK_DENSITY
 
 BRANCHES = 4
 """Sequences of junk labels carried along per hypothesis."""
-REACH_RAD, REACH_MM = math.radians(1.5), 3.0
+REACH_RAD, REACH_MM = math.radians(4.0), 10.0
 """Moves up to this are linear enough."""
-ROUNDS = 3
-"""Times that moved hypotheses are linearised again."""
+ROUNDS, SETTLED = 6, 5.0
+"""Times that moved hypotheses are linearised again, at most, until they move by no more than reach over this."""
+CLOSER = 6
+"""Candidates that are looked at more closely."""
 SUSPICION = 2.0
 """Log of the score by the first linearisation from which large moves are linearised again."""
 
@@ -78,8 +80,8 @@ class MoveScales:
 
 def default_scales() -> MoveScales:
     """A nudge, a shift, a large move, and the camera put back anywhere."""
-    degrees, mm = [0.5, 1.0, 2.0, 10.0, 40.0], [1.0, 2.0, 4.0, 30.0, 120.0]
-    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.2, 0.25, 0.3, 0.15, 0.1]))
+    degrees, mm = [0.5, 1.2, 4.0, 10.0, 40.0], [1.0, 2.5, 10.0, 30.0, 120.0]
+    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.25, 0.45, 0.15, 0.1, 0.05]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,36 +230,48 @@ class _Run:
     steady: _Groups
     moved: _Groups
 
-    def log_bayes(self, scales: int, share: FloatArray) -> FloatArray:
+    def log_bayes(self, share: FloatArray) -> FloatArray:
         """(C, K) of each candidate and scale."""
-        moved = logsumexp(self.moved.log_weight, axis=1).reshape(-1, scales) + np.log(share)
+        moved = logsumexp(self.moved.log_weight, axis=1).reshape(-1, len(share)) + np.log(share)
         return np.asarray(moved - logsumexp(self.steady.log_weight, axis=1))
 
 
 def _run(
-    before: Gaussian, terms: WhiteTerms, moved: WhiteTerms | None, settings: MoveSettings, pose: slice, births: range
+    before: Gaussian,
+    terms: WhiteTerms,
+    moved: WhiteTerms | None,
+    settings: MoveSettings,
+    pose: slice,
+    candidates: IntArray,
 ) -> _Run:
-    """Run all filters. ``moved``: terms as linearised at each candidate of ``births``, (C, n, ...); None: ``terms``."""
+    """Run all filters.
+
+    ``candidates`` (C,): increasing, the pairs before which the camera may have moved; ``moved``: terms as each of them
+    is linearised, (C, n, ...); None: as ``terms``.
+    """
     scales = settings.scales.covariance
     kinds = len(scales)
     steady = _Groups.one(before, terms.count)
     alive: _Groups | None = None
+    born = 0
     for j in range(terms.count):
         junk = _junk_logs(int(terms.equations[j]), settings.junk_probability)
-        if j in births:
-            born = steady.spawn(scales, pose)
-            alive = born if alive is None else _joined([alive, born])
+        if born < len(candidates) and candidates[born] == j:
+            fresh = steady.spawn(scales, pose)
+            alive = fresh if alive is None else _joined([alive, fresh])
+            born += 1
         if alive is not None:
             if moved is None:
                 line = terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j]
             else:
-                among = slice(0, min(j + 1, births.stop) - births.start)
-                line = tuple(  # type: ignore[assignment]
-                    np.repeat(part[among, j], kinds, axis=0) for part in (moved.residual, moved.jacobian, moved.rest)
+                line = (
+                    np.repeat(moved.residual[:born, j], kinds, axis=0),
+                    np.repeat(moved.jacobian[:born, j], kinds, axis=0),
+                    np.repeat(moved.rest[:born, j], kinds, axis=0),
                 )
             alive = _advance(alive, j, *line, junk)
         steady = _advance(steady, j, terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j], junk)
-    assert alive is not None
+    assert alive is not None  # there is a candidate
     return _Run(steady, alive)
 
 
@@ -295,44 +309,54 @@ def check_for_move(
     births = range(first, terms.count if last is None else last + 1)
     if not 0 <= births.start < births.stop <= terms.count:
         raise ValueError(f"first and last are {first} and {last}, expected pairs of {terms.count}")
-    kinds = len(settings.scales.share)
-    run = _run(before, terms, None, settings, pose, births)
-    by_scale = run.log_bayes(kinds, settings.scales.share)
-    if relinearise is not None and logsumexp(by_scale) > SUSPICION:
-        run = _closer(before, terms, settings, pose, births, relinearise, run)
-        by_scale = run.log_bayes(kinds, settings.scales.share)
-    candidates = logsumexp(by_scale, axis=1)
+    share = settings.scales.share
+    candidates = np.arange(births.start, births.stop)
+    run = _run(before, terms, None, settings, pose, candidates)
+    by_scale = run.log_bayes(share)
+    best = [_best_sequence(run.moved, c * len(share) + int(np.argmax(by_scale[c]))) for c in range(len(candidates))]
+    score = logsumexp(by_scale, axis=1)
+    if relinearise is not None and logsumexp(score) > SUSPICION:
+        _look_closer(before, terms, settings, pose, first, relinearise, score, best)
     log_bayes = np.full(terms.count, -np.inf)
-    log_bayes[births.start : births.stop] = candidates
-    best = int(np.argmax(candidates))
-    moved, good = _best_sequence(run.moved, best * kinds + int(np.argmax(by_scale[best])))
-    score = float(logsumexp(candidates))
+    log_bayes[births.start : births.stop] = score
+    since = int(np.argmax(log_bayes))
+    moved, good = best[since - first]
+    total = float(logsumexp(score))
     steady_good = _best_sequence(run.steady, 0)[1]
-    return MoveTest(log_bayes, score, first + best, score > settings.threshold, moved, good, steady_good)
+    return MoveTest(log_bayes, total, since, total > settings.threshold, moved, good, steady_good)
 
 
-def _closer(
+def _look_closer(
     before: Gaussian,
     terms: WhiteTerms,
     settings: MoveSettings,
     pose: slice,
-    births: range,
+    first: int,
     relinearise: Relinearise,
-    run: _Run,
-) -> _Run:
-    """The run with every candidate linearised about where it leads, if that is far."""
-    kinds = len(settings.scales.share)
-    candidates = len(births)
+    score: FloatArray,
+    best: list[tuple[Gaussian, FloatArray]],
+) -> None:
+    """Judge the likeliest candidates for large moves anew, linearised about where they lead; in place."""
+    share = settings.scales.share
+    order = np.argsort(-score)[:CLOSER]
+    far = np.array([c for c in sorted(order) if _far(best[c][0].mean[pose])], dtype=np.int64)
+    if not len(far):
+        return
+    at = np.zeros((len(far), len(before.mean)))
     for _ in range(ROUNDS):
-        by_scale = run.log_bayes(kinds, settings.scales.share)
-        best = np.argmax(by_scale, axis=1)
-        steps = np.stack([_best_sequence(run.moved, c * kinds + int(best[c]))[0].mean for c in range(candidates)])
-        moves = steps[:, pose]
-        far = (np.linalg.norm(moves[:, :3], axis=1) > REACH_RAD) | (np.linalg.norm(moves[:, 3:], axis=1) > REACH_MM)
-        if not far.any():
+        steps = np.stack([best[c][0].mean for c in far])
+        if not any(_far(step[pose]) for step in (steps - at) * SETTLED):
             break
-        run = _run(before, terms, relinearise(np.where(far[:, None], steps, 0.0)), settings, pose, births)
-    return run
+        at = steps
+        run = _run(before, terms, relinearise(at), settings, pose, first + far)
+        by_scale = run.log_bayes(share)
+        for row, c in enumerate(far):
+            best[c] = _best_sequence(run.moved, row * len(share) + int(np.argmax(by_scale[row])))
+            score[c] = logsumexp(by_scale[row])
+
+
+def _far(move: FloatArray) -> bool:
+    return bool(np.linalg.norm(move[:3]) > REACH_RAD or np.linalg.norm(move[3:]) > REACH_MM)
 
 
 def relinearisation(problem: PackedProblem, base: SharedState) -> Relinearise:
