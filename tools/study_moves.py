@@ -27,7 +27,7 @@ import numpy as np
 
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, exp_so3, inverse, make_transform, right_from_parent_covariance
+from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.reduced import log_posterior, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import make_state
@@ -35,7 +35,6 @@ from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
 from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 from fgreg.online.moves import MoveSettings, MoveTest, default_scales
-from fgreg.online.static_tags import StaticTagsWatch
 from fgreg.registration import pack_session, register
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
@@ -176,86 +175,3 @@ def run_shifts(
         ratios = ideal_ratios(model, measurements, truth, truth.trus_T_camera[0], moved.trus_T_camera[0])
         ideal.append(shiryaev_roberts(ratios)[STEADY:].tolist())
     return {"scores": scores, "since": since, "ideal": ideal}
-
-
-# --- static tags ----------------------------------------------------------------------------------------------------
-
-FRAMES_PER_PAIR = 10
-
-
-class TagNoise:
-    """Detection noise of tags in a row of frames: the session's defaults; a share of the variance drifts slowly.
-
-    The drift is a Gauss-Markov process of its own in each tag and axis; errors that never change are added as well
-    (they cancel as long as the camera stands still, and are drawn anew when it moves).
-    """
-
-    def __init__(self, rng: np.random.Generator, tags: int, drift_share: float, drift_frames: float) -> None:
-        self.rng = rng
-        self.sigma = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.8])
-        self.share, self.keep = drift_share, math.exp(-1.0 / drift_frames)
-        self.drift = rng.normal(size=(tags, 6))
-
-    def draw(self) -> FloatArray:
-        """(tags, 6) errors of one frame: rotation about the camera's axes, translation along them."""
-        fresh = self.rng.normal(size=self.drift.shape)
-        self.drift = self.keep * self.drift + math.sqrt(1.0 - self.keep**2) * self.rng.normal(size=self.drift.shape)
-        mixed = math.sqrt(self.share) * self.drift + math.sqrt(1.0 - self.share) * fresh
-        return np.asarray(mixed * self.sigma)
-
-
-def place_tags(rng: np.random.Generator, tags: int) -> list[FloatArray]:
-    """camera_T_tag of tags in view at 90 to 140 mm, within 45 mm of the optical axis, tilted up to some 35 deg."""
-    out = []
-    for _ in range(tags):
-        place = np.array([*rng.uniform(-45.0, 45.0, 2), rng.uniform(90.0, 140.0)])
-        turn = exp_so3(np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(-math.pi, math.pi)]))
-        out.append(make_transform(np.diag([1.0, -1.0, -1.0]) @ turn, place))
-    return out
-
-
-def see_tags(poses: list[FloatArray], noise: TagNoise) -> tuple[dict[int, FloatArray], dict[int, FloatArray]]:
-    """One frame: camera_T_tag and right-tangent covariances as the session's defaults have them."""
-    seen, covariance = {}, {}
-    for i, (pose, error) in enumerate(zip(poses, noise.draw(), strict=True)):
-        seen[i] = make_transform(exp_so3(error[:3]) @ pose[:3, :3], pose[:3, 3] + error[3:])
-        covariance[i] = right_from_parent_covariance(seen[i][:3, :3], np.diag(noise.sigma**2))
-    return seen, covariance
-
-
-def run_tags_clean(frames: int, seed: int, tags: int, drift_share: float, drift_frames: float) -> int:
-    """False alarms (each resets the watch) in so many frames, in epochs of 500."""
-    alarms = 0
-    for s in range(frames // 500):
-        rng = np.random.default_rng([seed, s])
-        poses, noise = place_tags(rng, tags), TagNoise(rng, tags, drift_share, drift_frames)
-        watch = StaticTagsWatch()
-        for _ in range(500):
-            test = watch.add(*see_tags(poses, noise))
-            if test is not None and test.alarm:
-                alarms += 1
-                watch.reset()
-    return alarms
-
-
-def run_tags_shifts(
-    sessions: int, mm: float, degrees: float, seed: int, tags: int, drift_share: float, drift_frames: float
-) -> list[int]:
-    """Frames from each shift to its alarm (99 where none within the frames before the next pair)."""
-    out = []
-    for s in range(sessions):
-        rng = np.random.default_rng([seed, s])
-        poses, noise = place_tags(rng, tags), TagNoise(rng, tags, drift_share, drift_frames)
-        motion = shift_of(rng, mm, degrees)
-        watch = StaticTagsWatch()
-        for _ in range(STEADY * FRAMES_PER_PAIR):
-            watch.add(*see_tags(poses, noise))
-        moved = [motion @ pose for pose in poses]
-        found = 99
-        for k in range(FRAMES_PER_PAIR):
-            test = watch.add(*see_tags(moved, noise))
-            if test is not None and test.alarm:
-                found = k + 1
-                break
-        out.append(found)
-    return out
