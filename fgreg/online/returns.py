@@ -17,7 +17,6 @@ from fgreg.online.moves import MoveScales, MoveSettings, Relinearise, check_for_
 from fgreg.online.tags import TagMotion, log_bayes_of_motion
 from fgreg.online.white import Gaussian, WhiteTerms
 
-
 SEEN_SIGMAS = 3.0
 """Differences that matter are seen where they are so many standard deviations of the tags' motion."""
 
