@@ -14,10 +14,19 @@ from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import Anchor, BeamArrays, LookArrays, PackedProblem, RotationShapes, only_aims, without_aims
 from fgreg.graph.reduced import contributions, evaluate, refine
-from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
 from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, relinearisation
-from fgreg.online.white import Gaussian, WhiteTerms, add_terms, gaussian_of, pivot_scale, pose_columns, whiten
+from fgreg.online.white import (
+    Gaussian,
+    WhiteTerms,
+    add_terms,
+    gaussian_of,
+    pivot_scale,
+    pose_columns,
+    white_terms,
+    whiten,
+)
 from fgreg.robust import junk_p, pm_degrees_of_freedom, pm_limits
 from fgreg.sensitivity import WindowShapes
 
@@ -184,11 +193,17 @@ class EpochFollower:
         closer = relinearisation(tail, self.state)
         return check_for_move(
             before,
-            self.here.terms.take(last),
+            white_terms(tail, self.state, self._private_of(last)),
             settings.learned(self.kept[old]),
             pose=pose_columns(0),
             relinearise=closer,
         )
+
+    def _private_of(self, pms: IntArray) -> PrivateState:
+        """The private variables of some PMs at the present state."""
+        mine = np.isin(self.seen.beam_pm, pms)
+        private = self.private
+        return replace(private, trus_p_pm=private.trus_p_pm[:, pms], beam_error=private.beam_error[:, mine])
 
     def everything(self) -> Gaussian:
         """The step given all kept PMs."""

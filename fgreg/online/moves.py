@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -31,8 +31,9 @@ from scipy.special import logsumexp
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
-from fgreg.online.white import Gaussian, WhiteTerms, linearise
+from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, linearise
 from fgreg.robust import JUNK_DENSITY
+from fgreg.sensitivity import interval_moments, log_interval
 
 BRANCHES = 4
 """Sequences of junk labels carried along per hypothesis."""
@@ -47,6 +48,8 @@ SUSPICION = 2.0
 
 JUNK_PRIOR, JUNK_PRIOR_PAIRS, JUNK_MEMORY = 0.04, 10.0, 50
 """Share of junk expected at first, how many pairs that opinion is worth, and how many pairs back it is learned from."""
+ALARM = 5.6
+"""Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and not reached by one odd pair."""
 LEAST_JUNK, MOST_JUNK = 0.01, 0.5
 """However clean the stream: a single odd pair must never pass for a move."""
 
@@ -94,9 +97,9 @@ class MoveSettings:
         threshold: log score from which it is an alarm.
     """
 
-    scales: MoveScales
+    scales: MoveScales = field(default_factory=default_scales)
     junk_probability: float = JUNK_PRIOR
-    threshold: float = math.log(2000.0)
+    threshold: float = ALARM
 
     def __post_init__(self) -> None:
         if not 0.0 < self.junk_probability < 1.0:
@@ -186,35 +189,74 @@ def _spread(innovation: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(np.linalg.inv(innovation)), np.asarray(np.linalg.slogdet(innovation)[1])
 
 
-def _advance(
-    groups: _Groups, j: int, residual: FloatArray, jacobian: FloatArray, rest: FloatArray, junk: tuple[float, float]
-) -> _Groups:
-    """One pair more: residual (G or 1, q), jacobian (G or 1, q, D); ``junk``: its log probability times density, and
-    the log probability of a good one."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """One pair as G (or 1) hypotheses have it: residual (G, q), jacobian (G, q, D), rest (G,); its window, if any."""
+
+    residual: FloatArray
+    jacobian: FloatArray
+    rest: FloatArray
+    window: WindowRows | None
+
+
+def _rows(terms: WhiteTerms, j: int, hypotheses: slice, times: int) -> _Rows:
+    """Pair ``j`` of some hypotheses of the terms, each several times over."""
+
+    def of(values: FloatArray) -> FloatArray:
+        return np.repeat(values[hypotheses, j], times, axis=0) if times > 1 else values[hypotheses, j]
+
+    window = None
+    if terms.windows is not None and terms.windows.there[j]:
+        w = terms.windows
+        window = replace(w.take(np.array([j])), mean=of(w.mean), variance=of(w.variance), gain=of(w.gain))
+    return _Rows(of(terms.residual), of(terms.jacobian), of(terms.rest), window)
+
+
+def _in_window(
+    mean: FloatArray, covariance: FloatArray, window: WindowRows
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Step given that the rotation is in its window, by moments (exact ones of its first two), and the log density.
+
+    Means (G, B, D), covariances (G, B, D, D). Density: of the interval's, in units of the site that stands for it.
+    """
+    gain = window.gain[:, None]
+    along = (covariance @ gain[..., None])[..., 0]
+    sigma = np.sqrt(window.variance[:, None] + np.sum(gain * along, axis=-1) + window.soft**2)
+    at = window.mean[:, None] + np.sum(gain * mean, axis=-1)
+    log = log_interval(window.low - at, window.high - at, sigma)
+    log = log + np.log(math.sqrt(2.0 * math.pi) * window.site / (window.high - window.low))
+    slope, bend = interval_moments(window.low - at, window.high - at, sigma)
+    covariance = covariance - bend[..., None, None] * (along[..., :, None] * along[..., None, :])
+    return mean + slope[..., None] * along, covariance, log
+
+
+def _advance(groups: _Groups, j: int, rows: _Rows, junk: tuple[float, float]) -> _Groups:
+    """One pair more; ``junk``: log of its probability times its density, and of the probability of a good pair."""
     log_junk, log_good = junk
-    jacobian = jacobian[:, None]
+    jacobian = rows.jacobian[:, None]
     gain = groups.covariance @ np.swapaxes(jacobian, -1, -2)
-    spread = jacobian @ gain + np.eye(jacobian.shape[-2])
-    inverted, log_det = _spread(spread)
-    innovation = residual[:, None] + (jacobian @ groups.mean[..., None])[..., 0]
+    inverted, log_det = _spread(jacobian @ gain + np.eye(jacobian.shape[-2]))
+    innovation = rows.residual[:, None] + (jacobian @ groups.mean[..., None])[..., 0]
     weighted = (inverted @ innovation[..., None])[..., 0]
-    log = log_good - 0.5 * (np.sum(innovation * weighted, axis=-1) + log_det + rest[:, None])
-    # Each sequence with this pair good, and with it junk; the heaviest go on.
+    log = log_good - 0.5 * (np.sum(innovation * weighted, axis=-1) + log_det + rows.rest[:, None])
+    mean = groups.mean - (gain @ weighted[..., None])[..., 0]
+    covariance = groups.covariance - gain @ inverted @ np.swapaxes(gain, -1, -2)
+    if rows.window is not None:
+        mean, covariance, more = _in_window(mean, covariance, rows.window)
+        log = log + more
+    # Each sequence with this pair good, and with it junk (it then learns nothing); the heaviest go on.
     both = np.concatenate([groups.log_weight + log, groups.log_weight + log_junk], axis=1)
     keep = np.argpartition(-both, BRANCHES - 1, axis=1)[:, :BRANCHES]
-    log_weight = np.take_along_axis(both, keep, axis=1)
     parent, is_good = keep % BRANCHES, keep < BRANCHES
-    rows = np.arange(len(both))[:, None]
-    # Sequences in which the pair is junk learn nothing from it.
-    taken = np.where(is_good, 1.0, 0.0)
-    gain, inverted = gain[rows, parent], inverted[rows, parent]
-    step = (gain @ weighted[rows, parent][..., None])[..., 0]
-    mean = groups.mean[rows, parent] - taken[..., None] * step
-    drop = gain @ inverted @ np.swapaxes(gain, -1, -2)
-    covariance = groups.covariance[rows, parent] - taken[..., None, None] * drop
-    good = groups.good[rows, parent]
-    good[..., j] = taken
-    return _Groups(mean, covariance, log_weight, good)
+    at = np.arange(len(both))[:, None]
+    good = groups.good[at, parent]
+    good[..., j] = is_good
+    return _Groups(
+        np.where(is_good[..., None], mean[at, parent], groups.mean[at, parent]),
+        np.where(is_good[..., None, None], covariance[at, parent], groups.covariance[at, parent]),
+        np.take_along_axis(both, keep, axis=1),
+        good,
+    )
 
 
 def _junk_logs(equations: int, probability: float) -> tuple[float, float]:
@@ -262,15 +304,10 @@ def _run(
             born += 1
         if alive is not None:
             if moved is None:
-                line = terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j]
+                alive = _advance(alive, j, _rows(terms, j, slice(None), 1), junk)
             else:
-                line = (
-                    np.repeat(moved.residual[:born, j], kinds, axis=0),
-                    np.repeat(moved.jacobian[:born, j], kinds, axis=0),
-                    np.repeat(moved.rest[:born, j], kinds, axis=0),
-                )
-            alive = _advance(alive, j, *line, junk)
-        steady = _advance(steady, j, terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j], junk)
+                alive = _advance(alive, j, _rows(moved, j, slice(0, born), kinds), junk)
+        steady = _advance(steady, j, _rows(terms, j, slice(None), 1), junk)
     assert alive is not None  # there is a candidate
     return _Run(steady, alive)
 
