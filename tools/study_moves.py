@@ -252,7 +252,7 @@ def main() -> None:
                     f"{time.perf_counter() - started:.0f} s",
                     flush=True,
                 )
-                for threshold in (5.0, 5.3, 5.6, 6.0, 6.5, 7.6):
+                for threshold in (5.0, 5.2, 5.4, 5.6, 6.0, 6.5, 7.6):
                     count = sum(excursions(np.array(row), threshold) for row in streams)
                     print(f"  threshold {threshold:.1f}: {count}", flush=True)
         if "shifts" in what:
