@@ -161,7 +161,7 @@ def ideal_clean_scores(seed: int, *, pairs: int, first_hit: bool, mm: float, deg
     motion = shift_of(rng, mm, degrees)
     model, measurements, truth = make_measurements(rng, aims=0, pairs=pairs, first_hit=first_hit)
     old = truth.trus_T_camera[0]
-    return shiryaev_roberts(ideal_ratios(model, measurements, truth, old, old @ inverse(motion))).tolist()
+    return [float(x) for x in shiryaev_roberts(ideal_ratios(model, measurements, truth, old, old @ inverse(motion)))]
 
 
 @dataclass(frozen=True, slots=True)
