@@ -1,4 +1,4 @@
-"""One epoch followed pair by pair: the batch optimum at every pair, whitened pairs, windows, and what is worth a test."""
+"""One epoch followed pair by pair: the batch optimum at each, whitened pairs, windows, and what is worth a test."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_transform
+from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced import contributions, refine
 from fgreg.graph.reduced_blocks import initial_private

@@ -191,7 +191,7 @@ class EpochFollower:
         good = nis < pm_limits(self.seen, junk_p(kept))
         self.kept = good if good.sum() >= MIN_BEFORE else before
 
-    def test(self, settings: MoveSettings, window: int = WINDOW) -> MoveTest | None:
+    def test(self, settings: MoveSettings, window: int = WINDOW, gate: float = GATE) -> MoveTest | None:
         """Whether the camera moved among the last PMs; None where nothing looks like it, or too few came before them.
 
         All PMs fitting, a test without junk, windows as Gaussians and no large moves is enough to tell that the proper
@@ -203,7 +203,7 @@ class EpochFollower:
         last = np.arange(self.count - size, self.count)
         if self.kept[last].all():
             score = quick_score(self.everything(), self.here.terms.take(last), settings.scales, pose_columns(0))
-            if score < GATE:
+            if score < gate:
                 return None
         old = np.arange(self.count) < self.count - size
         before = self.posterior(old)
