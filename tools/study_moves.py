@@ -3,6 +3,7 @@
 Poses with the documented noise, 12 aims. What is measured:
 
   clean     streams of steady pairs: false alarms (target: at most 1 in 2,000 pairs)
+  junk      the same with a fifth of the pairs replaced by junk
   shifts    15 steady pairs, then a shift in a random direction about the camera: share found within so many pairs
             (targets: 5 mm or 3 deg, first-hit: 80 % within 2 and 93 % within 6; window only: 55 % and 85 %; 2 mm or
             1 deg, first-hit: 50 % within 6 and 80 % within 15)
@@ -14,13 +15,13 @@ likelihood ratios (Shiryaev and Roberts); its threshold is set to the same rate 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +32,15 @@ from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.reduced import log_posterior, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import make_state
-from fgreg.measurements import EpochStart, Measurements
+from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
 from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
-from fgreg.online.moves import MoveSettings, MoveTest, default_scales
+from fgreg.online.moves import ALARM, MoveSettings, MoveTest
 from fgreg.registration import pack_session, register
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
+from study_junk import KINDS, spoil
+
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
 STEADY = 15
@@ -130,48 +133,137 @@ def excursions(scores: FloatArray, threshold: float) -> int:
     return int(np.sum(above[1:] & ~above[:-1]))
 
 
-def run_clean(sessions: int, pairs: int, *, first_hit: bool, settings: MoveSettings, seed: int) -> dict[str, object]:
-    scores, failed = [], 0
-    for s in range(sessions):
-        model, measurements, _ = make_measurements(
-            np.random.default_rng([seed, s]), aims=12, pairs=pairs, first_hit=first_hit
+def clean_scores(seed: int, *, pairs: int, first_hit: bool, junk: float) -> list[float] | None:
+    """Scores of one steady stream; a share of its pairs replaced by junk. None where it could not be registered."""
+    rng = np.random.default_rng([seed, 3])
+    model, measurements, _ = make_measurements(rng, aims=12, pairs=pairs, first_hit=first_hit)
+    if junk > 0.0:
+        spoilt = rng.uniform(size=pairs) < junk
+        spoilt[:START] = False  # what the first registration does about junk is not in question here
+        kinds = rng.integers(len(KINDS), size=pairs)
+        measurements = replace(
+            measurements,
+            pairs=tuple(
+                spoil(pair, KINDS[kind], rng) if bad else pair
+                for pair, bad, kind in zip(measurements.pairs, spoilt, kinds, strict=True)
+            ),
         )
-        try:
-            found = follow(model, measurements, settings)
-        except EstimationError:
-            failed += 1
-            continue
-        scores.append([test.score if test is not None else -np.inf for test in found])
-    return {"scores": scores, "failed": failed, "pairs": len(scores) * pairs}
+    try:
+        found = follow(model, measurements, MoveSettings())
+    except EstimationError:
+        return None
+    return [test.score if test is not None else -math.inf for test in found]
 
 
-def run_ideal_clean(
-    sessions: int, pairs: int, mm: float, degrees: float, *, first_hit: bool, seed: int
-) -> list[list[float]]:
-    out = []
-    for s in range(sessions):
-        rng = np.random.default_rng([seed, s])
-        motion = shift_of(rng, mm, degrees)
-        model, measurements, truth = make_measurements(rng, aims=0, pairs=pairs, first_hit=first_hit)
-        old = truth.trus_T_camera[0]
-        ratios = ideal_ratios(model, measurements, truth, old, old @ inverse(motion))
-        out.append(shiryaev_roberts(ratios).tolist())
-    return out
+def ideal_clean_scores(seed: int, *, pairs: int, first_hit: bool, mm: float, degrees: float) -> list[float]:
+    """Scores of the ideal detector on one steady stream, looking for a random shift."""
+    rng = np.random.default_rng([seed, 4])
+    motion = shift_of(rng, mm, degrees)
+    model, measurements, truth = make_measurements(rng, aims=0, pairs=pairs, first_hit=first_hit)
+    old = truth.trus_T_camera[0]
+    return [float(x) for x in shiryaev_roberts(ideal_ratios(model, measurements, truth, old, old @ inverse(motion)))]
 
 
-def run_shifts(
-    sessions: int, mm: float, degrees: float, *, first_hit: bool, settings: MoveSettings, seed: int
-) -> dict[str, object]:
-    scores, since, ideal = [], [], []
-    for s in range(sessions):
-        motion = shift_of(np.random.default_rng([seed, s, 7]), mm, degrees)
-        model, measurements, (truth, moved) = two_epochs(
-            seed * 100000 + s, motion, STEADY, AFTER, first_hit=first_hit
-        )
-        found = follow(model, measurements, settings, STEADY)
-        scores.append([test.score if test is not None else -np.inf for test in found])
-        since.append([-1 if t is None else len(found) and STEADY + k + 1 - (len(t.log_bayes) - t.since)
-                      for k, t in enumerate(found)])  # fmt: skip
-        ratios = ideal_ratios(model, measurements, truth, truth.trus_T_camera[0], moved.trus_T_camera[0])
-        ideal.append(shiryaev_roberts(ratios)[STEADY:].tolist())
-    return {"scores": scores, "since": since, "ideal": ideal}
+@dataclass(frozen=True, slots=True)
+class Shifted:
+    """Scores after each pair from the shift on, ours and the ideal detector's; where the likeliest move is then."""
+
+    scores: list[float]
+    ideal: list[float]
+    since: list[int]
+
+
+def shift_scores(seed: int, *, first_hit: bool, mm: float, degrees: float) -> Shifted:
+    """One shift after the steady pairs."""
+    motion = shift_of(np.random.default_rng([seed, 5]), mm, degrees)
+    model, measurements, (truth, moved) = two_epochs(seed, motion, STEADY, AFTER, first_hit=first_hit)
+    found = follow(model, measurements, MoveSettings(), STEADY)
+    ratios = ideal_ratios(model, measurements, truth, truth.trus_T_camera[0], moved.trus_T_camera[0])
+    return Shifted(
+        scores=[test.score if test is not None else -math.inf for test in found],
+        ideal=shiryaev_roberts(ratios)[STEADY:].tolist(),
+        since=[-1 if test is None else k + 1 - (len(test.log_bayes) - test.since) for k, test in enumerate(found)],
+    )
+
+
+def threshold_at(scores: list[list[float]], per_pairs: float) -> float:
+    """The lowest threshold with at most one excursion in so many pairs."""
+    pairs = sum(len(row) for row in scores)
+    for threshold in np.arange(0.0, 20.0, 0.05):
+        if sum(excursions(np.array(row), float(threshold)) for row in scores) <= pairs / per_pairs:
+            return float(threshold)
+    return 20.0
+
+
+def first_above(rows: FloatArray, threshold: float) -> FloatArray:
+    """Pairs after the shift at which each row passes the threshold; infinite where it does not."""
+    above = rows > threshold
+    return np.where(above.any(axis=1), above.argmax(axis=1) + 1.0, np.inf)
+
+
+def report_shifts(name: str, found: list[Shifted], ideal_threshold: float, targets: dict[int, float]) -> None:
+    ours = first_above(np.array([row.scores for row in found]), ALARM)
+    ideal = first_above(np.array([row.ideal for row in found]), ideal_threshold)
+    print(f"{name} ({len(found)} shifts; threshold {ALARM:.2f}, ideal {ideal_threshold:.2f})")
+    for count in (1, 2, 4, 6, 10, 15):
+        target = f"   target {100 * targets[count]:.0f} %" if count in targets else ""
+        share, best = float(np.mean(ours <= count)), float(np.mean(ideal <= count))
+        print(f"  within {count:2d} pairs: {100 * share:5.1f} %   ideal {100 * best:5.1f} %{target}")
+    error = [row.since[int(at) - 1] for row, at in zip(found, ours, strict=True) if np.isfinite(at)]
+    late = np.mean([abs(e) <= 1 for e in error]) if error else float("nan")
+    print(f"  first pair after the move, told at the alarm: right or next to it in {100 * late:.0f} %")
+
+
+ROWS = (
+    ("5 mm or 3 deg, first-hit", 5.0, 3.0, True, {2: 0.80, 6: 0.93}),
+    ("5 mm or 3 deg, window only", 5.0, 3.0, False, {2: 0.55, 6: 0.85}),
+    ("2 mm or 1 deg, first-hit", 2.0, 1.0, True, {6: 0.50, 15: 0.80}),
+)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--what", default="clean,junk,shifts", help="which parts, with commas between")
+    parser.add_argument("--shifts", type=int, default=500, help="shifts of each row")
+    parser.add_argument("--clean-pairs", type=int, default=40000, help="steady pairs of each kind")
+    parser.add_argument("--stream", type=int, default=108, help="pairs of each steady stream; the first 8 register it")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    what = set(args.what.split(","))
+    if not what <= {"clean", "junk", "shifts"}:
+        parser.error(f"--what is {args.what}, expected some of clean, junk, shifts")
+    per_stream = args.stream - START
+    seeds = [1000000 * args.seed + s for s in range(-(-args.clean_pairs // per_stream))]
+    with ProcessPoolExecutor(args.jobs) as pool:
+        for part, junk in (("clean", 0.0), ("junk", 0.2)):
+            if part not in what:
+                continue
+            for first_hit in (True, False):
+                started = time.perf_counter()
+                one = partial(clean_scores, pairs=args.stream, first_hit=first_hit, junk=junk)
+                streams = [row for row in pool.map(one, seeds, chunksize=4) if row is not None]
+                tests = sum(len(row) for row in streams)
+                alarms = sum(excursions(np.array(row), ALARM) for row in streams)
+                name = f"{100 * junk:.0f} % junk, {'first-hit' if first_hit else 'window only'}"
+                print(
+                    f"{name}: {alarms} false alarms in {tests} pairs (1 in {tests / max(alarms, 1):.0f}"
+                    f"{'; target 1 in 2000' if not junk else ''}), {len(seeds) - len(streams)} streams not registered, "
+                    f"{time.perf_counter() - started:.0f} s",
+                    flush=True,
+                )
+                for threshold in (5.0, 5.2, 5.4, 5.6, 6.0, 6.5, 7.6):
+                    count = sum(excursions(np.array(row), threshold) for row in streams)
+                    print(f"  threshold {threshold:.1f}: {count}", flush=True)
+        if "shifts" in what:
+            for name, mm, degrees, first_hit, targets in ROWS:
+                one_ideal = partial(ideal_clean_scores, pairs=per_stream, first_hit=first_hit, mm=mm, degrees=degrees)
+                ideal = list(pool.map(one_ideal, seeds[: max(len(seeds) // 4, 1)], chunksize=4))
+                one_shift = partial(shift_scores, first_hit=first_hit, mm=mm, degrees=degrees)
+                found = list(pool.map(one_shift, [7000000 * args.seed + s for s in range(args.shifts)], chunksize=4))
+                report_shifts(name, found, threshold_at(ideal, RATE), targets)
+                sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -14,10 +14,19 @@ from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import Anchor, BeamArrays, LookArrays, PackedProblem, RotationShapes, only_aims, without_aims
 from fgreg.graph.reduced import contributions, evaluate, refine
-from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
-from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, relinearisation
-from fgreg.online.white import Gaussian, WhiteTerms, add_terms, gaussian_of, pivot_scale, pose_columns, whiten
+from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, quick_score, relinearisation
+from fgreg.online.white import (
+    Gaussian,
+    WhiteTerms,
+    add_terms,
+    gaussian_of,
+    pivot_scale,
+    pose_columns,
+    white_terms,
+    whiten,
+)
 from fgreg.robust import junk_p, pm_degrees_of_freedom, pm_limits
 from fgreg.sensitivity import WindowShapes
 
@@ -25,8 +34,11 @@ MIN_BEFORE = 6
 """PMs that a registration takes; before so many there is nothing that could have moved."""
 WINDOW = 15
 """Last PMs among which a move is looked for."""
+GATE = 0.5
+"""Log score by the quick test below which the proper one is left out."""
 MAX_STEPS = 8
-TOLERANCE = 1e-4
+TOLERANCE = 3e-3
+"""Newton decrement (chi square) at which an estimate has settled: what is left is in the gradients that tests get."""
 
 
 def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:
@@ -109,10 +121,10 @@ class EpochFollower:
         """
         self.kept = np.concatenate([self.kept, np.ones(count - self.count, dtype=bool)])
         fresh = np.arange(len(self.kept)) >= self.count if self.count else np.zeros(count, dtype=bool)
-        self.count = count
+        known, self.count = self.count, count
         self.seen = select_pms(self.problem, np.arange(count))
-        self.private = initial_private(self.seen, self.state)
-        for _ in range(3):
+        self.private = self._warm_private(known)
+        for _ in range(3 if known == 0 else 1):
             _, self.private = refine(self.seen, self.state, self.private)
         self.here = self._linearise()
         if fresh.any() and self.posterior(~fresh) is not None:
@@ -123,6 +135,15 @@ class EpochFollower:
             self._judge(self.kept)
             if (before == self.kept).all():
                 break
+
+    def _warm_private(self, known: int) -> PrivateState:
+        """Private variables of all seen: as they were of the first ``known`` PMs, on the arcs of the others."""
+        fresh = initial_private(self.seen, self.state)
+        if known == 0:
+            return fresh
+        fresh.trus_p_pm[:, :known] = self.private.trus_p_pm
+        fresh.beam_error[:, self.seen.beam_pm < known] = self.private.beam_error
+        return fresh
 
     def _linearise(self) -> _Here:
         parts = contributions(self.seen, self.state, self.private)
@@ -170,25 +191,39 @@ class EpochFollower:
         good = nis < pm_limits(self.seen, junk_p(kept))
         self.kept = good if good.sum() >= MIN_BEFORE else before
 
-    def test(self, settings: MoveSettings, window: int = WINDOW) -> MoveTest | None:
-        """Whether the camera moved among the last PMs; None with too few before them."""
+    def test(self, settings: MoveSettings, window: int = WINDOW, gate: float = GATE) -> MoveTest | None:
+        """Whether the camera moved among the last PMs; None where nothing looks like it, or too few came before them.
+
+        All PMs fitting, a test without junk, windows as Gaussians and no large moves is enough to tell that the proper
+        one is not worth its time.
+        """
         size = min(window, self.count - MIN_BEFORE)
         if size < 1:
             return None
+        last = np.arange(self.count - size, self.count)
+        if self.kept[last].all():
+            score = quick_score(self.everything(), self.here.terms.take(last), settings.scales, pose_columns(0))
+            if score < gate:
+                return None
         old = np.arange(self.count) < self.count - size
         before = self.posterior(old)
         if before is None:
             return None
-        last = np.flatnonzero(~old)
         tail = select_pms(self.seen, last)
         closer = relinearisation(tail, self.state)
         return check_for_move(
             before,
-            self.here.terms.take(last),
+            white_terms(tail, self.state, self._private_of(last)),
             settings.learned(self.kept[old]),
             pose=pose_columns(0),
             relinearise=closer,
         )
+
+    def _private_of(self, pms: IntArray) -> PrivateState:
+        """The private variables of some PMs at the present state."""
+        mine = np.isin(self.seen.beam_pm, pms)
+        private = self.private
+        return replace(private, trus_p_pm=private.trus_p_pm[:, pms], beam_error=private.beam_error[:, mine])
 
     def everything(self) -> Gaussian:
         """The step given all kept PMs."""

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -31,20 +31,25 @@ from scipy.special import logsumexp
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
-from fgreg.online.white import Gaussian, WhiteTerms, linearise
+from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, linearise
 from fgreg.robust import JUNK_DENSITY
+from fgreg.sensitivity import interval_moments, log_interval
 
 BRANCHES = 4
 """Sequences of junk labels carried along per hypothesis."""
-REACH_RAD, REACH_MM = math.radians(1.5), 3.0
+REACH_RAD, REACH_MM = math.radians(4.0), 10.0
 """Moves up to this are linear enough."""
-ROUNDS = 3
-"""Times that moved hypotheses are linearised again."""
+ROUNDS, SETTLED = 6, 5.0
+"""Times that moved hypotheses are linearised again, at most, until they move by no more than reach over this."""
+CLOSER = 6
+"""Candidates that are looked at more closely."""
 SUSPICION = 2.0
 """Log of the score by the first linearisation from which large moves are linearised again."""
 
 JUNK_PRIOR, JUNK_PRIOR_PAIRS, JUNK_MEMORY = 0.04, 10.0, 50
 """Share of junk expected at first, how many pairs that opinion is worth, and how many pairs back it is learned from."""
+ALARM = 5.4
+"""Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and more than one odd pair has."""
 LEAST_JUNK, MOST_JUNK = 0.01, 0.5
 """However clean the stream: a single odd pair must never pass for a move."""
 
@@ -78,8 +83,8 @@ class MoveScales:
 
 def default_scales() -> MoveScales:
     """A nudge, a shift, a large move, and the camera put back anywhere."""
-    degrees, mm = [0.5, 1.0, 2.0, 10.0, 40.0], [1.0, 2.0, 4.0, 30.0, 120.0]
-    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.2, 0.25, 0.3, 0.15, 0.1]))
+    degrees, mm = [0.5, 1.2, 4.0, 10.0, 40.0], [1.0, 2.5, 10.0, 30.0, 120.0]
+    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.25, 0.45, 0.15, 0.1, 0.05]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +97,9 @@ class MoveSettings:
         threshold: log score from which it is an alarm.
     """
 
-    scales: MoveScales
+    scales: MoveScales = field(default_factory=default_scales)
     junk_probability: float = JUNK_PRIOR
-    threshold: float = math.log(2000.0)
+    threshold: float = ALARM
 
     def __post_init__(self) -> None:
         if not 0.0 < self.junk_probability < 1.0:
@@ -184,35 +189,74 @@ def _spread(innovation: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.asarray(np.linalg.inv(innovation)), np.asarray(np.linalg.slogdet(innovation)[1])
 
 
-def _advance(
-    groups: _Groups, j: int, residual: FloatArray, jacobian: FloatArray, rest: FloatArray, junk: tuple[float, float]
-) -> _Groups:
-    """One pair more: residual (G or 1, q), jacobian (G or 1, q, D); ``junk``: its log probability times density, and
-    the log probability of a good one."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """One pair as G (or 1) hypotheses have it: residual (G, q), jacobian (G, q, D), rest (G,); its window, if any."""
+
+    residual: FloatArray
+    jacobian: FloatArray
+    rest: FloatArray
+    window: WindowRows | None
+
+
+def _rows(terms: WhiteTerms, j: int, hypotheses: slice, times: int) -> _Rows:
+    """Pair ``j`` of some hypotheses of the terms, each several times over."""
+
+    def of(values: FloatArray) -> FloatArray:
+        return np.repeat(values[hypotheses, j], times, axis=0) if times > 1 else values[hypotheses, j]
+
+    window = None
+    if terms.windows is not None and terms.windows.there[j]:
+        w = terms.windows
+        window = replace(w.take(np.array([j])), mean=of(w.mean), variance=of(w.variance), gain=of(w.gain))
+    return _Rows(of(terms.residual), of(terms.jacobian), of(terms.rest), window)
+
+
+def _in_window(
+    mean: FloatArray, covariance: FloatArray, window: WindowRows
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Step given that the rotation is in its window, by moments (exact ones of its first two), and the log density.
+
+    Means (G, B, D), covariances (G, B, D, D). Density: of the interval's, in units of the site that stands for it.
+    """
+    gain = window.gain[:, None]
+    along = (covariance @ gain[..., None])[..., 0]
+    sigma = np.sqrt(window.variance[:, None] + np.sum(gain * along, axis=-1) + window.soft**2)
+    at = window.mean[:, None] + np.sum(gain * mean, axis=-1)
+    log = log_interval(window.low - at, window.high - at, sigma)
+    log = log + np.log(math.sqrt(2.0 * math.pi) * window.site / (window.high - window.low))
+    slope, bend = interval_moments(window.low - at, window.high - at, sigma)
+    covariance = covariance - bend[..., None, None] * (along[..., :, None] * along[..., None, :])
+    return mean + slope[..., None] * along, covariance, log
+
+
+def _advance(groups: _Groups, j: int, rows: _Rows, junk: tuple[float, float]) -> _Groups:
+    """One pair more; ``junk``: log of its probability times its density, and of the probability of a good pair."""
     log_junk, log_good = junk
-    jacobian = jacobian[:, None]
+    jacobian = rows.jacobian[:, None]
     gain = groups.covariance @ np.swapaxes(jacobian, -1, -2)
-    spread = jacobian @ gain + np.eye(jacobian.shape[-2])
-    inverted, log_det = _spread(spread)
-    innovation = residual[:, None] + (jacobian @ groups.mean[..., None])[..., 0]
+    inverted, log_det = _spread(jacobian @ gain + np.eye(jacobian.shape[-2]))
+    innovation = rows.residual[:, None] + (jacobian @ groups.mean[..., None])[..., 0]
     weighted = (inverted @ innovation[..., None])[..., 0]
-    log = log_good - 0.5 * (np.sum(innovation * weighted, axis=-1) + log_det + rest[:, None])
-    # Each sequence with this pair good, and with it junk; the heaviest go on.
+    log = log_good - 0.5 * (np.sum(innovation * weighted, axis=-1) + log_det + rows.rest[:, None])
+    mean = groups.mean - (gain @ weighted[..., None])[..., 0]
+    covariance = groups.covariance - gain @ inverted @ np.swapaxes(gain, -1, -2)
+    if rows.window is not None:
+        mean, covariance, more = _in_window(mean, covariance, rows.window)
+        log = log + more
+    # Each sequence with this pair good, and with it junk (it then learns nothing); the heaviest go on.
     both = np.concatenate([groups.log_weight + log, groups.log_weight + log_junk], axis=1)
     keep = np.argpartition(-both, BRANCHES - 1, axis=1)[:, :BRANCHES]
-    log_weight = np.take_along_axis(both, keep, axis=1)
     parent, is_good = keep % BRANCHES, keep < BRANCHES
-    rows = np.arange(len(both))[:, None]
-    # Sequences in which the pair is junk learn nothing from it.
-    taken = np.where(is_good, 1.0, 0.0)
-    gain, inverted = gain[rows, parent], inverted[rows, parent]
-    step = (gain @ weighted[rows, parent][..., None])[..., 0]
-    mean = groups.mean[rows, parent] - taken[..., None] * step
-    drop = gain @ inverted @ np.swapaxes(gain, -1, -2)
-    covariance = groups.covariance[rows, parent] - taken[..., None, None] * drop
-    good = groups.good[rows, parent]
-    good[..., j] = taken
-    return _Groups(mean, covariance, log_weight, good)
+    at = np.arange(len(both))[:, None]
+    good = groups.good[at, parent]
+    good[..., j] = is_good
+    return _Groups(
+        np.where(is_good[..., None], mean[at, parent], groups.mean[at, parent]),
+        np.where(is_good[..., None, None], covariance[at, parent], groups.covariance[at, parent]),
+        np.take_along_axis(both, keep, axis=1),
+        good,
+    )
 
 
 def _junk_logs(equations: int, probability: float) -> tuple[float, float]:
@@ -228,36 +272,43 @@ class _Run:
     steady: _Groups
     moved: _Groups
 
-    def log_bayes(self, scales: int, share: FloatArray) -> FloatArray:
+    def log_bayes(self, share: FloatArray) -> FloatArray:
         """(C, K) of each candidate and scale."""
-        moved = logsumexp(self.moved.log_weight, axis=1).reshape(-1, scales) + np.log(share)
+        moved = logsumexp(self.moved.log_weight, axis=1).reshape(-1, len(share)) + np.log(share)
         return np.asarray(moved - logsumexp(self.steady.log_weight, axis=1))
 
 
 def _run(
-    before: Gaussian, terms: WhiteTerms, moved: WhiteTerms | None, settings: MoveSettings, pose: slice, births: range
+    before: Gaussian,
+    terms: WhiteTerms,
+    moved: WhiteTerms | None,
+    settings: MoveSettings,
+    pose: slice,
+    candidates: IntArray,
 ) -> _Run:
-    """Run all filters. ``moved``: terms as linearised at each candidate of ``births``, (C, n, ...); None: ``terms``."""
+    """Run all filters.
+
+    ``candidates`` (C,): increasing, the pairs before which the camera may have moved; ``moved``: terms as each of them
+    is linearised, (C, n, ...); None: as ``terms``.
+    """
     scales = settings.scales.covariance
     kinds = len(scales)
     steady = _Groups.one(before, terms.count)
     alive: _Groups | None = None
+    born = 0
     for j in range(terms.count):
         junk = _junk_logs(int(terms.equations[j]), settings.junk_probability)
-        if j in births:
-            born = steady.spawn(scales, pose)
-            alive = born if alive is None else _joined([alive, born])
+        if born < len(candidates) and candidates[born] == j:
+            fresh = steady.spawn(scales, pose)
+            alive = fresh if alive is None else _joined([alive, fresh])
+            born += 1
         if alive is not None:
             if moved is None:
-                line = terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j]
+                alive = _advance(alive, j, _rows(terms, j, slice(None), 1), junk)
             else:
-                among = slice(0, min(j + 1, births.stop) - births.start)
-                line = tuple(  # type: ignore[assignment]
-                    np.repeat(part[among, j], kinds, axis=0) for part in (moved.residual, moved.jacobian, moved.rest)
-                )
-            alive = _advance(alive, j, *line, junk)
-        steady = _advance(steady, j, terms.residual[:, j], terms.jacobian[:, j], terms.rest[:, j], junk)
-    assert alive is not None
+                alive = _advance(alive, j, _rows(moved, j, slice(0, born), kinds), junk)
+        steady = _advance(steady, j, _rows(terms, j, slice(None), 1), junk)
+    assert alive is not None  # there is a candidate
     return _Run(steady, alive)
 
 
@@ -295,44 +346,84 @@ def check_for_move(
     births = range(first, terms.count if last is None else last + 1)
     if not 0 <= births.start < births.stop <= terms.count:
         raise ValueError(f"first and last are {first} and {last}, expected pairs of {terms.count}")
-    kinds = len(settings.scales.share)
-    run = _run(before, terms, None, settings, pose, births)
-    by_scale = run.log_bayes(kinds, settings.scales.share)
-    if relinearise is not None and logsumexp(by_scale) > SUSPICION:
-        run = _closer(before, terms, settings, pose, births, relinearise, run)
-        by_scale = run.log_bayes(kinds, settings.scales.share)
-    candidates = logsumexp(by_scale, axis=1)
+    share = settings.scales.share
+    candidates = np.arange(births.start, births.stop)
+    run = _run(before, terms, None, settings, pose, candidates)
+    by_scale = run.log_bayes(share)
+    best = [_best_sequence(run.moved, c * len(share) + int(np.argmax(by_scale[c]))) for c in range(len(candidates))]
+    score = logsumexp(by_scale, axis=1)
+    if relinearise is not None and logsumexp(score) > SUSPICION:
+        _look_closer(before, terms, settings, pose, first, relinearise, score, best)
     log_bayes = np.full(terms.count, -np.inf)
-    log_bayes[births.start : births.stop] = candidates
-    best = int(np.argmax(candidates))
-    moved, good = _best_sequence(run.moved, best * kinds + int(np.argmax(by_scale[best])))
-    score = float(logsumexp(candidates))
+    log_bayes[births.start : births.stop] = score
+    since = int(np.argmax(log_bayes))
+    moved, good = best[since - first]
+    total = float(logsumexp(score))
     steady_good = _best_sequence(run.steady, 0)[1]
-    return MoveTest(log_bayes, score, first + best, score > settings.threshold, moved, good, steady_good)
+    return MoveTest(log_bayes, total, since, total > settings.threshold, moved, good, steady_good)
 
 
-def _closer(
+def _look_closer(
     before: Gaussian,
     terms: WhiteTerms,
     settings: MoveSettings,
     pose: slice,
-    births: range,
+    first: int,
     relinearise: Relinearise,
-    run: _Run,
-) -> _Run:
-    """The run with every candidate linearised about where it leads, if that is far."""
-    kinds = len(settings.scales.share)
-    candidates = len(births)
+    score: FloatArray,
+    best: list[tuple[Gaussian, FloatArray]],
+) -> None:
+    """Judge the likeliest candidates for large moves anew, linearised about where they lead; in place."""
+    share = settings.scales.share
+    order = np.argsort(-score)[:CLOSER]
+    far = np.array([c for c in sorted(order) if _far(best[c][0].mean[pose])], dtype=np.int64)
+    if not len(far):
+        return
+    at = np.zeros((len(far), len(before.mean)))
     for _ in range(ROUNDS):
-        by_scale = run.log_bayes(kinds, settings.scales.share)
-        best = np.argmax(by_scale, axis=1)
-        steps = np.stack([_best_sequence(run.moved, c * kinds + int(best[c]))[0].mean for c in range(candidates)])
-        moves = steps[:, pose]
-        far = (np.linalg.norm(moves[:, :3], axis=1) > REACH_RAD) | (np.linalg.norm(moves[:, 3:], axis=1) > REACH_MM)
-        if not far.any():
+        steps = np.stack([best[c][0].mean for c in far])
+        if not any(_far(step[pose]) for step in (steps - at) * SETTLED):
             break
-        run = _run(before, terms, relinearise(np.where(far[:, None], steps, 0.0)), settings, pose, births)
-    return run
+        at = steps
+        run = _run(before, terms, relinearise(at), settings, pose, first + far)
+        by_scale = run.log_bayes(share)
+        for row, c in enumerate(far):
+            best[c] = _best_sequence(run.moved, row * len(share) + int(np.argmax(by_scale[row])))
+            score[c] = logsumexp(by_scale[row])
+
+
+def _far(move: FloatArray) -> bool:
+    return bool(np.linalg.norm(move[:3]) > REACH_RAD or np.linalg.norm(move[3:]) > REACH_MM)
+
+
+def quick_score(posterior: Gaussian, terms: WhiteTerms, scales: MoveScales, pose: slice) -> float:
+    """Log score as of :func:`check_for_move`, but of Gaussians throughout: no junk, no windows, no large moves.
+
+    Exact for these, and next to nothing to compute: with everything known so far (``posterior``, the last pairs in it),
+    a move of prior covariance S before pair j has the Bayes factor
+
+        |1 + S F|^(-1/2) exp(h' (1 + S F)^(-1) S h / 2),
+
+    F the information that the pairs from j on have on the move, the shared variables free, and h their pull.
+
+    Args:
+        posterior: of the shared variables' step, given all pairs and that nothing moved.
+        terms: the last M pairs, linearised once.
+        scales: prior of the move.
+        pose: columns of the current epoch's registration.
+    """
+    jacobian = terms.jacobian[0]
+    left = terms.residual[0] + jacobian @ posterior.mean
+    hessian = np.swapaxes(jacobian, -1, -2) @ jacobian
+    pull = -np.einsum("nqd,nq->nd", jacobian, left)
+    hessian, pull = np.cumsum(hessian[::-1], axis=0)[::-1], np.cumsum(pull[::-1], axis=0)[::-1, pose]
+    across = hessian[:, pose, :]
+    information = across[:, :, pose] - across @ posterior.covariance @ np.swapaxes(across, -1, -2)
+    prior = scales.covariance
+    spread = np.eye(6) + prior @ information[:, None]
+    shrunk = np.linalg.solve(spread, prior @ pull[:, None, :, None])[..., 0]
+    log = 0.5 * (np.sum(pull[:, None] * shrunk, axis=-1) - np.linalg.slogdet(spread)[1])
+    return float(logsumexp(log + np.log(scales.share)))
 
 
 def relinearisation(problem: PackedProblem, base: SharedState) -> Relinearise:

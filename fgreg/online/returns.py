@@ -17,6 +17,9 @@ from fgreg.online.moves import MoveScales, MoveSettings, Relinearise, check_for_
 from fgreg.online.tags import TagMotion, log_bayes_of_motion
 from fgreg.online.white import Gaussian, WhiteTerms
 
+SEEN_SIGMAS = 3.0
+"""Differences that matter are seen where they are so many standard deviations of the tags' motion."""
+
 
 class Return(enum.Enum):
     """What the evidence is good for."""
@@ -27,9 +30,12 @@ class Return(enum.Enum):
 
 
 def elsewhere_scales() -> MoveScales:
-    """Where the camera is if it is not back: from just far enough to matter to anywhere."""
-    degrees, mm = [1.0, 2.0, 10.0, 40.0], [2.0, 4.0, 30.0, 120.0]
-    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.4, 0.3, 0.2, 0.1]))
+    """Where the camera is if it is not back: from just far enough to matter to anywhere.
+
+    Near by, turned only and shifted only have shares of their own: else no turn would speak against a shift.
+    """
+    degrees, mm = [1.0, 1.2, 0.1, 2.0, 10.0, 40.0], [2.0, 0.3, 2.4, 4.0, 30.0, 120.0]
+    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.2, 0.15, 0.15, 0.2, 0.2, 0.1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +47,7 @@ class ReturnSettings:
         least_pairs: fewer never re-use an epoch.
         accept, reject: log Bayes factors of the same place from which it is (or below minus which it is not) re-used.
         junk_probability: of each pair.
+        least_difference: turn (rad) and shift (mm) that matter.
     """
 
     elsewhere: MoveScales
@@ -48,6 +55,7 @@ class ReturnSettings:
     accept: float = math.log(100.0)
     reject: float = math.log(100.0)
     junk_probability: float = 0.04
+    least_difference: tuple[float, float] = (math.radians(1.0), 2.0)
 
     def __post_init__(self) -> None:
         if not (self.accept > 0 and self.reject > 0 and self.least_pairs >= 1):
@@ -82,12 +90,20 @@ def fits_again(
         tags: motion of the static tags from the earlier epoch to now, where both saw them.
     """
     if tags is not None:
-        return _decided(-log_bayes_of_motion(tags, settings.elsewhere), settings, enough=True)
+        sure = _sees(tags, settings)
+        return _decided(-log_bayes_of_motion(tags, settings.elsewhere), settings, enough=sure)
     if terms.count == 0:
         return ReturnTest(0.0, Return.OPEN)
     moves = MoveSettings(settings.elsewhere, settings.junk_probability)
     test = check_for_move(earlier, terms, moves, pose=pose, last=0, relinearise=relinearise)
     return _decided(-float(test.log_bayes[0]), settings, enough=terms.count >= settings.least_pairs)
+
+
+def _sees(tags: TagMotion, settings: ReturnSettings) -> bool:
+    """Whether the tags would show every difference that matters, whichever way it goes."""
+    sigma = np.repeat(settings.least_difference, 3)
+    worst = float(np.linalg.eigvalsh(tags.covariance / np.outer(sigma, sigma))[-1])
+    return worst <= SEEN_SIGMAS**-2
 
 
 def _decided(log_bayes: float, settings: ReturnSettings, *, enough: bool) -> ReturnTest:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, logsumexp
 
-from fgreg.frames import FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
+from fgreg.frames import BoolArray, FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
 from fgreg.measurements import POSE_FLOOR, usable_covariance
 from fgreg.online.moves import MoveScales
 
@@ -90,25 +90,29 @@ class TagSettings:
 
 
 def _difference(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(6,) right tangent from one transform (4, 4) to another, rotation vector and translation apart."""
+    """(..., 6) right tangents from transforms (..., 4, 4) to others, rotation vector and translation apart."""
     between = inverse(first) @ second
-    return np.concatenate([log_so3(between[:3, :3]), between[:3, 3]])
+    return np.concatenate([log_so3(between[..., :3, :3]), between[..., :3, 3]], axis=-1)
+
+
+def usable_frame(frame: TagFrame) -> TagFrame:
+    """The frame with covariances that can be inverted: a noise of zero counts as the smallest."""
+    return TagFrame(frame.camera_T_tag, {tag: usable_covariance(c, POSE_FLOOR) for tag, c in frame.covariance.items()})
 
 
 def average_tags(frames: Sequence[TagFrame], steady_share: float) -> dict[int, TagPose]:
     """Each tag's mean pose over the frames that saw it; a few misread ones are left out by their median."""
     out = {}
+    limit = float(chdtri(6, TAG_P * 0.1))
     for tag in sorted({tag for frame in frames for tag in frame.camera_T_tag}):
-        seen = [(f.camera_T_tag[tag], f.covariance[tag]) for f in frames if tag in f.camera_T_tag]
-        base = seen[0][0]
+        seen = [frame for frame in frames if tag in frame.camera_T_tag]
+        poses = np.stack([frame.camera_T_tag[tag] for frame in seen])
+        covariance = np.stack([frame.covariance[tag] for frame in seen])
+        base = poses[0]
         for _ in range(2):  # the second time about the median, where a flipped first frame no longer matters
-            steps = np.stack([_difference(base, pose) for pose, _ in seen])
-            middle = np.median(steps, axis=0)
-            base = _moved(base, middle)
-        steps = np.stack([_difference(base, pose) for pose, _ in seen])
-        covariance = np.stack([usable_covariance(c, POSE_FLOOR) for _, c in seen])
-        chi2 = np.einsum("na,nab,nb->n", steps, np.linalg.inv(covariance), steps)
-        good = chi2 <= chdtri(6, TAG_P * 0.1)
+            base = _moved(base, np.median(_difference(base, poses), axis=0))
+        steps = _difference(base, poses)
+        good = np.einsum("na,nab,nb->n", steps, np.linalg.inv(covariance), steps) <= limit
         if 2 * good.sum() <= len(seen):
             continue
         count = int(good.sum())
@@ -122,32 +126,43 @@ def _moved(transform: FloatArray, step: FloatArray) -> FloatArray:
     return np.asarray(transform @ make_transform(exp_so3(step[:3]), step[3:]))
 
 
-def _fit(
-    old: Mapping[int, TagPose], new: Mapping[int, TagPose], tags: Sequence[int], start: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least squares motion (4, 4), its information (6, 6), and each tag's chi square (n,)."""
-    motion = start
-    weights = [np.linalg.inv(old[tag].covariance + new[tag].covariance) for tag in tags]
-    information = np.zeros((6, 6))
-    for _ in range(ROUNDS):
-        information, slope = np.zeros((6, 6)), np.zeros(6)
-        for tag, weight in zip(tags, weights, strict=True):
-            error = _difference(motion @ old[tag].camera_T_tag, new[tag].camera_T_tag)
-            turn = adjoint(inverse(old[tag].camera_T_tag))
-            information += turn.T @ weight @ turn
-            slope += turn.T @ weight @ error
-        motion = _moved(motion, np.asarray(np.linalg.solve(information, slope)))
-    return motion, information, _misfits(old, new, tags, motion)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Both:
+    """T tags seen on both sides: poses (T, 4, 4), weights (T, 6, 6) of their differences, adjoints (T, 6, 6)."""
+
+    old: FloatArray
+    new: FloatArray
+    weight: FloatArray
+    turn: FloatArray
+
+    def take(self, index: BoolArray) -> _Both:
+        return _Both(self.old[index], self.new[index], self.weight[index], self.turn[index])
+
+    def misfits(self, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors (T, 6) and chi squares (T,) of the tags under a motion (4, 4)."""
+        error = _difference(motion @ self.old, self.new)
+        return error, np.einsum("ta,tab,tb->t", error, self.weight, error)
+
+    def fit(self, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Least squares motion (4, 4) and its information (6, 6)."""
+        motion = start
+        weighted = np.swapaxes(self.turn, -1, -2) @ self.weight
+        information = np.einsum("tab,tbc->ac", weighted, self.turn)
+        for _ in range(ROUNDS):
+            error, _ = self.misfits(motion)
+            step = np.linalg.solve(information, np.einsum("tab,tb->a", weighted, error))
+            motion = _moved(motion, np.asarray(step))
+            if step @ information @ step < 1e-6:
+                break
+        return motion, information
 
 
-def _misfits(
-    old: Mapping[int, TagPose], new: Mapping[int, TagPose], tags: Sequence[int], motion: FloatArray
-) -> FloatArray:
-    out = []
-    for tag in tags:
-        error = _difference(motion @ old[tag].camera_T_tag, new[tag].camera_T_tag)
-        out.append(float(error @ np.linalg.solve(old[tag].covariance + new[tag].covariance, error)))
-    return np.array(out)
+def _both(old: Mapping[int, TagPose], new: Mapping[int, TagPose], tags: Sequence[int]) -> _Both:
+    before = np.stack([old[tag].camera_T_tag for tag in tags])
+    after = np.stack([new[tag].camera_T_tag for tag in tags])
+    covariance = np.stack([old[tag].covariance + new[tag].covariance for tag in tags])
+    turn = np.stack([adjoint(inverse(pose)) for pose in before])
+    return _Both(before, after, np.asarray(np.linalg.inv(covariance)), turn)
 
 
 def tag_motion(old: Mapping[int, TagPose], new: Mapping[int, TagPose]) -> TagMotion | None:
@@ -155,31 +170,41 @@ def tag_motion(old: Mapping[int, TagPose], new: Mapping[int, TagPose]) -> TagMot
     tags = sorted(set(old) & set(new))
     if not tags:
         return None
-    starts = [np.eye(4), *(new[tag].camera_T_tag @ inverse(old[tag].camera_T_tag) for tag in tags)]
-    best: tuple[int, float, FloatArray] | None = None
-    limit = float(chdtri(6, TAG_P))
-    for start in starts:
-        inside = [t for t, c in zip(tags, _misfits(old, new, tags, start), strict=True) if c <= 2.0 * limit]
-        if not inside:
-            continue
-        motion, _, misfit = _fit(old, new, inside, start)
-        misfit = _misfits(old, new, tags, motion)
-        score = int(np.sum(misfit <= limit)), -float(np.minimum(misfit, limit).sum())
-        if best is None or score > best[:2]:
-            best = (*score, motion)
-    if best is None or 2 * best[0] <= len(tags):
-        return None
-    misfit = _misfits(old, new, tags, best[2])
-    together = [tag for tag, c in zip(tags, misfit, strict=True) if c <= limit]
-    motion, information, _ = _fit(old, new, together, best[2])
+    both, limit = _both(old, new, tags), float(chdtri(6, TAG_P))
+    motion, information = both.fit(both.new[0] @ inverse(both.old[0]))
+    together = both.misfits(motion)[1] <= limit
+    if not together.all():
+        found = _majority(both, limit)
+        if found is None:
+            return None
+        motion, information, together = found
     step = _difference(np.eye(4), motion)
     return TagMotion(
         motion,
         np.asarray(np.linalg.inv(information)),
         float(step @ information @ step),
-        tuple(together),
-        tuple(tag for tag in tags if tag not in together),
+        tuple(tag for tag, good in zip(tags, together, strict=True) if good),
+        tuple(tag for tag, good in zip(tags, together, strict=True) if not good),
     )
+
+
+def _majority(both: _Both, limit: float) -> tuple[FloatArray, FloatArray, BoolArray] | None:
+    """Motion, information and who shares it: of no motion and each tag's own the one that most tags agree on."""
+    best: tuple[int, float, FloatArray] | None = None
+    for start in (np.eye(4), *(both.new @ inverse(both.old))):
+        inside = both.misfits(start)[1] <= 2.0 * limit
+        if not inside.any():
+            continue
+        motion, _ = both.take(inside).fit(start)
+        misfit = both.misfits(motion)[1]
+        score = int(np.sum(misfit <= limit)), -float(np.minimum(misfit, limit).sum())
+        if best is None or score > best[:2]:
+            best = (*score, motion)
+    if best is None or 2 * best[0] <= len(both.old):
+        return None
+    together = both.misfits(best[2])[1] <= limit
+    motion, information = both.take(together).fit(best[2])
+    return motion, information, together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +228,7 @@ class TagCheck:
 def watch_tags(watch: TagWatch, frame: TagFrame, settings: TagSettings) -> tuple[TagWatch, TagCheck]:
     """Take in a frame and test. After an alarm the caller goes on from :func:`restart_watch`."""
     longest = max(settings.windows)
-    recent = (*watch.recent, frame)
+    recent = (*watch.recent, usable_frame(frame))
     reference, means = watch.reference, watch.means
     if len(recent) > longest:
         if len(reference) < settings.reference_frames:

@@ -7,15 +7,16 @@ linearisation point, and H has the rank of the equations it leaves over (two for
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray, IntArray
+from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import Columns, PackedProblem
-from fgreg.graph.reduced import Contributions, contributions, refine
-from fgreg.graph.reduced_blocks import initial_private, times, transposed
+from fgreg.graph.reduced import Contributions, contributions, evaluate, refine
+from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times, transposed
 from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.windows import LEAST_PRECISION
 from fgreg.robust import pm_degrees_of_freedom
 
 TYPICAL_RAD, TYPICAL_MM = 1e-2, 1.0
@@ -33,6 +34,42 @@ class Gaussian:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class WindowRows:
+    """Rotations of PMs without what their windows say: Gaussian given a step, and the intervals they are in.
+
+    The rotation is ``mean + gain step``, with ``variance``; the window has it in (low, high), softened by ``soft``.
+
+    Attributes:
+        there: (n,) which PMs this is for: one look that knows only the window.
+        mean, variance: (S, n) rad and rad^2. gain: (S, n, D).
+        low, high, soft: (n,) rad.
+        site: (n,) the sigma that stands for the window elsewhere: densities are told in its units.
+    """
+
+    there: BoolArray
+    mean: FloatArray
+    variance: FloatArray
+    gain: FloatArray
+    low: FloatArray
+    high: FloatArray
+    soft: FloatArray
+    site: FloatArray
+
+    def take(self, index: IntArray) -> WindowRows:
+        """Some of the PMs."""
+        return WindowRows(
+            self.there[index],
+            self.mean[:, index],
+            self.variance[:, index],
+            self.gain[:, index],
+            self.low[index],
+            self.high[index],
+            self.soft[index],
+            self.site[index],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class WhiteTerms:
     """n PMs in time order, linearised at S places; steps are all counted from one base point.
 
@@ -40,13 +77,15 @@ class WhiteTerms:
         residual: (S, n, q), zero in rows that a PM does not have.
         jacobian: (S, n, q, D).
         rest: (S, n) chi square that no step takes away (looks that contradict each other).
-        equations: (n,) rows that count.
+        equations: (n,) that a PM leaves over.
+        windows: where some PMs' rotations are held by an interval instead of by a row; None: all by rows.
     """
 
     residual: FloatArray
     jacobian: FloatArray
     rest: FloatArray
     equations: IntArray
+    windows: WindowRows | None = None
 
     @property
     def count(self) -> int:
@@ -58,7 +97,13 @@ class WhiteTerms:
 
     def take(self, index: IntArray) -> WhiteTerms:
         """Some of the PMs."""
-        return WhiteTerms(self.residual[:, index], self.jacobian[:, index], self.rest[:, index], self.equations[index])
+        return WhiteTerms(
+            self.residual[:, index],
+            self.jacobian[:, index],
+            self.rest[:, index],
+            self.equations[index],
+            None if self.windows is None else self.windows.take(index),
+        )
 
 
 def pivot_scale(columns: Columns) -> FloatArray:
@@ -115,9 +160,79 @@ def linearise(problem: PackedProblem, state: SharedState, base: SharedState | No
     private = initial_private(problem, state)
     for _ in range(PRIVATE_ROUNDS):
         _, private = refine(problem, state, private)
-    part = contributions(problem, state, private).pm
     at = None if base is None else step_between(_repeated(base, state.count), state, problem.columns)
-    return whiten(part, pm_degrees_of_freedom(problem), pivot_scale(problem.columns), at)
+    return white_terms(problem, state, private, at)
+
+
+def white_terms(
+    problem: PackedProblem, state: SharedState, private: PrivateState, at: FloatArray | None = None
+) -> WhiteTerms:
+    """:func:`linearise` where the private variables are known.
+
+    PMs with one look that knows only the window are held by it as the interval it is, where the problem has shapes.
+    """
+    equations, scale = pm_degrees_of_freedom(problem), pivot_scale(problem.columns)
+    there = window_pms(problem)
+    if there is None:
+        return whiten(contributions(problem, state, private).pm, equations, scale, at)
+    look = first_looks(problem)
+    weight = problem.looks.weight.copy()
+    weight[look[there], 2, 2] = LEAST_PRECISION
+    free = replace(problem, looks=replace(problem.looks, weight=weight))
+    rows = equations - there
+    terms = whiten(contributions(free, state, private).pm, rows, scale, at)
+    return replace(terms, equations=equations, windows=_window_rows(free, problem, state, private, there, look, at))
+
+
+def first_looks(problem: PackedProblem) -> IntArray:
+    """(J,) the first look of each PM."""
+    first = np.zeros(len(problem.pms), dtype=np.int64)
+    first[problem.look_pm[::-1]] = np.arange(len(problem.look_pm))[::-1]
+    return first
+
+
+def window_pms(problem: PackedProblem) -> BoolArray | None:
+    """(J,) PMs with a single look that is no first hit; None where there are none, or the problem has no shapes."""
+    if problem.shapes is None or not len(problem.pms):
+        return None
+    single = np.bincount(problem.look_pm, minlength=len(problem.pms)) == 1
+    look = first_looks(problem)
+    there = single & (problem.looks.edge_gain[look] == 0.0) & (problem.shapes.amplitude_look < 0)
+    return np.asarray(there) if there.any() else None
+
+
+def _window_rows(
+    free: PackedProblem,
+    problem: PackedProblem,
+    state: SharedState,
+    private: PrivateState,
+    there: BoolArray,
+    look: IntArray,
+    at: FloatArray | None,
+) -> WindowRows:
+    assert problem.shapes is not None  # window_pms
+    found = evaluate(free, state, private)
+    block = look_block(free, state, private.trus_p_pm[:, problem.look_pm])
+    by_point = block.by_point[:, look, 2]
+    step = found.private.trus_p_pm - private.trus_p_pm
+    mean = block.residual[:, look, 2] + free.looks.centre_rad[look] + np.sum(by_point * step, axis=-1)
+    gain = np.einsum("sja,sjad->sjd", by_point, found.point_gain) + block.by_shared[:, look, 2]
+    variance = np.sum(by_point * times(found.point_covariance, by_point), axis=-1)
+    if at is not None:
+        mean = mean - np.sum(gain * at[:, None, :], axis=-1)
+    windows = problem.shapes.windows
+    edge = float(problem.prior_information[problem.columns.edge]) ** -0.5
+    return WindowRows(
+        there=there,
+        mean=mean,
+        variance=variance,
+        gain=gain,
+        low=windows.low_rad[look],
+        high=windows.high_rad[look],
+        # The edge's own error moves both ends: as much softness, since what it does to one pair is little.
+        soft=np.hypot(windows.soft_rad[look], edge),
+        site=problem.looks.weight[look, 2, 2] ** -0.5,
+    )
 
 
 def _repeated(state: SharedState, count: int) -> SharedState:

@@ -1,0 +1,165 @@
+"""A camera that moved and nobody said so: found in a recorded session, and solved as epochs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fgreg.cli import main
+from fgreg.config import SolveConfig
+from fgreg.frames import FloatArray, inverse, make_transform
+from fgreg.measurements import EpochStart, Measurements, Pair
+from fgreg.models import SessionModel
+from fgreg.online.detect import DetectedMove, find_moves, renumbered, split_epochs
+from fgreg.registration import register
+from fgreg.session.results import read_result
+from fgreg.simulation.presets import PRESETS
+from fgreg.simulation.simulate import simulate
+from fgreg.simulation.write import write_session
+from fgreg.targets import tre_mm
+from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
+
+CONFIG = SolveConfig()
+
+
+def _session(
+    seed: int, before: int, after: int, motion: FloatArray
+) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
+    """Pairs before and after a motion, all told to be of epoch 0."""
+    rng = np.random.default_rng(seed)
+    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
+    again = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 1])  # so that both have one window edge
+    model, first, truth = make_measurements(
+        again[0], aims=12, pairs=before, marker_T_laser=beam, trus_T_camera=trus_T_camera
+    )
+    _, second, moved = make_measurements(
+        again[1], aims=0, pairs=after, marker_T_laser=beam, trus_T_camera=trus_T_camera @ inverse(motion)
+    )
+    t = first.pairs[-1].t
+    later = tuple(
+        replace(p, t=p.t + t, pm=p.pm + before, marker=replace(p.marker, id=p.marker.id + 1000)) for p in second.pairs
+    )
+    return model, replace(first, pairs=first.pairs + later), (truth, moved)
+
+
+def _shift(mm: float) -> FloatArray:
+    return make_transform(np.eye(3), mm * np.array([0.6, -0.8, 0.0]))
+
+
+def test_an_untold_move_is_found_where_it_happened() -> None:
+    model, measurements, _ = _session(3, 15, 12, _shift(8.0))
+    (move,) = find_moves(measurements, model, CONFIG)
+    assert abs(move.since - 15) <= 1
+    assert move.since_t == measurements.pairs[move.since].t
+    assert move.last_t < move.since_t <= move.alarm_t
+    assert move.log_bayes > 0
+    assert f"between pair {move.since} and {move.since + 1}" in move.text
+
+
+def test_a_steady_session_has_no_moves() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), aims=12, pairs=30)
+    assert find_moves(measurements, model, CONFIG) == ()
+
+
+def test_one_gross_outlier_is_no_move() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(5), aims=12, pairs=24)
+    odd = measurements.pairs[15]
+    pairs = list(measurements.pairs)
+    pairs[15] = replace(odd, look=replace(odd.look, x_mm=odd.look.x_mm + 12.0))
+    assert find_moves(replace(measurements, pairs=tuple(pairs)), model, CONFIG) == ()
+
+
+def test_too_few_pairs_to_register_are_no_error() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(6), aims=12, pairs=4)
+    assert find_moves(measurements, model, CONFIG) == ()
+
+
+def test_solved_as_epochs_both_registrations_are_good() -> None:
+    model, measurements, truth = _session(7, 15, 15, _shift(10.0))
+    moves = find_moves(measurements, model, CONFIG)
+    split = split_epochs(measurements, moves)
+    found = register(split, model, CONFIG)
+    assert len(split.epochs) == 2
+    for epoch in (0, 1):
+        estimate = found.optimum.state.trus_T_camera(epoch)[0]
+        assert tre_mm(estimate, truth[epoch].trus_T_camera[0], model.targets_mm).mean() < 3.0
+    together = register(measurements, model, CONFIG)
+    assert len(together.shots.pm_kept) - together.shots.pm_kept.sum() > 5  # unsplit, one side of it is taken for junk
+
+
+def _pairs(epochs: tuple[int, ...], pms: tuple[int, ...]) -> tuple[Pair, ...]:
+    _, measurements, _ = make_measurements(np.random.default_rng(8), aims=0, pairs=len(pms))
+    return tuple(
+        replace(pair, epoch=epoch, pm=pm, t=float(i))
+        for i, (pair, epoch, pm) in enumerate(zip(measurements.pairs, epochs, pms, strict=True))
+    )
+
+
+def test_epochs_told_later_are_renumbered_and_keep_their_motion() -> None:
+    motion = EpochStart(4.0, np.eye(4), np.eye(6))
+    whole = Measurements((), _pairs((0, 0, 0, 0, 1, 1), (0, 1, 2, 3, 4, 5)), (EpochStart(0.0), motion))
+    split = split_epochs(whole, [DetectedMove(0, 2, 2.0, 1.0, 3.0, 9.0)])
+    assert [pair.epoch for pair in split.pairs] == [0, 0, 1, 1, 2, 2]
+    assert [epoch.t for epoch in split.epochs] == [0.0, 2.0, 4.0]
+    assert split.epochs[2] is motion
+    assert not split.epochs[1].motion_known
+
+
+def test_looks_at_one_pm_stay_together() -> None:
+    whole = Measurements((), _pairs((0, 0, 0, 0), (0, 1, 1, 2)), (EpochStart(0.0),))
+    split = split_epochs(whole, [DetectedMove(0, 2, 2.0, 1.0, 3.0, 9.0)])
+    assert [pair.epoch for pair in split.pairs] == [0, 0, 0, 1]
+
+
+def test_events_between_pairs_follow_the_pair_that_a_move_begins_with() -> None:
+    # Events 1, 3, 4 and 6 are the pairs; the move is before the third of them.
+    assert renumbered((0, 0, 0, 0, 0, 0, 0), (1, 3, 4, 6), [DetectedMove(0, 2, 4.0, 3.0, 6.0, 9.0)]) == (
+        0, 0, 0, 0, 1, 1, 1,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def untold(tmp_path: Path) -> Path:
+    """A simulated session of two camera epochs whose ``camera_moved`` is taken out."""
+    folder = tmp_path / "untold"
+    config = replace(PRESETS["camera-move"], pairs=30)
+    write_session(simulate(config, 2), folder)
+    lines = (folder / "events.jsonl").read_text().splitlines(keepends=True)
+    kept = [line for line in lines if json.loads(line)["type"] != "camera_moved"]
+    assert len(kept) == len(lines) - 1
+    (folder / "events.jsonl").write_text("".join(kept))
+    return folder
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
+    monkeypatch.setattr(sys, "argv", ["fgreg", *(str(word) for word in words)])
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+
+def test_solve_detects_moves_and_names_them(
+    untold: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _run(monkeypatch, "solve", untold, "--detect-moves", "--json")
+    document = json.loads(capsys.readouterr().out)
+    assert any("the camera moved between pair 15 and 16" in reason for reason in document["reasons"])
+    result = read_result(untold / "result.yaml")
+    assert len(result.epochs) == 2
+    assert {pair.epoch for pair in result.pairs} == {0, 1}
+    assert all(epoch.trus_T_camera is not None for epoch in result.epochs)
+
+
+def test_without_the_option_nothing_is_detected(
+    untold: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _run(monkeypatch, "solve", untold, "--json")
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["epochs"]) == 1
+    assert not any("the camera moved between" in reason for reason in document["reasons"])
