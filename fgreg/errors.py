@@ -41,3 +41,15 @@ class MissingExtraError(FgregError):
 
 class EstimationError(FgregError):
     """The estimate could not be formed from these measurements (not a defect of the file)."""
+
+
+class EventRefused(FgregError):  # noqa: N818: it is the event that is refused; nothing is in error
+    """An event that was not taken in; the state is what it was before, and later events work.
+
+    Args:
+        reason: in one line, what was wrong with it or what failed.
+    """
+
+    def __init__(self, reason: str) -> None:
+        self.reason = one_line(reason, 500)
+        super().__init__(f"event refused: {self.reason}")

@@ -28,7 +28,7 @@ from fgreg.robust import (
     Innovations,
     Sorted,
     deviant,
-    graduated,
+    graduated_or_near,
     innovations_at,
     junk_p,
     plausible_cost,
@@ -319,7 +319,7 @@ def _solve_jointly(
     if clean and aim_kept.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
         first = _enough(whole, ~beyond.pm, ~beyond.aim)
     else:
-        robust = graduated(whole, start, robust_aims=True)
+        robust = graduated_or_near(whole, start, robust_aims=True)
         start = robust.state
         first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
     judged = sort_shots(whole, start, *first)

@@ -78,8 +78,12 @@ def junk_p(pm_kept: BoolArray) -> float:
     Of two degrees of freedom a good shot's density falls as exp(-d / 2), and so does the share p that deviates by more
     than d: junk and good are equally likely where p is junk's density times the odds of junk.
     """
-    kept = int(pm_kept.sum())
-    return max(JUNK_P, JUNK_DENSITY * min((len(pm_kept) - kept) / max(kept, 1), 1.0))
+    return junk_p_of(int(pm_kept.sum()), len(pm_kept))
+
+
+def junk_p_of(kept: int, count: int) -> float:
+    """:func:`junk_p` where so many of ``count`` PMs are kept."""
+    return max(JUNK_P, JUNK_DENSITY * min((count - kept) / max(kept, 1), 1.0))
 
 
 def log_junk(problem: PackedProblem, pm_kept: BoolArray) -> FloatArray:
@@ -354,9 +358,23 @@ def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool =
         robust_aims: doubt the aims, too; else they count in full.
     """
     descent = _Descent(problem, state)
-    limit, aim_limit = pm_limits(problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
     for scale in CAUCHY_SCALES:
         descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
+    return _truncated_minima(descent, robust_aims=robust_aims)
+
+
+def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
+    """The better of :func:`graduated` and of the descent on the truncated cost alone, from one start.
+
+    The wide losses may lead away from a start that is good already, and into another minimum.
+    """
+    far = graduated(problem, state, robust_aims=robust_aims)
+    near = _truncated_minima(_Descent(problem, state), robust_aims=robust_aims)
+    return near if near.cost[0] < far.cost[0] else far
+
+
+def _truncated_minima(descent: _Descent, *, robust_aims: bool) -> RobustOptimum:
+    limit, aim_limit = pm_limits(descent.problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
     for _ in range(2):
         descent.settle()
         weights = descent.run(partial(_truncated, limit=limit, aim_limit=aim_limit), MAX_STEPS)
@@ -405,6 +423,11 @@ def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> Fl
     moved = np.sum(along**2 / np.maximum(eigenvalue, 1e-12), axis=1)
     out[good] = np.where(eigenvalue[:, 0] > UNKNOWN, cost[good] - sign[good] * moved, np.inf)
     return out
+
+
+def innovations_of(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
+    """Innovations (n,) of shots, one hypothesis, at an optimum whose Hessian (D, D) holds those kept (n,)."""
+    return _innovation(part, hessian, kept)
 
 
 def innovations_at(

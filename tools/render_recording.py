@@ -70,14 +70,19 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def ended(child: subprocess.Popen[bytes], log: Path) -> RenderError:
+    """Why a viewer that has ended did so."""
+    text = log.read_text(errors="replace")
+    if "graphics adapter" in text or "wgpu" in text:
+        return RenderError(NO_DRIVER)
+    return RenderError(f"the viewer ended at once, status {child.returncode}: {text.strip()[-400:]}")
+
+
 def wait_for_port(child: subprocess.Popen[bytes], port: int, log: Path, deadline: float) -> None:
     """Return once ``child`` listens; raise RenderError where it ended or the deadline passed."""
     while time.monotonic() < deadline:
         if child.poll() is not None:
-            text = log.read_text(errors="replace")
-            if "graphics adapter" in text or "wgpu" in text:
-                raise RenderError(NO_DRIVER)
-            raise RenderError(f"the viewer ended at once, status {child.returncode}: {text.strip()[-400:]}")
+            raise ended(child, log)
         with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5):
             return
         time.sleep(0.1)
@@ -110,6 +115,10 @@ def headless_viewer(width: int, height: int, deadline: float) -> Iterator[Any]:
         try:
             wait_for_port(child, port, log, deadline)
             yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+        except ConnectionError as error:  # it may listen before it looks for a driver
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(timeout=5.0)
+            raise ended(child, log) if child.poll() is not None else RenderError(str(error)) from error
         finally:
             end(child)
 

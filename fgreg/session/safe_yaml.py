@@ -125,6 +125,8 @@ def parse_yaml(text: str, label: str, *, max_nodes: int = 200_000) -> YamlMappin
             builder.take(event)
     except yaml.MarkedYAMLError as error:
         where = f"{label}: line {error.problem_mark.line + 1}" if error.problem_mark else label
+        if "nesting" in (error.problem or ""):  # libyaml may look ahead as far as its own limit
+            raise InputError(where, "nesting too deep", f"at most {MAX_DEPTH} levels") from None
         raise InputError(where, f"bad YAML ({_problem(error.problem)})", "YAML") from None
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(label, f"bad YAML ({_problem(getattr(error, 'reason', None))})", "YAML") from None

@@ -1,0 +1,76 @@
+"""The estimate after each event, and the predicted error of a Gaussian in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from fgreg.estimate import PredictedTre, Verdict
+from fgreg.frames import FloatArray
+from fgreg.targets import target_jacobians
+
+QUANTILE = 0.95
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OnlineEstimate:
+    """What is known after an event, about the camera epoch that lasts.
+
+    Attributes:
+        t: of the event.
+        epoch: index of the camera epoch.
+        trus_T_camera: (4, 4) as reported: the graph's optimum moved to the posterior's mean; None where there is none.
+        covariance: (6, 6), GTSAM's tangent (rotation rad, translation mm), right perturbation.
+        predicted_tre: from that covariance.
+        nis: of the pair just added: its squared deviation from what all others predict, over the predicted covariance;
+            None for other events, and where the others predict nothing.
+        used: whether the pair just added counts in the estimate.
+        verdict, reasons: as of a solve; at most a warning until this epoch was judged by the full solve.
+        pairs: looks of this epoch that count.
+        optimum_trus_T_camera: (4, 4) the graph's optimum, comparable with :mod:`fgreg.registration`.
+        settled: judged by the full solve with exactly these measurements.
+    """
+
+    t: float
+    epoch: int
+    trus_T_camera: FloatArray | None
+    covariance: FloatArray | None
+    predicted_tre: PredictedTre | None
+    nis: float | None
+    used: bool
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    pairs: int
+    optimum_trus_T_camera: FloatArray | None
+    settled: bool
+
+
+def gaussian_quantile_mm(covariance: FloatArray, quantile: float = QUANTILE) -> FloatArray:
+    """(n,) quantiles of |e| for zero-mean Gaussian errors e of covariances (n, 3, 3).
+
+    |e|^2 is a sum of weighted chi squares; matched in its first four cumulants by one chi square (Liu, Tang and Zhang,
+    2009). Exact for one, two or three equal axes; within 1 % of |e| for all others.
+    """
+    square = covariance @ covariance
+    c1 = np.einsum("nii->n", covariance)
+    c2 = np.einsum("nij,nji->n", covariance, covariance)
+    c3 = np.einsum("nij,nji->n", square, covariance)
+    freedom = np.maximum(c2**3 / np.maximum(c3**2, 1e-300), 1.0)
+    chi2 = 2.0 * gammaincinv(0.5 * freedom, quantile)
+    return np.asarray(np.sqrt(np.maximum(c1 + (chi2 - freedom) * np.sqrt(c2 / freedom), 0.0)))
+
+
+def gaussian_tre(covariance: FloatArray, trus_T_camera: FloatArray, targets_mm: FloatArray) -> PredictedTre:
+    """Predicted target registration error of a Gaussian (definitions: :class:`fgreg.estimate.PredictedTre`).
+
+    Args:
+        covariance: (6, 6), right tangent of ``trus_T_camera`` (4, 4).
+        targets_mm: (n, 3), TRUS.
+    """
+    jacobian = target_jacobians(trus_T_camera, targets_mm)
+    spread = jacobian @ covariance @ jacobian.swapaxes(1, 2)
+    quantiles = gaussian_quantile_mm(spread)
+    mean = np.sqrt(np.maximum(np.einsum("nii->n", spread), 0.0)).mean()
+    return PredictedTre(float(mean), float(quantiles.mean()), float(quantiles.max()))

@@ -1,0 +1,233 @@
+"""The judge: the full solve, run beside the incremental estimate, and what it says in terms that carry over.
+
+The incremental estimate is the optimum and its Gaussian. The posterior's mean is off the optimum, its covariance wider
+at few pairs, and whether two minima can be told apart, or something is suspicious, takes the whole search. All that is
+the full solve's (fgreg.batch.solve), some tenths of a second; its answer is adopted when it is there.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Protocol
+
+import numpy as np
+
+from fgreg.batch import Solution, solve
+from fgreg.config import SolveConfig
+from fgreg.estimate import PredictedTre, Verdict
+from fgreg.frames import FloatArray
+from fgreg.measurements import Measurements
+from fgreg.models import SessionModel
+from fgreg.posterior import pose_tangent
+from fgreg.registration import SoundSpeedPrior
+
+JUDGED_AT = (*range(1, 9), 10, 12, 15, 20, 25, 30, 40, 60, 80)
+"""Pairs of an epoch at which it is judged; from there on whenever they have doubled."""
+
+
+def is_due(pairs: int) -> bool:
+    """Whether an epoch of so many pairs is to be judged."""
+    if pairs <= JUDGED_AT[-1]:
+        return pairs in JUDGED_AT
+    return pairs % JUDGED_AT[-1] == 0 and (pairs // JUDGED_AT[-1]).bit_count() == 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """What the full solve said of the epoch that lasts.
+
+    Attributes:
+        serial: number of events that had been taken in. epoch: that was judged. pairs: looks it counted.
+        verdict, reasons: of the solve.
+        trus_T_camera, covariance, predicted_tre: as the solve reports them; None where it has no registration.
+        shift: (6,) from the optimum to the reported registration, in units of the optimum's Gaussian (its Cholesky
+            factor). inflation: (6, 6) that takes that factor to the reported covariance's.
+    """
+
+    serial: int
+    epoch: int
+    pairs: int
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    trus_T_camera: FloatArray | None
+    covariance: FloatArray | None
+    predicted_tre: PredictedTre | None
+    shift: FloatArray | None
+    root: FloatArray | None
+    optimum_root: FloatArray | None
+
+    def applied(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The posterior's covariance, and the tangent from optimum to mean, for an optimum of this covariance (6, 6).
+
+        With L_P, L_C the Cholesky factors of the judged posterior's and optimum's covariances: A C A', A = L_P / L_C.
+        """
+        if self.shift is None or self.root is None or self.optimum_root is None:
+            return covariance, np.zeros(6)
+        widen = np.linalg.solve(self.optimum_root.T, self.root.T).T
+        wide = widen @ covariance @ widen.T
+        return 0.5 * (wide + wide.T), np.linalg.cholesky(covariance) @ self.shift
+
+
+def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
+    """What carries over of a solve of all measurements up to an event."""
+    data = solution.epochs[epoch]
+    pose, covariance, registration = data.trus_T_camera, data.covariance, solution.registration
+    shift = root = optimum_root = None
+    if pose is not None and covariance is not None and registration is not None and epoch in registration.epochs:
+        place = registration.epochs.index(epoch)
+        block = slice(6 * place, 6 * place + 6)
+        optimum_root = np.asarray(np.linalg.cholesky(registration.covariance[block, block]))
+        root = np.asarray(np.linalg.cholesky(covariance))
+        optimum = registration.optimum.state.trus_T_camera(place)[0]
+        shift = np.asarray(np.linalg.solve(optimum_root, pose_tangent(optimum, pose)))
+    return Judgement(
+        serial,
+        epoch,
+        data.pairs,
+        max(data.verdict, solution.verdict, key=lambda v: v.severity),
+        solution.reasons,
+        pose,
+        covariance,
+        data.predicted_tre,
+        shift,
+        root,
+        optimum_root,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """What is to be judged: all measurements up to an event, and which epoch lasts."""
+
+    serial: int
+    epoch: int
+    measurements: Measurements
+
+
+def judge(
+    case: Case, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None
+) -> tuple[Judgement, Solution]:
+    """The full solve of a case."""
+    solution = solve(case.measurements, [], model, config, sound_speed_prior=sound_speed)
+    return judgement_of(solution, case.serial, case.epoch), solution
+
+
+class Judge(Protocol):
+    """Where judgements come from."""
+
+    def ask(self, case: Callable[[], Case], pairs: int) -> None:
+        """There is something new; ``case`` makes what is to be judged where that is wanted."""
+
+    def answer(self) -> Judgement | None:
+        """The latest judgement that has not been fetched yet."""
+
+    def close(self) -> None:
+        """Stop."""
+
+
+class InlineJudge:
+    """Judges at once, on a fixed schedule of pair counts: the same events give the same reports."""
+
+    def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
+        self._of = (model, config, sound_speed)
+        self._found: Judgement | None = None
+
+    def ask(self, case: Callable[[], Case], pairs: int) -> None:
+        """Judge now where the count of pairs is one of the schedule's."""
+        if is_due(pairs):
+            self._found, _ = judge(case(), *self._of)
+
+    def answer(self) -> Judgement | None:
+        """What :meth:`ask` found."""
+        found, self._found = self._found, None
+        return found
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+
+def _serve(
+    connection: Connection, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None
+) -> None:
+    """Judge what comes until the other end closes."""
+    while True:
+        try:
+            case = connection.recv()
+        except EOFError:
+            return
+        if case is None:
+            return
+        try:
+            found: Judgement | str = judge(case, model, config, sound_speed)[0]
+        except Exception as error:  # the judge's defects must not end the session's estimate
+            found = f"{type(error).__name__}: {error}"
+        try:
+            connection.send(found)
+        except (BrokenPipeError, OSError):
+            return
+
+
+class ProcessJudge:
+    """Judges in a process of its own: whenever it is idle and the epoch has grown by a quarter since, or by few pairs.
+
+    Attributes:
+        failure: what went wrong with the last case, empty where nothing did.
+    """
+
+    def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, model, config, sound_speed), name="fgreg-judge", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self._busy = False
+        self._asked: tuple[int, int] = (-1, 0)
+        self.failure = ""
+
+    def ask(self, case: Callable[[], Case], pairs: int) -> None:
+        """Send the case where the process is idle and enough is new."""
+        if self._busy or self._process is None or not self._process.is_alive():
+            return
+        _, before = self._asked
+        if before <= pairs < before + max(1, before // 4):
+            return
+        made = case()
+        try:
+            self._connection.send(made)
+        except (BrokenPipeError, OSError) as error:
+            self.failure = str(error)
+            return
+        self._busy, self._asked = True, (made.epoch, pairs)
+
+    def answer(self) -> Judgement | None:
+        """What has come back since."""
+        try:
+            if not (self._busy and self._connection.poll()):
+                return None
+            found = self._connection.recv()
+        except (EOFError, OSError) as error:
+            self._busy, self.failure = False, f"the judging process ended: {error}"
+            return None
+        self._busy = False
+        if isinstance(found, str):
+            self.failure = found
+            return None
+        self.failure = ""
+        return found  # type: ignore[no-any-return]
+
+    def close(self) -> None:
+        """End the process."""
+        try:
+            self._connection.send(None)
+        except (BrokenPipeError, OSError):
+            pass
+        self._connection.close()
+        self._process.join(timeout=0.5)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join()

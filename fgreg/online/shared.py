@@ -1,0 +1,172 @@
+"""The shared variables of one camera epoch, as GTSAM's variables and as the reduced problem's state; quadratics on them.
+
+A quadratic is the cost ``c + 2 g' d + d' H d`` (chi square) of steps ``d`` from a state, as
+:meth:`fgreg.graph.shared_state.SharedState.retract` takes them: 6 of ``trus_T_camera``, 4 of the beam's chart, the
+window's edge, then the marker bias and the sound speed ratio where they are variables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from fgreg.factors.adapter import Residual, custom_factor
+from fgreg.frames import FloatArray, exp_so3, hat, log_so3
+from fgreg.graph.explicit import Variable
+from fgreg.graph.packing import Columns
+from fgreg.graph.shared_state import SharedState, step_between
+
+POSE = slice(0, 6)
+LEAST_CORRELATION = 1e-12
+"""Eigenvalue of a correlation matrix below which a direction counts as not seen."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quadratic:
+    """Cost, gradient (D,) and Hessian (D, D), of half the cost, about a state of one hypothesis and one epoch."""
+
+    state: SharedState
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+
+    def at(self, state: SharedState, columns: Columns) -> Quadratic:
+        """The same quadratic about another state near by."""
+        step = step_between(self.state, state, columns)[0]
+        pull = self.hessian @ step
+        turn = chart_turn(step)
+        gradient = turn.T @ (self.gradient + pull)
+        cost = self.cost + float(step @ (2.0 * self.gradient + pull))
+        return Quadratic(state, cost, gradient, turn.T @ self.hessian @ turn)
+
+    def plus(self, other: Quadratic) -> Quadratic:
+        """Sum of two quadratics about the same state."""
+        return Quadratic(
+            self.state, self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian
+        )
+
+
+def chart_turn(step: FloatArray) -> FloatArray:
+    """(D, D) derivative of ``step_between(a, b.retract(d))`` by d, where b is ``step`` (D,) from a."""
+    turn = np.eye(len(step))
+    turn[:3, :3] += 0.5 * hat(step[:3])
+    turn[3:6, 3:6] = exp_so3(step[:3])
+    return turn
+
+
+def square_root(hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rows (m, D) and residual (m,) with ``rows' rows = hessian``, ``rows' residual = gradient``; m its rank."""
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    value, vector = np.linalg.eigh(hessian / np.outer(scale, scale))
+    seen = value > LEAST_CORRELATION * value[-1]
+    root = np.sqrt(value[seen])
+    rows = (vector[:, seen] * root).T * scale
+    return rows, (vector[:, seen] / root).T @ (gradient / scale)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Where the shared variables of an epoch are: columns of the reduced problem (one epoch) and GTSAM's keys.
+
+    ``marker_T_nominal`` (4, 4): fixed frame of the beam's chart. ``sound_speed_mean``: of its prior.
+    """
+
+    columns: Columns
+    marker_T_nominal: FloatArray
+
+    def keys(self, epoch: int) -> tuple[int, ...]:
+        """GTSAM's keys in the order of the columns."""
+        keys = [Variable.trus_T_camera.key(epoch), Variable.marker_laser.key(), Variable.window_edge.key()]
+        if self.columns.bias is not None:
+            keys.append(Variable.marker_bias.key())
+        if self.columns.sound_speed is not None:
+            keys.append(Variable.sound_speed_ratio.key())
+        return tuple(keys)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Tangent dimensions of :meth:`keys`."""
+        sizes = [6, 4, 1]
+        if self.columns.bias is not None:
+            sizes.append(3)
+        if self.columns.sound_speed is not None:
+            sizes.append(1)
+        return tuple(sizes)
+
+    def insert(self, values: gtsam.Values, state: SharedState, epoch: int) -> None:
+        """Put a state into values."""
+        keys = self.keys(epoch)
+        values.insert(keys[0], gtsam.Pose3(state.trus_T_camera()[0]))
+        values.insert(keys[1], state.beam[0])
+        values.insert(keys[2], float(state.edge_rad[0]))
+        if self.columns.bias is not None:
+            values.insert(Variable.marker_bias.key(), state.bias_mm[0])
+        if self.columns.sound_speed is not None:
+            values.insert(Variable.sound_speed_ratio.key(), float(state.sound_speed_ratio[0]))
+
+    def read(self, isam: gtsam.ISAM2, epoch: int, like: SharedState) -> SharedState:
+        """The estimate of the shared variables; what is no variable is as in ``like``."""
+        keys = self.keys(epoch)
+        pose = isam.calculateEstimatePose3(keys[0]).matrix()
+        state = replace(
+            like,
+            rotation=pose[None, None, :3, :3],
+            translation_mm=pose[None, None, :3, 3],
+            beam=isam.calculateEstimateVector(keys[1])[None],
+            edge_rad=np.array([isam.calculateEstimateDouble(keys[2])]),
+        )
+        if self.columns.bias is not None:
+            state = replace(state, bias_mm=isam.calculateEstimateVector(Variable.marker_bias.key())[None])
+        if self.columns.sound_speed is not None:
+            ratio = isam.calculateEstimateDouble(Variable.sound_speed_ratio.key())
+            state = replace(state, sound_speed_ratio=np.array([ratio]))
+        return state
+
+
+def finite(state: SharedState) -> bool:
+    """Whether every number of a state is finite."""
+    return all(bool(np.isfinite(getattr(state, name)).all()) for name in SharedState.__slots__)
+
+
+def summary_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> gtsam.CustomFactor:
+    """A quadratic as a factor on the shared variables: ``rows * step + residual`` of unit noise.
+
+    GTSAM's own containers of linear factors hold at most three variables in Python, and take the registration's chart
+    as flat; here the step from the linearisation point is the reduced problem's, wherever it is evaluated.
+    """
+    rows, residual = square_root(quadratic.hessian, quadratic.gradient)
+    keys, sizes = layout.keys(epoch), layout.sizes
+    starts = np.cumsum((0, *sizes)).tolist()
+    state = quadratic.state
+    old_R_trus, old_t = state.rotation[0, 0].T.copy(), state.translation_mm[0, 0].copy()
+    at = [state.beam[0].copy(), float(state.edge_rad[0])]
+    readers = ["vector", "double"]
+    if layout.columns.bias is not None:
+        at.append(state.bias_mm[0].copy())
+        readers.append("vector")
+    if layout.columns.sound_speed is not None:
+        at.append(float(state.sound_speed_ratio[0]))
+        readers.append("double")
+
+    def evaluate(values: gtsam.Values, want_jacobians: bool) -> Residual:
+        pose = values.atPose3(keys[0]).matrix()
+        turn = old_R_trus @ pose[:3, :3]
+        step = np.empty(starts[-1])
+        step[:3] = log_so3(turn)
+        step[3:6] = old_R_trus @ (pose[:3, 3] - old_t)
+        for i, (kind, origin) in enumerate(zip(readers, at, strict=True), start=1):
+            value = values.atVector(keys[i]) if kind == "vector" else values.atDouble(keys[i])
+            step[starts[i] : starts[i + 1]] = value - origin
+        error = (residual + rows @ step).tolist()
+        if not want_jacobians:
+            return error, ()
+        by_pose = rows[:, :6].copy()
+        by_pose[:, :3] = rows[:, :3] @ (np.eye(3) + 0.5 * hat(step[:3]))
+        by_pose[:, 3:] = rows[:, 3:6] @ turn
+        others = [rows[:, starts[i] : starts[i + 1]].tolist() for i in range(1, len(keys))]
+        return error, [by_pose.tolist(), *others]
+
+    noise = gtsam.noiseModel.Unit.Create(len(rows))
+    return custom_factor("summary of older shots", noise, keys, len(rows), sizes, evaluate)

@@ -1,0 +1,88 @@
+"""All measurements of a session, raw, in a few hundred bytes each: what summaries are built anew from.
+
+A pair as Python objects takes over a kilobyte; hours of pairs are kept as rows of floats, exactly as they came.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.measurements import Aim, Look, MarkerObservation, Pair
+
+ROWS = 512
+_T, _POSE, _COVARIANCE, _SCAN, _LOOK_COVARIANCE, _SWEEP, _AMPLITUDE, WIDTH = 0, 1, 17, 53, 57, 61, 62, 63
+
+
+class MeasurementStore:
+    """Aims and pairs in the order they came; append only."""
+
+    def __init__(self) -> None:
+        self.aims: list[Aim] = []
+        self._blocks: list[FloatArray] = []
+        self._pm = array("q")
+        self._marker = array("q")
+        self._of_pm: dict[int, int | tuple[int, ...]] = {}
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self._pm)
+
+    def append(self, pair: Pair) -> None:
+        """Keep one more pair (its epoch is not kept: that may turn out to be another)."""
+        index = len(self._pm)
+        if index == len(self._blocks) * ROWS:
+            self._blocks.append(np.empty((ROWS, WIDTH)))
+        row = self._blocks[-1][index % ROWS]
+        look = pair.look
+        row[_T] = pair.t
+        row[_POSE:_COVARIANCE] = pair.marker.camera_T_marker.ravel()
+        row[_COVARIANCE:_SCAN] = pair.marker.covariance.ravel()
+        row[_SCAN:_LOOK_COVARIANCE] = look.scan_rad, look.scan_sigma_rad, look.x_mm, look.range_mm
+        row[_LOOK_COVARIANCE:_SWEEP] = look.covariance.ravel()
+        row[_SWEEP] = look.sweep
+        row[_AMPLITUDE] = np.nan if look.amplitude is None else look.amplitude
+        self._pm.append(pair.pm)
+        self._marker.append(pair.marker.id)
+        before = self._of_pm.get(pair.pm)
+        if before is None:
+            self._of_pm[pair.pm] = index
+        else:
+            self._of_pm[pair.pm] = (*(before if isinstance(before, tuple) else (before,)), index)
+
+    def looks_at(self, pm: int) -> tuple[int, ...]:
+        """Places of the pairs at a PM so far."""
+        found = self._of_pm.get(pm, ())
+        return found if isinstance(found, tuple) else (found,)
+
+    def pair(self, index: int, epoch: int, pm: int | None = None) -> Pair:
+        """The pair at a place, bit for bit as it came, in this epoch; ``pm`` gives it another number."""
+        row = self._blocks[index // ROWS][index % ROWS]
+        marker = MarkerObservation(
+            row[_POSE:_COVARIANCE].reshape(4, 4).copy(),
+            row[_COVARIANCE:_SCAN].reshape(6, 6).copy(),
+            self._marker[index],
+        )
+        scan, scan_sigma, x_mm, range_mm = (float(v) for v in row[_SCAN:_LOOK_COVARIANCE])
+        amplitude = float(row[_AMPLITUDE])
+        look = Look(
+            scan,
+            scan_sigma,
+            x_mm,
+            range_mm,
+            row[_LOOK_COVARIANCE:_SWEEP].reshape(2, 2).copy(),
+            int(row[_SWEEP]),
+            None if np.isnan(amplitude) else amplitude,
+        )
+        return Pair(float(row[_T]), self._pm[index] if pm is None else pm, epoch, marker, look)
+
+    def pairs(self, indices: Iterable[int], epoch: int) -> tuple[Pair, ...]:
+        """Several pairs, all in one epoch."""
+        return tuple(self.pair(index, epoch) for index in indices)
+
+    def time(self, index: int) -> float:
+        """When a pair was taken."""
+        return float(self._blocks[index // ROWS][index % ROWS, _T])

@@ -1,0 +1,426 @@
+"""The window: recent pairs as the real factors in ISAM2, beside one summary factor of everything older.
+
+All variables of a recent pair are in the graph as they are in the reference (fgreg.graph.explicit): its marker pose,
+PM, lambda and theta' are *variables*, nothing is eliminated by hand. Two facts of GTSAM's Python wrapper rule how ISAM2
+is used here:
+
+- A Python factor is given all values by copy unless their C++ object has a live Python wrapper. So the linearisation
+  point is held as long as ISAM2 lives (``Window.theta``).
+- An update that throws leaves ISAM2 poisoned. So every update works on a copy, and the copy becomes the window only
+  when it has succeeded and every number is finite.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from fgreg.factors.marker_pose import marker_pose_factor
+from fgreg.factors.point_on_arc import point_on_arc_factor
+from fgreg.factors.point_on_line import point_on_line_factor
+from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
+from fgreg.frames import FloatArray
+from fgreg.graph.explicit import Variable, make_ordering
+from fgreg.graph.explicit_values import beam_of_chart
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
+from fgreg.models import SessionModel
+from fgreg.online.shared import Layout, Quadratic, finite, summary_factor
+from fgreg.sensitivity import arc_of_rotation, sensitivity_priors
+
+THRESHOLDS: dict[Variable, tuple[float, ...]] = {
+    Variable.trus_T_camera: (2e-3, 2e-3, 2e-3, 0.2, 0.2, 0.2),
+    Variable.marker_laser: (0.1, 0.1, 2e-3, 2e-3),
+    Variable.window_edge: (1e-3,),
+    Variable.marker_bias: (0.1, 0.1, 0.1),
+    Variable.sound_speed_ratio: (2e-3,),
+    Variable.camera_T_marker: (3e-3, 3e-3, 3e-3, 0.1, 0.1, 0.1),
+    Variable.trus_p_pm: (0.3, 0.3, 0.3),
+    Variable.lam: (0.5,),
+    Variable.theta: (5e-3,),
+}
+"""Steps (rad, mm) beyond which a variable is linearised anew."""
+PRIVATE_STEPS = 8
+SETTLED_CHI2 = 1e-5
+"""Newton decrement at which a new pair's own variables have settled."""
+FAR_CHI2 = 1e4
+"""What a PM counts as that has no place where beam and arc meet."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """The looks at one PM as factors, their private variables at their optimum given the shared ones.
+
+    Attributes:
+        graph: the factors. values: of the private variables.
+        rows, residual: (m, D) and (m,): what they say about the shared variables, private ones eliminated: the cost
+            ``|residual + rows d|^2`` of steps d from ``state``. m their degrees of freedom.
+        state: shared variables where that holds.
+        far: no place was found where they fit.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    rows: FloatArray
+    residual: FloatArray
+    state: SharedState
+    far: bool
+
+    @property
+    def quadratic(self) -> Quadratic:
+        """As cost, gradient and Hessian on the shared variables."""
+        cost = float(self.residual @ self.residual)
+        return Quadratic(
+            self.state,
+            max(cost, FAR_CHI2) if self.far else cost,
+            self.rows.T @ self.residual,
+            self.rows.T @ self.rows,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """The looks at one PM as measured.
+
+    Attributes:
+        label: PM number (an own one where a look was split off as junk).
+        places: of its pairs in the session's order.
+        pairs: themselves.
+        kept: whether it counts in the estimate.
+    """
+
+    label: int
+    places: tuple[int, ...]
+    pairs: tuple[Pair, ...]
+    kept: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """The looks at one PM that is in the window, used or not.
+
+    Attributes:
+        bundle: its looks.
+        prepared: as factors, when it came or was last prepared.
+        slots: where those are in ISAM2; empty where it is left out.
+    """
+
+    bundle: Bundle
+    prepared: Prepared
+    slots: tuple[int, ...] = ()
+
+    @property
+    def label(self) -> int:
+        """Of the PM."""
+        return self.bundle.label
+
+    @property
+    def kept(self) -> bool:
+        """Whether it counts in the estimate."""
+        return self.bundle.kept
+
+
+def private_keys(pairs: Sequence[Pair], first: int) -> tuple[list[int], list[int], int, list[int]]:
+    """Keys of marker poses, lambdas (one of each per marker observation), PM, and thetas (one per look)."""
+    shots = len({pair.marker.id for pair in pairs})
+    markers = [Variable.camera_T_marker.key(first + i) for i in range(shots)]
+    lambdas = [Variable.lam.key(first + i) for i in range(shots)]
+    return markers, lambdas, Variable.trus_p_pm.key(first), [Variable.theta.key(first + i) for i in range(len(pairs))]
+
+
+def prepare(
+    pairs: Sequence[Pair], layout: Layout, state: SharedState, epoch: int, model: SessionModel, first: int
+) -> Prepared:
+    """Factors of the looks at one PM, and Gauss-Newton on its private variables with the shared ones held.
+
+    Args:
+        pairs: the looks.
+        layout: of the shared variables.
+        state: their values.
+        epoch: index of the registration's variable.
+        model: the session's set-up.
+        first: number of the first of its private variables; ``len(pairs)`` numbers are taken.
+
+    Raises:
+        FactorError: a factor that cannot be computed here.
+        ArithmeticError: numbers that are not finite.
+    """
+    markers, lambdas, point, thetas = private_keys(pairs, first)
+    shared, columns = layout.keys(epoch), layout.columns
+    bias = Variable.marker_bias.key() if columns.bias is not None else None
+    ratio = Variable.sound_speed_ratio.key() if columns.sound_speed is not None else None
+    probe = model.probe
+    priors = sensitivity_priors([pair.look for pair in pairs], probe, model.stage.step_rad)
+    centres, gains, sigmas = priors.centre_rad.tolist(), priors.edge_gain.tolist(), priors.sigma_rad.tolist()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    layout.insert(values, state, epoch)
+
+    # The PM first: on the first look's arc, in the middle of where it may be.
+    look = pairs[0].look
+    reach = float(state.sound_speed_ratio[0]) * look.range_mm
+    expected = centres[0] + gains[0] * float(state.edge_rad[0])
+    theta = look.scan_rad + float(arc_of_rotation(expected, look.range_mm, probe.radius_mm))
+    trus_p = np.array(
+        [
+            look.x_mm,
+            probe.radius_mm * math.sin(look.scan_rad) + reach * math.sin(theta),
+            probe.radius_mm * math.cos(look.scan_rad) + reach * math.cos(theta),
+        ]
+    )
+    values.insert(point, trus_p)
+    camera_p = state.rotation[0, 0].T @ (trus_p - state.translation_mm[0, 0])
+    origin, direction = beam_of_chart(state.beam[0], layout.marker_T_nominal)
+    shot_of: dict[int, int] = {}
+    for i, pair in enumerate(pairs):
+        look = pair.look
+        if pair.marker.id not in shot_of:
+            shot = shot_of[pair.marker.id] = len(shot_of)
+            pose = pair.marker.camera_T_marker.copy()
+            pose[:3, 3] -= state.bias_mm[0]
+            covariance = usable_covariance(pair.marker.covariance, POSE_FLOOR)
+            graph.add(marker_pose_factor(markers[shot], pair.marker.camera_T_marker, covariance, bias))
+            graph.add(
+                point_on_line_factor(
+                    shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal
+                )
+            )
+            values.insert(markers[shot], gtsam.Pose3(pose))
+            values.insert(lambdas[shot], float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin)))
+        sine, cosine = math.sin(look.scan_rad), math.cos(look.scan_rad)
+        own = math.atan2(float(trus_p[1]) - probe.radius_mm * sine, float(trus_p[2]) - probe.radius_mm * cosine)
+        values.insert(thetas[i], own)
+        covariance = usable_covariance(look.covariance, (FLOOR_MM,) * 2)
+        graph.add(
+            point_on_arc_factor(
+                point, thetas[i], look.scan_rad, look.x_mm, look.range_mm, covariance, probe.radius_mm, ratio
+            )
+        )
+        edge = shared[2] if gains[i] else None
+        graph.add(
+            sensitivity_prior_factor(
+                thetas[i],
+                look.scan_rad,
+                look.range_mm,
+                probe.radius_mm,
+                centres[i],
+                gains[i],
+                sigmas[i],
+                edge,
+                ratio,
+            )
+        )
+    markers = markers[: len(shot_of)]
+    lambdas = lambdas[: len(shot_of)]
+    rows, residual, far = _settle(graph, values, (markers, lambdas, point, thetas), layout, epoch)
+    private = gtsam.Values()
+    for key in markers:
+        private.insert(key, values.atPose3(key))
+    for key in (*lambdas, *thetas):
+        private.insert(key, values.atDouble(key))
+    private.insert(point, values.atPoint3(point))
+    return Prepared(graph, private, rows, residual, state, far)
+
+
+def _settle(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    keys: tuple[list[int], list[int], int, list[int]],
+    layout: Layout,
+    epoch: int,
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Move the private values (in place) to their optimum; the shared variables' rows and residual there."""
+    markers, lambdas, point, thetas = keys
+    own = 6 * len(markers) + len(lambdas) + 3 + len(thetas)
+    there = set(graph.keyVector())
+    shared = [(key, size) for key, size in zip(layout.keys(epoch), layout.sizes, strict=True)]
+    ordering = make_ordering([*markers, *lambdas, point, *thetas, *(key for key, _ in shared if key in there)])
+    far = True
+    for _ in range(PRIVATE_STEPS):
+        jacobian, right = graph.linearize(values).jacobian(ordering)
+        if not (math.isfinite(right.sum()) and math.isfinite(jacobian.sum())):
+            raise ArithmeticError("a pair's linear system is not finite")
+        q, r = np.linalg.qr(jacobian[:, :own], mode="complete")
+        turned = q.T @ right
+        step = np.linalg.solve(r[:own], turned[:own])
+        if float(turned[:own] @ turned[:own]) < SETTLED_CHI2:
+            far = False
+            break
+        at = 0
+        for key in markers:
+            values.update(key, values.atPose3(key).retract(step[at : at + 6]))
+            at += 6
+        for key in lambdas:
+            values.update(key, values.atDouble(key) + float(step[at]))
+            at += 1
+        values.update(point, values.atPoint3(point) + step[at : at + 3])
+        at += 3
+        for key in thetas:
+            values.update(key, values.atDouble(key) + float(step[at]))
+            at += 1
+    # What is left over after the private variables, on the shared ones; absent ones (the edge) get zeros.
+    left = q.T[own:] @ jacobian[:, own:]
+    rows = np.zeros((len(left), layout.columns.size))
+    at, column = 0, 0
+    for key, size in shared:
+        if key in there:
+            rows[:, column : column + size] = left[:, at : at + size]
+            at += size
+        column += size
+    return rows, -turned[own:], far
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """ISAM2 with the recent pairs in it, and the shared variables' Gaussian.
+
+    Attributes:
+        isam: never updated in place once it is in a window.
+        theta: its linearisation point, held so that Python factors are not given copies of it.
+        epoch: index of the registration's variable.
+        groups: oldest first.
+        summary_slot: where the summary factor is.
+        state: the estimate (one hypothesis, one epoch).
+        covariance: (D, D) of the shared variables.
+        numbers: of private variables used so far.
+    """
+
+    isam: gtsam.ISAM2
+    theta: gtsam.Values
+    epoch: int
+    groups: tuple[Group, ...]
+    summary_slot: int
+    state: SharedState
+    covariance: FloatArray
+    numbers: int
+
+
+def empty_isam() -> gtsam.ISAM2:
+    """ISAM2 that eliminates by QR (see fgreg.graph.explicit_solver) and re-linearises by the thresholds above."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.relinearizeSkip = 1
+    parameters.findUnusedFactorSlots = True
+    parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for variable, steps in THRESHOLDS.items():
+        thresholds.insert((variable.value, np.array(steps)))
+    parameters.setRelinearizeThreshold(thresholds)
+    return gtsam.ISAM2(parameters)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """What an update does to a window.
+
+    Attributes:
+        take_in: groups that count from now on, new ones or some of those left out.
+        leave_out: labels of groups that stay and no longer count.
+        forget: labels of groups that go.
+        set_aside: new groups that do not count.
+        summary: another summary.
+    """
+
+    take_in: tuple[Group, ...] = ()
+    leave_out: tuple[int, ...] = ()
+    forget: tuple[int, ...] = ()
+    set_aside: tuple[Group, ...] = ()
+    summary: Quadratic | None = None
+
+
+def open_window(
+    groups: Sequence[Group], summary: Quadratic, layout: Layout, epoch: int, numbers: int
+) -> Window:
+    """A window anew: these groups and a summary.
+
+    Raises:
+        RuntimeError: an indeterminate system, or another failure of GTSAM.
+        ArithmeticError: a result that is not finite.
+    """
+    isam = empty_isam()
+    theta = isam.getLinearizationPoint()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    layout.insert(values, summary.state, epoch)
+    graph.add(summary_factor(summary, layout, epoch))
+    for group in groups:
+        if group.kept:
+            graph.push_back(group.prepared.graph)
+            values.insert(group.prepared.values)
+    slots = list(isam.update(graph, values).getNewFactorsIndices())
+    placed, at = [], 1
+    for group in groups:
+        size = group.prepared.graph.size() if group.kept else 0
+        placed.append(_with_slots(group, tuple(slots[at : at + size])))
+        at += size
+    return _read(isam, theta, layout, epoch, tuple(placed), slots[0], summary.state, numbers)
+
+
+def updated(window: Window, change: Change, layout: Layout, numbers: int) -> Window:
+    """The window after one update of ISAM2; the window given is left as it was.
+
+    Raises:
+        RuntimeError: an indeterminate system, or another failure of GTSAM.
+        ArithmeticError: a result that is not finite.
+    """
+    isam = gtsam.ISAM2(window.isam)
+    theta = isam.getLinearizationPoint()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    removed: list[int] = []
+    summary_slot = window.summary_slot
+    if change.summary is not None:
+        graph.add(summary_factor(change.summary, layout, window.epoch))
+        removed.append(summary_slot)
+    gone = set(change.leave_out) | set(change.forget)
+    for group in window.groups:
+        if group.label in gone:
+            removed.extend(group.slots)
+    for group in change.take_in:
+        graph.push_back(group.prepared.graph)
+        values.insert(group.prepared.values)
+    slots = list(isam.update(graph, values, removed).getNewFactorsIndices())
+    at = 0
+    if change.summary is not None:
+        summary_slot, at = slots[0], 1
+    new: dict[int, Group] = {}
+    for group in change.take_in:
+        size = group.prepared.graph.size()
+        new[group.label] = _with_slots(group, tuple(slots[at : at + size]))
+        at += size
+    groups = []
+    for group in window.groups:
+        if group.label in change.forget and group.label not in new:
+            continue
+        if group.label in new:
+            groups.append(new.pop(group.label))
+        elif group.label in change.leave_out:
+            groups.append(_with_slots(group, ()))
+        else:
+            groups.append(group)
+    groups.extend(new.values())
+    groups.extend(change.set_aside)
+    return _read(isam, theta, layout, window.epoch, tuple(groups), summary_slot, window.state, numbers)
+
+
+def _with_slots(group: Group, slots: tuple[int, ...]) -> Group:
+    bundle = replace(group.bundle, kept=bool(slots))
+    return Group(bundle, group.prepared, slots)
+
+
+def _read(
+    isam: gtsam.ISAM2,
+    theta: gtsam.Values,
+    layout: Layout,
+    epoch: int,
+    groups: tuple[Group, ...],
+    summary_slot: int,
+    like: SharedState,
+    numbers: int,
+) -> Window:
+    state = layout.read(isam, epoch, like)
+    covariance = np.asarray(isam.jointMarginalCovariance(list(layout.keys(epoch))).fullMatrix())
+    if not (finite(state) and np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
+        raise ArithmeticError("the estimate or its covariance is not finite")
+    return Window(isam, theta, epoch, groups, summary_slot, state, covariance, numbers)
