@@ -9,7 +9,7 @@ import pytest
 
 from fgreg.batch import solve
 from fgreg.config import SolveConfig
-from fgreg.measurements import Measurements, Track
+from fgreg.measurements import Aim, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.tracking import fast_track
@@ -24,7 +24,8 @@ def _session(seed: int, pairs: int) -> tuple[SessionModel, Measurements, list[Tr
 
 
 def _ran(engine: OnlineRegistration, measurements: Measurements) -> None:
-    for event in sorted([*measurements.aims, *measurements.pairs], key=lambda event: event.t):
+    events: list[Aim | Pair] = [*measurements.aims, *measurements.pairs]
+    for event in sorted(events, key=lambda event: event.t):
         engine.add(event)
 
 

@@ -9,8 +9,9 @@ after each. Meanwhile queries come at camera rate from
   - a client in another process, by a round trip to the query process;
   - a thread of the updating process, by a round trip to the query process;
   - a thread of the updating process, which answers its queries itself.
-Each client also times a fixed piece of arithmetic of about the same length: how much later than in isolation that ends
-is what the machine's other work costs, whoever waits.
+Given are the time from call to answer, and that from the moment at which the query was due (a frame's arrival): a
+thread may have to wait before it can even call. Each client also times a fixed piece of arithmetic: how much longer
+that takes than in isolation is what the machine's other work costs, whoever waits.
 
     python tools/bench_queries.py
     python tools/bench_queries.py --seconds 10 --judge process
@@ -19,6 +20,7 @@ is what the machine's other work costs, whoever waits.
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import os
 import sys
@@ -129,8 +131,18 @@ def _ask_of(client: Client) -> Ask:
     return lambda query: fast_track(query, reader.snapshot())
 
 
-def run_client(client: Client) -> tuple[FloatArray, FloatArray, int]:
-    """Wall times of queries and of :func:`spin` (s), and how many queries had an answer."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Times:
+    """Wall times (s) of queries from call and from when they were due, and of :func:`spin`; how many had an answer."""
+
+    call: FloatArray
+    due: FloatArray
+    spin: FloatArray
+    answered: int
+
+
+def run_client(client: Client) -> Times:
+    """Ask until the time is up."""
     ask = _ask_of(client)
     ready = time.monotonic() + 60.0
     while time.monotonic() < ready:
@@ -139,7 +151,7 @@ def run_client(client: Client) -> tuple[FloatArray, FloatArray, int]:
             break
         except (NoSnapshotError, QueryError):
             time.sleep(0.01)
-    times, spins, answered = [], [], 0
+    times, from_due, spins, answered = [], [], [], 0
     end, due, k = time.perf_counter() + client.seconds, time.perf_counter(), 0
     while time.perf_counter() < end:
         start = time.perf_counter()
@@ -148,11 +160,12 @@ def run_client(client: Client) -> tuple[FloatArray, FloatArray, int]:
         spin()
         spins.append(time.perf_counter() - between)
         times.append(between - start)
+        from_due.append(between - due)
         answered += getattr(answer, "stage_rad", None) is not None
         k += 1
-        due = max(due + client.period_s, time.perf_counter())
+        due += client.period_s * max(1, math.ceil((time.perf_counter() - due) / client.period_s))
         time.sleep(max(due - time.perf_counter(), 0.0))
-    return np.array(times), np.array(spins), answered
+    return Times(np.array(times), np.array(from_due), np.array(spins), answered)
 
 
 def _client_process(client: Client, back: Connection[Any, Any]) -> None:
@@ -206,12 +219,12 @@ def under_updates(options: argparse.Namespace) -> None:
             client = Client(shared.name, server.address, round_trip, queries, options.seconds, 1e-3 * options.period_ms)
             updates = Updates(model, used, judge)
             if in_process:
-                found: list[tuple[FloatArray, FloatArray, int]] = []
+                found: list[Times] = []
                 thread = threading.Thread(target=_collect, args=(client, found))
                 thread.start()
                 updates.run(shared, thread.is_alive)
                 thread.join()
-                times, spins, answered = found[0]
+                times = found[0]
             else:
                 context = multiprocessing.get_context("spawn")
                 mine, theirs = context.Pipe(duplex=False)
@@ -219,17 +232,18 @@ def under_updates(options: argparse.Namespace) -> None:
                 process.start()
                 theirs.close()
                 updates.run(shared, lambda at=mine: not at.poll())  # type: ignore[misc]
-                times, spins, answered = mine.recv()
+                times = mine.recv()
                 process.join()
-        print(line(name, times, UNDER_MS))
-        print(line("    fixed arithmetic in its place", spins, {}))
+        print(line(name, times.call, UNDER_MS))
+        print(line("    from when it was due", times.due, UNDER_MS))
+        print(line("    fixed arithmetic in its place", times.spin, {}))
         print(line("    updates", np.array(updates.add_s), {}))
         print(line("    snapshot and publishing", np.array(updates.publish_s), {}))
-        if answered < len(times):
-            print(f"    {len(times) - answered} queries had no answer")
+        if times.answered < len(times.call):
+            print(f"    {len(times.call) - times.answered} queries had no answer")
 
 
-def _collect(client: Client, found: list[tuple[FloatArray, FloatArray, int]]) -> None:
+def _collect(client: Client, found: list[Times]) -> None:
     found.append(run_client(client))
 
 
