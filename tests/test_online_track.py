@@ -84,17 +84,19 @@ def test_before_a_registration_and_after_a_move_nothing_old_is_presented() -> No
     assert "camera epoch 1 is refused" in new.reason
 
 
-def test_after_a_known_motion_the_sigma_is_wider_until_pairs_come() -> None:
+def test_after_a_measured_motion_the_sigma_is_wider_and_after_a_vague_one_nothing_is_answered() -> None:
     model, used, queries = _session(4, 25)
-    engine = OnlineRegistration(model, judge=None)
-    _ran(engine, used)
-    before = engine.track(queries[0])
-    loose = np.diag(np.square([0.02, 0.02, 0.02, 2.0, 2.0, 2.0]))
-    engine.add(CameraMoved(used.pairs[-1].t + 1.0, np.eye(4), loose))
-    after = engine.track(replace(queries[0], epoch=1))
-    assert before.sigma_rad is not None
-    if after.stage_rad is None:
-        assert "camera epoch 1 is refused" in after.reason
-    else:
+    for sigma_rad, sigma_mm in ((0.005, 0.7), (0.2, 20.0)):
+        engine = OnlineRegistration(model, judge=None)
+        _ran(engine, used)
+        before = engine.track(queries[0])
+        loose = np.diag(np.square([sigma_rad] * 3 + [sigma_mm] * 3))
+        engine.add(CameraMoved(used.pairs[-1].t + 1.0, np.eye(4), loose))
+        after = engine.track(replace(queries[0], epoch=1))
+        if sigma_rad > 0.1:
+            assert after.stage_rad is None
+            assert "camera epoch 1 is refused" in after.reason
+            continue
+        assert before.sigma_rad is not None
         assert after.sigma_rad is not None
-        assert after.sigma_rad > before.sigma_rad
+        assert after.sigma_rad > 1.1 * before.sigma_rad
