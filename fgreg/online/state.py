@@ -133,7 +133,6 @@ class State:
         window: None where the epoch has no registration (yet).
         why_none: the reason, then.
         is_open: two minima cannot be told apart.
-        odd: labels of PMs that are in though deviant or out though fitting, as the last registration left them.
         recent: oldest first.
         steps: events since the start, which the spreading of work goes by.
         nis, used: of the last event, where it was a pair.
@@ -148,7 +147,6 @@ class State:
     window: Window | None = None
     why_none: str = ""
     is_open: bool = False
-    odd: frozenset[int] = frozenset()
     recent: tuple[Recent, ...] = ()
     steps: int = 0
     nis: float | None = None

@@ -46,7 +46,7 @@ from fgreg.robust import AIM_LIMIT, innovations_of, junk_p_of, pm_degrees_of_fre
 FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
-"""Up to so many, who counts is settled by a registration whenever a PM is in that should be out, or the reverse."""
+"""Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
 ALL_PAIRS = 120
 """Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
 EARLIER_PAIRS = 60
@@ -98,7 +98,7 @@ def registered(state: State, tools: Tools, pair: Pair | None = None, aim: Aim | 
     taken += [replace(p, epoch=state.epoch) for p in new]
     aims = (*store.aims, *([] if aim is None else [aim]))
     measurements = Measurements(aims, tuple(taken), tuple(data.start for data in state.epochs))
-    after = replace(state, pairs=pairs + len(new), aims=len(aims), window=None, is_open=True, odd=frozenset())
+    after = replace(state, pairs=pairs + len(new), aims=len(aims), window=None, is_open=True)
     try:
         found = register(measurements, tools.setting.model, tools.config, tools.setting.sound_speed)
     except EstimationError as error:
@@ -155,8 +155,7 @@ def _from_registration(
         groups.append(Group(bundle, prepare(bundle.pairs, layout, here, state.epoch, setting.model, numbers)))
         numbers += len(bundle.pairs)
     state, window = opened(state, groups, here, numbers, setting)
-    state = replace(state.with_now(state=window.state), window=window)
-    return replace(state, odd=odd_ones(state, setting))
+    return replace(state.with_now(state=window.state), window=window)
 
 
 def _one_epoch(state: SharedState, place: int) -> SharedState:
@@ -255,11 +254,11 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         used=fits,
     )
     if few:
-        odd = odd_ones(state, setting)
-        if state.epoch_pairs <= FIRST_PAIRS or state.is_open or not odd <= state.odd:
+        first = state.epoch_pairs <= FIRST_PAIRS or state.is_open
+        if first or not fits or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=_is_kept(found, place), recent=state.recent)
-        return replace(state, odd=odd)
+        return state
     if state.steps % VISIT == 3:
         state = _toggled(state, setting)
     return state
@@ -439,7 +438,7 @@ def with_move(state: State, start: EpochStart, tools: Tools, last: int = 0) -> S
     A measured motion ties the new registration to the old, which is then known at once; else it is free.
     """
     setting = tools.setting
-    state = replace(state, nis=None, used=False, recent=(), odd=frozenset())
+    state = replace(state, nis=None, used=False, recent=())
     first = state.pairs - last
     if first < state.now.first:
         raise ValueError(f"the last {last} pairs are not all of the epoch that lasts")
