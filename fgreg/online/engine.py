@@ -192,6 +192,11 @@ class OnlineRegistration:
         """The latest."""
         return self._estimate
 
+    def refresh(self) -> OnlineEstimate:
+        """Adopt what the judge has found since, without an event."""
+        self._consult(ask=False)
+        return self._estimate
+
     @property
     def recent(self) -> tuple[Recent, ...]:
         """The last pairs' quadratics and what was known before each, oldest first: for tests on moves."""
