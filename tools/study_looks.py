@@ -3,9 +3,9 @@
 looks     sessions of first hits, and the same sessions with two more looks at each PM, 2 deg on each, and amplitudes
           (5 % noise, unknown peak): ratio of RMS target errors where each look has its own marker detection (target:
           at most 0.80) and where they share one (at most 0.95).
-tracking  queries at PMs that the session does not have, answered from the session (of first hits, or of three looks with
-          amplitudes at each PM) and from the true registration and beam: RMS angle errors and their ratio (target: at
-          most 1.10 after three looks); with three looks, amplitudes and marker detections at most 0.5 deg.
+tracking  queries at PMs that the session does not have, answered from the session (of first hits, or of three looks
+          with amplitudes at each PM) and from the true registration and beam: RMS angle errors and their ratio (target:
+          at most 1.10 after three looks); with three looks, amplitudes and marker detections at most 0.5 deg.
 speed     a sound speed 2 % off, with and without --estimate sound_speed, against sessions in which it is right (target:
           at most 10 % worse where estimated, noticed where not), without and with wavefronts that say it to 0.3 %.
 
@@ -85,7 +85,8 @@ def looks(pairs: int, seed: int) -> Row:
 
 def tracking(pairs: int, seed: int) -> Row:
     out: Row = {}
-    for name, options in (("", {}), ("after 3 looks: ", LADDER)):
+    sessions: dict[str, dict[str, object]] = {"": {}, "after 3 looks: ": dict[str, object](LADDER)}
+    for name, options in sessions.items():
         out |= {name + key: values for key, values in _tracked(pairs, seed, options).items()}
     return out
 

@@ -69,8 +69,11 @@ def optimize(
         _, ahead = refine(problem, moved, replace(before, trus_p_pm=points))
         trial = evaluate(problem, moved, ahead)
         good = np.isfinite(trial.cost) & (trial.cost <= current.cost[index] + 1e-9 * (1.0 + current.cost[index]))
-        state = _merge_state(state, moved, index, good)
-        current = _merge_evaluation(current, trial, index, good)
+        if len(index) == count and good.all():
+            state, current = moved, trial
+        elif good.any():
+            state = _merge_state(state, moved, index, good)
+            current = _merge_evaluation(current, trial, index, good)
         damping[index] = np.clip(np.where(good, damping[index] * 0.1, damping[index] * 8.0), 1e-9, 1e12)
         active[index[(good & (decrement < tolerance)) | (damping[index] > 1e9)]] = False
         if keep_within is not None and not active.all():
