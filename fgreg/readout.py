@@ -8,6 +8,7 @@ import numpy as np
 
 from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate
 from fgreg.frames import exp_so3, make_transform, rotation_to_direction
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
 from fgreg.registration import Registration
@@ -22,6 +23,13 @@ class LaserReadout:
     origin_shift_mm: float
 
 
+def beam_origin_shift(state: SharedState, model: SessionModel) -> float:
+    """Lambda (mm) in the beam chart of the laser frame's origin: the nominal tip's foot, else nearest the marker's."""
+    direction, start = state.beam_direction()[0], state.beam_origin()[0]
+    initial = model.initial_marker_T_laser
+    return float(-start @ direction) if initial is None else float((initial[:3, 3] - start) @ direction)
+
+
 def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
     """``marker_T_laser`` with +z along the beam; origin at the nominal tip's foot, else nearest the marker's origin.
 
@@ -31,7 +39,7 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
     direction, start = state.beam_direction()[0], state.beam_origin()[0]
     initial = model.initial_marker_T_laser
     if initial is None:
-        rotation, shift = rotation_to_direction(direction), float(-start @ direction)
+        rotation = rotation_to_direction(direction)
     else:
         # The nominal frame turned by the least that brings its z onto the beam: its roll stays.
         if initial[:3, 2] @ direction < 0:  # given the wrong way round
@@ -39,7 +47,8 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
         axis = np.cross(initial[:3, 2], direction)
         sine, cosine = float(np.linalg.norm(axis)), float(initial[:3, 2] @ direction)
         turn = axis / max(sine, 1e-12) * np.arctan2(sine, cosine)
-        rotation, shift = exp_so3(turn) @ initial[:3, :3], float((initial[:3, 3] - start) @ direction)
+        rotation = exp_so3(turn) @ initial[:3, :3]
+    shift = beam_origin_shift(state, model)
     r0 = state.marker_T_nominal[0, :3, :3]
     chart = np.array([*state.beam[0, 2:], 1.0])
     length = float(np.linalg.norm(chart))

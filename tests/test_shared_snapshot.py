@@ -44,7 +44,8 @@ def hammer() -> None:
     base = plain_snapshot(MODEL, _surface())
     with SharedSnapshot(Layout.of(MODEL)) as shared:
         shared.publish(marked_snapshot(base, 1))
-        print(shared.name, flush=True)
+        sys.stdout.write(f"{shared.name}\n")
+        sys.stdout.flush()
         for version in range(2, 1_000_000):
             shared.publish(marked_snapshot(base, version))
 

@@ -19,8 +19,7 @@ from typing import Literal
 import gtsam
 import numpy as np
 
-from fgreg.answer import answer
-from fgreg.batch import Solution, track_context
+from fgreg.batch import Solution
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError, EventRefused
 from fgreg.estimate import PredictedTre, TrackEstimate, Verdict
@@ -33,10 +32,10 @@ from fgreg.online.judge import Case, InlineJudge, Judge, Judgement, ProcessJudge
 from fgreg.online.shared import POSE
 from fgreg.online.state import EpochData, Recent, State, make_setting
 from fgreg.online.store import MeasurementStore
+from fgreg.online.tracking import online_snapshot
 from fgreg.online.updates import Tools, all_measurements, with_aim, with_move, with_pair
-from fgreg.readout import read_laser
-from fgreg.registration import SoundSpeedPrior, register
-from fgreg.tracking import TrackContext, track
+from fgreg.registration import SoundSpeedPrior
+from fgreg.tracking import Snapshot, SurfaceMap, fast_track
 from fgreg.verdict import accuracy
 
 INT64 = 2**63
@@ -74,7 +73,8 @@ class OnlineRegistration:
         self._t = -math.inf
         self._serial = 0
         self._judgement: Judgement | None = None
-        self._context: TrackContext | None = None
+        self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
+        self._surface: SurfaceMap | None = None
         kinds: dict[str, Callable[[], Judge]] = {
             "inline": lambda: InlineJudge(model, self._config, sound_speed_prior),
             "process": lambda: ProcessJudge(model, self._config, sound_speed_prior),
@@ -120,7 +120,7 @@ class OnlineRegistration:
             self._tools.store.append(event)
         elif isinstance(event, Aim):
             self._tools.store.aims.append(event)
-        self._state, self._t, self._context = state, event.t, None
+        self._state, self._t = state, event.t
         self._serial += 1
         moved = state.epoch != before.epoch
         self._estimate = estimate
@@ -155,7 +155,7 @@ class OnlineRegistration:
             estimate = self._report(state, max(self._t, start.t), self._judgement)
         except Exception as error:
             raise EventRefused(f"the update failed: {type(error).__name__}: {error}") from error
-        self._state, self._estimate, self._context = state, estimate, None
+        self._state, self._estimate = state, estimate
         self._serial += 1
         self._consult(ask=True)
         return self._estimate
@@ -176,6 +176,8 @@ class OnlineRegistration:
                 verdict=max(self._estimate.verdict, Verdict.WARNING, key=lambda v: v.severity),
             )
             return
+        if found is not None:
+            self._surface = found.surface or self._surface
         if found is not None and found.epoch == self._state.epoch:
             self._judgement = found
             self._estimate = self._report(self._state, self._estimate.t, found)
@@ -188,6 +190,11 @@ class OnlineRegistration:
     @property
     def estimate(self) -> OnlineEstimate:
         """The latest."""
+        return self._estimate
+
+    def refresh(self) -> OnlineEstimate:
+        """Adopt what the judge has found since, without an event."""
+        self._consult(ask=False)
         return self._estimate
 
     @property
@@ -225,29 +232,22 @@ class OnlineRegistration:
     def solution(self) -> Solution:
         """The full solve of everything so far, adopted as :meth:`settle` does."""
         found, solution = judge(self._case(), self._model, self._config, self._prior)
-        self._judgement = found
+        self._judgement, self._surface = found, found.surface or self._surface
         self._estimate = self._report(self._state, self._estimate.t, found)
         return solution
 
     def track(self, query: Track) -> TrackEstimate:
         """Answer a query from the estimate as it is; the graph is not touched."""
-        epoch = self._state.epoch
-        if query.epoch != epoch:
-            return TrackEstimate(query.t, None, None, None, True, f"camera epoch {query.epoch} is not the present one")
-        if self._estimate.trus_T_camera is None or self._estimate.verdict is Verdict.REFUSED:
-            return TrackEstimate(
-                query.t, None, None, None, True, f"the registration of camera epoch {epoch} is refused"
-            )
-        return track(query, self._tracking())
+        return fast_track(query, self.snapshot())
 
-    def _tracking(self) -> TrackContext:
-        """What queries are answered from, made once per event."""
-        if self._context is None:
-            found = answer(register(self.measurements(), self._model, self._config, self._prior), self._config)
-            shift = read_laser(found.registration, self._model).origin_shift_mm
-            context = track_context(found.registration, found.posterior, self._model, self._config, shift)
-            self._context = replace(context, causal=True)
-        return self._context
+    def snapshot(self) -> Snapshot:
+        """All that queries need of the estimate as it is; made once per event, on demand."""
+        if self._snapshot is None or self._snapshot[0] is not self._estimate:
+            window = self._state.window
+            optimum = None if window is None else (window.state, window.covariance, self._tools.setting.columns)
+            made = online_snapshot(self._model, self._config, self._estimate, optimum, self._surface)
+            self._snapshot = (self._estimate, made)
+        return self._snapshot[1]
 
     # --- reporting --------------------------------------------------------------------------------------------------
 

@@ -23,6 +23,7 @@ from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
 from fgreg.posterior import pose_tangent
 from fgreg.registration import SoundSpeedPrior
+from fgreg.tracking import SurfaceMap, make_surface_map
 
 JUDGED_AT = (*range(1, 9), 10, 12, 15, 20, 25, 30, 40, 60, 80)
 """Pairs of an epoch at which it is judged; from there on whenever they have doubled."""
@@ -45,6 +46,7 @@ class Judgement:
         trus_T_camera, covariance, predicted_tre: as the solve reports them; None where it has no registration.
         shift: (6,) from the optimum to the reported registration, in units of the optimum's Gaussian (its Cholesky
             factor). inflation: (6, 6) that takes that factor to the reported covariance's.
+        surface: the tissue that the PMs trace, where they trace any.
     """
 
     serial: int
@@ -58,6 +60,7 @@ class Judgement:
     shift: FloatArray | None
     root: FloatArray | None
     optimum_root: FloatArray | None
+    surface: SurfaceMap | None = None
 
     def applied(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The posterior's covariance, and the tangent from optimum to mean, for an optimum of this covariance (6, 6).
@@ -75,6 +78,7 @@ def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
     """What carries over of a solve of all measurements up to an event."""
     data = solution.epochs[epoch]
     pose, covariance, registration = data.trus_T_camera, data.covariance, solution.registration
+    context = solution.context
     shift = root = optimum_root = None
     if pose is not None and covariance is not None and registration is not None and epoch in registration.epochs:
         place = registration.epochs.index(epoch)
@@ -95,6 +99,7 @@ def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
         shift,
         root,
         optimum_root,
+        None if context is None or context.surface is None else make_surface_map(context.surface),
     )
 
 

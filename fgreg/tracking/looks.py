@@ -273,7 +273,7 @@ def _look_rows(
     by_point: FloatArray,
     by_state: FloatArray,
 ) -> None:
-    """Lateral position and range (rows ``row``, ``row + 1``) and rotation; see fgreg.graph.reduced_blocks.look_block."""
+    """Lateral position and range (rows ``row``, ``row + 1``) and rotation, as fgreg.graph.reduced_blocks.look_block."""
     radius, ratio = at.radius, at.speed
     sine, cosine = math.sin(look.scan_rad), math.cos(look.scan_rad)
     dy, dz = point[1] - radius * sine, point[2] - radius * cosine

@@ -37,10 +37,13 @@ class SharedPlace:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """Attributes:
-    nominal: (3, 3) and origin (3,) of the beam chart's frame. beam: x, y (mm), a, b.
-    covariance: (SHARED, SHARED). depth, half_width: of the sensitivity window. curve: of amplitudes, where there is one.
-    place: where the shared variables are.
+    """An epoch's common parts.
+
+    Attributes:
+        nominal: (3, 3) and origin (3,) of the beam chart's frame. beam: x, y (mm), a, b.
+        covariance: (SHARED, SHARED).
+        depth, half_width: of the sensitivity window. curve: of amplitudes, where there is one.
+        place: where the shared variables are.
     """
 
     nominal: FloatArray

@@ -88,6 +88,29 @@ class Snapshot:
         return None
 
     @classmethod
+    def without_registration(cls, model: SessionModel, config: SolveConfig, refused: Mapping[int, str]) -> Snapshot:
+        """A snapshot that answers nothing: epochs refused, with the reason (which may be empty)."""
+        return cls(
+            t=0.0,
+            pairs=0,
+            causal=True,
+            epochs=tuple(_refused_epoch(number, reason) for number, reason in sorted(refused.items())),
+            marker_T_nominal=np.eye(4),
+            beam=np.zeros(4),
+            origin_shift_mm=0.0,
+            edge_rad=0.0,
+            bias_mm=np.zeros(3),
+            sound_speed_ratio=1.0,
+            radius_mm=model.probe.radius_mm,
+            edge_variance=model.probe.sensitivity.edge_sigma_rad**2,
+            sensitivity=model.probe.sensitivity,
+            stage=model.stage,
+            amplitude_sigma=config.amplitude_sigma,
+            window_shape=config.window_shape,
+            surface=None,
+        )
+
+    @classmethod
     def from_context(
         cls,
         context: TrackContext,
@@ -118,6 +141,11 @@ class Snapshot:
             causal=context.causal,
             refused=refused,
         )
+
+
+def _refused_epoch(number: int, reason: str) -> EpochSnapshot:
+    nothing = np.zeros((SHARED, SHARED))
+    return EpochSnapshot(number, Verdict.REFUSED, np.eye(3), np.zeros(3), nothing, reason)
 
 
 def epoch_columns(columns: Columns, place: int) -> tuple[IntArray, IntArray]:
@@ -165,11 +193,7 @@ def make_snapshot(
         verdict = Verdict.REFUSED if number in refused else Verdict.OK
         rotation, translation = state.rotation[0, place].copy(), state.translation_mm[0, place].copy()
         found.append(EpochSnapshot(number, verdict, rotation, translation, block, refused.get(number, "")))
-    found += [
-        EpochSnapshot(number, Verdict.REFUSED, np.eye(3), np.zeros(3), np.zeros((SHARED, SHARED)), reason)
-        for number, reason in refused.items()
-        if number not in epochs
-    ]
+    found += [_refused_epoch(number, reason) for number, reason in refused.items() if number not in epochs]
     return Snapshot(
         t=t,
         pairs=pairs,

@@ -1,0 +1,54 @@
+"""Streams of events for the online registration, and how far an estimate is from the batch solver's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.measurements import EpochStart, Measurements
+from fgreg.models import SessionModel
+from fgreg.online import CameraMoved, OnlineEstimate, OnlineEvent, OnlineRegistration
+from fgreg.posterior import pose_tangent
+from fgreg.registration import Registration, register
+
+
+def events(measurements: Measurements) -> Iterator[OnlineEvent]:
+    """Aims, pairs and moves in the order in which they happened."""
+    yield from measurements.aims
+    epoch = 0
+    for pair in measurements.pairs:
+        while epoch < pair.epoch:
+            epoch += 1
+            start: EpochStart = measurements.epochs[epoch]
+            yield CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance)
+        yield pair
+
+
+def run(engine: OnlineRegistration, measurements: Measurements) -> list[OnlineEstimate]:
+    """The estimates after each event."""
+    return [engine.add(event) for event in events(measurements)]
+
+
+def first(measurements: Measurements, pairs: int) -> Measurements:
+    """The measurements up to so many pairs."""
+    taken = measurements.pairs[:pairs]
+    epochs = measurements.epochs[: taken[-1].epoch + 1] if taken else measurements.epochs[:1]
+    return replace(measurements, pairs=taken, epochs=epochs)
+
+
+def batch(measurements: Measurements, model: SessionModel) -> Registration:
+    """The optimum that the online estimate is compared with."""
+    return register(measurements, model, SolveConfig())
+
+
+def sigmas_apart(found: Registration, estimate: OnlineEstimate) -> float:
+    """Mahalanobis distance of the online optimum from the batch optimum, by the batch covariance."""
+    place = found.epochs.index(estimate.epoch)
+    if estimate.optimum_trus_T_camera is None:
+        return float("inf")
+    covariance = found.covariance[6 * place : 6 * place + 6, 6 * place : 6 * place + 6]
+    tangent = pose_tangent(found.optimum.state.trus_T_camera(place)[0], estimate.optimum_trus_T_camera)
+    return float(np.sqrt(tangent @ np.linalg.solve(covariance, tangent)))

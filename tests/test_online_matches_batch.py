@@ -1,0 +1,241 @@
+"""The online registration: the optimum of the batch solver after every event, whatever the session's shape."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fgreg.batch import solve
+from fgreg.config import SolveConfig
+from fgreg.estimate import Verdict
+from fgreg.frames import as_float_array
+from fgreg.measurements import Pair
+from fgreg.models import NoiseModel
+from fgreg.online import CameraMoved, OnlineRegistration
+from fgreg.online.estimate import gaussian_quantile_mm, gaussian_tre
+from fgreg.online.judge import is_due
+from fgreg.online.store import MeasurementStore
+from fgreg.registration import register
+from tests.forward import make_measurements, make_session
+from tests.online_streams import batch, events, first, run, sigmas_apart
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "first hit": {"pairs": 30},
+    "window only": {"pairs": 24, "first_hit": False},
+    "few aims": {"pairs": 20, "aims": 4},
+    "two epochs, known motion": {"pairs": 24, "epochs": 2, "known_motion": True},
+    "two epochs, unknown motion": {"pairs": 24, "epochs": 2},
+    "three looks, own markers": {"pairs": 9, "looks_per_pm": 3},
+    "two looks, one marker": {"pairs": 12, "looks_per_pm": 2, "share_marker": True},
+    "marker bias": {"pairs": 18, "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.3))},
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_optimum_is_that_of_the_batch_solver_after_every_pair(shape: str) -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(1), **SHAPES[shape])
+    engine = OnlineRegistration(model, judge=None)
+    pairs = 0
+    for event in events(measurements):
+        estimate = engine.add(event)
+        if isinstance(event, CameraMoved):
+            continue
+        pairs = len(engine.measurements().pairs)
+        if pairs < 8 or pairs % 3:
+            continue
+        found = batch(first(measurements, pairs), model)
+        if estimate.epoch not in found.epochs:
+            assert estimate.trus_T_camera is None
+            continue
+        assert sigmas_apart(found, estimate) < 0.05
+        place = found.epochs.index(estimate.epoch)
+        assert estimate.covariance is not None
+        there = np.sqrt(np.diag(found.covariance))[6 * place : 6 * place + 6]
+        np.testing.assert_allclose(np.sqrt(np.diag(estimate.covariance)), there, rtol=0.05)
+    assert pairs == len(measurements.pairs)
+
+
+def test_long_streams_stay_at_the_batch_optimum_while_pairs_go_into_the_summary() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=320)
+    engine = OnlineRegistration(model, judge=None)
+    for event in events(measurements):
+        estimate = engine.add(event)
+        if isinstance(event, Pair) and engine.state.pairs in (60, 140, 320):
+            assert sigmas_apart(batch(first(measurements, engine.state.pairs), model), estimate) < 0.05
+    assert len(engine.state.now.shelf.full) == 2
+
+
+def test_sound_speed_as_a_variable_is_followed() -> None:
+    config = SolveConfig(estimate_sound_speed=True)
+    model, measurements, _ = make_measurements(np.random.default_rng(5), pairs=20, sound_speed_ratio=1.01)
+    engine = OnlineRegistration(model, config, judge=None)
+    estimate = run(engine, measurements)[-1]
+    assert sigmas_apart(register(measurements, model, config), estimate) < 0.05
+    assert engine.state.window is not None
+    assert float(engine.state.window.state.sound_speed_ratio[0]) > 1.003
+
+
+def test_the_radius_as_a_variable_is_refused() -> None:
+    with pytest.raises(ValueError, match="holds the probe's radius"):
+        OnlineRegistration(make_session(), SolveConfig(estimate_radius=True))
+
+
+def test_the_same_events_give_the_same_bits() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=45)
+    one, two = (OnlineRegistration(model, judge=None) for _ in range(2))
+    for a, b in zip(run(one, measurements), run(two, measurements), strict=True):
+        if a.trus_T_camera is None or b.trus_T_camera is None:
+            assert a.trus_T_camera is b.trus_T_camera
+            continue
+        np.testing.assert_array_equal(a.trus_T_camera, b.trus_T_camera)
+        np.testing.assert_array_equal(np.asarray(a.covariance), np.asarray(b.covariance))
+
+
+def test_measurements_come_back_bit_for_bit() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(0), pairs=12, amplitude_noise=0.05)
+    store = MeasurementStore()
+    for pair in measurements.pairs:
+        store.append(pair)
+    for index, pair in enumerate(measurements.pairs):
+        back = store.pair(index, 0)
+        assert (back.t, back.pm, back.marker.id, back.look.sweep) == (
+            pair.t, pair.pm, pair.marker.id, pair.look.sweep,
+        )  # fmt: skip
+        assert (back.look.scan_rad, back.look.x_mm, back.look.amplitude) == (
+            pair.look.scan_rad, pair.look.x_mm, pair.look.amplitude,
+        )  # fmt: skip
+        np.testing.assert_array_equal(back.marker.camera_T_marker, pair.marker.camera_T_marker)
+        np.testing.assert_array_equal(back.marker.covariance, pair.marker.covariance)
+        np.testing.assert_array_equal(back.look.covariance, pair.look.covariance)
+    assert model.name == "test"
+
+
+# --- reports --------------------------------------------------------------------------------------------------------
+
+
+def test_settled_estimates_are_those_of_the_solve() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=14)
+    engine = OnlineRegistration(model, judge=None)
+    run(engine, measurements)
+    assert not engine.estimate.settled
+    settled, solution = engine.settle(), solve(measurements, [], model, SolveConfig())
+    assert settled.settled
+    assert settled.verdict is solution.verdict
+    assert settled.reasons == solution.reasons
+    np.testing.assert_array_equal(np.asarray(settled.trus_T_camera), np.asarray(solution.epochs[0].trus_T_camera))
+    np.testing.assert_array_equal(np.asarray(settled.covariance), np.asarray(solution.epochs[0].covariance))
+
+
+def test_an_epoch_that_was_not_judged_is_at_most_a_warning() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=14)
+    engine = OnlineRegistration(model, judge=None)
+    estimates = run(engine, measurements)
+    assert all(estimate.verdict is not Verdict.OK for estimate in estimates)
+    assert "not been judged" in estimates[-1].reasons[0]
+
+
+def test_between_judgements_the_report_keeps_the_posteriors_shift_and_width() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=11, first_hit=False)
+    engine = OnlineRegistration(model)
+    estimates = run(engine, measurements)
+    assert estimates[-2].settled  # judged at 10 pairs
+    last, optimum = estimates[-1], engine.state.window
+    assert not last.settled
+    assert optimum is not None
+    assert last.covariance is not None
+    assert last.optimum_trus_T_camera is not None
+    # Wider than the optimum's Gaussian, as the posterior of so few pairs is; and off the optimum.
+    assert np.linalg.det(last.covariance) > np.linalg.det(optimum.covariance[:6, :6])
+    assert np.abs(np.asarray(last.trus_T_camera) - last.optimum_trus_T_camera).max() > 1e-6
+    solution = solve(measurements, [], model, SolveConfig())
+    ratio = np.sqrt(np.diag(last.covariance) / np.diag(np.asarray(solution.epochs[0].covariance)))
+    assert np.all((ratio > 0.6) & (ratio < 1.7))
+
+
+def test_a_judging_process_reports_what_the_solve_says() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=12)
+    with OnlineRegistration(model, judge="process") as engine:
+        run(engine, measurements)
+        deadline = time.monotonic() + 60.0
+        while engine.refresh().reasons[0].startswith("this camera epoch has not been judged"):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        solution = solve(first(measurements, 12), [], model, SolveConfig())
+        assert engine.estimate.verdict.severity >= min(solution.verdict.severity, Verdict.OK.severity)
+        assert "judged" not in " ".join(engine.estimate.reasons)
+
+
+def test_the_schedule_of_judgements_thins_out() -> None:
+    due = [n for n in range(1, 700) if is_due(n)]
+    assert due == [*range(1, 9), 10, 12, 15, 20, 25, 30, 40, 60, 80, 160, 320, 640]
+
+
+def test_closed_form_quantiles_are_within_one_percent() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((400_000, 3))
+    for axes in ((1, 1, 1), (1, 0, 0), (1, 0.5, 0.1), (1, 0.9, 0.05), (1, 0.1, 0.1), (1, 0.4, 0.4), (1, 1, 0.3)):
+        variance = np.array(axes, dtype=np.float64)
+        drawn = float(np.quantile(np.sqrt((z**2) @ variance), 0.95))
+        assert float(gaussian_quantile_mm(np.diag(variance)[None])[0]) == pytest.approx(drawn, rel=0.01)
+
+
+def test_predicted_tre_of_a_pure_shift_is_that_shift() -> None:
+    covariance = np.diag([1e-12] * 3 + [1.0] * 3)
+    model = make_session()
+    tre = gaussian_tre(as_float_array(covariance), np.eye(4), model.targets_mm)
+    assert tre.mean_mm == pytest.approx(np.sqrt(3.0), rel=1e-3)
+    assert tre.worst_mm == pytest.approx(np.sqrt(7.815), rel=1e-2)
+
+
+# --- epochs ---------------------------------------------------------------------------------------------------------
+
+
+def test_after_an_untold_motion_no_old_transform_is_presented_as_current() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(6), pairs=20, epochs=2)
+    engine = OnlineRegistration(model, judge=None)
+    seen = False
+    for event in events(measurements):
+        estimate = engine.add(event)
+        if isinstance(event, CameraMoved):
+            seen = True
+            assert estimate.epoch == 1
+            assert estimate.trus_T_camera is None
+            assert estimate.verdict is Verdict.REFUSED
+    assert seen
+    assert estimate.trus_T_camera is not None
+
+
+def test_a_told_motion_gives_the_new_registration_at_once_and_widens_it() -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(6), pairs=30, epochs=2, known_motion=True)
+    engine = OnlineRegistration(model, judge=None)
+    before = None
+    for event in events(measurements):
+        estimate = engine.add(event)
+        if isinstance(event, CameraMoved):
+            assert before is not None
+            assert estimate.predicted_tre is not None
+            assert estimate.predicted_tre.worst_mm > before.predicted_tre.worst_mm
+            tangent = np.linalg.inv(truth.trus_T_camera[1]) @ np.asarray(estimate.trus_T_camera)
+            assert np.abs(tangent[:3, 3]).max() < 5.0
+        before = estimate
+    assert estimate.epoch == 1
+
+
+def test_reassigned_pairs_belong_to_a_new_epoch_and_the_old_one_is_rid_of_them() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(7), pairs=30, epochs=2)
+    untold = replace(
+        measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs[:21]), epochs=measurements.epochs[:1]
+    )
+    engine = OnlineRegistration(model, judge=None)
+    run(engine, untold)
+    estimate = engine.reassign(6, measurements.epochs[1])
+    assert estimate.epoch == 1
+    assert [pair.epoch for pair in engine.measurements().pairs] == [0] * 15 + [1] * 6
+    for pair in measurements.pairs[21:]:
+        estimate = engine.add(pair)
+    found = batch(measurements, model)
+    assert sigmas_apart(found, estimate) < 0.05
