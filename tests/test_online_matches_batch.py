@@ -217,6 +217,7 @@ def test_a_told_motion_gives_the_new_registration_at_once_and_widens_it() -> Non
         estimate = engine.add(event)
         if isinstance(event, CameraMoved):
             assert before is not None
+            assert before.predicted_tre is not None
             assert estimate.predicted_tre is not None
             assert estimate.predicted_tre.worst_mm > before.predicted_tre.worst_mm
             tangent = np.linalg.inv(truth.trus_T_camera[1]) @ np.asarray(estimate.trus_T_camera)

@@ -5,6 +5,7 @@ Nothing here changes a state: an update that fails on its way leaves the one bef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
-from fgreg.frames import BoolArray, FloatArray
+from fgreg.frames import FloatArray
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
@@ -233,7 +234,8 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
     """Mahalanobis distance of two states near each other."""
     scale = np.sqrt(np.diag(covariance))
     step = small_step(first, second, columns) / scale
-    return float(np.sqrt(max(step @ np.linalg.solve(covariance / np.outer(scale, scale), step), 0.0)))
+    square = float(step @ np.linalg.solve(covariance / np.outer(scale, scale), step))
+    return math.sqrt(max(square, 0.0))
 
 
 # --- groups into chunks ---------------------------------------------------------------------------------------------
@@ -254,7 +256,7 @@ def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Se
             private = joined_private(before.private, initial_private(problem, at))
             problem, places = joined(before.problem, problem), np.concatenate([before.places, places])
             kept = np.concatenate([before.kept, kept])
-        shelf = shelf.with_open(make_chunk(places, problem, kept, at, private)[0], setting.columns)
+        shelf = shelf.with_open(make_chunk(places, problem, kept, at, private), setting.columns)
     return shelf
 
 
@@ -266,7 +268,7 @@ def without_label(shelf: Shelf, label: int, at: SharedState, columns: Columns) -
         problem, looks, _ = without_pms(chunk.problem, np.array([place]))
         if not len(problem.pms):
             return None
-        return make_chunk(chunk.places[looks], problem, np.delete(chunk.kept, place), at)[0]
+        return make_chunk(chunk.places[looks], problem, np.delete(chunk.kept, place), at)
 
     if shelf.open is not None and label in shelf.open.problem.pms:
         return replace(shelf, open=less(shelf.open))
@@ -358,7 +360,7 @@ def refreshed(state: State, at: SharedState, setting: Setting) -> State:
 
 def again(chunk: Chunk, at: SharedState) -> Chunk:
     """A chunk linearised at another state near by."""
-    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private)[0]
+    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private, rounds=1)
 
 
 def opened(
@@ -377,4 +379,3 @@ def opened(
         if sigma_distance(before, window.state, window.covariance, setting.columns) < SETTLED_FEW:
             break
     return state, window
-

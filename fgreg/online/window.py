@@ -184,9 +184,7 @@ def prepare(
             covariance = usable_covariance(pair.marker.covariance, POSE_FLOOR)
             graph.add(marker_pose_factor(markers[shot], pair.marker.camera_T_marker, covariance, bias))
             graph.add(
-                point_on_line_factor(
-                    shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal
-                )
+                point_on_line_factor(shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal)
             )
             values.insert(markers[shot], gtsam.Pose3(pose))
             values.insert(lambdas[shot], float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin)))
@@ -324,9 +322,7 @@ class Change:
     summary: Quadratic | None = None
 
 
-def open_window(
-    groups: Sequence[Group], summary: Quadratic, layout: Layout, epoch: int, numbers: int
-) -> Window:
+def open_window(groups: Sequence[Group], summary: Quadratic, layout: Layout, epoch: int, numbers: int) -> Window:
     """A window anew: these groups and a summary.
 
     Raises:
