@@ -44,7 +44,7 @@ WINDOW, STEP = 24, 8
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
-SETTLED_FEW, SETTLED_MANY = 0.05, 0.3
+SETTLED_FEW, SETTLED_NEAR, SETTLED_MANY = 0.05, 0.1, 0.3
 """Updates are repeated until the estimate moves by less, in its own standard deviations. What then is left is of second
 order, and falls with the number of pairs: with few, chunks are linearised anew on the way."""
 
@@ -326,11 +326,12 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 
-def relaxed(state: State, window: Window, change: Change, setting: Setting, *, refresh: bool) -> tuple[State, Window]:
+def relaxed(state: State, window: Window, change: Change, setting: Setting, settled: float) -> tuple[State, Window]:
     """Update the window until the estimate stands still.
 
     Args:
-        refresh: linearise the epoch's chunks at every new estimate (few pairs), else leave them where they are.
+        settled: movement, in sigma, at which it does. Below ``SETTLED_MANY`` the epoch's chunks and the aims are
+            linearised at every new estimate, else they are left where they are.
     """
     layout = state.layout
     if layout is None:
@@ -339,10 +340,10 @@ def relaxed(state: State, window: Window, change: Change, setting: Setting, *, r
         before = window.state
         window = updated(window, change, layout, window.numbers)
         moved = sigma_distance(before, window.state, window.covariance, setting.columns)
-        if moved < (SETTLED_FEW if refresh else SETTLED_MANY):
+        if moved < settled:
             break
         change = Change()
-        if refresh:
+        if settled < SETTLED_MANY:
             state = refreshed(state, window.state, setting)
             change = Change(summary=summary(state, window.state, setting))
     return state, window

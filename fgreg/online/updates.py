@@ -14,6 +14,9 @@ from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered
 from fgreg.online.shared import small_step
 from fgreg.online.state import (
     RECENT,
+    SETTLED_FEW,
+    SETTLED_MANY,
+    SETTLED_NEAR,
     EpochData,
     Recent,
     Setting,
@@ -25,13 +28,15 @@ from fgreg.online.state import (
     opened,
     passed_from,
     popped,
+    refreshed,
     relaxed,
     shelved,
     summary,
     with_common,
     without_label,
 )
-from fgreg.online.summary import carried_over, chunk_of, joined, make_chunk, settled
+from fgreg.online.summary import carried_over, chunk_of, joined, make_chunk
+from fgreg.online.summary import settled as settled_parts
 from fgreg.online.window import Bundle, Change, Group, Window, open_window, prepare
 from fgreg.robust import AIM_LIMIT, innovations_of, junk_p_of, pm_limits
 
@@ -39,6 +44,8 @@ FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
+NEAR_PAIRS = 160
+"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
 VISIT, VISIT_EARLIER = 8, 64
 """A full chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
@@ -78,9 +85,12 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     forget = () if same is None else (same.label,)
     group = Group(replace(bundle, kept=fits), prepared)
     change = Change(take_in=(group,) if fits else (), set_aside=() if fits else (group,), forget=forget)
-    few = state.epoch_pairs <= FEW_PAIRS
+    few, near = state.epoch_pairs <= FEW_PAIRS, state.epoch_pairs <= NEAR_PAIRS
+    settled = SETTLED_FEW if few else SETTLED_NEAR if near else SETTLED_MANY
     state, gone = popped(state, window, setting)
     if gone:
+        if near:
+            state = refreshed(state, window.state, setting)
         # What is shelved leaves the window in the same update in which the summary takes it up.
         change = replace(change, forget=(*change.forget, *gone))
     elif not few:
@@ -89,7 +99,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     if gone:
         change = replace(change, summary=summary(state, window.state, setting))
     window = replace(window, numbers=numbers)
-    state, window = relaxed(state, window, change, setting, refresh=few)
+    state, window = relaxed(state, window, change, setting, settled)
     state = replace(
         state.with_now(state=window.state),
         window=window,
@@ -98,7 +108,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         used=fits,
     )
     if few:
-        first = state.epoch_pairs <= FIRST_PAIRS or state.is_open
+        first = pms_in_epoch(state) <= FIRST_PAIRS or state.is_open
         if first or not fits or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=_is_kept(found, place), recent=state.recent)
@@ -108,9 +118,15 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     return state
 
 
+def pms_in_epoch(state: State) -> int:
+    """PMs of the epoch that lasts."""
+    groups = state.window.groups if state.window is not None else ()
+    return len(groups) + sum(len(chunk.kept) for chunk in state.now.shelf.chunks)
+
+
 def open_window_again(state: State, window: Window, setting: Setting) -> Window:
     """The window with a summary from which a PM was taken."""
-    return relaxed(state, window, Change(summary=summary(state, window.state, setting)), setting, refresh=False)[1]
+    return relaxed(state, window, Change(summary=summary(state, window.state, setting)), setting, SETTLED_MANY)[1]
 
 
 def _is_kept(state: State, place: int) -> bool:
@@ -141,7 +157,7 @@ def odd_ones(state: State, setting: Setting) -> frozenset[int]:
     if problem is None:
         return frozenset()
     counted = np.array(kept)
-    parts = settled(problem, window.state)
+    parts = settled_parts(problem, window.state)
     found = innovations_of(parts.pm, _information(window), counted)
     limits = pm_limits(problem, junk_p_of(*counts(state)))
     known = np.isfinite(found)
@@ -159,7 +175,7 @@ def visited_chunks(state: State, window: Window, setting: Setting) -> tuple[Stat
     if state.steps % VISIT == 0 and shelf.full:
         place = turn % len(shelf.full)
         chunk = shelf.full[place]
-        parts = settled(chunk.problem, window.state, chunk.private, rounds=1)
+        parts = settled_parts(chunk.problem, window.state, chunk.private, rounds=1)
         found = innovations_of(parts.pm, _information(window), chunk.kept)
         limits = pm_limits(chunk.problem, junk_p_of(*counts(state)))
         kept = np.where(np.isfinite(found), found <= limits, chunk.kept)
@@ -226,7 +242,7 @@ def _toggled(state: State, setting: Setting) -> State:
         numbers += len(back.bundle.pairs)
         taken = (Group(replace(back.bundle, kept=True), fresh),)
     change = Change(take_in=taken, leave_out=() if out is None else (out.label,))
-    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, refresh=False)
+    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, SETTLED_MANY)
     return replace(state.with_now(state=window.state), window=window)
 
 
@@ -260,7 +276,7 @@ def with_aim(state: State, aim: Aim, tools: Tools) -> State:
     if state.epoch_pairs <= FEW_PAIRS and state.pairs <= ALL_PAIRS:
         return registered(state, tools, aim=aim)
     problem = setting.pack([aim], ())
-    parts = settled(problem, window.state)
+    parts = settled_parts(problem, window.state)
     alone = np.zeros(1, dtype=bool)
     found = innovations_of(parts.aim, _information(window), alone)
     kept = np.array([bool(found[0] <= AIM_LIMIT)])
@@ -276,7 +292,7 @@ def with_aim(state: State, aim: Aim, tools: Tools) -> State:
         chunks.append(new)
     state = replace(state, aims=state.aims + 1, aim_chunks=tuple(chunks))
     change = Change(summary=summary(state, window.state, setting))
-    state, window = relaxed(state, window, change, setting, refresh=False)
+    state, window = relaxed(state, window, change, setting, SETTLED_MANY)
     return replace(state.with_now(state=window.state), window=window)
 
 
