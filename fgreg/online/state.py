@@ -39,6 +39,7 @@ from fgreg.online.window import Bundle, Change, Group, Prepared, Window, open_wi
 from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import junk_p_of
 
+NOTHING = Shelf()
 WINDOW, STEP = 24, 8
 """Most groups in the window, and how many of the oldest go into the summary at once when one more comes."""
 RECENT = 24
@@ -117,7 +118,7 @@ class EpochData:
 
     start: EpochStart
     first: int
-    shelf: Shelf = Shelf()
+    shelf: Shelf = NOTHING
     state: SharedState | None = None
 
 

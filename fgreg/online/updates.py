@@ -61,7 +61,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         found = registered(state, tools, pair)
         return replace(found, nis=None, used=_is_kept(found, place), recent=())
     before = window
-    earlier = tuple(p for p in tools.store.looks_at(pair.pm) if p >= state.now.first)
+    earlier = tools.store.looks_at(pair.pm, state.now.first)
     bundle = Bundle(
         pair.pm,
         (*earlier, place),

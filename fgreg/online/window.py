@@ -46,8 +46,8 @@ THRESHOLDS: dict[Variable, tuple[float, ...]] = {
 }
 """Steps (rad, mm) beyond which a variable is linearised anew."""
 PRIVATE_STEPS = 10
-SETTLED_CHI2 = 1e-2
-"""Newton decrement (chi square) of a step of a new pair's own variables after which they have settled."""
+SETTLED_MM = 0.1
+"""A new pair's own variables have settled after a step that moves the PM by less: what is left is of second order."""
 FAR_CHI2 = 1e4
 """What a PM counts as that has no place where beam and arc meet."""
 
@@ -243,11 +243,12 @@ def _settle(
         q, r = np.linalg.qr(jacobian[:, :own], mode="complete")
         turned = q.T @ right
         step = solve_triangular(r[:own], turned[:own], check_finite=False)
-        far = float(turned[:own] @ turned[:own]) > SETTLED_CHI2
         # By retraction: setting a double anew goes through all of the wrapper's overloads, ten times as slow.
         delta, at = gtsam.VectorValues(), 0
         for key, size in sizes.items():
             delta.insert(key, step[at : at + size])
+            if size == 3:
+                far = float(np.linalg.norm(step[at : at + size])) > SETTLED_MM
             at += size
         private = private.retract(delta)
         if not far:
