@@ -43,7 +43,7 @@ class EstimationError(FgregError):
     """The estimate could not be formed from these measurements (not a defect of the file)."""
 
 
-class EventRefused(FgregError):  # noqa: N818: it is the event that is refused; nothing is in error
+class EventRefused(FgregError):  # noqa: N818
     """An event that was not taken in; the state is what it was before, and later events work.
 
     Args:

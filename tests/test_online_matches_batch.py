@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -17,19 +18,19 @@ from fgreg.measurements import Pair
 from fgreg.models import NoiseModel
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.online.estimate import gaussian_quantile_mm, gaussian_tre
-from fgreg.online.judge import is_due
+from fgreg.online.judge import is_due, judgement_of
 from fgreg.online.store import MeasurementStore
 from fgreg.registration import register
 from tests.forward import make_measurements, make_session
 from tests.online_streams import batch, events, first, run, sigmas_apart
 
 SHAPES: dict[str, dict[str, Any]] = {
-    "first hit": {"pairs": 30},
-    "window only": {"pairs": 24, "first_hit": False},
+    "first hit": {"pairs": 20},
+    "window only": {"pairs": 20, "first_hit": False},
     "few aims": {"pairs": 20, "aims": 4},
     "two epochs, known motion": {"pairs": 24, "epochs": 2, "known_motion": True},
     "two epochs, unknown motion": {"pairs": 24, "epochs": 2},
-    "three looks, own markers": {"pairs": 9, "looks_per_pm": 3},
+    "three looks, own markers": {"pairs": 10, "looks_per_pm": 3},
     "two looks, one marker": {"pairs": 12, "looks_per_pm": 2, "share_marker": True},
     "marker bias": {"pairs": 18, "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.3))},
 }
@@ -45,7 +46,7 @@ def test_the_optimum_is_that_of_the_batch_solver_after_every_pair(shape: str) ->
         if isinstance(event, CameraMoved):
             continue
         pairs = len(engine.measurements().pairs)
-        if pairs < 8 or pairs % 3:
+        if pairs < 8 or pairs % 4:
             continue
         found = batch(first(measurements, pairs), model)
         if estimate.epoch not in found.epochs:
@@ -60,13 +61,13 @@ def test_the_optimum_is_that_of_the_batch_solver_after_every_pair(shape: str) ->
 
 
 def test_long_streams_stay_at_the_batch_optimum_while_pairs_go_into_the_summary() -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=320)
+    model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=180)
     engine = OnlineRegistration(model, judge=None)
     for event in events(measurements):
         estimate = engine.add(event)
-        if isinstance(event, Pair) and engine.state.pairs in (60, 140, 320):
+        if isinstance(event, Pair) and engine.state.pairs in (43, 75, 180):
             assert sigmas_apart(batch(first(measurements, engine.state.pairs), model), estimate) < 0.05
-    assert len(engine.state.now.shelf.full) == 2
+    assert len(engine.state.now.shelf.full) == 1
 
 
 def test_sound_speed_as_a_variable_is_followed() -> None:
@@ -74,9 +75,12 @@ def test_sound_speed_as_a_variable_is_followed() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(5), pairs=20, sound_speed_ratio=1.01)
     engine = OnlineRegistration(model, config, judge=None)
     estimate = run(engine, measurements)[-1]
-    assert sigmas_apart(register(measurements, model, config), estimate) < 0.05
+    found = register(measurements, model, config)
+    assert sigmas_apart(found, estimate) < 0.05
     assert engine.state.window is not None
-    assert float(engine.state.window.state.sound_speed_ratio[0]) > 1.003
+    ratio = float(engine.state.window.state.sound_speed_ratio[0])
+    assert ratio == pytest.approx(float(found.optimum.state.sound_speed_ratio[0]), abs=1e-4)
+    assert ratio != 1.0
 
 
 def test_the_radius_as_a_variable_is_refused() -> None:
@@ -84,15 +88,17 @@ def test_the_radius_as_a_variable_is_refused() -> None:
         OnlineRegistration(make_session(), SolveConfig(estimate_radius=True))
 
 
-def test_the_same_events_give_the_same_bits() -> None:
+def test_the_same_events_give_the_same_estimates() -> None:
+    # Not to the last bit: how GTSAM's and numpy's sums round depends on where arrays happen to lie in memory.
     model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=45)
     one, two = (OnlineRegistration(model, judge=None) for _ in range(2))
     for a, b in zip(run(one, measurements), run(two, measurements), strict=True):
         if a.trus_T_camera is None or b.trus_T_camera is None:
             assert a.trus_T_camera is b.trus_T_camera
             continue
-        np.testing.assert_array_equal(a.trus_T_camera, b.trus_T_camera)
-        np.testing.assert_array_equal(np.asarray(a.covariance), np.asarray(b.covariance))
+        assert a.used == b.used
+        np.testing.assert_allclose(a.trus_T_camera, b.trus_T_camera, rtol=0, atol=1e-8)
+        np.testing.assert_allclose(np.asarray(a.covariance), np.asarray(b.covariance), rtol=1e-7, atol=1e-12)
 
 
 def test_measurements_come_back_bit_for_bit() -> None:
@@ -142,18 +148,24 @@ def test_between_judgements_the_report_keeps_the_posteriors_shift_and_width() ->
     model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=11, first_hit=False)
     engine = OnlineRegistration(model)
     estimates = run(engine, measurements)
-    assert estimates[-2].settled  # judged at 10 pairs
-    last, optimum = estimates[-1], engine.state.window
+    judged, last, window = estimates[-2], estimates[-1], engine.state.window
+    assert judged.settled  # at 10 pairs
     assert not last.settled
-    assert optimum is not None
-    assert last.covariance is not None
-    assert last.optimum_trus_T_camera is not None
-    # Wider than the optimum's Gaussian, as the posterior of so few pairs is; and off the optimum.
-    assert np.linalg.det(last.covariance) > np.linalg.det(optimum.covariance[:6, :6])
-    assert np.abs(np.asarray(last.trus_T_camera) - last.optimum_trus_T_camera).max() > 1e-6
-    solution = solve(measurements, [], model, SolveConfig())
-    ratio = np.sqrt(np.diag(last.covariance) / np.diag(np.asarray(solution.epochs[0].covariance)))
-    assert np.all((ratio > 0.6) & (ratio < 1.7))
+    assert window is not None
+    solution = solve(first(measurements, 10), [], model, SolveConfig())
+    judgement, registration = judgement_of(solution, 0, 0), solution.registration
+    assert registration is not None
+    # At the covariance that was judged it gives the posterior's covariance and mean back ...
+    wide, shift = judgement.applied(registration.covariance[:6, :6])
+    np.testing.assert_allclose(wide, np.asarray(judged.covariance), rtol=1e-6, atol=1e-12)
+    mean = registration.optimum.state.trus_T_camera()[0] @ gtsam.Pose3.Expmap(shift).matrix()
+    np.testing.assert_allclose(mean, np.asarray(judged.trus_T_camera), atol=1e-6)
+    # ... and with one pair more what the optimum's own covariance makes of them.
+    wide, shift = judgement.applied(window.covariance[:6, :6])
+    np.testing.assert_allclose(np.asarray(last.covariance), wide, rtol=1e-3, atol=1e-9)
+    mean = np.asarray(last.optimum_trus_T_camera) @ gtsam.Pose3.Expmap(shift).matrix()
+    np.testing.assert_allclose(np.asarray(last.trus_T_camera), mean, atol=1e-3)
+    assert np.abs(shift).max() > 1e-4
 
 
 def test_a_judging_process_reports_what_the_solve_says() -> None:
@@ -210,13 +222,14 @@ def test_after_an_untold_motion_no_old_transform_is_presented_as_current() -> No
 
 
 def test_a_told_motion_gives_the_new_registration_at_once_and_widens_it() -> None:
-    model, measurements, truth = make_measurements(np.random.default_rng(6), pairs=30, epochs=2, known_motion=True)
+    model, measurements, truth = make_measurements(np.random.default_rng(6), pairs=16, epochs=2, known_motion=True)
     engine = OnlineRegistration(model, judge=None)
     before = None
     for event in events(measurements):
         estimate = engine.add(event)
         if isinstance(event, CameraMoved):
             assert before is not None
+            assert before.predicted_tre is not None
             assert estimate.predicted_tre is not None
             assert estimate.predicted_tre.worst_mm > before.predicted_tre.worst_mm
             tangent = np.linalg.inv(truth.trus_T_camera[1]) @ np.asarray(estimate.trus_T_camera)
@@ -226,16 +239,16 @@ def test_a_told_motion_gives_the_new_registration_at_once_and_widens_it() -> Non
 
 
 def test_reassigned_pairs_belong_to_a_new_epoch_and_the_old_one_is_rid_of_them() -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(7), pairs=30, epochs=2)
+    model, measurements, _ = make_measurements(np.random.default_rng(7), pairs=24, epochs=2)
     untold = replace(
-        measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs[:21]), epochs=measurements.epochs[:1]
+        measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs[:18]), epochs=measurements.epochs[:1]
     )
     engine = OnlineRegistration(model, judge=None)
     run(engine, untold)
     estimate = engine.reassign(6, measurements.epochs[1])
     assert estimate.epoch == 1
-    assert [pair.epoch for pair in engine.measurements().pairs] == [0] * 15 + [1] * 6
-    for pair in measurements.pairs[21:]:
+    assert [pair.epoch for pair in engine.measurements().pairs] == [0] * 12 + [1] * 6
+    for pair in measurements.pairs[18:]:
         estimate = engine.add(pair)
     found = batch(measurements, model)
     assert sigmas_apart(found, estimate) < 0.05

@@ -21,19 +21,20 @@ import numpy as np
 
 from fgreg.batch import Solution
 from fgreg.config import SolveConfig
-from fgreg.errors import EstimationError, EventRefused
-from fgreg.estimate import PredictedTre, TrackEstimate, Verdict
-from fgreg.frames import FloatArray, inverse, is_rigid
+from fgreg.errors import EventRefused
+from fgreg.estimate import TrackEstimate, Verdict
+from fgreg.frames import FloatArray, is_rigid
 from fgreg.measurements import Aim, EpochStart, MarkerObservation, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
 from fgreg.online.judge import Case, InlineJudge, Judge, Judgement, ProcessJudge, judge
+from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
 from fgreg.online.state import EpochData, Recent, State, make_setting
 from fgreg.online.store import MeasurementStore
 from fgreg.online.tracking import online_snapshot
-from fgreg.online.updates import Tools, all_measurements, with_aim, with_move, with_pair
+from fgreg.online.updates import with_aim, with_move, with_pair
 from fgreg.registration import SoundSpeedPrior
 from fgreg.tracking import Snapshot, SurfaceMap, fast_track
 from fgreg.verdict import accuracy
@@ -272,9 +273,13 @@ class OnlineRegistration:
             )
         covariance = window.covariance[POSE, POSE]
         pose = optimum
-        verdict, reasons = Verdict.WARNING, (NOT_JUDGED,)
+        verdict: Verdict = Verdict.WARNING
+        reasons: tuple[str, ...] = (NOT_JUDGED,)
         if state.is_open:
-            verdict, reasons = Verdict.REFUSED, ("two registrations explain these pairs equally well: take more", *reasons)
+            verdict, reasons = (
+                Verdict.REFUSED,
+                ("two registrations explain these pairs equally well: take more", *reasons),
+            )
         if found is not None:
             covariance, shift = found.applied(covariance)
             if np.any(shift):
@@ -373,6 +378,3 @@ def _covariance(name: str, value: FloatArray, size: int) -> None:
     scale = float(np.abs(value).max())
     if np.abs(value - value.T).max() > 1e-6 * scale or (np.diag(value) < 0).any():
         raise EventRefused(f"{name} is not symmetric with variances >= 0")
-
-
-

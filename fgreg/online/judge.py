@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Protocol
@@ -33,7 +34,7 @@ def is_due(pairs: int) -> bool:
     """Whether an epoch of so many pairs is to be judged."""
     if pairs <= JUDGED_AT[-1]:
         return pairs in JUDGED_AT
-    return pairs % JUDGED_AT[-1] == 0 and (pairs // JUDGED_AT[-1]).bit_count() == 1
+    return bool(pairs % JUDGED_AT[-1] == 0 and (pairs // JUDGED_AT[-1]).bit_count() == 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,10 +228,8 @@ class ProcessJudge:
 
     def close(self) -> None:
         """End the process."""
-        try:
+        with suppress(OSError):
             self._connection.send(None)
-        except (BrokenPipeError, OSError):
-            pass
         self._connection.close()
         self._process.join(timeout=0.5)
         if self._process.is_alive():

@@ -1,4 +1,4 @@
-"""The shared variables of one camera epoch, as GTSAM's variables and as the reduced problem's state; quadratics on them.
+"""The shared variables of one camera epoch: GTSAM's variables, the reduced problem's state, and quadratics on them.
 
 A quadratic is the cost ``c + 2 g' d + d' H d`` (chi square) of steps ``d`` from a state, as
 :meth:`fgreg.graph.shared_state.SharedState.retract` takes them: 6 of ``trus_T_camera``, 4 of the beam's chart, the
@@ -49,7 +49,7 @@ class Quadratic:
 
 
 def small_step(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
-    """(D,) of :func:`step_between` for states so near that the turn's third order does not matter; many times faster."""
+    """(D,) of :func:`step_between`, many times faster, for states so near that the turn's third order is nothing."""
     out = np.zeros(columns.size)
     back = first.rotation[0, 0].T
     turn = back @ second.rotation[0, 0]

@@ -5,6 +5,7 @@ Nothing here changes a state: an update that fails on its way leaves the one bef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
-from fgreg.frames import BoolArray, FloatArray
+from fgreg.frames import FloatArray
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
@@ -38,12 +39,13 @@ from fgreg.online.window import Bundle, Change, Group, Prepared, Window, open_wi
 from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import junk_p_of
 
+NOTHING = Shelf()
 WINDOW, STEP = 24, 8
 """Most groups in the window, and how many of the oldest go into the summary at once when one more comes."""
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
-SETTLED_FEW, SETTLED_MANY = 0.05, 0.3
+SETTLED_FEW, SETTLED_NEAR, SETTLED_MANY = 0.05, 0.1, 0.3
 """Updates are repeated until the estimate moves by less, in its own standard deviations. What then is left is of second
 order, and falls with the number of pairs: with few, chunks are linearised anew on the way."""
 
@@ -116,7 +118,7 @@ class EpochData:
 
     start: EpochStart
     first: int
-    shelf: Shelf = Shelf()
+    shelf: Shelf = NOTHING
     state: SharedState | None = None
 
 
@@ -233,7 +235,8 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
     """Mahalanobis distance of two states near each other."""
     scale = np.sqrt(np.diag(covariance))
     step = small_step(first, second, columns) / scale
-    return float(np.sqrt(max(step @ np.linalg.solve(covariance / np.outer(scale, scale), step), 0.0)))
+    square = float(step @ np.linalg.solve(covariance / np.outer(scale, scale), step))
+    return math.sqrt(max(square, 0.0))
 
 
 # --- groups into chunks ---------------------------------------------------------------------------------------------
@@ -254,7 +257,7 @@ def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Se
             private = joined_private(before.private, initial_private(problem, at))
             problem, places = joined(before.problem, problem), np.concatenate([before.places, places])
             kept = np.concatenate([before.kept, kept])
-        shelf = shelf.with_open(make_chunk(places, problem, kept, at, private)[0], setting.columns)
+        shelf = shelf.with_open(make_chunk(places, problem, kept, at, private), setting.columns)
     return shelf
 
 
@@ -266,7 +269,7 @@ def without_label(shelf: Shelf, label: int, at: SharedState, columns: Columns) -
         problem, looks, _ = without_pms(chunk.problem, np.array([place]))
         if not len(problem.pms):
             return None
-        return make_chunk(chunk.places[looks], problem, np.delete(chunk.kept, place), at)[0]
+        return make_chunk(chunk.places[looks], problem, np.delete(chunk.kept, place), at)
 
     if shelf.open is not None and label in shelf.open.problem.pms:
         return replace(shelf, open=less(shelf.open))
@@ -324,11 +327,12 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 
-def relaxed(state: State, window: Window, change: Change, setting: Setting, *, refresh: bool) -> tuple[State, Window]:
+def relaxed(state: State, window: Window, change: Change, setting: Setting, settled: float) -> tuple[State, Window]:
     """Update the window until the estimate stands still.
 
     Args:
-        refresh: linearise the epoch's chunks at every new estimate (few pairs), else leave them where they are.
+        settled: movement, in sigma, at which it does. Below ``SETTLED_MANY`` the epoch's chunks and the aims are
+            linearised at every new estimate, else they are left where they are.
     """
     layout = state.layout
     if layout is None:
@@ -337,10 +341,10 @@ def relaxed(state: State, window: Window, change: Change, setting: Setting, *, r
         before = window.state
         window = updated(window, change, layout, window.numbers)
         moved = sigma_distance(before, window.state, window.covariance, setting.columns)
-        if moved < (SETTLED_FEW if refresh else SETTLED_MANY):
+        if moved < settled:
             break
         change = Change()
-        if refresh:
+        if settled < SETTLED_MANY:
             state = refreshed(state, window.state, setting)
             change = Change(summary=summary(state, window.state, setting))
     return state, window
@@ -358,7 +362,7 @@ def refreshed(state: State, at: SharedState, setting: Setting) -> State:
 
 def again(chunk: Chunk, at: SharedState) -> Chunk:
     """A chunk linearised at another state near by."""
-    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private)[0]
+    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private, rounds=1)
 
 
 def opened(
@@ -377,4 +381,3 @@ def opened(
         if sigma_distance(before, window.state, window.covariance, setting.columns) < SETTLED_FEW:
             break
     return state, window
-

@@ -25,7 +25,6 @@ class MeasurementStore:
         self._blocks: list[FloatArray] = []
         self._pm = array("q")
         self._marker = array("q")
-        self._of_pm: dict[int, int | tuple[int, ...]] = {}
 
     def __len__(self) -> int:
         """Number of pairs."""
@@ -47,16 +46,11 @@ class MeasurementStore:
         row[_AMPLITUDE] = np.nan if look.amplitude is None else look.amplitude
         self._pm.append(pair.pm)
         self._marker.append(pair.marker.id)
-        before = self._of_pm.get(pair.pm)
-        if before is None:
-            self._of_pm[pair.pm] = index
-        else:
-            self._of_pm[pair.pm] = (*(before if isinstance(before, tuple) else (before,)), index)
 
-    def looks_at(self, pm: int) -> tuple[int, ...]:
-        """Places of the pairs at a PM so far."""
-        found = self._of_pm.get(pm, ())
-        return found if isinstance(found, tuple) else (found,)
+    def looks_at(self, pm: int, first: int = 0) -> tuple[int, ...]:
+        """Places of the pairs at a PM so far, from a place on."""
+        numbers = np.frombuffer(self._pm, dtype=np.int64) if self._pm else np.zeros(0, dtype=np.int64)
+        return tuple((first + np.flatnonzero(numbers[first:] == pm)).tolist())
 
     def pair(self, index: int, epoch: int, pm: int | None = None) -> Pair:
         """The pair at a place, bit for bit as it came, in this epoch; ``pm`` gives it another number."""

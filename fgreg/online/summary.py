@@ -108,21 +108,16 @@ def joined_private(first: PrivateState, second: PrivateState) -> PrivateState:
     )
 
 
-def settled(problem: PackedProblem, state: SharedState, private: PrivateState | None = None) -> Parts:
+def settled(
+    problem: PackedProblem, state: SharedState, private: PrivateState | None = None, *, rounds: int = 3
+) -> Parts:
     """The problem's parts at a state, private variables at their optimum (from the arcs where None are given).
 
     A PM that still wanders counts as far off, whatever it passes on its way.
     """
     private = initial_private(problem, state) if private is None else private
-    for _ in range(3):
+    for _ in range(rounds):
         _, private = refine(problem, state, private)
-    return _honest(contributions(problem, state, private), private)
-
-
-def moved(problem: PackedProblem, parts: Parts, step: FloatArray, state: SharedState) -> Parts:
-    """The parts at a state that is ``step`` (D,) from where they are, their private variables carried along."""
-    points = parts.private.trus_p_pm + (parts.point_gain @ step[None, None, :, None])[..., 0]
-    _, private = refine(problem, state, replace(parts.private, trus_p_pm=points))
     return _honest(contributions(problem, state, private), private)
 
 
@@ -140,15 +135,20 @@ def shots_of(chunk_problem: PackedProblem, parts: Parts) -> Contributions:
 
 
 def make_chunk(
-    places: IntArray, problem: PackedProblem, kept: BoolArray, state: SharedState, private: PrivateState | None = None
-) -> tuple[Chunk, Parts]:
+    places: IntArray,
+    problem: PackedProblem,
+    kept: BoolArray,
+    state: SharedState,
+    private: PrivateState | None = None,
+    *,
+    rounds: int = 3,
+) -> Chunk:
     """Linearise shots at a state.
 
     Raises:
         ArithmeticError: a number is not finite.
     """
-    parts = settled(problem, state, private)
-    return chunk_of(places, problem, kept, state, parts), parts
+    return chunk_of(places, problem, kept, state, settled(problem, state, private, rounds=rounds))
 
 
 def chunk_of(places: IntArray, problem: PackedProblem, kept: BoolArray, state: SharedState, parts: Parts) -> Chunk:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.errors import EstimationError
-from fgreg.frames import make_transform
-from fgreg.graph.explicit_values import laser_chart
+from fgreg.frames import FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.shared_state import SharedState, nominal_frame
-from fgreg.measurements import Aim, EpochStart, Measurements, Pair
-from fgreg.online.shared import Layout, small_step
+from fgreg.measurements import Aim, EpochStart, Pair
+from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered
+from fgreg.online.shared import small_step
 from fgreg.online.state import (
     RECENT,
-    STEP,
-    WINDOW,
+    SETTLED_FEW,
+    SETTLED_MANY,
+    SETTLED_NEAR,
     EpochData,
     Recent,
     Setting,
@@ -30,173 +28,26 @@ from fgreg.online.state import (
     opened,
     passed_from,
     popped,
+    refreshed,
     relaxed,
     shelved,
-    sigma_distance,
     summary,
     with_common,
     without_label,
 )
-from fgreg.online.store import MeasurementStore
-from fgreg.online.summary import Shelf, carried_over, chunk_of, joined, make_chunk, settled
+from fgreg.online.summary import carried_over, chunk_of, joined, make_chunk
+from fgreg.online.summary import settled as settled_parts
 from fgreg.online.window import Bundle, Change, Group, Window, open_window, prepare
-from fgreg.registration import Registration, register
-from fgreg.robust import AIM_LIMIT, innovations_of, junk_p_of, pm_degrees_of_freedom, pm_limits
+from fgreg.robust import AIM_LIMIT, innovations_of, junk_p_of, pm_limits
 
 FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
-ALL_PAIRS = 120
-"""Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
-EARLIER_PAIRS = 60
-AIMS_IN_CHUNK = 64
+NEAR_PAIRS = 160
+"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
 VISIT, VISIT_EARLIER = 8, 64
 """A full chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tools:
-    """What an update works with: the setting, the configuration of registrations, what is stored."""
-
-    setting: Setting
-    config: SolveConfig
-    store: MeasurementStore
-
-
-def epoch_of(state: State, place: int) -> int:
-    """The epoch of a pair."""
-    return max(k for k, data in enumerate(state.epochs) if data.first <= place)
-
-
-def all_measurements(state: State, store: MeasurementStore) -> Measurements:
-    """Everything that came, with the epochs as they are now known."""
-    firsts = [data.first for data in state.epochs] + [state.pairs]
-    pairs = [
-        store.pair(place, k)
-        for k, (first, end) in enumerate(zip(firsts[:-1], firsts[1:], strict=True))
-        for place in range(first, end)
-    ]
-    return Measurements(tuple(store.aims), tuple(pairs), tuple(data.start for data in state.epochs))
-
-
-# --- a registration from no guess -----------------------------------------------------------------------------------
-
-
-def registered(state: State, tools: Tools, pair: Pair | None = None, aim: Aim | None = None) -> State:
-    """The state from a registration of the measurements so far and one more, which the counts do not hold yet.
-
-    All of them, or where there are many the epoch that lasts and the last pairs before it; what is known of earlier
-    epochs then stays as it is.
-    """
-    store, new = tools.store, [] if pair is None else [pair]
-    first, pairs = state.now.first, state.pairs
-    whole = state.layout is None or pairs <= ALL_PAIRS
-    begin = 0 if whole else max(0, first - EARLIER_PAIRS)
-    places = [*range(begin, pairs), *range(pairs, pairs + len(new))]
-    taken = [store.pair(place, epoch_of(state, place)) for place in range(begin, pairs)]
-    taken += [replace(p, epoch=state.epoch) for p in new]
-    aims = (*store.aims, *([] if aim is None else [aim]))
-    measurements = Measurements(aims, tuple(taken), tuple(data.start for data in state.epochs))
-    after = replace(state, pairs=pairs + len(new), aims=len(aims), window=None, is_open=True)
-    try:
-        found = register(measurements, tools.setting.model, tools.config, tools.setting.sound_speed)
-    except EstimationError as error:
-        return replace(after, why_none=str(error))
-    if state.epoch not in found.epochs:
-        count = len({p.pm for p in taken if p.epoch == state.epoch})
-        text = f"{count} pairs are too few for a registration: take at least {tools.config.min_pairs}"
-        return replace(after, why_none=text)
-    return _from_registration(after, found, measurements, places, aims, tools, whole=whole)
-
-
-def _from_registration(
-    state: State,
-    found: Registration,
-    measurements: Measurements,
-    places: Sequence[int],
-    aims: Sequence[Aim],
-    tools: Tools,
-    *,
-    whole: bool,
-) -> State:
-    setting, optimum = tools.setting, found.optimum.state
-    columns = setting.columns
-    if whole or state.layout is None:
-        state = replace(state, layout=Layout(columns, optimum.marker_T_nominal[0].copy()))
-    else:
-        optimum = _in_chart(optimum, state.layout)
-    layout = state.layout
-    if layout is None:
-        raise ValueError("no shared variables")
-    bundles = _bundles(found, measurements, places)
-    at_epoch = {k: _one_epoch(optimum, found.epochs.index(k)) for k in found.epochs}
-    here = at_epoch[state.epoch]
-    if whole:
-        epochs = []
-        for k, data in enumerate(state.epochs):
-            if k < state.epoch and k in at_epoch:
-                shelf = shelved(Shelf(), bundles[k], at_epoch[k], setting)
-                data = replace(data, shelf=shelf, state=at_epoch[k])
-            epochs.append(data)
-        state = replace(state, epochs=tuple(epochs))
-    mine = bundles[state.epoch]
-    recent = max(0, len(mine) - (WINDOW - STEP))
-    shelf = shelved(Shelf(), mine[:recent], here, setting)
-    state = replace(
-        state.with_now(shelf=shelf, state=here),
-        aim_chunks=_aim_chunks(aims, [bool(k) for k in found.shots.aim_kept], here, setting),
-        is_open=state.epoch in found.ambiguous,
-        why_none="",
-    )
-    state = replace(state, passed=passed_from(state.epochs, here, columns)[0])
-    groups, numbers = [], 0
-    for bundle in mine[recent:]:
-        groups.append(Group(bundle, prepare(bundle.pairs, layout, here, state.epoch, setting.model, numbers)))
-        numbers += len(bundle.pairs)
-    state, window = opened(state, groups, here, numbers, setting)
-    return replace(state.with_now(state=window.state), window=window)
-
-
-def _one_epoch(state: SharedState, place: int) -> SharedState:
-    """The shared variables with one of the registrations."""
-    return replace(
-        state,
-        rotation=state.rotation[:, place : place + 1].copy(),
-        translation_mm=state.translation_mm[:, place : place + 1].copy(),
-    )
-
-
-def _in_chart(state: SharedState, layout: Layout) -> SharedState:
-    """The state with its beam in another chart."""
-    marker_T_laser = nominal_frame(state.beam_origin()[0], state.beam_direction()[0])
-    chart, _ = laser_chart(marker_T_laser, layout.marker_T_nominal)
-    return replace(state, beam=chart[None], marker_T_nominal=layout.marker_T_nominal[None])
-
-
-def _bundles(found: Registration, measurements: Measurements, places: Sequence[int]) -> dict[int, list[Bundle]]:
-    """The looks by PM and epoch, with what the registration keeps; looks it split off as junk are PMs of their own."""
-    shots = found.shots
-    taken = [(place, pair) for place, pair in zip(places, measurements.pairs, strict=True) if pair.epoch in found.epochs]
-    looks: dict[tuple[int, int], list[tuple[int, Pair]]] = {}
-    kept: dict[int, bool] = {}
-    for (place, pair), pm in zip(taken, shots.problem.look_pm.tolist(), strict=True):
-        label = shots.problem.pms[pm]
-        kept[label] = bool(shots.pm_kept[pm])
-        looks.setdefault((pair.epoch, label), []).append((place, pair))
-    out: dict[int, list[Bundle]] = {epoch: [] for epoch in found.epochs}
-    for (epoch, label), mine in looks.items():
-        out[epoch].append(Bundle(label, tuple(p for p, _ in mine), tuple(pair for _, pair in mine), kept[label]))
-    return out
-
-
-def _aim_chunks(aims: Sequence[Aim], kept: Sequence[bool], at: SharedState, setting: Setting) -> tuple:  # type: ignore[type-arg]
-    chunks = []
-    for first in range(0, len(aims), AIMS_IN_CHUNK):
-        rows = range(first, min(first + AIMS_IN_CHUNK, len(aims)))
-        problem = setting.pack([aims[i] for i in rows], ())
-        chunks.append(make_chunk(np.array(rows), problem, np.array([kept[i] for i in rows]), at)[0])
-    return tuple(chunks)
 
 
 # --- one pair more --------------------------------------------------------------------------------------------------
@@ -210,7 +61,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         found = registered(state, tools, pair)
         return replace(found, nis=None, used=_is_kept(found, place), recent=())
     before = window
-    earlier = tuple(p for p in tools.store.looks_at(pair.pm) if p >= state.now.first)
+    earlier = tools.store.looks_at(pair.pm, state.now.first)
     bundle = Bundle(
         pair.pm,
         (*earlier, place),
@@ -234,9 +85,12 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     forget = () if same is None else (same.label,)
     group = Group(replace(bundle, kept=fits), prepared)
     change = Change(take_in=(group,) if fits else (), set_aside=() if fits else (group,), forget=forget)
-    few = state.epoch_pairs <= FEW_PAIRS
+    few, near = state.epoch_pairs <= FEW_PAIRS, state.epoch_pairs <= NEAR_PAIRS
+    settled = SETTLED_FEW if few else SETTLED_NEAR if near else SETTLED_MANY
     state, gone = popped(state, window, setting)
     if gone:
+        if near:
+            state = refreshed(state, window.state, setting)
         # What is shelved leaves the window in the same update in which the summary takes it up.
         change = replace(change, forget=(*change.forget, *gone))
     elif not few:
@@ -245,7 +99,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     if gone:
         change = replace(change, summary=summary(state, window.state, setting))
     window = replace(window, numbers=numbers)
-    state, window = relaxed(state, window, change, setting, refresh=few)
+    state, window = relaxed(state, window, change, setting, settled)
     state = replace(
         state.with_now(state=window.state),
         window=window,
@@ -254,7 +108,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         used=fits,
     )
     if few:
-        first = state.epoch_pairs <= FIRST_PAIRS or state.is_open
+        first = pms_in_epoch(state) <= FIRST_PAIRS or state.is_open
         if first or not fits or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=_is_kept(found, place), recent=state.recent)
@@ -264,15 +118,25 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     return state
 
 
+def pms_in_epoch(state: State) -> int:
+    """PMs of the epoch that lasts."""
+    groups = state.window.groups if state.window is not None else ()
+    return len(groups) + sum(len(chunk.kept) for chunk in state.now.shelf.chunks)
+
+
 def open_window_again(state: State, window: Window, setting: Setting) -> Window:
     """The window with a summary from which a PM was taken."""
-    return relaxed(state, window, Change(summary=summary(state, window.state, setting)), setting, refresh=False)[1]
+    return relaxed(state, window, Change(summary=summary(state, window.state, setting)), setting, SETTLED_MANY)[1]
 
 
 def _is_kept(state: State, place: int) -> bool:
     """Whether the pair at a place counts; only the window is looked at, where the last pairs are."""
     groups = state.window.groups if state.window is not None else ()
     return any(group.kept and place in group.bundle.places for group in groups)
+
+
+def _information(window: Window) -> FloatArray:
+    return np.asarray(np.linalg.inv(window.covariance), dtype=np.float64)
 
 
 def odd_ones(state: State, setting: Setting) -> frozenset[int]:
@@ -293,8 +157,8 @@ def odd_ones(state: State, setting: Setting) -> frozenset[int]:
     if problem is None:
         return frozenset()
     counted = np.array(kept)
-    parts = settled(problem, window.state)
-    found = innovations_of(parts.pm, np.linalg.inv(window.covariance), counted)
+    parts = settled_parts(problem, window.state)
+    found = innovations_of(parts.pm, _information(window), counted)
     limits = pm_limits(problem, junk_p_of(*counts(state)))
     known = np.isfinite(found)
     odd = known & (counted == (found > limits))
@@ -311,8 +175,8 @@ def visited_chunks(state: State, window: Window, setting: Setting) -> tuple[Stat
     if state.steps % VISIT == 0 and shelf.full:
         place = turn % len(shelf.full)
         chunk = shelf.full[place]
-        parts = settled(chunk.problem, window.state, chunk.private)
-        found = innovations_of(parts.pm, np.linalg.inv(window.covariance), chunk.kept)
+        parts = settled_parts(chunk.problem, window.state, chunk.private, rounds=1)
+        found = innovations_of(parts.pm, _information(window), chunk.kept)
         limits = pm_limits(chunk.problem, junk_p_of(*counts(state)))
         kept = np.where(np.isfinite(found), found <= limits, chunk.kept)
         new = chunk_of(chunk.places, chunk.problem, kept, window.state, parts)
@@ -378,7 +242,7 @@ def _toggled(state: State, setting: Setting) -> State:
         numbers += len(back.bundle.pairs)
         taken = (Group(replace(back.bundle, kept=True), fresh),)
     change = Change(take_in=taken, leave_out=() if out is None else (out.label,))
-    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, refresh=False)
+    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, SETTLED_MANY)
     return replace(state.with_now(state=window.state), window=window)
 
 
@@ -412,9 +276,9 @@ def with_aim(state: State, aim: Aim, tools: Tools) -> State:
     if state.epoch_pairs <= FEW_PAIRS and state.pairs <= ALL_PAIRS:
         return registered(state, tools, aim=aim)
     problem = setting.pack([aim], ())
-    parts = settled(problem, window.state)
+    parts = settled_parts(problem, window.state)
     alone = np.zeros(1, dtype=bool)
-    found = innovations_of(parts.aim, np.linalg.inv(window.covariance), alone)
+    found = innovations_of(parts.aim, _information(window), alone)
     kept = np.array([bool(found[0] <= AIM_LIMIT)])
     chunks = list(state.aim_chunks)
     new = chunk_of(np.array([state.aims]), problem, kept, window.state, parts)
@@ -423,12 +287,12 @@ def with_aim(state: State, aim: Aim, tools: Tools) -> State:
         places = np.concatenate([last.places, new.places])
         every = [*tools.store.aims, aim]
         problem = setting.pack([every[i] for i in places.tolist()], ())
-        chunks[-1] = make_chunk(places, problem, np.concatenate([last.kept, kept]), window.state)[0]
+        chunks[-1] = make_chunk(places, problem, np.concatenate([last.kept, kept]), window.state)
     else:
         chunks.append(new)
     state = replace(state, aims=state.aims + 1, aim_chunks=tuple(chunks))
     change = Change(summary=summary(state, window.state, setting))
-    state, window = relaxed(state, window, change, setting, refresh=False)
+    state, window = relaxed(state, window, change, setting, SETTLED_MANY)
     return replace(state.with_now(state=window.state), window=window)
 
 
@@ -452,19 +316,17 @@ def with_move(state: State, start: EpochStart, tools: Tools, last: int = 0) -> S
         state = state.with_now(shelf=shelf, state=window.state)
     else:
         common = next((data.state for data in reversed(state.epochs) if data.state is not None), None)
-    tied = start.motion_known and window is not None
+    tied, layout = start.motion_known and window is not None, state.layout
     new = EpochData(start, first)
     state = replace(state, epochs=(*state.epochs, new), why_none="the camera has moved: take pairs")
-    if common is None or state.layout is None:
+    if common is None or layout is None:
         return registered(state, tools) if last else state
     there = carried_over(common, start)
     state = replace(state, passed=passed_from(state.epochs, there, setting.columns)[0])
     if last:
         return registered(state, tools)
     if tied:
-        window = open_window((), summary(state, there, setting), state.layout, state.epoch, 0)
-        if sigma_distance(there, window.state, window.covariance, setting.columns) > 0.0:
-            state = replace(state, passed=passed_from(state.epochs, window.state, setting.columns)[0])
+        window = open_window((), summary(state, there, setting), layout, state.epoch, 0)
         return replace(state.with_now(state=window.state), window=window, why_none="", is_open=False)
     return state
 
@@ -490,13 +352,8 @@ def _without_last(state: State, first: int, tools: Tools) -> State:
     return replace(state.with_now(state=window.state), window=window)
 
 
-def _places_by_label(problem: PackedProblem, places: np.ndarray) -> list[tuple[int, list[int]]]:  # type: ignore[type-arg]
+def _places_by_label(problem: PackedProblem, places: IntArray) -> list[tuple[int, list[int]]]:
     out: dict[int, list[int]] = {}
     for pm, place in zip(problem.look_pm.tolist(), places.tolist(), strict=True):
         out.setdefault(problem.pms[pm], []).append(place)
     return list(out.items())
-
-
-def equations(problem: PackedProblem) -> int:
-    """Equations that a chunk's shots leave over."""
-    return int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)

@@ -46,8 +46,8 @@ THRESHOLDS: dict[Variable, tuple[float, ...]] = {
 }
 """Steps (rad, mm) beyond which a variable is linearised anew."""
 PRIVATE_STEPS = 10
-SETTLED_CHI2 = 1e-2
-"""Newton decrement (chi square) of a step of a new pair's own variables after which they have settled."""
+SETTLED_MM = 0.1
+"""A new pair's own variables have settled after a step that moves the PM by less: what is left is of second order."""
 FAR_CHI2 = 1e4
 """What a PM counts as that has no place where beam and arc meet."""
 
@@ -184,9 +184,7 @@ def prepare(
             covariance = usable_covariance(pair.marker.covariance, POSE_FLOOR)
             graph.add(marker_pose_factor(markers[shot], pair.marker.camera_T_marker, covariance, bias))
             graph.add(
-                point_on_line_factor(
-                    shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal
-                )
+                point_on_line_factor(shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal)
             )
             values.insert(markers[shot], gtsam.Pose3(pose))
             values.insert(lambdas[shot], float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin)))
@@ -245,11 +243,12 @@ def _settle(
         q, r = np.linalg.qr(jacobian[:, :own], mode="complete")
         turned = q.T @ right
         step = solve_triangular(r[:own], turned[:own], check_finite=False)
-        far = float(turned[:own] @ turned[:own]) > SETTLED_CHI2
         # By retraction: setting a double anew goes through all of the wrapper's overloads, ten times as slow.
         delta, at = gtsam.VectorValues(), 0
         for key, size in sizes.items():
             delta.insert(key, step[at : at + size])
+            if size == 3:
+                far = float(np.linalg.norm(step[at : at + size])) > SETTLED_MM
             at += size
         private = private.retract(delta)
         if not far:
@@ -324,9 +323,7 @@ class Change:
     summary: Quadratic | None = None
 
 
-def open_window(
-    groups: Sequence[Group], summary: Quadratic, layout: Layout, epoch: int, numbers: int
-) -> Window:
+def open_window(groups: Sequence[Group], summary: Quadratic, layout: Layout, epoch: int, numbers: int) -> Window:
     """A window anew: these groups and a summary.
 
     Raises:

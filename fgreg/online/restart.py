@@ -1,0 +1,168 @@
+"""A state from no guess: the batch registration of the measurements so far, taken over as chunks and a window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.errors import EstimationError
+from fgreg.graph.explicit_values import laser_chart
+from fgreg.graph.shared_state import SharedState, nominal_frame
+from fgreg.measurements import Aim, Measurements, Pair
+from fgreg.online.shared import Layout
+from fgreg.online.state import STEP, WINDOW, Setting, State, opened, passed_from, shelved
+from fgreg.online.store import MeasurementStore
+from fgreg.online.summary import Chunk, Shelf, make_chunk
+from fgreg.online.window import Bundle, Group, prepare
+from fgreg.registration import Registration, register
+
+ALL_PAIRS = 120
+"""Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
+EARLIER_PAIRS = 60
+AIMS_IN_CHUNK = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tools:
+    """What an update works with: the setting, the configuration of registrations, what is stored."""
+
+    setting: Setting
+    config: SolveConfig
+    store: MeasurementStore
+
+
+def epoch_of(state: State, place: int) -> int:
+    """The epoch of a pair."""
+    return max(k for k, data in enumerate(state.epochs) if data.first <= place)
+
+
+def all_measurements(state: State, store: MeasurementStore) -> Measurements:
+    """Everything that came, with the epochs as they are now known."""
+    firsts = [data.first for data in state.epochs] + [state.pairs]
+    pairs = [store.pair(place, k) for k, (first, end) in enumerate(pairwise(firsts)) for place in range(first, end)]
+    return Measurements(tuple(store.aims), tuple(pairs), tuple(data.start for data in state.epochs))
+
+
+# --- a registration from no guess -----------------------------------------------------------------------------------
+
+
+def registered(state: State, tools: Tools, pair: Pair | None = None, aim: Aim | None = None) -> State:
+    """The state from a registration of the measurements so far and one more, which the counts do not hold yet.
+
+    All of them, or where there are many the epoch that lasts and the last pairs before it; what is known of earlier
+    epochs then stays as it is.
+    """
+    store, new = tools.store, [] if pair is None else [pair]
+    first, pairs = state.now.first, state.pairs
+    whole = state.layout is None or pairs <= ALL_PAIRS
+    begin = 0 if whole else max(0, first - EARLIER_PAIRS)
+    places = [*range(begin, pairs), *range(pairs, pairs + len(new))]
+    taken = [store.pair(place, epoch_of(state, place)) for place in range(begin, pairs)]
+    taken += [replace(p, epoch=state.epoch) for p in new]
+    aims = (*store.aims, *([] if aim is None else [aim]))
+    measurements = Measurements(aims, tuple(taken), tuple(data.start for data in state.epochs))
+    after = replace(state, pairs=pairs + len(new), aims=len(aims), window=None, is_open=True)
+    try:
+        found = register(measurements, tools.setting.model, tools.config, tools.setting.sound_speed)
+    except EstimationError as error:
+        return replace(after, why_none=str(error))
+    if state.epoch not in found.epochs:
+        count = len({p.pm for p in taken if p.epoch == state.epoch})
+        text = f"{count} pairs are too few for a registration: take at least {tools.config.min_pairs}"
+        return replace(after, why_none=text)
+    return _from_registration(after, found, measurements, places, aims, tools, whole=whole)
+
+
+def _from_registration(
+    state: State,
+    found: Registration,
+    measurements: Measurements,
+    places: Sequence[int],
+    aims: Sequence[Aim],
+    tools: Tools,
+    *,
+    whole: bool,
+) -> State:
+    setting, optimum = tools.setting, found.optimum.state
+    columns = setting.columns
+    if whole or state.layout is None:
+        state = replace(state, layout=Layout(columns, optimum.marker_T_nominal[0].copy()))
+    else:
+        optimum = _in_chart(optimum, state.layout)
+    layout = state.layout
+    if layout is None:
+        raise ValueError("no shared variables")
+    bundles = _bundles(found, measurements, places)
+    at_epoch = {k: _one_epoch(optimum, found.epochs.index(k)) for k in found.epochs}
+    here = at_epoch[state.epoch]
+    if whole:
+        epochs = []
+        for k, data in enumerate(state.epochs):
+            if k < state.epoch and k in at_epoch:
+                shelf = shelved(Shelf(), bundles[k], at_epoch[k], setting)
+                data = replace(data, shelf=shelf, state=at_epoch[k])
+            epochs.append(data)
+        state = replace(state, epochs=tuple(epochs))
+    mine = bundles[state.epoch]
+    recent = max(0, len(mine) - (WINDOW - STEP))
+    shelf = shelved(Shelf(), mine[:recent], here, setting)
+    state = replace(
+        state.with_now(shelf=shelf, state=here),
+        aim_chunks=_aim_chunks(aims, [bool(k) for k in found.shots.aim_kept], here, setting),
+        is_open=state.epoch in found.ambiguous,
+        why_none="",
+    )
+    state = replace(state, passed=passed_from(state.epochs, here, columns)[0])
+    groups, numbers = [], 0
+    for bundle in mine[recent:]:
+        groups.append(Group(bundle, prepare(bundle.pairs, layout, here, state.epoch, setting.model, numbers)))
+        numbers += len(bundle.pairs)
+    state, window = opened(state, groups, here, numbers, setting)
+    return replace(state.with_now(state=window.state), window=window)
+
+
+def _one_epoch(state: SharedState, place: int) -> SharedState:
+    """The shared variables with one of the registrations."""
+    return replace(
+        state,
+        rotation=state.rotation[:, place : place + 1].copy(),
+        translation_mm=state.translation_mm[:, place : place + 1].copy(),
+    )
+
+
+def _in_chart(state: SharedState, layout: Layout) -> SharedState:
+    """The state with its beam in another chart."""
+    marker_T_laser = nominal_frame(state.beam_origin()[0], state.beam_direction()[0])
+    chart, _ = laser_chart(marker_T_laser, layout.marker_T_nominal)
+    return replace(state, beam=chart[None], marker_T_nominal=layout.marker_T_nominal[None])
+
+
+def _bundles(found: Registration, measurements: Measurements, places: Sequence[int]) -> dict[int, list[Bundle]]:
+    """The looks by PM and epoch, with what the registration keeps; looks it split off as junk are PMs of their own."""
+    shots = found.shots
+    taken = [
+        (place, pair) for place, pair in zip(places, measurements.pairs, strict=True) if pair.epoch in found.epochs
+    ]
+    looks: dict[tuple[int, int], list[tuple[int, Pair]]] = {}
+    kept: dict[int, bool] = {}
+    for (place, pair), pm in zip(taken, shots.problem.look_pm.tolist(), strict=True):
+        label = shots.problem.pms[pm]
+        kept[label] = bool(shots.pm_kept[pm])
+        looks.setdefault((pair.epoch, label), []).append((place, pair))
+    out: dict[int, list[Bundle]] = {epoch: [] for epoch in found.epochs}
+    for (epoch, label), mine in looks.items():
+        out[epoch].append(Bundle(label, tuple(p for p, _ in mine), tuple(pair for _, pair in mine), kept[label]))
+    return out
+
+
+def _aim_chunks(aims: Sequence[Aim], kept: Sequence[bool], at: SharedState, setting: Setting) -> tuple[Chunk, ...]:
+    chunks = []
+    for first in range(0, len(aims), AIMS_IN_CHUNK):
+        rows = range(first, min(first + AIMS_IN_CHUNK, len(aims)))
+        problem = setting.pack([aims[i] for i in rows], ())
+        chunks.append(make_chunk(np.array(rows), problem, np.array([kept[i] for i in rows]), at))
+    return tuple(chunks)

@@ -1,0 +1,243 @@
+"""Latency of the online registration on a long stream with several camera epochs.
+
+    python tools/bench_online.py                      # 20,000 pairs, three epochs
+    python tools/bench_online.py --pairs 2000 --epochs 1
+
+Prints, each figure beside its target: p50, p99, p99.9 and the largest of ``add`` without disk (the first 8 pairs of
+each epoch apart, since there every event searches all minima anew), the last 1,000 against the second 1,000, ``track``,
+memory growth, and the same stream with native GTSAM factors of the same dimensions: the limit of this design.
+Wall time and processor time: on a machine that does other work as well the second is the engine's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import math
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_transform
+from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track, default_marker_covariance
+from fgreg.models import SessionModel
+from fgreg.online import CameraMoved, OnlineRegistration
+
+FIRST = 8
+WINDOW = 24
+
+
+def _place(rng: np.random.Generator, camera_p: FloatArray, marker_T_laser: FloatArray) -> FloatArray:
+    """``camera_T_marker`` with its beam through a camera point."""
+    sight = camera_p / np.linalg.norm(camera_p)
+    across = np.linalg.svd(sight[None])[2][1:]
+    rotation, lean = rng.uniform(-math.pi, math.pi), 0.35 * math.sqrt(rng.uniform())
+    direction = sight + math.tan(lean) * (math.cos(rotation) * across[0] + math.sin(rotation) * across[1])
+    direction /= np.linalg.norm(direction)
+    basis = np.linalg.svd(direction[None])[2][1:]
+    spin = rng.uniform(-math.pi, math.pi)
+    x = math.cos(spin) * basis[0] + math.sin(spin) * basis[1]
+    rotation_matrix = np.stack([x, np.cross(direction, x), direction], axis=1)
+    camera_T_laser = make_transform(rotation_matrix, camera_p - rng.uniform(25.0, 60.0) * direction)
+    return np.asarray(camera_T_laser @ inverse(marker_T_laser))
+
+
+def _observed(
+    rng: np.random.Generator, camera_T_marker: FloatArray, model: SessionModel, number: int
+) -> MarkerObservation:
+    noise = model.noise
+    turn = exp_so3(rng.normal(size=3) * np.array(noise.marker_rotation_rad))
+    shift = rng.normal(size=3) * np.array(noise.marker_translation_mm)
+    pose = make_transform(turn @ camera_T_marker[:3, :3], camera_T_marker[:3, 3] + shift)
+    covariance = default_marker_covariance(pose, noise)
+    return MarkerObservation(as_float_array(pose, 4, 4), as_float_array(covariance, 6, 6), number)
+
+
+class Stream:
+    """Events made one by one, so that what grows is the engine."""
+
+    def __init__(self, model: SessionModel, seed: int) -> None:
+        self.model, self.rng = model, np.random.default_rng(seed)
+        down = np.diag([1.0, -1.0, -1.0]) @ exp_so3(np.array([0.2, -0.15, 0.7]))
+        self.trus_T_camera = make_transform(down, np.array([1.0, 2.0, 42.0]) - down @ np.array([0.0, 0.0, 105.0]))
+        self.marker_T_laser = make_transform(exp_so3(np.array([0.2, -0.15, 0.3])), np.array([8.0, -5.0, 7.0]))
+        self.edge = float(self.rng.normal() * model.probe.sensitivity.edge_sigma_rad)
+        self.t, self.number = 0.0, 0
+
+    def aims(self, count: int) -> Iterator[Aim]:
+        """Calibration shots."""
+        for _ in range(count):
+            self.t += 1.0
+            self.number += 1
+            spot = np.array([*self.rng.uniform(-30.0, 30.0, 2), self.rng.uniform(90.0, 130.0)])
+            marker = _observed(self.rng, _place(self.rng, spot, self.marker_T_laser), self.model, self.number)
+            sigma = np.array(self.model.noise.aim_mm)
+            yield Aim(self.t, marker, spot + sigma * self.rng.normal(size=3), np.diag(sigma**2))
+
+    def pair(self, pm: int) -> Pair:
+        """A first-hit pair, sweeps from both sides in turn."""
+        rng, model = self.rng, self.model
+        self.t += 1.0
+        self.number += 1
+        bearing, reach = rng.uniform(-0.5, 0.5), model.probe.radius_mm + rng.uniform(22.0, 42.0)
+        trus_p = np.array([rng.uniform(-20.0, 20.0), reach * math.sin(bearing), reach * math.cos(bearing)])
+        camera_p = (inverse(self.trus_T_camera) @ np.array([*trus_p, 1.0]))[:3]
+        marker = _observed(rng, _place(rng, camera_p, self.marker_T_laser), model, self.number)
+        sweep = 1 if pm % 2 else -1
+        scan, radius = bearing, model.probe.radius_mm
+        distance = 0.0
+        share = rng.uniform()
+        for _ in range(30):
+            distance = math.hypot(trus_p[1] - radius * math.sin(scan), trus_p[2] - radius * math.cos(scan))
+            width = float(model.probe.sensitivity.half_width_at(np.array(distance))) + self.edge
+            scan = bearing - sweep * (width - share * model.stage.step_rad)
+        noise = model.noise
+        look = Look(
+            scan + noise.scan_rad * float(rng.normal()),
+            noise.scan_rad,
+            float(trus_p[0]) + noise.lateral_mm * float(rng.normal()),
+            distance + noise.range_mm * float(rng.normal()),
+            np.diag([noise.lateral_mm**2, noise.range_mm**2]),
+            sweep,
+        )
+        return Pair(self.t, pm, 0, marker, look)
+
+    def moved(self) -> CameraMoved:
+        """The camera moves, told without the motion."""
+        self.t += 1.0
+        motion = make_transform(exp_so3(self.rng.uniform(-0.1, 0.1, 3)), self.rng.uniform(-10.0, 10.0, 3))
+        self.trus_T_camera = self.trus_T_camera @ inverse(motion)
+        return CameraMoved(self.t)
+
+
+def _memory_mb() -> float:
+    """Resident memory now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def _native(pairs: int) -> FloatArray:
+    """Milliseconds of the same updates with native factors of the same dimensions, ``(n, 2)``: wall, processor."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.relinearizeSkip = 1
+    parameters.findUnusedFactorSlots = True
+    isam = gtsam.ISAM2(parameters)
+    theta = isam.getLinearizationPoint()
+    pose, beam, edge = gtsam.symbol("T", 0), gtsam.symbol("B", 0), gtsam.symbol("W", 0)
+    unit6, unit3, unit1 = (gtsam.noiseModel.Unit.Create(n) for n in (6, 3, 1))
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(), unit6))
+    graph.add(gtsam.PriorFactorVector(beam, np.zeros(4), gtsam.noiseModel.Unit.Create(4)))
+    graph.add(gtsam.PriorFactorDouble(edge, 0.0, unit1))
+    values.insert(pose, gtsam.Pose3())
+    values.insert(beam, np.zeros(4))
+    values.insert(edge, 0.0)
+    isam.update(graph, values)
+    slots: list[list[int]] = []
+    took = []
+    for i in range(pairs):
+        start, used = time.perf_counter(), time.thread_time()
+        isam = gtsam.ISAM2(isam)
+        theta = isam.getLinearizationPoint()
+        marker, point = gtsam.symbol("M", i), gtsam.symbol("P", i)
+        lam, arc = gtsam.symbol("L", i), gtsam.symbol("H", i)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph.add(gtsam.PriorFactorPose3(marker, gtsam.Pose3(), unit6))
+        graph.add(gtsam.BetweenFactorPose3(pose, marker, gtsam.Pose3(), unit6))
+        graph.add(gtsam.PoseTranslationPrior3D(marker, np.zeros(3), unit3))
+        graph.add(gtsam.PriorFactorPoint3(point, np.zeros(3), unit3))
+        graph.add(gtsam.PriorFactorVector(beam, np.zeros(4), gtsam.noiseModel.Isotropic.Sigma(4, 100.0)))
+        graph.add(gtsam.BetweenFactorDouble(edge, arc, 0.0, unit1))
+        graph.add(gtsam.BetweenFactorDouble(arc, lam, 0.0, unit1))
+        values.insert(marker, gtsam.Pose3())
+        values.insert(point, np.zeros(3))
+        values.insert(lam, 0.0)
+        values.insert(arc, 0.0)
+        result = isam.update(graph, values, slots.pop(0) if len(slots) == WINDOW else [])
+        slots.append(list(result.getNewFactorsIndices()))
+        isam.calculateEstimatePose3(pose)
+        isam.jointMarginalCovariance([pose, beam, edge])
+        took.append((1e3 * (time.perf_counter() - start), 1e3 * (time.thread_time() - used)))
+    assert theta is not None
+    return np.array(took)
+
+
+def _row(name: str, values: FloatArray, targets: str) -> None:
+    wall, used = values[:, 0], values[:, 1]
+    quantiles = (50.0, 99.0, 99.9)
+    shown = [" ".join(f"{q:8.2f}" for q in (*np.percentile(v, quantiles), v.max())) for v in (wall, used)]
+    print(f"{name:<34} wall {shown[0]}   processor {shown[1]}   target {targets}")
+
+
+def bench(pairs: int, epochs: int, seed: int, judge: str | None) -> None:
+    """One stream."""
+    from tests.forward import make_session
+
+    model = make_session()
+    stream = Stream(model, seed)
+    engine = OnlineRegistration(model, judge=None if judge is None else "process")
+    for aim in stream.aims(12):
+        engine.add(aim)
+    times: list[tuple[float, float]] = []
+    first: list[tuple[float, float]] = []
+    tracks: list[tuple[float, float]] = []
+    memory, epoch = 0.0, 0
+    for i in range(pairs):
+        if i and i * epochs // pairs > epoch:
+            epoch += 1
+            engine.add(stream.moved())
+        pair = stream.pair(i)
+        start, used = time.perf_counter(), time.thread_time()
+        estimate = engine.add(pair)
+        took = (1e3 * (time.perf_counter() - start), 1e3 * (time.thread_time() - used))
+        (first if engine.state.epoch_pairs <= FIRST else times).append(took)
+        if i == min(200, pairs // 4):
+            gc.collect()
+            memory = _memory_mb()
+        if i in (pairs // 20, pairs // 40):
+            query = Track(pair.t, engine.state.epoch, pair.marker, (pair.look,))
+            for _ in range(20):
+                start, used = time.perf_counter(), time.thread_time()
+                engine.track(query)
+                tracks.append((1e3 * (time.perf_counter() - start), 1e3 * (time.thread_time() - used)))
+    gc.collect()
+    growth = _memory_mb() - memory
+    engine.close()
+    every, start_up = np.array(times), np.array(first)
+    print(f"{pairs} pairs, {epochs} epochs, {sum(engine.kept)} kept; milliseconds: p50, p99, p99.9, largest")
+    _row("add", every, "p50 1, p99 5, p99.9 20")
+    _row(f"add, first {FIRST} pairs of an epoch", start_up, "none: apart")
+    if tracks:
+        _row("track", np.array(tracks), "p50 0.2, p99 0.5 (fgreg.online.queries)")
+    if len(every) >= 3000:
+        for name, column in (("wall", 0), ("processor", 1)):
+            late, early = np.median(every[-1000:, column]), np.median(every[1000:2000, column])
+            means = every[-1000:, column].mean() / every[1000:2000, column].mean()
+            print(f"last 1,000 over second 1,000, {name}: median {late / early:.2f}, mean {means:.2f}   target 1.2")
+    print(f"memory growth {growth:.1f} MB   target 30")
+    native = _native(min(pairs, 2000))[100:]
+    _row("native factors, same dimensions", native, "the limit of this design")
+    ratio = np.median(every, axis=0) / np.median(native, axis=0)
+    print(f"ratio of medians to native: wall {ratio[0]:.1f}, processor {ratio[1]:.1f}")
+    error = np.linalg.inv(stream.trus_T_camera) @ np.asarray(estimate.optimum_trus_T_camera)
+    print(f"at the end the registration is off by {np.abs(error[:3, 3]).max():.3f} mm at the camera")
+
+
+def main() -> None:
+    """Parse and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pairs", type=int, default=20_000)
+    parser.add_argument("--epochs", type=int, default=3)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--judge", choices=["process"], default=None, help="judge in a process of its own meanwhile")
+    arguments = parser.parse_args()
+    bench(arguments.pairs, arguments.epochs, arguments.seed, arguments.judge)
+
+
+if __name__ == "__main__":
+    main()
