@@ -133,7 +133,8 @@ def replay_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        engine = (make_engine or online_engine)(session.model, config)
+        prior = sound_speed_prior(recognised, config)
+        engine = (make_engine or online_engine)(session.model, config, prior)
         player = _Player(session, recognised, engine, viewer, request.speed)
         player.play(on_step)
         taken = player.taken()
@@ -143,7 +144,7 @@ def replay_session(
             session.model,
             config,
             detection_conditions(recognised, config),
-            sound_speed_prior(recognised, config),
+            prior,
         )
         settled = engine.settle() if player.estimate is not None else None
         estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from fgreg.batch import Solution, solve
@@ -13,7 +14,7 @@ from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, OnlineEvent
-from fgreg.registration import register
+from fgreg.registration import SoundSpeedPrior, register
 
 
 class BatchEngine:
@@ -22,9 +23,10 @@ class BatchEngine:
     the value.
     """
 
-    def __init__(self, model: SessionModel, config: SolveConfig) -> None:
-        self.model, self.config = model, config
+    def __init__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None = None) -> None:
+        self.model, self.config, self.prior = model, config, prior
         self.all = Measurements((), (), (EpochStart(0.0),))
+        self.estimate = self._estimate(CameraMoved(0.0))
         self.refuse_t: set[float] = set()
         self.notice: dict[float, float] = {}
 
@@ -46,7 +48,8 @@ class BatchEngine:
                 self._move(event)
             case _:
                 raise AssertionError("not an event of a session")
-        return self._estimate(event)
+        self.estimate = self._estimate(event)
+        return self.estimate
 
     def _move(self, moved: CameraMoved) -> None:
         since, epoch = moved.t if moved.since_t is None else moved.since_t, len(self.all.epochs)
@@ -92,6 +95,9 @@ class BatchEngine:
             None,
             True,
         )
+
+    def catching_up(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
     def marker_T_laser(self) -> FloatArray | None:
         laser = self.solution().laser

@@ -200,7 +200,7 @@ def difference_from_uninterrupted(folder: Path, source: Path) -> float:
     """Largest difference of registration and covariance: reopened, and the same events taken in without a break."""
     with LiveSession.open(folder) as live:
         reopened, model, config = live.estimate, live.journal.model, live.config
-    feed, recogniser = EpochFeed(online_engine(model, config)), EventRecogniser(model)
+    feed, recogniser = EpochFeed(online_engine(model, config, None)), EventRecogniser(model)
     unbroken = None
     for event in read_session(folder).events:
         if isinstance(event, AimEvent | PairEvent):

@@ -150,7 +150,7 @@ def test_a_pair_that_the_engine_refuses_is_listed_with_its_reason(short: Path, m
     report = replay_session(
         ReplayRequest(short),
         on_step=steps.append,
-        make_engine=lambda model, config: Picky(make_engine(model, config), pair.t),  # type: ignore[arg-type, return-value]
+        make_engine=lambda *setting: Picky(make_engine(*setting), pair.t),  # type: ignore[arg-type]
     )
     assert [step.event.t for step in steps if step.refused] == [pair.t]
     assert [(p.t, p.used) for p in report.solved.estimate.pairs if not p.used] == [(pair.t, False)]
