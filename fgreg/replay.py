@@ -283,6 +283,11 @@ def quantiles(elapsed_ms: Sequence[float]) -> Quantiles | None:
     return Quantiles(p50, p99, max(elapsed_ms))
 
 
+def left_out(known: OnlineEstimate | None) -> bool:
+    """Whether the pair just added does not fit; before there is a registration none does or does not."""
+    return known is not None and known.trus_T_camera is not None and not known.used
+
+
 def describe(step: ReplayStep) -> str:
     """What the event was, in a few words."""
     event = step.event
@@ -297,7 +302,7 @@ def describe(step: ReplayStep) -> str:
             what = "camera moved" + (" (found out)" if event.detected else "")
     if step.refused:
         what += f", not used: {step.refused}"
-    elif isinstance(event, PairEvent) and step.estimate is not None and not step.estimate.used:
+    elif isinstance(event, PairEvent) and left_out(step.estimate):
         what += ", not used"
     if step.answer is not None and step.answer.stage_rad is None:
         what += f", no answer: {step.answer.reason}"
