@@ -1,4 +1,4 @@
-"""An engine that registers anew after every event: what recording and replay are tested with, slow and simple."""
+"""An engine that registers anew at every fifth pair of an epoch: simple, and can be told to refuse and to notice."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class BatchEngine:
     def __init__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None = None) -> None:
         self.model, self.config, self.prior = model, config, prior
         self.all = Measurements((), (), (EpochStart(0.0),))
-        self.estimate = self._estimate(CameraMoved(0.0))
+        self.estimate: OnlineEstimate | None = None
         self.refuse_t: set[float] = set()
         self.notice: dict[float, float] = {}
 
@@ -48,8 +48,8 @@ class BatchEngine:
                 self._move(event)
             case _:
                 raise AssertionError("not an event of a session")
-        self.estimate = self._estimate(event)
-        return self.estimate
+        self.estimate = found = self._estimate(event)
+        return found
 
     def _move(self, moved: CameraMoved) -> None:
         since, epoch = moved.t if moved.since_t is None else moved.since_t, len(self.all.epochs)
@@ -60,8 +60,11 @@ class BatchEngine:
     def _estimate(self, event: OnlineEvent) -> OnlineEstimate:
         epoch = len(self.all.epochs) - 1
         count = sum(pair.epoch == epoch for pair in self.all.pairs)
-        transform = covariance = None
-        if count >= 5:
+        before = self.estimate
+        lasts = before is not None and before.epoch == epoch
+        transform = before.trus_T_camera if before is not None and lasts else None
+        covariance = before.covariance if before is not None and lasts else None
+        if isinstance(event, Pair) and count % 5 == 0:
             try:
                 found = register(self.all, self.model, self.config)
                 if epoch in found.epochs:

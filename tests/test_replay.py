@@ -117,7 +117,7 @@ def test_queries_are_answered_from_what_was_known_at_their_time(
 
 def test_a_told_move_of_the_camera_begins_an_epoch(tmp_path: Path, make_engine: MakeEngine) -> None:
     folder = tmp_path / "moved"
-    write_session(simulate(replace(PRESETS["camera-move"], aims=8, pairs=14), 3), folder)
+    write_session(simulate(replace(PRESETS["camera-move"], aims=6, pairs=12), 3), folder)
     steps: list[ReplayStep] = []
     report = replay_session(ReplayRequest(folder), FAST, on_step=steps.append, make_engine=make_engine).solved
     assert [epoch.index for epoch in report.estimate.epochs] == [0, 1]
