@@ -48,6 +48,23 @@ class Quadratic:
         )
 
 
+def small_step(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
+    """(D,) of :func:`step_between` for states so near that the turn's third order does not matter; many times faster."""
+    out = np.zeros(columns.size)
+    back = first.rotation[0, 0].T
+    turn = back @ second.rotation[0, 0]
+    out[0], out[1], out[2] = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    out[:3] *= 0.5
+    out[3:6] = back @ (second.translation_mm[0, 0] - first.translation_mm[0, 0])
+    out[6:10] = second.beam[0] - first.beam[0]
+    out[10] = second.edge_rad[0] - first.edge_rad[0]
+    if columns.bias is not None:
+        out[columns.bias : columns.bias + 3] = second.bias_mm[0] - first.bias_mm[0]
+    if columns.sound_speed is not None:
+        out[columns.sound_speed] = second.sound_speed_ratio[0] - first.sound_speed_ratio[0]
+    return out
+
+
 def chart_turn(step: FloatArray) -> FloatArray:
     """(D, D) derivative of ``step_between(a, b.retract(d))`` by d, where b is ``step`` (D,) from a."""
     turn = np.eye(len(step))

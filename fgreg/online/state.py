@@ -16,10 +16,10 @@ from fgreg.config import SolveConfig
 from fgreg.frames import BoolArray, FloatArray
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
-from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.shared import Layout, Quadratic
+from fgreg.online.shared import Layout, Quadratic, small_step
 from fgreg.online.summary import (
     CHUNK,
     Chunk,
@@ -43,8 +43,9 @@ WINDOW, STEP = 24, 8
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
-SETTLED_SIGMA = 0.01
-"""Updates are repeated until the estimate moves by less, in its own standard deviations."""
+SETTLED_FEW, SETTLED_MANY = 0.05, 0.3
+"""Updates are repeated until the estimate moves by less, in its own standard deviations. What then is left is of second
+order, and falls with the number of pairs: with few, chunks are linearised anew on the way."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,11 +231,11 @@ def with_common(state: SharedState, common: SharedState) -> SharedState:
     return replace(common, rotation=state.rotation, translation_mm=state.translation_mm)
 
 
-def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArray, layout: Layout) -> float:
-    """Mahalanobis distance of two states."""
-    step = step_between(first, second, layout.columns)[0]
+def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArray, columns: Columns) -> float:
+    """Mahalanobis distance of two states near each other."""
     scale = np.sqrt(np.diag(covariance))
-    return float(np.sqrt(max(step / scale @ np.linalg.solve(covariance / np.outer(scale, scale), step / scale), 0.0)))
+    step = small_step(first, second, columns) / scale
+    return float(np.sqrt(max(step @ np.linalg.solve(covariance / np.outer(scale, scale), step), 0.0)))
 
 
 # --- groups into chunks ---------------------------------------------------------------------------------------------
@@ -337,9 +338,8 @@ def relaxed(state: State, window: Window, change: Change, setting: Setting, *, r
     for _ in range(MOST_UPDATES):
         before = window.state
         window = updated(window, change, layout, window.numbers)
-        if not refresh and sigma_distance(before, window.state, window.covariance, layout) < 5.0 * SETTLED_SIGMA:
-            break
-        if sigma_distance(before, window.state, window.covariance, layout) < SETTLED_SIGMA:
+        moved = sigma_distance(before, window.state, window.covariance, setting.columns)
+        if moved < (SETTLED_FEW if refresh else SETTLED_MANY):
             break
         change = Change()
         if refresh:
@@ -376,7 +376,7 @@ def opened(
         before = window.state
         change = Change(summary=summary(state, window.state, setting))
         window = updated(window, change, layout, numbers)
-        if sigma_distance(before, window.state, window.covariance, layout) < SETTLED_SIGMA:
+        if sigma_distance(before, window.state, window.covariance, setting.columns) < SETTLED_FEW:
             break
     return state, window
 

@@ -14,7 +14,7 @@ from fgreg.graph.explicit_values import laser_chart
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState, nominal_frame
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
-from fgreg.online.shared import Layout
+from fgreg.online.shared import Layout, small_step
 from fgreg.online.state import (
     RECENT,
     STEP,
@@ -51,7 +51,7 @@ ALL_PAIRS = 120
 """Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
 EARLIER_PAIRS = 60
 AIMS_IN_CHUNK = 64
-VISIT, VISIT_EARLIER = 4, 64
+VISIT, VISIT_EARLIER = 8, 64
 """A full chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
 
@@ -243,7 +243,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     elif not few:
         state, visited = visited_chunks(state, window, setting)
         gone = (0,) if visited else ()
-    if gone or few:
+    if gone:
         change = replace(change, summary=summary(state, window.state, setting))
     window = replace(window, numbers=numbers)
     state, window = relaxed(state, window, change, setting, refresh=few)
@@ -260,7 +260,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=_is_kept(found, place), recent=state.recent)
         return replace(state, odd=odd)
-    if state.steps % 4 == 3:
+    if state.steps % VISIT == 3:
         state = _toggled(state, setting)
     return state
 
@@ -361,22 +361,11 @@ def _toggled(state: State, setting: Setting) -> State:
     window, layout = state.window, state.layout
     if window is None or layout is None or not window.groups:
         return state
+    found = _window_innovations(window.groups, window, setting)
     kept, every = counts(state)
     out, back = None, None
-    for group in window.groups:
-        prepared = group.prepared
-        if prepared.far:
-            continue
-        here = prepared.quadratic.at(window.state, layout.columns)
-        rest = np.linalg.inv(window.covariance) - (here.hessian if group.kept else 0.0)
-        sign = 1.0 if group.kept else 0.0
-        total = rest + here.hessian
-        # As in fgreg.robust: leaving it out, or taking it in, moves the optimum.
-        if sign:
-            value = here.cost + float(here.gradient @ np.linalg.solve(rest, here.gradient))
-        else:
-            value = here.cost - float(here.gradient @ np.linalg.solve(total, here.gradient))
-        fits = value <= limit_of(len(prepared.rows), kept, every)
+    for group, value in zip(window.groups, found, strict=True):
+        fits = value <= limit_of(len(group.prepared.rows), kept, every)
         if group.kept and not fits and out is None:
             out = group
         if not group.kept and fits and back is None:
@@ -392,6 +381,24 @@ def _toggled(state: State, setting: Setting) -> State:
     change = Change(take_in=taken, leave_out=() if out is None else (out.label,))
     state, window = relaxed(state, replace(window, numbers=numbers), change, setting, refresh=False)
     return replace(state.with_now(state=window.state), window=window)
+
+
+def _window_innovations(groups: Sequence[Group], window: Window, setting: Setting) -> list[float]:
+    """Innovations of the window's PMs by their rows; a PM that counts is predicted without itself, in closed form."""
+    out = []
+    root = np.linalg.cholesky(window.covariance)
+    for group in groups:
+        prepared = group.prepared
+        if prepared.far:
+            out.append(prepared.quadratic.cost)
+            continue
+        step = small_step(prepared.state, window.state, setting.columns)
+        residual = prepared.residual + prepared.rows @ step
+        seen = prepared.rows @ root
+        # |r|^2 + g' (H -+ A)^-1 g with A = rows' rows, g = rows' r, written in the few rows (Woodbury).
+        spread = np.eye(len(seen)) + (-1.0 if group.kept else 1.0) * (seen @ seen.T)
+        out.append(float(residual @ np.linalg.solve(spread, residual)))
+    return out
 
 
 # --- aims, moves ----------------------------------------------------------------------------------------------------
@@ -457,7 +464,7 @@ def with_move(state: State, start: EpochStart, tools: Tools, last: int = 0) -> S
         return registered(state, tools)
     if tied:
         window = open_window((), summary(state, there, setting), state.layout, state.epoch, 0)
-        if sigma_distance(there, window.state, window.covariance, state.layout) > 0.0:
+        if sigma_distance(there, window.state, window.covariance, setting.columns) > 0.0:
             state = replace(state, passed=passed_from(state.epochs, window.state, setting.columns)[0])
         return replace(state.with_now(state=window.state), window=window, why_none="", is_open=False)
     return state

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
@@ -33,20 +34,20 @@ from fgreg.online.shared import Layout, Quadratic, finite, summary_factor
 from fgreg.sensitivity import arc_of_rotation, sensitivity_priors
 
 THRESHOLDS: dict[Variable, tuple[float, ...]] = {
-    Variable.trus_T_camera: (2e-3, 2e-3, 2e-3, 0.2, 0.2, 0.2),
-    Variable.marker_laser: (0.1, 0.1, 2e-3, 2e-3),
-    Variable.window_edge: (1e-3,),
-    Variable.marker_bias: (0.1, 0.1, 0.1),
-    Variable.sound_speed_ratio: (2e-3,),
-    Variable.camera_T_marker: (3e-3, 3e-3, 3e-3, 0.1, 0.1, 0.1),
-    Variable.trus_p_pm: (0.3, 0.3, 0.3),
-    Variable.lam: (0.5,),
-    Variable.theta: (5e-3,),
+    Variable.trus_T_camera: (6e-4, 6e-4, 6e-4, 0.06, 0.06, 0.06),
+    Variable.marker_laser: (0.03, 0.03, 6e-4, 6e-4),
+    Variable.window_edge: (3e-4,),
+    Variable.marker_bias: (0.03, 0.03, 0.03),
+    Variable.sound_speed_ratio: (6e-4,),
+    Variable.camera_T_marker: (1e-3, 1e-3, 1e-3, 0.03, 0.03, 0.03),
+    Variable.trus_p_pm: (0.1, 0.1, 0.1),
+    Variable.lam: (0.15,),
+    Variable.theta: (1.5e-3,),
 }
 """Steps (rad, mm) beyond which a variable is linearised anew."""
-PRIVATE_STEPS = 8
-SETTLED_CHI2 = 1e-5
-"""Newton decrement at which a new pair's own variables have settled."""
+PRIVATE_STEPS = 10
+SETTLED_CHI2 = 1e-2
+"""Newton decrement (chi square) of a step of a new pair's own variables after which they have settled."""
 FAR_CHI2 = 1e4
 """What a PM counts as that has no place where beam and arc meet."""
 
@@ -157,7 +158,6 @@ def prepare(
     priors = sensitivity_priors([pair.look for pair in pairs], probe, model.stage.step_rad)
     centres, gains, sigmas = priors.centre_rad.tolist(), priors.edge_gain.tolist(), priors.sigma_rad.tolist()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    layout.insert(values, state, epoch)
 
     # The PM first: on the first look's arc, in the middle of where it may be.
     look = pairs[0].look
@@ -215,52 +215,45 @@ def prepare(
         )
     markers = markers[: len(shot_of)]
     lambdas = lambdas[: len(shot_of)]
-    rows, residual, far = _settle(graph, values, (markers, lambdas, point, thetas), layout, epoch)
-    private = gtsam.Values()
-    for key in markers:
-        private.insert(key, values.atPose3(key))
-    for key in (*lambdas, *thetas):
-        private.insert(key, values.atDouble(key))
-    private.insert(point, values.atPoint3(point))
-    return Prepared(graph, private, rows, residual, state, far)
+    held = gtsam.Values()
+    layout.insert(held, state, epoch)
+    sizes = {**dict.fromkeys(markers, 6), **dict.fromkeys(lambdas, 1), point: 3, **dict.fromkeys(thetas, 1)}
+    values, rows, residual, far = _settle(graph, values, held, sizes, layout, epoch)
+    return Prepared(graph, values, rows, residual, state, far)
 
 
 def _settle(
     graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    keys: tuple[list[int], list[int], int, list[int]],
+    private: gtsam.Values,
+    held: gtsam.Values,
+    sizes: dict[int, int],
     layout: Layout,
     epoch: int,
-) -> tuple[FloatArray, FloatArray, bool]:
-    """Move the private values (in place) to their optimum; the shared variables' rows and residual there."""
-    markers, lambdas, point, thetas = keys
-    own = 6 * len(markers) + len(lambdas) + 3 + len(thetas)
+) -> tuple[gtsam.Values, FloatArray, FloatArray, bool]:
+    """The private values at their optimum; the shared variables' rows and residual there, and whether it was found."""
+    own = sum(sizes.values())
     there = set(graph.keyVector())
     shared = [(key, size) for key, size in zip(layout.keys(epoch), layout.sizes, strict=True)]
-    ordering = make_ordering([*markers, *lambdas, point, *thetas, *(key for key, _ in shared if key in there)])
+    ordering = make_ordering([*sizes, *(key for key, _ in shared if key in there)])
     far = True
     for _ in range(PRIVATE_STEPS):
+        values = gtsam.Values(held)
+        values.insert(private)
         jacobian, right = graph.linearize(values).jacobian(ordering)
         if not (math.isfinite(right.sum()) and math.isfinite(jacobian.sum())):
             raise ArithmeticError("a pair's linear system is not finite")
         q, r = np.linalg.qr(jacobian[:, :own], mode="complete")
         turned = q.T @ right
-        step = np.linalg.solve(r[:own], turned[:own])
-        if float(turned[:own] @ turned[:own]) < SETTLED_CHI2:
-            far = False
+        step = solve_triangular(r[:own], turned[:own], check_finite=False)
+        far = float(turned[:own] @ turned[:own]) > SETTLED_CHI2
+        # By retraction: setting a double anew goes through all of the wrapper's overloads, ten times as slow.
+        delta, at = gtsam.VectorValues(), 0
+        for key, size in sizes.items():
+            delta.insert(key, step[at : at + size])
+            at += size
+        private = private.retract(delta)
+        if not far:
             break
-        at = 0
-        for key in markers:
-            values.update(key, values.atPose3(key).retract(step[at : at + 6]))
-            at += 6
-        for key in lambdas:
-            values.update(key, values.atDouble(key) + float(step[at]))
-            at += 1
-        values.update(point, values.atPoint3(point) + step[at : at + 3])
-        at += 3
-        for key in thetas:
-            values.update(key, values.atDouble(key) + float(step[at]))
-            at += 1
     # What is left over after the private variables, on the shared ones; absent ones (the edge) get zeros.
     left = q.T[own:] @ jacobian[:, own:]
     rows = np.zeros((len(left), layout.columns.size))
@@ -270,7 +263,7 @@ def _settle(
             rows[:, column : column + size] = left[:, at : at + size]
             at += size
         column += size
-    return rows, -turned[own:], far
+    return private, rows, -turned[own:], far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
