@@ -250,7 +250,11 @@ class LiveSession:
             if isinstance(event, AimEvent | PairEvent):
                 found = self._recogniser.add(event, self._feed.epoch)
                 if isinstance(found, Aim | Pair):
-                    estimate = self._feed.add(found)
+                    try:
+                        estimate = self._feed.add(found)
+                    except BaseException:  # its frames must not count either: opened again, the session lacks them
+                        self._recogniser.take_back()
+                        raise
             elif isinstance(event, CameraMovedEvent):
                 estimate = self._feed.add(event)
         except (EventRefused, InputError) as error:
