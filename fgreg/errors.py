@@ -53,3 +53,19 @@ class EventRefused(FgregError):  # noqa: N818
     def __init__(self, reason: str) -> None:
         self.reason = one_line(reason, 500)
         super().__init__(f"event refused: {self.reason}")
+
+
+class JournalError(FgregError):
+    """An event or a frame could not be put on disk: it is not recorded, and what was recorded before is whole.
+
+    Args:
+        where: the file.
+        found: what happened.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, where: str, found: str, remedy: str) -> None:
+        self.where = one_line(where)
+        self.found = one_line(found)
+        self.remedy = one_line(remedy)
+        super().__init__(f"{self.where}: {self.found}; {self.remedy}")

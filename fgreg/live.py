@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -27,9 +28,11 @@ from fgreg.events import (
 from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, OnlineEvent
 from fgreg.recognition import EventRecogniser
+from fgreg.registration import SoundSpeedPrior
 from fgreg.session.event_document import event_document, type_of, writable
 from fgreg.session.journal import Journal
 
@@ -49,9 +52,12 @@ class Engine(Protocol):
     def settle(self) -> OnlineEstimate: ...
     def measurements(self) -> Measurements: ...
     def marker_T_laser(self) -> FloatArray | None: ...
+    def catching_up(self) -> AbstractContextManager[None]: ...
+    @property
+    def estimate(self) -> OnlineEstimate | None: ...
 
 
-MakeEngine = Callable[[SessionModel, SolveConfig], Engine]
+MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engine]
 
 
 class EpochFeed:
@@ -119,7 +125,7 @@ class LiveSession:
         config = config or SolveConfig()
         journal = Journal.open(folder)
         try:
-            found = cls(journal, (make_engine or online_engine)(journal.model, config), config)
+            found = cls(journal, (make_engine or online_engine)(journal.model, config, None), config)
             found._take_recorded()
         except BaseException:
             journal.close()
@@ -141,10 +147,13 @@ class LiveSession:
     def _take_recorded(self) -> None:
         events = self.journal.take_recorded()
         refused = refused_lines(events)
-        for event in events:
-            if event.line not in refused:
-                with contextlib.suppress(EventRefused):  # noted now: the time before did not get so far
-                    self._take(event)
+        with self._engine.catching_up():
+            for event in events:
+                if event.line not in refused:
+                    with contextlib.suppress(EventRefused):  # noted now: the time before did not get so far
+                        self._take(event)
+        if self.estimate is not None:
+            self.estimate = self._engine.estimate
         self._tell_moves()
         self._write_waiting()
 
@@ -241,7 +250,11 @@ class LiveSession:
             if isinstance(event, AimEvent | PairEvent):
                 found = self._recogniser.add(event, self._feed.epoch)
                 if isinstance(found, Aim | Pair):
-                    estimate = self._feed.add(found)
+                    try:
+                        estimate = self._feed.add(found)
+                    except BaseException:  # its frames must not count either: opened again, the session lacks them
+                        self._recogniser.take_back()
+                        raise
             elif isinstance(event, CameraMovedEvent):
                 estimate = self._feed.add(event)
         except (EventRefused, InputError) as error:
@@ -299,8 +312,6 @@ def _brief(event: Event) -> dict[str, object]:
     return {"type": type_of(event), "t": event.t}
 
 
-def online_engine(model: SessionModel, config: SolveConfig) -> Engine:
+def online_engine(model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> Engine:
     """The incremental engine, its judgement in the same process: the same events always give the same estimates."""
-    from fgreg.online.engine import OnlineRegistration
-
-    return OnlineRegistration(model, config, judge="inline")
+    return OnlineRegistration(model, config, judge="inline", sound_speed_prior=sound_speed_prior)

@@ -393,8 +393,8 @@ class _Builder:
 class EventRecogniser:
     """Recognises events one after another, as they come: corner noise is pooled over the frames so far.
 
-    What it makes of an event depends on the events before it alone, so that the same events give the same measurements
-    however often a session is interrupted.
+    What it makes of an event depends on the aims and pairs before it that were taken in, and on nothing else, so that
+    the same events give the same measurements however often a session is interrupted.
     """
 
     def __init__(self, model: SessionModel) -> None:
@@ -402,20 +402,20 @@ class EventRecogniser:
         self._builder = _Builder(model, _Found(), nothing, nothing, redetect=False)
         self._marker_fits: list[MarkerFit] = []
         self._board_fits: list[BoardFit] = []
+        self._before = (0, 0)
 
     def add(self, event: AimEvent | PairEvent | TrackEvent, epoch: int) -> Aim | Pair | Track | str:
-        """The event as a measurement in camera epoch ``epoch``, or why there is none.
+        """The event as a measurement in camera epoch ``epoch``, or why there is none. A query leaves no trace.
 
         Raises:
             InputError: a frame that is missing or not what it should be.
         """
         builder = self._builder
         found = builder.found = _detect([event], builder.model, redetect=False, progress=None)
+        self._before = len(self._marker_fits), len(self._board_fits)
         self._marker_fits += [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
         self._board_fits += [fit for fit in found.boards.values() if isinstance(fit, BoardFit)]
-        if found.markers or found.boards:
-            builder.marker_noise = pool_corner_noise(fit.pose for fit in self._marker_fits)
-            builder.board_noise = pool_corner_noise(fit.pose for fit in self._board_fits)
+        self._pool()
         builder.add(0, event, epoch)
         made: list[Aim | Pair | Track] = [*builder.aims, *builder.pairs, *builder.tracks]
         reason = builder.unused.get(0, "")
@@ -424,4 +424,15 @@ class EventRecogniser:
         for numbers in (builder.aim_events, builder.pair_events, builder.track_events):
             numbers.clear()
         builder.unused.clear()
+        if isinstance(event, TrackEvent):
+            self.take_back()
         return made[0] if made else reason
+
+    def take_back(self) -> None:
+        """Forget the last event: it was not taken in, and will not be there when the session is opened again."""
+        del self._marker_fits[self._before[0] :], self._board_fits[self._before[1] :]
+        self._pool()
+
+    def _pool(self) -> None:
+        self._builder.marker_noise = pool_corner_noise(fit.pose for fit in self._marker_fits)
+        self._builder.board_noise = pool_corner_noise(fit.pose for fit in self._board_fits)

@@ -133,7 +133,8 @@ def replay_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        engine = (make_engine or online_engine)(session.model, config)
+        prior = sound_speed_prior(recognised, config)
+        engine = (make_engine or online_engine)(session.model, config, prior)
         player = _Player(session, recognised, engine, viewer, request.speed)
         player.play(on_step)
         taken = player.taken()
@@ -143,7 +144,7 @@ def replay_session(
             session.model,
             config,
             detection_conditions(recognised, config),
-            sound_speed_prior(recognised, config),
+            prior,
         )
         settled = engine.settle() if player.estimate is not None else None
         estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())
@@ -282,6 +283,11 @@ def quantiles(elapsed_ms: Sequence[float]) -> Quantiles | None:
     return Quantiles(p50, p99, max(elapsed_ms))
 
 
+def left_out(known: OnlineEstimate | None) -> bool:
+    """Whether the pair just added does not fit; before there is a registration none does or does not."""
+    return known is not None and known.trus_T_camera is not None and not known.used
+
+
 def describe(step: ReplayStep) -> str:
     """What the event was, in a few words."""
     event = step.event
@@ -296,7 +302,7 @@ def describe(step: ReplayStep) -> str:
             what = "camera moved" + (" (found out)" if event.detected else "")
     if step.refused:
         what += f", not used: {step.refused}"
-    elif isinstance(event, PairEvent) and step.estimate is not None and not step.estimate.used:
+    elif isinstance(event, PairEvent) and left_out(step.estimate):
         what += ", not used"
     if step.answer is not None and step.answer.stage_rad is None:
         what += f", no answer: {step.answer.reason}"

@@ -1,7 +1,8 @@
-"""An engine that registers anew after every event: what recording and replay are tested with, slow and simple."""
+"""An engine that registers anew at every fifth pair of an epoch: simple, and can be told to refuse and to notice."""
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 from fgreg.batch import Solution, solve
@@ -13,7 +14,7 @@ from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, OnlineEvent
-from fgreg.registration import register
+from fgreg.registration import SoundSpeedPrior, register
 
 
 class BatchEngine:
@@ -22,9 +23,10 @@ class BatchEngine:
     the value.
     """
 
-    def __init__(self, model: SessionModel, config: SolveConfig) -> None:
-        self.model, self.config = model, config
+    def __init__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None = None) -> None:
+        self.model, self.config, self.prior = model, config, prior
         self.all = Measurements((), (), (EpochStart(0.0),))
+        self.estimate: OnlineEstimate | None = None
         self.refuse_t: set[float] = set()
         self.notice: dict[float, float] = {}
 
@@ -46,7 +48,8 @@ class BatchEngine:
                 self._move(event)
             case _:
                 raise AssertionError("not an event of a session")
-        return self._estimate(event)
+        self.estimate = found = self._estimate(event)
+        return found
 
     def _move(self, moved: CameraMoved) -> None:
         since, epoch = moved.t if moved.since_t is None else moved.since_t, len(self.all.epochs)
@@ -57,8 +60,11 @@ class BatchEngine:
     def _estimate(self, event: OnlineEvent) -> OnlineEstimate:
         epoch = len(self.all.epochs) - 1
         count = sum(pair.epoch == epoch for pair in self.all.pairs)
-        transform = covariance = None
-        if count >= 5:
+        before = self.estimate
+        lasts = before is not None and before.epoch == epoch
+        transform = before.trus_T_camera if before is not None and lasts else None
+        covariance = before.covariance if before is not None and lasts else None
+        if isinstance(event, Pair) and count % 5 == 0:
             try:
                 found = register(self.all, self.model, self.config)
                 if epoch in found.epochs:
@@ -92,6 +98,9 @@ class BatchEngine:
             None,
             True,
         )
+
+    def catching_up(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
     def marker_T_laser(self) -> FloatArray | None:
         laser = self.solution().laser

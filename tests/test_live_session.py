@@ -94,6 +94,32 @@ def test_raw_frames_are_looked_at_as_they_come_and_the_same_again_when_reopened(
     assert (len(found.aims), len(found.pairs)) == (6, 8)
 
 
+@pytest.mark.parametrize("between", ["query", "query not recorded", "refused pair"])
+def test_frames_of_queries_and_refused_events_leave_no_trace_in_the_estimate(raw_session: Path, between: str) -> None:
+    folder, events = empty_copy(raw_session)
+    queries = [event for event in events if isinstance(event, TrackEvent)]
+    shots = [event for event in events if isinstance(event, AimEvent | PairEvent)]
+    pairs = [event for event in shots if isinstance(event, PairEvent)]
+    place = shots.index(pairs[1])
+    with LiveSession.open(folder, make_engine=BatchEngine) as live:
+        assert isinstance(live._engine, BatchEngine)
+        feed(live, shots[:place])
+        if between == "refused pair":
+            live._engine.refuse_t = {shots[place].t}
+            with pytest.raises(EventRefused):
+                feed(live, shots[place : place + 1])
+            place += 1
+        else:
+            for query in queries:
+                live.track(replace(query, t=shots[place - 1].t), record=between == "query")
+        feed(live, shots[place:])
+        first, found = live.estimate, live.measurements()
+    with LiveSession.open(folder, make_engine=BatchEngine) as live:
+        same(live.estimate, first)
+        for a, b in zip(found.pairs, live.measurements().pairs, strict=True):
+            assert a.marker.covariance.tobytes() == b.marker.covariance.tobytes()
+
+
 def test_an_event_that_the_engine_refuses_is_recorded_as_refused_and_never_taken_in_again(pose_session: Path) -> None:
     folder, events = empty_copy(pose_session)
     pairs = [event for event in events if isinstance(event, PairEvent)]

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from fgreg import cli
+from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused, InputError
 from fgreg.events import PairEvent, TrackEvent
-from fgreg.live import Engine, MakeEngine
+from fgreg.live import Engine, MakeEngine, online_engine
 from fgreg.models import NoiseModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import OnlineEvent
@@ -26,13 +27,14 @@ from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
 from fgreg.viewer.spawn import ViewerError, spawn_viewer
-from tests.batch_engine import BatchEngine
 from tests.recordings import read_recording, transform_of, views
 
+FAST = SolveConfig(posterior_effective=60.0, posterior_samples=600)
 
-@pytest.fixture(params=["batch"])
-def make_engine(request: pytest.FixtureRequest) -> MakeEngine:
-    return BatchEngine
+
+@pytest.fixture
+def make_engine() -> MakeEngine:
+    return online_engine
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +67,8 @@ def test_the_final_result_is_that_of_a_solve_with_timing_and_causal_answers(
     short: Path, tmp_path: Path, make_engine: MakeEngine
 ) -> None:
     steps: list[ReplayStep] = []
-    replayed = replay_session(ReplayRequest(short), on_step=steps.append, make_engine=make_engine)
-    solve_session(SolveRequest(short, tmp_path / "solved.yaml"))
+    replayed = replay_session(ReplayRequest(short), FAST, on_step=steps.append, make_engine=make_engine)
+    solve_session(SolveRequest(short, tmp_path / "solved.yaml"), FAST)
     ours, solved = read_result(short / "result.yaml"), read_result(tmp_path / "solved.yaml")
     assert (ours.verdict, ours.reasons, len(ours.pairs)) == (solved.verdict, solved.reasons, len(solved.pairs))
     for a, b in zip(ours.epochs, solved.epochs, strict=True):
@@ -102,27 +104,27 @@ def test_queries_are_answered_from_what_was_known_at_their_time(
     events.insert(events.index(pairs[7]) + 1, late)
     path = short / "events.jsonl"
     path.write_text("".join(json.dumps(event) + "\n" for event in events))
-    whole = replay_session(ReplayRequest(short), make_engine=make_engine).solved.estimate.tracks
+    whole = replay_session(ReplayRequest(short), FAST, make_engine=make_engine).solved.estimate.tracks
     assert whole[0].stage_rad is None
     assert whole[0].reason
     assert whole[1].stage_rad is not None
     # What comes after a query cannot matter to it.
     path.write_text("".join(json.dumps(event) + "\n" for event in events[: events.index(late) + 1]))
-    cut = replay_session(ReplayRequest(short), make_engine=make_engine).solved.estimate.tracks
+    cut = replay_session(ReplayRequest(short), FAST, make_engine=make_engine).solved.estimate.tracks
     assert [track.stage_rad for track in cut] == [track.stage_rad for track in whole]
     assert [track.sigma_rad for track in cut] == [track.sigma_rad for track in whole]
 
 
 def test_a_told_move_of_the_camera_begins_an_epoch(tmp_path: Path, make_engine: MakeEngine) -> None:
     folder = tmp_path / "moved"
-    write_session(simulate(replace(PRESETS["camera-move"], aims=8, pairs=14), 3), folder)
+    write_session(simulate(replace(PRESETS["camera-move"], aims=6, pairs=12), 3), folder)
     steps: list[ReplayStep] = []
-    report = replay_session(ReplayRequest(folder), on_step=steps.append, make_engine=make_engine).solved
+    report = replay_session(ReplayRequest(folder), FAST, on_step=steps.append, make_engine=make_engine).solved
     assert [epoch.index for epoch in report.estimate.epochs] == [0, 1]
     known = [step.estimate.epoch for step in steps if step.estimate is not None]
     assert sorted(known) == known
     assert set(known) == {0, 1}
-    solved = solve_session(SolveRequest(folder, tmp_path / "solved.yaml")).estimate
+    solved = solve_session(SolveRequest(folder, tmp_path / "solved.yaml"), FAST).estimate
     for a, b in zip(report.estimate.epochs, solved.epochs, strict=True):
         assert a.trus_T_camera is not None
         assert b.trus_T_camera is not None
@@ -149,8 +151,9 @@ def test_a_pair_that_the_engine_refuses_is_listed_with_its_reason(short: Path, m
     steps: list[ReplayStep] = []
     report = replay_session(
         ReplayRequest(short),
+        FAST,
         on_step=steps.append,
-        make_engine=lambda model, config: Picky(make_engine(model, config), pair.t),  # type: ignore[arg-type, return-value]
+        make_engine=lambda *setting: Picky(make_engine(*setting), pair.t),  # type: ignore[arg-type]
     )
     assert [step.event.t for step in steps if step.refused] == [pair.t]
     assert [(p.t, p.used) for p in report.solved.estimate.pairs if not p.used] == [(pair.t, False)]
@@ -168,7 +171,10 @@ def test_lines_tell_what_is_known_after_each_event(
         assert word in lines[0]
     assert [line for line in lines if "aim" in line and "none yet" in line]
     rows = [line.split() for line in lines if " pair, PM " in line]
-    assert [row[3:6] for row in rows] == [[str(i), "0", str(i + 1)] for i in range(9)]
+    assert [row[3] for row in rows] == [str(i) for i in range(9)]
+    known = [row[4:] for row in rows if row[-1] != "yet"]
+    assert [row[:2] for row in known] == [["0", str(i)] for i in range(10 - len(known), 10)]
+    assert all(float(row[3]) > 0 and row[4] in ("ok", "warning", "refused") for row in known)
     assert sum("track: stage to" in line for line in lines) == 2
     assert max(map(len, lines[:30])) <= 80
     assert "Taking in an event: median" in captured.out
@@ -232,7 +238,7 @@ def test_an_older_result_does_not_survive_a_bad_session(short: Path, make_engine
     with (short / "events.jsonl").open("a") as file:
         file.write('{"type": "pair", "t": 1e6}\n')
     with pytest.raises(InputError, match=r"events\.jsonl: line"):
-        replay_session(ReplayRequest(short), make_engine=make_engine)
+        replay_session(ReplayRequest(short), FAST, make_engine=make_engine)
     assert not (short / "result.yaml").exists()
 
 
@@ -241,7 +247,7 @@ def test_speed_keeps_the_recorded_pace(short: Path, make_engine: MakeEngine) -> 
     speed = (times[-1] - times[0]) / 1.5
     at: list[float] = []
     replay_session(
-        ReplayRequest(short, speed=speed), on_step=lambda _: at.append(time.monotonic()), make_engine=make_engine
+        ReplayRequest(short, speed=speed), FAST, on_step=lambda _: at.append(time.monotonic()), make_engine=make_engine
     )
     due = [(t - times[0]) / speed for t in times]
     late = [moment - at[0] - wanted for moment, wanted in zip(at, due, strict=True)]
@@ -251,7 +257,7 @@ def test_speed_keeps_the_recorded_pace(short: Path, make_engine: MakeEngine) -> 
 def test_the_recording_shows_the_registration_as_it_moves(short: Path, tmp_path: Path, make_engine: MakeEngine) -> None:
     steps: list[ReplayStep] = []
     rrd = tmp_path / "moving.rrd"
-    replay_session(ReplayRequest(short, rrd=rrd), on_step=steps.append, make_engine=make_engine)
+    replay_session(ReplayRequest(short, rrd=rrd), FAST, on_step=steps.append, make_engine=make_engine)
     found = read_recording(rrd)
     cameras = {row.shot: row for row in found["/world/camera"]}
     drawn = 0
@@ -296,7 +302,7 @@ def test_a_query_whose_marker_is_not_found_has_a_reason(raw_session: Path, make_
             picture = cv2.imread(str(path))
             assert picture is not None
             cv2.imwrite(str(path), np.zeros_like(picture))
-    tracks = replay_session(ReplayRequest(raw_session), make_engine=make_engine).solved.estimate.tracks
+    tracks = replay_session(ReplayRequest(raw_session), FAST, make_engine=make_engine).solved.estimate.tracks
     assert tracks[0].stage_rad is None
     assert tracks[0].reason
     assert tracks[0].causal

@@ -11,7 +11,8 @@ shift from optimum to posterior mean, the widening of the covariance at few pair
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
 from typing import Literal
@@ -23,12 +24,12 @@ from fgreg.batch import Solution
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.frames import FloatArray, is_rigid
+from fgreg.frames import FloatArray, is_rigid, make_transform, rotation_to_direction
 from fgreg.measurements import Aim, EpochStart, MarkerObservation, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
-from fgreg.online.judge import Case, InlineJudge, Judge, Judgement, ProcessJudge, judge
+from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
 from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
 from fgreg.online.state import EpochData, Recent, State, make_setting
@@ -186,6 +187,23 @@ class OnlineRegistration:
     def _case(self) -> Case:
         return Case(self._serial, self._state.epoch, self.measurements())
 
+    @contextmanager
+    def catching_up(self) -> Iterator[None]:
+        """While many events of before are taken in again: judged once, at the end, where the last judgement was due.
+
+        What is reported afterwards is what ``inline`` reports after the same events, but for the time that it takes.
+        """
+        usual, deferred = self._judge, DeferredJudge()
+        self._judge = None if usual is None else deferred
+        try:
+            yield
+        finally:
+            self._judge = usual
+        if deferred.case is not None and deferred.case.epoch == self._state.epoch:
+            found, _ = judge(deferred.case, self._model, self._config, self._prior)
+            self._judgement = found
+            self._estimate = self._report(self._state, self._estimate.t, found)
+
     # --- what is known ----------------------------------------------------------------------------------------------
 
     @property
@@ -224,6 +242,13 @@ class OnlineRegistration:
     def measurements(self) -> Measurements:
         """All that was taken in, as the batch solve takes it."""
         return all_measurements(self._state, self._tools.store)
+
+    def marker_T_laser(self) -> FloatArray | None:
+        """(4, 4) the beam as the present epoch's estimate has it, origin by its chart; None where there is none yet."""
+        if self._state.window is None:
+            return None
+        shared = self._state.window.state
+        return make_transform(rotation_to_direction(shared.beam_direction()[0]), shared.beam_origin()[0])
 
     def settle(self) -> OnlineEstimate:
         """Judge now, by the full solve of everything so far; the estimate is then that solve's."""

@@ -155,6 +155,25 @@ class InlineJudge:
         """Nothing to stop."""
 
 
+class DeferredJudge:
+    """Keeps the last case that the schedule of :class:`InlineJudge` asks for, and judges none: for catching up."""
+
+    def __init__(self) -> None:
+        self.case: Case | None = None
+
+    def ask(self, case: Callable[[], Case], pairs: int) -> None:
+        """Keep it where it is due."""
+        if is_due(pairs):
+            self.case = case()
+
+    def answer(self) -> Judgement | None:
+        """Nothing yet."""
+        return None
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+
 def _serve(
     connection: Connection, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None
 ) -> None:
