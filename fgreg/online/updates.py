@@ -47,7 +47,7 @@ FEW_PAIRS = 40
 NEAR_PAIRS = 160
 """Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
 VISIT, VISIT_EARLIER = 8, 64
-"""A full chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
+"""A chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
 
 # --- one pair more --------------------------------------------------------------------------------------------------
@@ -188,17 +188,19 @@ def odd_ones(state: State, setting: Setting) -> frozenset[int]:
 
 
 def visited_chunks(state: State, window: Window, setting: Setting) -> tuple[State, bool]:
-    """Linearise one full chunk anew and judge its PMs, where it is time; whether that was done."""
+    """Linearise one chunk anew and judge its PMs, where it is time; whether that was done."""
     columns, shelf = setting.columns, state.now.shelf
     turn = state.steps // VISIT
-    if state.steps % VISIT == 0 and shelf.full:
-        place = turn % len(shelf.full)
-        chunk = shelf.full[place]
+    if state.steps % VISIT == 0 and shelf.chunks:
+        place = turn % len(shelf.chunks)
+        chunk = shelf.chunks[place]
         parts = settled_parts(chunk.problem, window.state, chunk.private, rounds=1)
         found = innovations_of(parts.pm, _information(window), chunk.kept)
         limits = pm_limits(chunk.problem, junk_p_of(*counts(state)))
         kept = np.where(np.isfinite(found), found <= limits, chunk.kept)
         new = chunk_of(chunk.places, chunk.problem, kept, window.state, parts)
+        if place == len(shelf.full):
+            return state.with_now(shelf=replace(shelf, open=new)), True
         return state.with_now(shelf=shelf.with_full(place, new, columns)), True
     if state.steps % VISIT_EARLIER == 2 and state.epoch:
         return _visit_earlier(state, window, setting), True
