@@ -132,8 +132,9 @@ def test_settled_estimates_are_those_of_the_solve() -> None:
     assert settled.settled
     assert settled.verdict is solution.verdict
     assert settled.reasons == solution.reasons
-    np.testing.assert_array_equal(np.asarray(settled.trus_T_camera), np.asarray(solution.epochs[0].trus_T_camera))
-    np.testing.assert_array_equal(np.asarray(settled.covariance), np.asarray(solution.epochs[0].covariance))
+    pose, covariance = np.asarray(solution.epochs[0].trus_T_camera), np.asarray(solution.epochs[0].covariance)
+    np.testing.assert_allclose(np.asarray(settled.trus_T_camera), pose, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(settled.covariance), covariance, rtol=1e-8, atol=1e-15)
 
 
 def test_an_epoch_that_was_not_judged_is_at_most_a_warning() -> None:

@@ -14,16 +14,28 @@ from fgreg.graph.explicit_values import laser_chart
 from fgreg.graph.shared_state import SharedState, nominal_frame
 from fgreg.measurements import Aim, Measurements, Pair
 from fgreg.online.shared import Layout
-from fgreg.online.state import STEP, WINDOW, Setting, State, opened, passed_from, shelved
+from fgreg.online.state import (
+    STEP,
+    WINDOW,
+    Setting,
+    State,
+    opened,
+    passed_from,
+    shelved,
+    sigma_distance,
+    summary,
+)
 from fgreg.online.store import MeasurementStore
 from fgreg.online.summary import Chunk, Shelf, make_chunk
-from fgreg.online.window import Bundle, Group, prepare
+from fgreg.online.window import Bundle, Group, open_window, prepare
 from fgreg.registration import Registration, register
 
 ALL_PAIRS = 120
 """Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
 EARLIER_PAIRS = 60
 AIMS_IN_CHUNK = 64
+STAYS_SIGMA = 1.0
+"""A window that was opened at an optimum has to come to rest no farther from it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +133,20 @@ def _from_registration(
     for bundle in mine[recent:]:
         groups.append(Group(bundle, prepare(bundle.pairs, layout, here, state.epoch, setting.model, numbers)))
         numbers += len(bundle.pairs)
-    state, window = opened(state, groups, here, numbers, setting)
-    return replace(state.with_now(state=window.state), window=window)
+    try:
+        after, window = opened(state, groups, here, numbers, setting)
+        stays = sigma_distance(here, window.state, window.covariance, columns) < STAYS_SIGMA
+    except (ArithmeticError, RuntimeError):
+        stays = False
+    if not stays:
+        # Among few pairs that contradict each other, full Gauss-Newton steps lead away from the optimum that damped
+        # ones found. The optimum stands: all pairs are summed up at it, and the window starts empty.
+        after = state.with_now(shelf=shelved(Shelf(), mine, here, setting))
+        try:
+            window = open_window((), summary(after, here, setting), layout, state.epoch, numbers)
+        except RuntimeError:  # GTSAM's word for a system that is indeterminate, as three pairs can leave it
+            return replace(state, why_none="these pairs leave the registration undetermined: take more")
+    return replace(after.with_now(state=window.state), window=window)
 
 
 def _one_epoch(state: SharedState, place: int) -> SharedState:

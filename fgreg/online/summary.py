@@ -116,9 +116,10 @@ def settled(
     A PM that still wanders counts as far off, whatever it passes on its way.
     """
     private = initial_private(problem, state) if private is None else private
-    for _ in range(rounds):
-        _, private = refine(problem, state, private)
-    return _honest(contributions(problem, state, private), private)
+    with np.errstate(all="ignore"):  # far from everything numbers may overflow: who sums them up looks at them
+        for _ in range(rounds):
+            _, private = refine(problem, state, private)
+        return _honest(contributions(problem, state, private), private)
 
 
 def _honest(parts: Parts, before: PrivateState) -> Parts:

@@ -11,7 +11,7 @@ from fgreg.frames import FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.measurements import Aim, EpochStart, Pair
 from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered
-from fgreg.online.shared import small_step
+from fgreg.online.shared import Layout, small_step
 from fgreg.online.state import (
     RECENT,
     SETTLED_FEW,
@@ -47,7 +47,7 @@ FEW_PAIRS = 40
 NEAR_PAIRS = 160
 """Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
 VISIT, VISIT_EARLIER = 8, 64
-"""A full chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
+"""A chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
 
 # --- one pair more --------------------------------------------------------------------------------------------------
@@ -55,11 +55,23 @@ VISIT, VISIT_EARLIER = 8, 64
 
 def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     """The state with one pair more."""
-    window, layout, setting = state.window, state.layout, tools.setting
     place = state.pairs
-    if window is None or layout is None:
+    if state.window is None or state.layout is None:
         found = registered(state, tools, pair)
-        return replace(found, nis=None, used=_is_kept(found, place), recent=())
+        return replace(found, nis=None, used=is_kept(found, place), recent=())
+    try:
+        return _one_more(state, state.window, state.layout, pair, tools)
+    except ArithmeticError:
+        if state.epoch_pairs >= FEW_PAIRS:
+            raise
+    # Among few pairs that contradict each other full steps may lead anywhere: begin anew, with damped ones.
+    found = registered(state, tools, pair)
+    return replace(found, nis=None, used=is_kept(found, place))
+
+
+def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: Tools) -> State:
+    """:func:`with_pair` where there is a registration to begin with."""
+    setting, place = tools.setting, state.pairs
     before = window
     earlier = tools.store.looks_at(pair.pm, state.now.first)
     bundle = Bundle(
@@ -111,7 +123,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         first = pms_in_epoch(state) <= FIRST_PAIRS or state.is_open
         if first or not fits or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
-            return replace(found, nis=nis, used=_is_kept(found, place), recent=state.recent)
+            return replace(found, nis=nis, used=is_kept(found, place), recent=state.recent)
         return state
     if state.steps % VISIT == 3:
         state = _toggled(state, setting)
@@ -129,10 +141,17 @@ def open_window_again(state: State, window: Window, setting: Setting) -> Window:
     return relaxed(state, window, Change(summary=summary(state, window.state, setting)), setting, SETTLED_MANY)[1]
 
 
-def _is_kept(state: State, place: int) -> bool:
-    """Whether the pair at a place counts; only the window is looked at, where the last pairs are."""
+def is_kept(state: State, place: int) -> bool:
+    """Whether the pair at a place counts: in the window, or among what is summed up last."""
     groups = state.window.groups if state.window is not None else ()
-    return any(group.kept and place in group.bundle.places for group in groups)
+    for group in groups:
+        if place in group.bundle.places:
+            return group.kept
+    chunks = state.now.shelf.chunks
+    if not chunks or state.window is None:
+        return False
+    found = np.flatnonzero(chunks[-1].places == place)
+    return bool(len(found) and chunks[-1].kept[chunks[-1].problem.look_pm[found[0]]])
 
 
 def _information(window: Window) -> FloatArray:
@@ -169,17 +188,19 @@ def odd_ones(state: State, setting: Setting) -> frozenset[int]:
 
 
 def visited_chunks(state: State, window: Window, setting: Setting) -> tuple[State, bool]:
-    """Linearise one full chunk anew and judge its PMs, where it is time; whether that was done."""
+    """Linearise one chunk anew and judge its PMs, where it is time; whether that was done."""
     columns, shelf = setting.columns, state.now.shelf
     turn = state.steps // VISIT
-    if state.steps % VISIT == 0 and shelf.full:
-        place = turn % len(shelf.full)
-        chunk = shelf.full[place]
+    if state.steps % VISIT == 0 and shelf.chunks:
+        place = turn % len(shelf.chunks)
+        chunk = shelf.chunks[place]
         parts = settled_parts(chunk.problem, window.state, chunk.private, rounds=1)
         found = innovations_of(parts.pm, _information(window), chunk.kept)
         limits = pm_limits(chunk.problem, junk_p_of(*counts(state)))
         kept = np.where(np.isfinite(found), found <= limits, chunk.kept)
         new = chunk_of(chunk.places, chunk.problem, kept, window.state, parts)
+        if place == len(shelf.full):
+            return state.with_now(shelf=replace(shelf, open=new)), True
         return state.with_now(shelf=shelf.with_full(place, new, columns)), True
     if state.steps % VISIT_EARLIER == 2 and state.epoch:
         return _visit_earlier(state, window, setting), True
