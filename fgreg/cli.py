@@ -19,6 +19,7 @@ import typer
 
 from fgreg import __version__
 from fgreg.cli_evaluate import add_commands
+from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
 from fgreg.errors import FgregError, InputError
 
@@ -121,22 +122,11 @@ def solve(
         Path | None,
         typer.Option("--rrd", metavar="FILE", help="Also write a Rerun recording; open it with: rerun FILE."),
     ] = None,
-    limit_mm: Annotated[
-        float,
-        typer.Option("--limit-mm", help="Predicted error (95 %) at the worst target up to which the verdict is ok."),
-    ] = 3.0,
+    limit_mm: LimitOption = 3.0,
     redetect: Annotated[
         bool, typer.Option("--redetect", help="Detect in the frames even where events bring poses.")
     ] = False,
-    estimate: Annotated[
-        str,
-        typer.Option(
-            "--estimate",
-            metavar="NAMES",
-            help="Estimate these too, with the values in session.yaml as priors: sound_speed, probe_radius, or both "
-            "with a comma between.",
-        ),
-    ] = "",
+    estimate: EstimateOption = "",
     detect_moves: Annotated[
         bool, typer.Option("--detect-moves", help="Find camera moves that nobody told, by the pairs.")
     ] = False,
@@ -148,22 +138,11 @@ def solve(
     Reads SESSION, looks at its frames, writes result.yaml and prints a summary: verdict first, with what to do where it
     is not ok. No initial guess is needed. Exit status 1 where the verdict is refused.
     """
-    from fgreg.config import SolveConfig
     from fgreg.estimate import Verdict
     from fgreg.pipeline import SolveRequest, solve_session
     from fgreg.report import print_summary, summary_dict
 
-    wanted = {name.strip() for name in estimate.split(",") if name.strip()}
-    if not wanted <= {"sound_speed", "probe_radius"}:
-        raise InputError("--estimate", estimate, "sound_speed, probe_radius, or both with a comma between")
-    try:
-        config = SolveConfig(
-            limit_mm=limit_mm,
-            estimate_sound_speed="sound_speed" in wanted,
-            estimate_radius="probe_radius" in wanted,
-        )
-    except ValueError as error:
-        raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
+    config = solve_config(limit_mm, estimate)
     with _progress(quiet or as_json) as progress:
         report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves), config, progress)
     extras = _summary_extras(report)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fgreg.cli_options import LimitOption, OnlineEstimateOption, solve_config
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,12 +49,8 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
         live: Annotated[
             bool, typer.Option("--live", help="Open a Rerun viewer and show the session in it while it is replayed.")
         ] = False,
-        limit_mm: Annotated[
-            float,
-            typer.Option(
-                "--limit-mm", help="Predicted error (95 %) at the worst target up to which the verdict is ok."
-            ),
-        ] = 3.0,
+        limit_mm: LimitOption = 3.0,
+        estimate: OnlineEstimateOption = "",
         redetect: Annotated[
             bool, typer.Option("--redetect", help="Detect in the frames even where events bring poses.")
         ] = False,
@@ -70,16 +67,12 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         Watch it in real time: fgreg replay SESSION --speed 1 --live. Or record it: --rrd FILE.
         """
-        from fgreg.config import SolveConfig
         from fgreg.estimate import Verdict
         from fgreg.replay import ReplayRequest, replay_session
         from fgreg.report import print_summary, summary_dict
 
         pace = _speed(speed)
-        try:
-            config = SolveConfig(limit_mm=limit_mm)
-        except ValueError as error:
-            raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
+        config = solve_config(limit_mm, estimate, ("sound_speed",))
         with _display(quiet or as_json) as (progress, on_step):
             request = ReplayRequest(session, out, rrd, live, pace, redetect)
             report = replay_session(request, config, progress, on_step)

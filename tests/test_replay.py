@@ -196,6 +196,19 @@ def test_json_is_one_document_with_timing(
     assert read_result(tmp_path / "r.yaml").timing is not None
 
 
+def test_the_sound_speed_is_estimated_where_asked_as_a_solve_does(
+    short: Path, tmp_path: Path, make_engine: MakeEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(monkeypatch, make_engine, short, "--estimate", "sound_speed", "-q", "--out", tmp_path / "r.yaml") == 0
+    config = SolveConfig(estimate_sound_speed=True)
+    solved = solve_session(SolveRequest(short, tmp_path / "s.yaml"), config).estimate.epochs[0]
+    held = solve_session(SolveRequest(short, tmp_path / "h.yaml")).estimate.epochs[0]
+    replayed = read_result(tmp_path / "r.yaml").epochs[0]
+    assert replayed.trus_T_camera is not None and solved.trus_T_camera is not None and held.trus_T_camera is not None
+    np.testing.assert_allclose(replayed.trus_T_camera, solved.trus_T_camera, atol=1e-4)
+    assert np.abs(solved.trus_T_camera - held.trus_T_camera).max() > 0.01
+
+
 def test_a_refused_session_exits_with_1(
     short: Path, make_engine: MakeEngine, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -213,6 +226,7 @@ def test_a_refused_session_exits_with_1(
         (("--speed", "0"), "--speed"),
         (("--speed", "inf"), "--speed"),
         (("--limit-mm", "-1"), "--limit-mm"),
+        (("--estimate", "probe_radius"), "expected sound_speed"),
         (("--rrd", "/nowhere/x.rrd"), "/nowhere"),
         (("--out", "/nowhere/x.yaml"), "/nowhere"),
     ],
