@@ -111,8 +111,10 @@ def test_queries_are_answered_from_what_was_known_at_their_time(
     # What comes after a query cannot matter to it.
     path.write_text("".join(json.dumps(event) + "\n" for event in events[: events.index(late) + 1]))
     cut = replay_session(ReplayRequest(short), FAST, make_engine=make_engine).solved.estimate.tracks
-    assert [track.stage_rad for track in cut] == [track.stage_rad for track in whole]
-    assert [track.sigma_rad for track in cut] == [track.sigma_rad for track in whole]
+    assert cut[0].stage_rad is None
+    # Not bit by bit: what rounding decides depends on where arrays lie in memory.
+    assert cut[1].stage_rad == pytest.approx(whole[1].stage_rad, rel=0, abs=1e-9)
+    assert cut[1].sigma_rad == pytest.approx(whole[1].sigma_rad, rel=1e-9)
 
 
 def test_a_told_move_of_the_camera_begins_an_epoch(tmp_path: Path, make_engine: MakeEngine) -> None:
@@ -204,7 +206,9 @@ def test_the_sound_speed_is_estimated_where_asked_as_a_solve_does(
     solved = solve_session(SolveRequest(short, tmp_path / "s.yaml"), config).estimate.epochs[0]
     held = solve_session(SolveRequest(short, tmp_path / "h.yaml")).estimate.epochs[0]
     replayed = read_result(tmp_path / "r.yaml").epochs[0]
-    assert replayed.trus_T_camera is not None and solved.trus_T_camera is not None and held.trus_T_camera is not None
+    assert replayed.trus_T_camera is not None
+    assert solved.trus_T_camera is not None
+    assert held.trus_T_camera is not None
     np.testing.assert_allclose(replayed.trus_T_camera, solved.trus_T_camera, atol=1e-4)
     assert np.abs(solved.trus_T_camera - held.trus_T_camera).max() > 0.01
 
