@@ -62,7 +62,7 @@ def test_a_viewer_that_finds_no_driver_is_named_as_that(
     fake = tmp_path / "rerun"
     fake.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('No graphics adapter was found')\n")
     fake.chmod(0o755)
-    monkeypatch.setattr(tool, "rerun_executable", lambda: fake)
+    monkeypatch.setattr(tool, "viewer_executable", lambda: fake)
     with pytest.raises(tool.RenderError, match="mesa-vulkan-drivers"):
         tool.render(tmp_path / "a.rrd", tmp_path / "a.png", timeout_s=20.0)
 

@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import io
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -29,6 +27,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from fgreg.viewer.spawn import ViewerError, free_port, viewer_executable
+
 NO_DRIVER = "no Vulkan driver was found; install one (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
 
 
@@ -37,37 +37,6 @@ MENU_HEIGHT_PX = 36
 
 class RenderError(Exception):
     """The picture could not be made; the message says why and what to do."""
-
-
-def rerun_executable() -> Path:
-    """The viewer's executable: the one in the installed Rerun package, else beside this interpreter, else on PATH.
-
-    Raises:
-        RenderError: there is none.
-    """
-    name = "rerun.exe" if sys.platform.startswith("win") else "rerun"
-    candidates: list[Path] = []
-    # The package's own binary comes first: the console script beside the interpreter only starts it as a child, and
-    # ending the script would leave that child running.
-    spec = importlib.util.find_spec("rerun_cli")
-    if spec is not None and spec.origin is not None:
-        folder = Path(spec.origin).parent
-        candidates += [folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun", folder / name]
-    candidates.append(Path(sys.executable).parent / name)
-    on_path = shutil.which("rerun")
-    if on_path is not None:
-        candidates.append(Path(on_path))
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise RenderError("the rerun executable was not found; install it with: pip install rerun-sdk")
-
-
-def free_port() -> int:
-    """A TCP port of the loopback interface that nothing listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def ended(child: subprocess.Popen[bytes], log: Path) -> RenderError:
@@ -100,7 +69,7 @@ def headless_viewer(width: int, height: int, deadline: float) -> Iterator[Any]:
         with log.open("wb") as sink:
             child = subprocess.Popen(
                 [
-                    str(rerun_executable()),
+                    str(viewer_executable()),
                     "--headless",
                     "--bind=127.0.0.1",
                     f"--port={port}",
@@ -250,7 +219,7 @@ def main(arguments: list[str] | None = None) -> int:
             settle_s=options.settle,
             timeout_s=options.timeout,
         )
-    except RenderError as error:
+    except (RenderError, ViewerError) as error:
         print(f"render_recording: error: {error}", file=sys.stderr)
         return 2
     print(f"{options.picture}: {options.picture.stat().st_size / 1024:.0f} kB")

@@ -30,6 +30,8 @@ def viewer_executable() -> Path:
     Raises:
         ViewerError: there is none.
     """
+    # The package's own binary comes first: the script beside the interpreter only starts it as a child, and ending the
+    # script would leave that child running.
     name = "rerun.exe" if sys.platform.startswith("win") else "rerun"
     candidates: list[Path] = []
     spec = importlib.util.find_spec("rerun_cli")
@@ -45,6 +47,13 @@ def viewer_executable() -> Path:
     raise ViewerError("the rerun viewer was not found; install it with: pip install rerun-sdk")
 
 
+def free_port() -> int:
+    """A TCP port of the loopback interface that nothing listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 def spawn_viewer(executable: Path | None = None) -> str:
     """Start a viewer and return the address to send a recording to; the viewer stays open when this program ends.
 
@@ -52,9 +61,7 @@ def spawn_viewer(executable: Path | None = None) -> str:
         ViewerError: no viewer, no screen for it, or it did not start in time.
     """
     program = executable or viewer_executable()
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
+    port = free_port()
     with tempfile.TemporaryFile() as log:
         try:
             child = subprocess.Popen(
