@@ -1,0 +1,274 @@
+"""A simulated operating room as it goes on: where everything is at any moment, and what camera and probe take in.
+
+A surgeon holds the fibre still at one place after another: first at corners of a calibration board, then at tissue.
+Between places the marker travels smoothly; while it is held the hand trembles a little. Now and then somebody bumps
+into the camera. Truth only, forward only; times are seconds since the room was made and never go back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform, transform_points
+from fgreg.models import ChannelModel, NoiseModel
+from fgreg.simulation import sweeps
+from fgreg.simulation.config import SimulationConfig, default_probe, default_rig
+from fgreg.simulation.pictures import LookPicture, ShotPicture
+from fgreg.simulation.render import UInt8Image
+from fgreg.simulation.scene import Scene, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
+
+TRAVEL_MM_S, TRAVEL_RAD_S, LEAST_TRAVEL_S = 40.0, math.radians(30.0), 0.8
+"""Mean speed of the fibre from place to place."""
+TREMOR_HZ = (0.7, 2.3, 5.1, 8.7)
+TREMOR_MM, TREMOR_RAD = 0.03, 0.0006
+"""Amplitude of each tremor component and axis."""
+BUMP_S = 0.5
+"""A bump moves the camera for so long."""
+SCENES = 6
+"""Scenes that are drawn before a configuration is given up as one in which the camera sees no marker."""
+REACH_MM = 140.0
+"""Beams that meet no tissue within this distance end there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RoomConfig:
+    """What goes on.
+
+    Attributes:
+        seed: of everything random.
+        aims: calibration shots before the surgeon turns to the tissue.
+        bump_every_s: mean time between camera moves once that has begun; infinite: none.
+        bump_rad, bump_mm: size (sigma per axis) of a move, about the middle of the tissue.
+        scene: cameras, probe, stage, noise of the room; ``frames`` and amplitudes on.
+    """
+
+    seed: int = 1
+    aims: int = 10
+    bump_every_s: float = 90.0
+    bump_rad: float = math.radians(2.0)
+    bump_mm: float = 2.5
+    scene: SimulationConfig
+
+    def __post_init__(self) -> None:
+        if self.aims < 0:
+            raise ValueError(f"aims is {self.aims}, expected 0 or more")
+        if not self.bump_every_s > 0:
+            raise ValueError(f"bump_every_s is {self.bump_every_s}, expected a number > 0, or infinity")
+        if self.scene.probe.channels is None:
+            raise ValueError("the room's probe has to record channel data")
+
+
+def room_config(seed: int = 1, width_px: int = 640, *, aims: int = 10, bump_every_s: float = 90.0) -> RoomConfig:
+    """A room with a stereo camera of this width and a probe that records channel data."""
+    scene = SimulationConfig(
+        name="room",
+        frames=True,
+        amplitudes=True,
+        probe=default_probe(ChannelModel(sampling_mhz=40.0, t0_us=13.0, pulse_delay_us=0.4)),
+        camera=default_rig(width_px),
+        noise=NoiseModel(aim_mm=(0.3, 0.3, 0.1)),
+        samples=1160,
+        snr_db=18.0,
+    )
+    return RoomConfig(seed=seed, aims=aims, bump_every_s=bump_every_s, scene=scene)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where the fibre is held: ``trus_T_marker`` (4, 4); for aims the corner [column, row] and the board's pose."""
+
+    trus_T_marker: FloatArray
+    corner: tuple[int, int] | None = None
+    trus_T_board: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Travel:
+    """From one pose to another between two times, at rest at either end."""
+
+    start_s: float
+    end_s: float
+    start: FloatArray
+    end: FloatArray
+
+    def at(self, t_s: float) -> FloatArray:
+        share = min(max((t_s - self.start_s) / max(self.end_s - self.start_s, 1e-9), 0.0), 1.0)
+        smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)  # least jerk
+        turn = log_so3(self.start[:3, :3].T @ self.end[:3, :3])
+        return make_transform(
+            self.start[:3, :3] @ exp_so3(smooth * turn),
+            (1.0 - smooth) * self.start[:3, 3] + smooth * self.end[:3, 3],
+        )
+
+
+class Room:
+    """The room. What has happened up to a time does not depend on what is asked afterwards.
+
+    Attributes:
+        config: what goes on.
+        moved_s: when the camera began to move, each time.
+    """
+
+    def __init__(self, config: RoomConfig) -> None:
+        self.config = config
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(config.seed).spawn(6)]
+        self._scene_rng, self._aim_rng, self._shot_rng, self._bump_rng, tremor, self._miss_rng = streams
+        self._aims = self._begin()
+        trus_T_camera = self.scene.trus_T_camera[0]
+        self._phase = tremor.uniform(0.0, 2.0 * math.pi, (6, len(TREMOR_HZ)))
+        self._cameras: list[_Travel] = [_Travel(0.0, 0.0, trus_T_camera, trus_T_camera)]
+        self.moved_s: list[float] = []
+        self._bump_due_s = math.inf
+        self._places = 0
+        self._place = self._next_place()
+        start = self._place.trus_T_marker
+        self._travel = _Travel(0.0, 0.0, start, start)
+
+    def _begin(self) -> list[Place]:
+        """A scene in which aims and spots can be seen, and the aims."""
+        config = replace(self.config.scene, aims=self.config.aims)
+        for attempt in range(SCENES):
+            self.scene: Scene = draw_scene(config, self._scene_rng)
+            miss = self._miss_rng.standard_normal((config.aims, 3))
+            try:
+                aims = draw_aim_shots(config, self.scene, self._aim_rng, miss)
+                self._spot(self.scene.trus_T_camera[0])
+            except UnseenError:
+                if attempt == SCENES - 1:
+                    raise
+            else:
+                break
+        trus_T_camera = self.scene.trus_T_camera[0]
+        return [
+            Place(trus_T_camera @ pose, (int(corner[0]), int(corner[1])), trus_T_camera @ board)
+            for pose, corner, board in zip(aims.shots.camera_T_marker, aims.corner, aims.camera_T_board, strict=True)
+        ]
+
+    # --- what happens -----------------------------------------------------------------------------------------------
+
+    @property
+    def place(self) -> Place:
+        """Where the fibre is held, or is on its way to."""
+        return self._place
+
+    @property
+    def marker_T_laser(self) -> FloatArray:
+        """(4, 4) the true calibration."""
+        return self.scene.marker_T_laser
+
+    def arrives_s(self) -> float:
+        """When the fibre comes (came) to rest at its place."""
+        return self._travel.end_s
+
+    def proceed(self, t_s: float) -> Place:
+        """The surgeon goes on to the next place, from wherever the fibre is at ``t_s``."""
+        start = self._travel.at(t_s)
+        self._place = self._next_place()
+        end = self._place.trus_T_marker
+        way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
+        turn = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
+        took = max(LEAST_TRAVEL_S, way / TRAVEL_MM_S, turn / TRAVEL_RAD_S)
+        self._travel = _Travel(t_s, t_s + took, start, end)
+        if self._place.corner is None and not math.isfinite(self._bump_due_s):
+            self._bump_due_s = self._next_bump(t_s)
+        return self._place
+
+    def pass_to(self, t_s: float) -> None:
+        """Let time pass: bumps that are due happen."""
+        if t_s >= self._bump_due_s:
+            self.bump(self._bump_due_s)
+            self._bump_due_s = self._next_bump(t_s)
+
+    def bump(self, t_s: float) -> None:
+        """Somebody moves the camera, beginning at ``t_s``."""
+        rng, config = self._bump_rng, self.config
+        before = self.trus_T_camera(t_s)
+        middle = self.scene.tissue.point(np.zeros(()), np.zeros(()))
+        turn = exp_so3(rng.normal(0.0, config.bump_rad, 3))
+        move = make_transform(turn, middle - turn @ middle + rng.normal(0.0, config.bump_mm, 3))
+        self._cameras.append(_Travel(t_s, t_s + BUMP_S, before, move @ before))
+        self.moved_s.append(t_s)
+
+    def _next_bump(self, t_s: float) -> float:
+        mean = self.config.bump_every_s
+        return math.inf if math.isinf(mean) else t_s + mean * float(self._bump_rng.uniform(0.5, 1.5))
+
+    def _next_place(self) -> Place:
+        number, self._places = self._places, self._places + 1
+        return self._aims[number] if number < len(self._aims) else self._spot(self._cameras[-1].end)
+
+    def _spot(self, trus_T_camera: FloatArray) -> Place:
+        """A shot at tissue that a camera that stands there can see."""
+        scene = replace(self.scene, trus_T_camera=(trus_T_camera,))
+        shots = draw_pm_shots(self.config.scene, scene, np.zeros(1, dtype=np.int64), self._shot_rng)
+        return Place(trus_T_camera @ shots.camera_T_marker[0])
+
+    # --- where things are -------------------------------------------------------------------------------------------
+
+    def trus_T_camera(self, t_s: float) -> FloatArray:
+        """(4, 4) the true registration."""
+        return next(move for move in reversed(self._cameras) if move.start_s <= max(t_s, 0.0)).at(t_s)
+
+    def trus_T_marker(self, t_s: float) -> FloatArray:
+        """(4, 4) the marker, with the hand's tremor."""
+        wave = np.sin(2.0 * math.pi * np.array(TREMOR_HZ) * t_s + self._phase).sum(axis=1)
+        still = self._travel.at(t_s)
+        return make_transform(still[:3, :3] @ exp_so3(TREMOR_RAD * wave[:3]), still[:3, 3] + TREMOR_MM * wave[3:])
+
+    def camera_T_marker(self, t_s: float) -> FloatArray:
+        """(4, 4) as the camera sees it."""
+        return np.asarray(inverse(self.trus_T_camera(t_s)) @ self.trus_T_marker(t_s))
+
+    def spot_mm(self, t_s: float) -> FloatArray:
+        """(3,) TRUS point where the beam ends: on the tissue, or in the air where it misses it."""
+        trus_T_laser = self.trus_T_marker(t_s) @ self.marker_T_laser
+        low, high = 0.0, REACH_MM
+        for _ in range(4):
+            lam = np.linspace(low, high, 65)
+            above = self._above_tissue(trus_T_laser[:3, 3] + lam[:, None] * trus_T_laser[:3, 2])
+            inside = np.flatnonzero(above[1:] <= 0.0)
+            if above[0] <= 0.0 or not inside.size:
+                break
+            low, high = float(lam[inside[0]]), float(lam[inside[0] + 1])
+        return np.asarray(trus_T_laser[:3, 3] + 0.5 * (low + high) * trus_T_laser[:3, 2])
+
+    def _above_tissue(self, trus_p_mm: FloatArray) -> FloatArray:
+        """How far (n,) points (n, 3) are outside the tissue's surface, away from the probe."""
+        angle = sweeps.plane_angle_rad(trus_p_mm)
+        surface = self.scene.tissue.point(trus_p_mm[:, 0], angle)
+        return np.asarray(np.hypot(trus_p_mm[:, 1], trus_p_mm[:, 2]) - np.hypot(surface[:, 1], surface[:, 2]))
+
+    def plane_rad(self, t_s: float) -> float:
+        """Angle to which the plane has to turn for the beam's end to be in it."""
+        return float(sweeps.plane_angle_rad(self.spot_mm(t_s)))
+
+    # --- what is taken in -------------------------------------------------------------------------------------------
+
+    def pictures(self, t_s: float, index: int) -> tuple[UInt8Image, UInt8Image]:
+        """Left and right image (h, w) at a time; ``index`` seeds the sensor's noise."""
+        camera_T_trus = inverse(self.trus_T_camera(t_s))
+        camera_T_marker = self.camera_T_marker(t_s)
+        board = self._place.trus_T_board
+        spot = transform_points(camera_T_trus, self.spot_mm(t_s)[None])[0]
+        seed = self.config.seed
+        picture = ShotPicture(
+            camera_T_marker,
+            camera_T_marker @ self.marker_T_laser,
+            spot,
+            seed,
+            (seed, index),
+            None if board is None else camera_T_trus @ board,
+            camera_T_trus if board is None else None,
+        )
+        return picture.render(self.config.scene, right=False), picture.render(self.config.scene, right=True)
+
+    def channel_data(self, t_s: float, scan_rad: float, index: int) -> npt.NDArray[np.int16]:
+        """(elements, samples) what the probe records of a pulse at ``t_s`` with its plane at ``scan_rad``."""
+        config, source = self.config.scene, self.spot_mm(t_s)
+        depth = sweeps.range_mm(source, np.asarray(scan_rad), config.probe.radius_mm)
+        width = float(sweeps.half_width_rad(config.probe.sensitivity, depth)) + self.scene.window_edge_rad
+        return LookPicture(source, scan_rad, width, (self.config.seed, index, 2)).record(config)
