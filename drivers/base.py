@@ -21,6 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,13 +33,16 @@ from fgreg.motion.device import RotationStage, StageError, StageLost, StageStatu
 from fgreg.pairing import Stamp
 
 __all__ = [
+    "Command",
     "DeviceLost",
     "MotionSample",
     "MotionSource",
+    "Operator",
     "PaFrame",
     "PhotoacousticSource",
     "Registration",
     "RotationStage",
+    "Said",
     "StageError",
     "StageLost",
     "StageStatus",
@@ -138,6 +142,43 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Let go of the device."""
+
+
+class Said(StrEnum):
+    """What an operator can say."""
+
+    HOME = "home"
+    AIM = "aim"
+    NEXT = "next"
+    REGISTER = "register"
+    SEARCH = "search"
+    FOLLOW = "follow"
+    MOVED = "moved"
+    STOP = "stop"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Words of the operator.
+
+    ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
+    ``search``, ``follow``: the stage may turn in search of PMs, after the beam; ``next``: leave this spot; ``moved``:
+    the camera has moved; ``stop`` the stage at once.
+    """
+
+    said: Said
+    corner: tuple[int, int] | None = None
+
+
+class Operator(Device, Protocol):
+    """Whoever holds the fibre, and whoever speaks for them: a keyboard, a foot switch, a simulated surgeon."""
+
+    def poll(self) -> Sequence[Command]:
+        """What was said since the last call. Raises DeviceLost."""
+
+    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+        """Something they should know. ``done``: the present spot needs the fibre no longer; ``wants``: what they are
+        asked to say."""
 
 
 class StereoCamera(Device, Protocol):

@@ -183,6 +183,14 @@ class PoseHistory:
         """Time of the newest pose."""
         return self._poses[-1].t_s if self._poses else None
 
+    def newest(self) -> TimedPose | None:
+        """The newest pose."""
+        return self._poses[-1] if self._poses else None
+
+    def since(self, t_s: float) -> tuple[TimedPose, ...]:
+        """The poses from a time on, oldest first."""
+        return tuple(pose for pose in self._poses if pose.t_s >= t_s)
+
     def at(self, t_s: float, max_gap_s: float = MAX_GAP_S) -> TimedPose:
         """:func:`pose_at` in this history."""
         return pose_at(tuple(self._poses), t_s, max_gap_s)

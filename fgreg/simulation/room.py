@@ -18,7 +18,7 @@ from fgreg.models import ChannelModel, NoiseModel
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, default_probe, default_rig
 from fgreg.simulation.pictures import LookPicture, ShotPicture
-from fgreg.simulation.render import UInt8Image
+from fgreg.simulation.render import Optics, UInt8Image
 from fgreg.simulation.scene import Scene, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
 TRAVEL_MM_S, TRAVEL_RAD_S, LEAST_TRAVEL_S = 40.0, math.radians(30.0), 0.8
@@ -73,6 +73,7 @@ def room_config(seed: int = 1, width_px: int = 640, *, aims: int = 10, bump_ever
         noise=NoiseModel(aim_mm=(0.3, 0.3, 0.1)),
         samples=1160,
         snr_db=18.0,
+        optics=Optics(samples=16),
     )
     return RoomConfig(seed=seed, aims=aims, bump_every_s=bump_every_s, scene=scene)
 
@@ -105,6 +106,11 @@ class _Travel:
         )
 
 
+def _at(travels: list[_Travel], t_s: float) -> FloatArray:
+    """Where a body is that travels one way after another."""
+    return next(travel for travel in reversed(travels) if travel.start_s <= max(t_s, 0.0)).at(t_s)
+
+
 class Room:
     """The room. What has happened up to a time does not depend on what is asked afterwards.
 
@@ -126,7 +132,7 @@ class Room:
         self._places = 0
         self._place = self._next_place()
         start = self._place.trus_T_marker
-        self._travel = _Travel(0.0, 0.0, start, start)
+        self._travels: list[_Travel] = [_Travel(0.0, 0.0, start, start)]
 
     def _begin(self) -> list[Place]:
         """A scene in which aims and spots can be seen, and the aims."""
@@ -162,17 +168,17 @@ class Room:
 
     def arrives_s(self) -> float:
         """When the fibre comes (came) to rest at its place."""
-        return self._travel.end_s
+        return self._travels[-1].end_s
 
     def proceed(self, t_s: float) -> Place:
         """The surgeon goes on to the next place, from wherever the fibre is at ``t_s``."""
-        start = self._travel.at(t_s)
+        start = self._travels[-1].at(t_s)
         self._place = self._next_place()
         end = self._place.trus_T_marker
         way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
         turn = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
         took = max(LEAST_TRAVEL_S, way / TRAVEL_MM_S, turn / TRAVEL_RAD_S)
-        self._travel = _Travel(t_s, t_s + took, start, end)
+        self._travels.append(_Travel(t_s, t_s + took, start, end))
         if self._place.corner is None and not math.isfinite(self._bump_due_s):
             self._bump_due_s = self._next_bump(t_s)
         return self._place
@@ -211,12 +217,12 @@ class Room:
 
     def trus_T_camera(self, t_s: float) -> FloatArray:
         """(4, 4) the true registration."""
-        return next(move for move in reversed(self._cameras) if move.start_s <= max(t_s, 0.0)).at(t_s)
+        return _at(self._cameras, t_s)
 
     def trus_T_marker(self, t_s: float) -> FloatArray:
         """(4, 4) the marker, with the hand's tremor."""
         wave = np.sin(2.0 * math.pi * np.array(TREMOR_HZ) * t_s + self._phase).sum(axis=1)
-        still = self._travel.at(t_s)
+        still = _at(self._travels, t_s)
         return make_transform(still[:3, :3] @ exp_so3(TREMOR_RAD * wave[:3]), still[:3, 3] + TREMOR_MM * wave[3:])
 
     def camera_T_marker(self, t_s: float) -> FloatArray:

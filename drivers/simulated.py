@@ -1,0 +1,232 @@
+"""Drivers of the simulated room's devices: they connect to its process (fgreg.drivers.simulated_room).
+
+A connection that is lost is looked for again by itself, as with a real device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from fgreg.drivers.base import Command, DeviceLost, PaFrame, Said, StereoFrame, host_now
+from fgreg.drivers.simulated_wire import WireClosed, receive, send
+from fgreg.errors import FgregError
+from fgreg.pairing import Stamp
+
+AGAIN_S = 0.2
+"""Between attempts to connect."""
+SILENT_S = 0.5
+"""A device that sends by itself and has not for so long is gone."""
+START_S = 60.0
+
+Item = TypeVar("Item")
+
+
+class RoomProcess:
+    """Starts a room, and ends it when closed or when this program ends. Use as a context manager.
+
+    Args:
+        seed, width_px, aims, bump_every_s: of the room (fgreg.simulation.room).
+
+    Attributes:
+        path: of the socket that its devices are reached by.
+
+    Raises:
+        FgregError: it did not start.
+    """
+
+    def __init__(
+        self, seed: int = 1, width_px: int = 640, aims: int = 10, bump_every_s: float = 90.0, *extra: str
+    ) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="fgreg-room-"))  # of mode 0700
+        self.path = self._folder / "socket"
+        words = [sys.executable, "-m", "fgreg.drivers.simulated_room", "--socket", os.fspath(self.path)]
+        words += ["--seed", str(seed), "--width", str(width_px), "--aims", str(aims)]
+        words += ["--bump-every-s", str(bump_every_s), *extra]
+        self._child = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, text=True
+        )
+        said = "" if self._child.stdout is None else self._child.stdout.readline()
+        if said.strip() != "ready":
+            self.close()
+            raise FgregError("the simulated room did not start")
+
+    def __enter__(self) -> RoomProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it."""
+        if self._child.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._child.stdin.close()
+        try:
+            self._child.wait(3.0)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        if self._child.stdout is not None:
+            self._child.stdout.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class _Feed(Generic[Item]):
+    """What one of the room's devices sends, received by a thread; the base of its drivers."""
+
+    def __init__(
+        self, role: str, path: Path, most: int, made: Callable[[dict[str, Any], bytearray], Item], *, sends: bool
+    ) -> None:
+        self._role, self._path, self._made, self._sends = role, path, made, sends
+        self._waiting: deque[Item] = deque()
+        self._most, self._lock = most, threading.Lock()
+        self._connection: socket.socket | None = None
+        self._end, self._lost, self._dropped = threading.Event(), "", 0
+        self._heard_s = -np.inf
+        self._index: int | None = None
+        self._thread = threading.Thread(target=self._run, name=f"simulated {role}", daemon=True)
+        self._thread.start()
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return f"simulated {self._role}"
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device is there, and sends where it should."""
+        return self._connection is not None and (not self._sends or host_now() - self._heard_s < SILENT_S)
+
+    @property
+    def dropped(self) -> int:
+        """How many were lost on the way because nobody fetched them in time."""
+        return self._dropped
+
+    def poll(self) -> Sequence[Item]:
+        """What came since the last call.
+
+        Raises:
+            DeviceLost: the connection is gone; told once.
+        """
+        with self._lock:
+            items, lost = list(self._waiting), self._lost
+            self._waiting.clear()
+            self._lost = ""
+        if lost:
+            raise DeviceLost(lost)
+        return items
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._end.set()
+        self._shut()
+        self._thread.join(2.0)
+
+    def _shut(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+            connection.close()
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            try:
+                connection.connect(os.fspath(self._path))
+                send(connection, {"role": self._role})
+            except (OSError, WireClosed):
+                connection.close()
+                self._end.wait(AGAIN_S)
+                continue
+            self._connection, self._index = connection, None
+            try:
+                while not self._end.is_set():
+                    self._take(*receive(connection))
+            except WireClosed as error:
+                self._shut()
+                if not self._end.is_set():
+                    with self._lock:
+                        self._lost = f"{self.name} is gone ({error})"
+
+    def _take(self, header: dict[str, Any], payload: bytearray) -> None:
+        index = header.get("index")
+        if isinstance(index, int):
+            if self._index is not None:
+                self._dropped += max(0, index - self._index - 1)
+            self._index = index
+        item = self._made(header, payload)
+        self._heard_s = host_now()
+        with self._lock:
+            self._waiting.append(item)
+            while len(self._waiting) > self._most:
+                self._waiting.popleft()
+                self._dropped += 1
+
+
+def _stereo(header: dict[str, Any], payload: bytearray) -> StereoFrame:
+    height, width = header["shape"]
+    both = np.frombuffer(payload, dtype=np.uint8).reshape(2, height, width)
+    return StereoFrame(Stamp(header["device_s"], host_now()), both[0], both[1], header["index"])
+
+
+def _pa(header: dict[str, Any], payload: bytearray) -> PaFrame:
+    data = np.frombuffer(payload, dtype=np.int16).reshape(header["shape"])
+    return PaFrame(Stamp(header["device_s"], host_now()), data, header["index"])
+
+
+def _command(header: dict[str, Any], _payload: bytearray) -> Command:
+    corner = header.get("corner")
+    return Command(Said(header["says"]), None if corner is None else (int(corner[0]), int(corner[1])))
+
+
+class SimulatedCamera(_Feed[StereoFrame]):
+    """The endoscope (StereoCamera)."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("camera", path, 2, _stereo, sends=True)
+
+
+class SimulatedProbe(_Feed[PaFrame]):
+    """Laser and ultrasound machine (PhotoacousticSource)."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("probe", path, 64, _pa, sends=True)
+
+
+class SimulatedOperator(_Feed[Command]):
+    """The surgeon, who says what he does and goes on when he is told that a spot is done (Operator)."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("operator", path, 64, _command, sends=False)
+
+    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:  # noqa: ARG002
+        """He goes on to the next spot, and says what he is asked to say."""
+        connection = self._connection
+        if connection is not None and (done or wants is not None):
+            with contextlib.suppress(WireClosed):
+                send(connection, {"next": done, "say": wants})
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:
+    """Whether a condition came true within some seconds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True

@@ -1,0 +1,247 @@
+"""The simulated operating room as a process of its own: the devices that drivers in fgreg.drivers.simulated connect to.
+
+    python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
+
+Devices, each by a connection that begins with ``{"role": ...}``: ``camera`` and ``probe`` only send; ``stage`` is asked
+and answers; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp with
+clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import queue
+import signal
+import socket
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fgreg.drivers.simulated_wire import WireClosed, receive, send
+from fgreg.simulation.room import Room, RoomConfig, room_config
+
+CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
+"""What the devices' clocks read when the room begins."""
+FRAMES_WAITING, PULSES_WAITING = 2, 64
+"""What a slow receiver may leave unread before the oldest is dropped."""
+SETTLE_S = 0.4
+"""The surgeon says that he aims once the fibre has been still for so long."""
+ROAM_S = 4.0
+"""Where he roams, the surgeon goes on by himself after so long at one place."""
+
+
+@dataclass(slots=True, eq=False)
+class _Client:
+    """A connected driver, and what waits to be sent to it."""
+
+    role: str
+    connection: socket.socket
+    waiting: queue.Queue[tuple[dict[str, Any], tuple[bytes, ...]] | None]
+    gone: threading.Event = field(default_factory=threading.Event)
+
+    def put(self, header: dict[str, Any], *payload: bytes) -> None:
+        """Send soon; where the receiver is slow the oldest is dropped, and its header's ``index`` tells."""
+        while True:
+            try:
+                self.waiting.put_nowait((header, payload))
+                return
+            except queue.Full:
+                with contextlib.suppress(queue.Empty):
+                    self.waiting.get_nowait()
+
+    def run(self) -> None:
+        while not self.gone.is_set():
+            message = self.waiting.get()
+            if message is None:
+                break
+            try:
+                send(self.connection, message[0], *message[1])
+            except WireClosed:
+                break
+        self.close()
+
+    def close(self) -> None:
+        self.gone.set()
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
+        self.connection.close()
+        with contextlib.suppress(queue.Full):
+            self.waiting.put_nowait(None)
+
+
+class RoomServer:
+    """Runs a room in real time and serves its devices.
+
+    Args:
+        room: the world.
+        path: of the Unix socket; its folder should be this user's alone.
+        frame_rate, pulse_rate: of camera and laser, per second.
+        roam: the surgeon goes on by himself at tissue, without being asked.
+    """
+
+    def __init__(
+        self, room: Room, path: Path, *, frame_rate: float = 30.0, pulse_rate: float = 10.0, roam: bool = False
+    ) -> None:
+        self.room, self._frame_rate, self._pulse_rate, self._roam = room, frame_rate, pulse_rate, roam
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._listener.bind(os.fspath(path))
+        self._listener.listen(16)
+        self._lock = threading.Lock()
+        self._clients: list[_Client] = []
+        self._asked: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._end = threading.Event()
+        self._start_s = time.monotonic()
+        self._said_s = -math.inf
+
+    # --- clients ----------------------------------------------------------------------------------------------------
+
+    def _accept(self) -> None:
+        while not self._end.is_set():
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        try:
+            connection.settimeout(5.0)
+            header, _ = receive(connection)
+            connection.settimeout(None)
+        except (WireClosed, OSError):
+            connection.close()
+            return
+        role = header.get("role")
+        if role not in ("camera", "probe", "operator"):
+            connection.close()
+            return
+        client = _Client(role, connection, queue.Queue(FRAMES_WAITING if role == "camera" else PULSES_WAITING))
+        with self._lock:
+            self._clients.append(client)
+        threading.Thread(target=client.run, daemon=True).start()
+        try:
+            while True:
+                header, _ = receive(connection)
+                if role == "operator":
+                    self._asked.put(header)
+        except WireClosed:
+            client.close()
+        with self._lock:
+            self._clients.remove(client)
+
+    def _to(self, role: str) -> list[_Client]:
+        with self._lock:
+            return [client for client in self._clients if client.role == role and not client.gone.is_set()]
+
+    # --- time -------------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        """Seconds since the room began."""
+        return time.monotonic() - self._start_s
+
+    def run(self) -> None:
+        """Until :meth:`stop`."""
+        threading.Thread(target=self._accept, daemon=True).start()
+        frame = pulse = 0
+        while not self._end.is_set():
+            due_frame, due_pulse = frame / self._frame_rate, (pulse + 0.37) / self._pulse_rate
+            due = min(due_frame, due_pulse)
+            wait = due - self.now_s()
+            if wait > 0 and self._end.wait(wait):
+                break
+            now = self.now_s()
+            self._live(now)
+            if due_pulse <= due_frame:
+                self._pulse(due_pulse, pulse)
+                pulse = max(pulse + 1, math.floor((now - 0.2) * self._pulse_rate))
+            else:
+                self._frame(due_frame, frame)
+                frame = max(frame + 1, math.floor(now * self._frame_rate))  # what cannot be kept up with is skipped
+        self._listener.close()
+        for client in list(self._clients):
+            client.close()
+
+    def stop(self) -> None:
+        """End :meth:`run`."""
+        self._end.set()
+
+    def _frame(self, t_s: float, index: int) -> None:
+        clients = self._to("camera")
+        if not clients:
+            return
+        left, right = self.room.pictures(t_s, index)
+        header = {"index": index, "device_s": CAMERA_CLOCK_S + t_s, "shape": list(left.shape)}
+        for client in clients:
+            client.put(header, left.tobytes(), right.tobytes())
+
+    def _pulse(self, t_s: float, index: int) -> None:
+        clients = self._to("probe")
+        if not clients:
+            return
+        data = self.room.channel_data(t_s, self.scan_rad(t_s), index)
+        header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
+        for client in clients:
+            client.put(header, data.tobytes())
+
+    def scan_rad(self, t_s: float) -> float:  # noqa: ARG002
+        """Where the plane stands."""
+        return 0.0
+
+    # --- the surgeon ------------------------------------------------------------------------------------------------
+
+    def _live(self, now_s: float) -> None:
+        """What the surgeon does now, and what happens by itself."""
+        room = self.room
+        room.pass_to(now_s)
+        go_on = False
+        with contextlib.suppress(queue.Empty):
+            while True:
+                asked = self._asked.get_nowait()
+                go_on |= asked.get("next") is True
+                if isinstance(asked.get("say"), str):
+                    self._say({"says": asked["say"]})
+        rested = now_s - room.arrives_s()
+        roams = self._roam and room.place.corner is None and rested > ROAM_S
+        if (go_on and rested > 0) or roams:
+            room.proceed(now_s)
+        elif rested > SETTLE_S and self._said_s < room.arrives_s() and room.place.corner is not None:
+            self._said_s = now_s
+            self._say({"says": "aim", "corner": list(room.place.corner)})
+
+    def _say(self, words: dict[str, Any]) -> None:
+        for client in self._to("operator"):
+            client.put(words)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The process."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--socket", type=Path, required=True, help="where the drivers connect")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--width", type=int, default=640, help="of the camera's images, px")
+    parser.add_argument("--aims", type=int, default=10, help="calibration shots before the surgeon turns to the tissue")
+    parser.add_argument("--bump-every-s", type=float, default=90.0, help="mean time between camera moves; inf: none")
+    given = parser.parse_args(arguments)
+    config: RoomConfig = room_config(given.seed, given.width, aims=given.aims, bump_every_s=given.bump_every_s)
+    server = RoomServer(Room(config), given.socket)
+    signal.signal(signal.SIGTERM, lambda *_: server.stop())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program that started it ends it
+
+    def watch() -> None:
+        sys.stdin.buffer.read()
+        server.stop()
+
+    threading.Thread(target=watch, daemon=True).start()
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    server.run()
+
+
+if __name__ == "__main__":
+    main()

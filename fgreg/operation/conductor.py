@@ -1,0 +1,293 @@
+"""What happens next, and what the stage is asked for: calibration shots, searches for PMs, following the beam.
+
+No devices, no clock of its own, no estimate: :meth:`Conductor.step` gets a view of the moment and returns what it asks
+for. Whether the stage may really turn is decided elsewhere (fgreg.motion): here is only what would be useful.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from fgreg.drivers.base import Command, Said
+from fgreg.estimate import Verdict
+from fgreg.frames import FloatArray
+from fgreg.models import SessionModel
+from fgreg.motion.limits import MotionKind
+from fgreg.operation.hunt import Hunt
+from fgreg.operation.stillness import held_pose, moved_mm, turned_rad
+from fgreg.operation.view import (
+    Action,
+    Ask,
+    Follow,
+    Halt,
+    Heard,
+    StageView,
+    Sweep,
+    TakeAim,
+    TakeMove,
+    TakePairs,
+    Tell,
+    View,
+)
+from fgreg.search.hearing import HearingModel
+from fgreg.search.planner import Found, NotFound, Prediction, SearchPlanner, Turn
+
+SLIP_MM, SLIP_RAD = 1.2, 0.03
+"""A fibre that leaves its pose by more than this during a search has moved: what was heard belongs to no one spot."""
+ANOTHER_MM, ANOTHER_RAD = 3.0, 0.06
+"""A new PM wants the fibre to be held so far from where the last one was taken."""
+WORTH_PREDICTING_RAD = math.radians(8.0)
+"""A prediction less certain than this is no better than a sweep."""
+CHECK_RAD = math.radians(2.0)
+"""While the stage follows, a PM heard with the plane so near to the answer becomes a pair."""
+ASK_AGAIN_S = 10.0
+DEAF = 8
+"""Pulses in a row that are not heard where they should be before the operator is told."""
+
+
+class Stage(StrEnum):
+    """How far the session has come."""
+
+    AIMING = "calibrating"
+    COLLECTING = "registering"
+    FOLLOWING = "following"
+
+
+@dataclass(frozen=True, slots=True)
+class ConductorSettings:
+    """What is wanted.
+
+    Attributes:
+        aims: calibration shots before PMs are searched; the operator can end them earlier.
+        pms: PMs of an epoch after which the stage begins to follow, if the verdict is ok then, or after
+            ``most_pms`` where it is a warning.
+        hearing_threshold: least amplitude that counts as heard, in the unit of the source's amplitudes.
+        follow: whether the stage follows the beam at all.
+    """
+
+    aims: int = 8
+    pms: int = 8
+    most_pms: int = 15
+    hearing_threshold: float = 0.0
+    follow: bool = True
+
+    def __post_init__(self) -> None:
+        if self.aims < 0 or not 1 <= self.pms <= self.most_pms:
+            raise ValueError("aims has to be 0 or more, pms from 1 to most_pms")
+        if not (math.isfinite(self.hearing_threshold) and self.hearing_threshold > 0):
+            raise ValueError(f"hearing_threshold is {self.hearing_threshold}, expected a number > 0")
+
+
+class Conductor:
+    """Conducts one session.
+
+    Args:
+        model: its set-up.
+        settings: what is wanted.
+        next_pm: number of the next PM: beyond those of a session that goes on.
+
+    Attributes:
+        stage: how far the session has come.
+    """
+
+    def __init__(self, model: SessionModel, settings: ConductorSettings, next_pm: int = 0) -> None:
+        self._model, self._settings, self._next_pm = model, settings, next_pm
+        self._hearing = HearingModel.of_session(
+            model.probe.sensitivity, settings.hearing_threshold, scan_sigma_rad=model.noise.scan_rad
+        )
+        low, high = (model.stage.scan_from_device(angle) for angle in model.stage.limits_device_rad)
+        self._field = (min(low, high), max(low, high))
+        self.stage = Stage.AIMING if settings.aims else Stage.COLLECTING
+        self._hunt: Hunt | None = None
+        self._done_at: FloatArray | None = None
+        self._pms, self._epoch = 0, 0
+        self._deaf = 0
+        self._wanted: Said | None = None
+        self._wanted_s = -math.inf
+
+    def step(self, view: View) -> tuple[Action, ...]:
+        """What to do now."""
+        out: list[Action] = []
+        for command in view.commands:
+            out += self._obey(command)
+        if view.known.epoch != self._epoch:
+            self._epoch, self._pms, self._done_at, self._deaf = view.known.epoch, 0, None, 0
+            self._hunt = None
+            out.append(Tell("the camera has moved: the registration begins anew"))
+        self._advance(view, out)
+        if any(isinstance(action, Ask | Halt) for action in out):
+            self._hunt = None
+            return tuple(out)  # what the stage is asked for next depends on how it takes that
+        if view.stage is not None and self._may_turn(view, view.stage, out):
+            searches = view.stage.requested is MotionKind.SEARCH
+            if self.stage is Stage.COLLECTING or (self.stage is Stage.FOLLOWING and searches):
+                self._collect(view, view.stage, out)
+            elif self.stage is Stage.FOLLOWING:
+                self._follow(view, view.stage, out)
+        else:
+            self._hunt = None
+        return tuple(out)
+
+    def _may_turn(self, view: View, stage: StageView, out: list[Action]) -> bool:
+        """Whether the stage knows its zero and has the operator's request for what comes next; asks where not."""
+        if not stage.homed:
+            self._want(Said.HOME, "the stage has to find its zero position", view.now_s, out)
+            return False
+        if self.stage is Stage.COLLECTING and stage.requested is not MotionKind.SEARCH:
+            self._want(Said.SEARCH, "the stage has to turn in search of PMs", view.now_s, out)
+            return False
+        if self.stage is Stage.FOLLOWING and self._settings.follow and self._hunt is None:
+            answered = view.answer is not None and view.answer.stage_rad is not None
+            if answered and stage.requested is not MotionKind.TRACK:
+                self._want(Said.FOLLOW, "the stage is ready to follow the beam", view.now_s, out)
+            elif not answered and view.answer is not None and stage.requested is MotionKind.TRACK:
+                self._want(Said.SEARCH, f"{view.answer.reason}: hold it still and search here", view.now_s, out)
+        return True
+
+    def _want(self, said: Said, text: str, now_s: float, out: list[Action]) -> None:
+        """Ask the operator, and again after a while."""
+        if self._wanted == said and now_s - self._wanted_s < ASK_AGAIN_S:
+            return
+        self._wanted, self._wanted_s = said, now_s
+        out.append(Tell(text, wants=said))
+
+    # --- the session's course ---------------------------------------------------------------------------------------
+
+    def _obey(self, command: Command) -> list[Action]:
+        match command.said:
+            case Said.HOME:
+                return [Ask(MotionKind.HOME)]
+            case Said.SEARCH:
+                return [Ask(MotionKind.SEARCH)]
+            case Said.FOLLOW:
+                return [Ask(MotionKind.TRACK)]
+            case Said.AIM if command.corner is not None:
+                return [TakeAim(command.corner)]
+            case Said.REGISTER if self.stage is Stage.AIMING:
+                self.stage = Stage.COLLECTING
+            case Said.NEXT:
+                self._hunt = None
+            case Said.MOVED:
+                return [TakeMove()]
+            case Said.STOP:
+                self._hunt = None
+                return [Halt("the operator has stopped the stage")]
+        return []
+
+    def _advance(self, view: View, out: list[Action]) -> None:
+        known = view.known
+        usable = known.registered and known.verdict is not Verdict.REFUSED
+        if self.stage is Stage.AIMING and view.aims >= self._settings.aims:
+            self.stage = Stage.COLLECTING
+            out.append(Tell("calibrated: hold the fibre at the tissue", done=True))
+        elif self.stage is Stage.COLLECTING and usable:
+            enough = self._settings.pms if known.verdict is Verdict.OK else self._settings.most_pms
+            if self._pms >= enough and self._hunt is None:
+                self.stage = Stage.FOLLOWING
+                out.append(Tell("registered", done=True))
+        elif self.stage is Stage.FOLLOWING and not usable:
+            self.stage, self._pms = Stage.COLLECTING, 0
+            why = known.reasons[0] if known.reasons else "no registration"
+            out += [Halt(f"the registration is refused: {why}"), Tell("hold the fibre at the tissue: registering")]
+
+    # --- searching --------------------------------------------------------------------------------------------------
+
+    def _collect(self, view: View, stage: StageView, out: list[Action]) -> None:
+        held = held_pose(view.poses, view.now_s)
+        if self._hunt is None:
+            if held is None or not self._is_another(held):
+                return
+            self._hunt = self._begin(view, stage, held, cold=False)
+        elif (slipped := self._slipped(view, self._hunt)) is not None:
+            self._hunt = None
+            if slipped:
+                out.append(Tell(f"{slipped}: hold it still"))
+            return
+        step = self._hunt.step(view.now_s, stage, view.heard)
+        if isinstance(step, Turn):
+            out.append(Sweep(step.scan_rad, step.reason))
+        elif isinstance(step, Found):
+            self._found(self._hunt, step, out)
+        elif isinstance(step, NotFound):
+            self._not_found(view, stage, self._hunt, step, out)
+
+    def _begin(self, view: View, stage: StageView, held: FloatArray, *, cold: bool) -> Hunt:
+        low, high = self._field
+        prediction, answer = None, view.answer
+        if not cold and answer is not None and answer.stage_rad is not None and answer.sigma_rad is not None:
+            at, sigma = self._model.stage.scan_from_device(answer.stage_rad), max(answer.sigma_rad, 1e-3)
+            if low <= at <= high and sigma <= WORTH_PREDICTING_RAD and view.known.verdict is not Verdict.REFUSED:
+                prediction = Prediction(at, sigma)
+        stands = min(max(stage.scan_rad, low), high)
+        planner = SearchPlanner(self._hearing, low, high, stands, prediction)
+        return Hunt(planner, held, prediction is None, self._settings.hearing_threshold, view.now_s, [])
+
+    def _found(self, hunt: Hunt, found: Found, out: list[Action]) -> None:
+        self._hunt, self._done_at = None, hunt.held
+        looks = tuple(look for look in hunt.kept(found, self._model) if look.marker is not None)
+        if not looks:
+            why = next((look.unpaired for look in hunt.looks if look.unpaired), "the looks were off the window")
+            out.append(Tell(f"the PM was heard, but cannot be paired ({why}): go on to the next spot", done=True))
+            return
+        out.append(TakePairs(self._next_pm, looks))
+        self._next_pm += 1
+        self._pms += 1
+        turn, sigma = math.degrees(found.scan_rad), math.degrees(found.sigma_rad)
+        text = f"PM heard at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions: go on to the next spot"
+        out.append(Tell(text, done=True))
+
+    def _not_found(self, view: View, stage: StageView, hunt: Hunt, why: NotFound, out: list[Action]) -> None:
+        if not hunt.cold:
+            self._hunt = self._begin(view, stage, hunt.held, cold=True)
+            out.append(Tell(f"{why.reason}: searching the whole field"))
+            return
+        self._hunt, self._done_at = None, hunt.held
+        out.append(Tell(f"{why.reason}: go on to the next spot", done=True))
+
+    def _slipped(self, view: View, hunt: Hunt) -> str | None:
+        """Why a search is over; None where it goes on."""
+        newest = view.poses.newest()
+        if newest is None or view.now_s - newest.t_s > 1.0:
+            return "the marker is not seen"
+        pose = newest.parent_T_child
+        if moved_mm(pose, hunt.held) > SLIP_MM or turned_rad(pose, hunt.held) > SLIP_RAD:
+            return "the fibre has moved during the search"
+        return None
+
+    def _is_another(self, held: FloatArray) -> bool:
+        """Whether the fibre is held elsewhere than where the last PM was taken."""
+        if self._done_at is None:
+            return True
+        return moved_mm(held, self._done_at) > ANOTHER_MM or turned_rad(held, self._done_at) > ANOTHER_RAD
+
+    # --- following --------------------------------------------------------------------------------------------------
+
+    def _follow(self, view: View, stage: StageView, out: list[Action]) -> None:
+        answer, newest = view.answer, view.poses.newest()
+        if answer is None or answer.stage_rad is None or answer.sigma_rad is None or newest is None:
+            return
+        plane = self._model.stage.scan_from_device(answer.stage_rad)
+        if self._settings.follow and stage.requested is MotionKind.TRACK:
+            reason = f"following the beam, +- {math.degrees(answer.sigma_rad):.1f} deg"
+            out.append(Follow(plane, answer.sigma_rad, newest.t_s, reason))
+        held = held_pose(view.poses, view.now_s)
+        if held is None or abs(stage.scan_rad - plane) > CHECK_RAD:
+            self._deaf = 0
+            return
+        for pulse in view.heard:
+            if pulse.scan_rad is None or abs(pulse.scan_rad - plane) > CHECK_RAD:
+                continue
+            loud = pulse.amplitude is not None and pulse.amplitude >= self._settings.hearing_threshold
+            self._deaf = 0 if loud else self._deaf + 1
+            if loud and pulse.marker is not None and self._is_another(held):
+                self._done_at = held
+                out.append(TakePairs(self._next_pm, (pulse,)))
+                self._next_pm += 1
+                self._pms += 1
+        if self._deaf == DEAF:
+            out.append(Tell("the PM is not heard where the registration expects it: has the camera moved?"))
+
+
+__all__ = ["Conductor", "ConductorSettings", "Heard", "Stage"]

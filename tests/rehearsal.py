@@ -1,0 +1,234 @@
+"""A session conducted in a simulated room in made-up time: no processes, no pictures, observations with known noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.drivers.base import Command, Said
+from fgreg.drivers.simulated_stage import SimulatedStage
+from fgreg.errors import InputError
+from fgreg.frames import FloatArray, as_float_array, exp_so3, make_transform
+from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track
+from fgreg.models import SessionModel
+from fgreg.motion.limits import MotionKind
+from fgreg.online import OnlineRegistration
+from fgreg.operation.conductor import Conductor, ConductorSettings
+from fgreg.operation.view import (
+    Action,
+    Ask,
+    Follow,
+    Halt,
+    Heard,
+    Known,
+    StageView,
+    Sweep,
+    TakeAim,
+    TakeMove,
+    TakePairs,
+    Tell,
+    View,
+)
+from fgreg.pairing import PairRefused, PoseHistory, TimedPose
+from fgreg.session.setup import read_setup
+from fgreg.simulation.documents import session_document
+from fgreg.simulation.room import Room
+
+SIGMA_RAD, SIGMA_MM = 0.003, np.array([0.05, 0.05, 0.2])
+FRAME_S, PULSE_S = 1.0 / 30.0, 0.1
+TRACK_SIGMA_RAD = math.radians(2.0)
+
+
+@dataclass(eq=False)
+class Rehearsal:
+    """One session; :meth:`run` lets time pass.
+
+    Attributes:
+        obliging: the operator says what he is asked to say.
+        deaf_from_s: from then on the probe hears nothing. blind_from_s: nor does the camera see the marker.
+        told: all that the operator was told, with the time. asked: all actions but words.
+        errors_deg: while the stage follows a beam held still, how far its plane is off, at the end of each hold.
+    """
+
+    room: Room
+    threshold: float = 0.45
+    obliging: bool = True
+    deaf_from_s: float = math.inf
+    blind_from_s: float = math.inf
+    now_s: float = 0.0
+    told: list[tuple[float, Tell]] = field(default_factory=list)
+    asked: list[tuple[float, Action]] = field(default_factory=list)
+    errors_deg: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        config = self.room.config.scene
+        problems: list[InputError] = []
+        model = read_setup(session_document(config), "session.yaml", "room", problems).model
+        assert model is not None, problems
+        self.model: SessionModel = model
+        self.stage = SimulatedStage(self.model.stage, device_rad=math.radians(20.0), clock=lambda: self.now_s)
+        self.engine = OnlineRegistration(self.model, SolveConfig(), judge="inline")
+        settings = ConductorSettings(aims=self.room.config.aims, hearing_threshold=self.threshold)
+        self.conductor = Conductor(self.model, settings)
+        self.poses = PoseHistory()
+        self.requested: MotionKind | None = None
+        self._rng = np.random.default_rng(self.room.config.seed)
+        self._said: list[Command] = []
+        self._aimed_s, self._next_pulse, self._number, self._aims = -math.inf, 0.0, 0, 0
+        self._noted_s = -math.inf
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        end = self.now_s + seconds
+        while self.now_s < end:
+            self._frame()
+
+    def _frame(self) -> None:
+        self.now_s += FRAME_S
+        room, now = self.room, self.now_s
+        room.pass_to(now)
+        if now < self.blind_from_s:
+            self.poses.add(self._observed(now))
+        status = self.stage.status()
+        heard = []
+        while self._next_pulse <= now - FRAME_S:  # the poses about it are there
+            heard.append(self._pulse(self._next_pulse, status.moving))
+            self._next_pulse += PULSE_S
+        estimate = self.engine.estimate
+        answer = None
+        newest = self.poses.newest()
+        if newest is not None and estimate.trus_T_camera is not None:
+            answer = self.engine.track(Track(now, estimate.epoch, self._marker(newest), (), status.scan_rad))
+        place = room.place
+        if place.corner is not None and self._aimed_s < room.arrives_s() < now - 0.5:
+            self._aimed_s = now
+            self._said.append(Command(Said.AIM, place.corner))
+        view = View(
+            now,
+            self.poses,
+            StageView(status.scan_rad, status.moving, status.homed, now, self.requested),
+            tuple(heard),
+            tuple(self._said),
+            Known(
+                estimate.verdict,
+                estimate.reasons,
+                estimate.epoch,
+                estimate.pairs,
+                estimate.trus_T_camera is not None,
+            ),
+            answer,
+            self._aims,
+        )
+        self._said = []
+        for action in self.conductor.step(view):
+            self._do(action)
+        resting = now - room.arrives_s()
+        answered = answer is not None and answer.stage_rad is not None
+        if resting > 5.0 and self._noted_s < room.arrives_s() and self.requested is MotionKind.TRACK and answered:
+            self._noted_s = now
+            if answer is not None and answer.sigma_rad is not None and answer.sigma_rad < TRACK_SIGMA_RAD:
+                self.errors_deg.append(math.degrees(abs(status.scan_rad - room.plane_rad(now))))
+            room.proceed(now)
+
+    def _do(self, action: Action) -> None:
+        if not isinstance(action, Tell):
+            self.asked.append((self.now_s, action))
+        match action:
+            case Ask(kind):
+                self.requested = kind
+                if kind is MotionKind.HOME:
+                    self.stage.home(math.radians(10.0))
+                    self.requested = None
+            case Sweep(scan_rad):
+                assert self.requested is MotionKind.SEARCH
+                self.stage.move_to(scan_rad, math.radians(20.0))
+            case Follow(scan_rad):
+                assert self.requested is MotionKind.TRACK
+                self.stage.move_to(scan_rad, math.radians(20.0))
+            case Halt():
+                self.requested = None
+                self.stage.stop()
+            case TakeAim():
+                self._aim()
+            case TakeMove():
+                raise AssertionError("nobody told a move")
+            case TakePairs(pm, looks):
+                for look in looks:
+                    self._pair(pm, look)
+            case Tell():
+                self.told.append((self.now_s, action))
+                if action.wants is not None and self.obliging:
+                    self._said.append(Command(action.wants))
+                if action.done:
+                    self.room.proceed(self.now_s)
+
+    def _observed(self, t_s: float) -> TimedPose:
+        true = self.room.camera_T_marker(t_s)
+        turn = exp_so3(SIGMA_RAD * self._rng.standard_normal(3))
+        pose = make_transform(true[:3, :3] @ turn, true[:3, 3] + SIGMA_MM * self._rng.standard_normal(3))
+        about = true[:3, :3].T @ np.diag(SIGMA_MM**2) @ true[:3, :3]
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3], covariance[3:, 3:] = SIGMA_RAD**2 * np.eye(3), about
+        return TimedPose(t_s, pose, as_float_array(covariance, 6, 6))
+
+    def _pulse(self, t_s: float, moving: bool) -> Heard:
+        room, config, rng = self.room, self.room.config.scene, self._rng
+        scan = self.stage.model.scan_from_device(self.stage.device_rad)
+        source = room.spot_mm(t_s)
+        marker, unpaired = None, ""
+        try:
+            marker = self.poses.at(t_s)
+        except PairRefused as error:
+            unpaired = str(error)
+        radius = config.probe.radius_mm
+        distance = math.hypot(source[1] - radius * math.sin(scan), source[2] - radius * math.cos(scan))
+        width = math.radians(6.0) + room.scene.window_edge_rad
+        amplitude = float(config.elevation.amplitude(room.plane_rad(t_s) - scan, width))
+        amplitude *= math.exp(0.05 * rng.standard_normal())
+        where = None if moving else scan + config.noise.scan_rad * rng.standard_normal()
+        if amplitude < self.threshold or t_s >= self.deaf_from_s:
+            return Heard(t_s, where, marker, unpaired)
+        x = float(source[0]) + config.noise.lateral_mm * rng.standard_normal()
+        covariance = np.diag([config.noise.lateral_mm**2, config.noise.range_mm**2])
+        distance += config.noise.range_mm * rng.standard_normal()
+        return Heard(t_s, where, marker, unpaired, x, distance, covariance, amplitude)
+
+    def _marker(self, pose: TimedPose) -> MarkerObservation:
+        self._number += 1
+        return MarkerObservation(
+            as_float_array(pose.parent_T_child, 4, 4), as_float_array(pose.covariance, 6, 6), self._number
+        )
+
+    def _aim(self) -> None:
+        newest, place = self.poses.newest(), self.room.place
+        assert newest is not None
+        assert place.corner is not None
+        assert place.trus_T_board is not None
+        square = self.room.config.scene.board.square_mm
+        spot = place.trus_T_board @ np.array([place.corner[0] * square, place.corner[1] * square, 0.0, 1.0])
+        camera_p = (np.linalg.inv(self.room.trus_T_camera(self.now_s)) @ spot)[:3]
+        self.engine.add(Aim(self.now_s, self._marker(newest), camera_p, 0.3**2 * np.eye(3)))
+        self._aims += 1
+        self.room.proceed(self.now_s)
+
+    def _pair(self, pm: int, look: Heard) -> None:
+        assert look.marker is not None
+        assert look.scan_rad is not None
+        assert look.x_mm is not None
+        assert look.range_mm is not None
+        assert look.covariance is not None
+        noise = self.model.noise
+        made = Look(look.scan_rad, noise.scan_rad, look.x_mm, look.range_mm, look.covariance, 0, look.amplitude)
+        self.engine.add(Pair(self.now_s, pm, 0, self._marker(look.marker), made))
+
+    def error_mm(self) -> float:
+        """Largest error of the registration at the targets; infinite without one."""
+        estimate = self.engine.estimate
+        if estimate.trus_T_camera is None:
+            return math.inf
+        targets: FloatArray = np.column_stack([self.model.targets_mm, np.ones(len(self.model.targets_mm))])
+        wrong = estimate.trus_T_camera @ np.linalg.inv(self.room.trus_T_camera(self.now_s))
+        return float(np.linalg.norm((targets @ wrong.T - targets)[:, :3], axis=1).max())
