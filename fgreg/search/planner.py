@@ -54,7 +54,7 @@ class SearchSettings:
     passes: int = 2
 
     def __post_init__(self) -> None:
-        if not (0 < self.stop_sigma_rad and self.most_positions >= 1 and self.passes >= 1):
+        if not (self.stop_sigma_rad > 0 and self.most_positions >= 1 and self.passes >= 1):
             raise ValueError("stop_sigma_rad has to be > 0, most_positions and passes at least 1")
 
 
