@@ -1,4 +1,4 @@
-"""The search for a PM: steps that jump no window, few positions, an honest sigma, and giving up where there is nothing."""
+"""The search for a PM: steps that jump no window, few positions, an honest sigma, and giving up where nothing is."""
 
 from __future__ import annotations
 

@@ -226,9 +226,9 @@ def main() -> int:
         return search
 
     print(
-        f"{count} PMs, field {FIELD_DEG[1] - FIELD_DEG[0]:g} deg, heard from amplitude {THRESHOLD:g} on, noise {NOISE:.0%}, "
-        f"peaks {strong[0]:g} to {strong[1]:g}, half width {HALF_WIDTH_DEG:g} deg; search ends at sigma "
-        f"{math.degrees(settings.stop_sigma_rad):.2f} deg"
+        f"{count} PMs, field {FIELD_DEG[1] - FIELD_DEG[0]:g} deg, heard from amplitude {THRESHOLD:g} on, "
+        f"noise {NOISE:.0%}, peaks {strong[0]:g} to {strong[1]:g}, half width {HALF_WIDTH_DEG:g} deg; "
+        f"search ends at sigma {math.degrees(settings.stop_sigma_rad):.2f} deg"
     )
     print(
         f"{'':<34}{'stops':>7} {'with it':>7} {'most':>5}   {'mean':>6} {'95 %':>6} {'worst':>6}  "
