@@ -24,6 +24,7 @@ import numpy as np
 from fgreg.drivers.base import Command, DeviceLost, PaFrame, Said, StereoFrame, host_now
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
+from fgreg.motion.device import MAX_CALL_S, StageLost, StageStatus
 from fgreg.pairing import Stamp
 
 AGAIN_S = 0.2
@@ -220,6 +221,64 @@ class SimulatedOperator(_Feed[Command]):
         if connection is not None and (done or wants is not None):
             with contextlib.suppress(WireClosed):
                 send(connection, {"next": done, "say": wants})
+
+
+class RoomStage:
+    """The room's stage (RotationStage): every call asks the room and has its answer within the time allowed.
+
+    Args:
+        path: of the room's socket.
+
+    Raises:
+        StageLost: the room is not there.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._connection.settimeout(MAX_CALL_S)
+        try:
+            self._connection.connect(os.fspath(path))
+            send(self._connection, {"role": "stage"})
+        except (OSError, WireClosed) as error:
+            self._connection.close()
+            raise StageLost(f"simulated stage: the room is not there ({error})") from None
+
+    def _ask(self, what: str, **more: float) -> StageStatus:
+        try:
+            send(self._connection, {"do": what, **more})
+            told, _ = receive(self._connection)
+            now = host_now()
+            return StageStatus(
+                Stamp(told["device_s"], now),
+                told["scan"],
+                told["velocity"],
+                told["moving"],
+                told["homing"],
+                told["homed"],
+            )
+        except (WireClosed, KeyError) as error:
+            self._connection.close()
+            raise StageLost(f"simulated stage: gone ({error})") from None
+
+    def home(self, speed_rad_s: float) -> None:
+        """Begin to look for the zero position."""
+        self._ask("home", speed=speed_rad_s)
+
+    def move_to(self, scan_rad: float, speed_rad_s: float) -> None:
+        """Begin to turn to a plane angle."""
+        self._ask("move", scan=scan_rad, speed=speed_rad_s)
+
+    def stop(self) -> None:
+        """Brake."""
+        self._ask("stop")
+
+    def status(self) -> StageStatus:
+        """What it reports now."""
+        return self._ask("status")
+
+    def close(self) -> None:
+        """Let go of it."""
+        self._connection.close()
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.simulation.room import Room, RoomConfig, room_config
 
@@ -30,6 +31,8 @@ CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
 """What the devices' clocks read when the room begins."""
 FRAMES_WAITING, PULSES_WAITING = 2, 64
 """What a slow receiver may leave unread before the oldest is dropped."""
+STAGE_BEGINS_RAD = math.radians(-17.0)
+"""Where the stage stands when the room begins; it does not know."""
 SETTLE_S = 0.4
 """The surgeon says that he aims once the fibre has been still for so long."""
 ROAM_S = 4.0
@@ -96,6 +99,8 @@ class RoomServer:
         self._clients: list[_Client] = []
         self._asked: queue.Queue[dict[str, Any]] = queue.Queue()
         self._end = threading.Event()
+        self._stage = SimulatedStage(room.config.scene.stage, device_rad=STAGE_BEGINS_RAD)
+        self._stage_lock = threading.Lock()
         self._start_s = time.monotonic()
         self._said_s = -math.inf
 
@@ -118,6 +123,9 @@ class RoomServer:
             connection.close()
             return
         role = header.get("role")
+        if role == "stage":
+            self._turn(connection)
+            return
         if role not in ("camera", "probe", "operator"):
             connection.close()
             return
@@ -134,6 +142,17 @@ class RoomServer:
             client.close()
         with self._lock:
             self._clients.remove(client)
+
+    def _turn(self, connection: socket.socket) -> None:
+        """The stage: one answer to each command, until the other end leaves."""
+        try:
+            while True:
+                header, _ = receive(connection)
+                with self._stage_lock:
+                    answer = _do(self._stage, header)
+                send(connection, answer)
+        except WireClosed:
+            connection.close()
 
     def _to(self, role: str) -> list[_Client]:
         with self._lock:
@@ -184,14 +203,16 @@ class RoomServer:
         clients = self._to("probe")
         if not clients:
             return
-        data = self.room.channel_data(t_s, self.scan_rad(t_s), index)
+        data = self.room.channel_data(t_s, self.scan_rad(), index)
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
         for client in clients:
             client.put(header, data.tobytes())
 
-    def scan_rad(self, t_s: float) -> float:  # noqa: ARG002
-        """Where the plane stands."""
-        return 0.0
+    def scan_rad(self) -> float:
+        """Where the plane truly stands."""
+        with self._stage_lock:
+            self._stage.status()
+            return self._stage.model.scan_from_device(self._stage.device_rad)
 
     # --- the surgeon ------------------------------------------------------------------------------------------------
 
@@ -217,6 +238,26 @@ class RoomServer:
     def _say(self, words: dict[str, Any]) -> None:
         for client in self._to("operator"):
             client.put(words)
+
+
+def _do(stage: SimulatedStage, header: dict[str, Any]) -> dict[str, Any]:
+    """Carry out a command of the stage's driver; what the stage reports then. Angles rad, TRUS convention."""
+    match header.get("do"):
+        case "home":
+            stage.home(float(header["speed"]))
+        case "move":
+            stage.move_to(float(header["scan"]), float(header["speed"]))
+        case "stop":
+            stage.stop()
+    status = stage.status()
+    return {
+        "device_s": status.stamp.device_s,
+        "scan": status.scan_rad,
+        "velocity": status.velocity_rad_s,
+        "moving": status.moving,
+        "homing": status.homing,
+        "homed": status.homed,
+    }
 
 
 def main(arguments: list[str] | None = None) -> None:

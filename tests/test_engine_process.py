@@ -1,0 +1,106 @@
+"""The online registration in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgreg.config import SolveConfig
+from fgreg.errors import EventRefused
+from fgreg.measurements import Measurements, Track
+from fgreg.models import SessionModel
+from fgreg.online import OnlineRegistration
+from fgreg.online.engine_process import EngineGone, EngineProcess
+from fgreg.online.events import OnlineEvent
+from fgreg.tracking import fast_track
+from tests.forward import make_measurements
+
+Case = tuple[SessionModel, Measurements]
+
+
+def events(measurements: Measurements) -> tuple[OnlineEvent, ...]:
+    return (*measurements.aims, *measurements.pairs)
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    model, measurements, _ = make_measurements(np.random.default_rng(5), aims=10, pairs=12)
+    return model, measurements
+
+
+@pytest.fixture(scope="module")
+def started(case: Case) -> Iterator[EngineProcess]:
+    """After all events of the case."""
+    with EngineProcess(case[0], SolveConfig(), None) as engine:
+        for event in events(case[1]):
+            engine.add(event)
+        yield engine
+
+
+def test_it_says_what_the_engine_says(case: Case, started: EngineProcess) -> None:
+    model, measurements = case
+    here = OnlineRegistration(model, judge=None)
+    for event in events(measurements):
+        known = here.add(event)
+    there = started.refresh()
+    assert there.optimum_trus_T_camera is not None
+    assert known.optimum_trus_T_camera is not None
+    np.testing.assert_allclose(there.optimum_trus_T_camera, known.optimum_trus_T_camera, atol=1e-7)
+    assert there.pairs == known.pairs
+    taken = started.measurements()
+    assert len(taken.pairs) == len(measurements.pairs)
+    beam, wanted = started.marker_T_laser(), here.marker_T_laser()
+    assert beam is not None
+    assert wanted is not None
+    np.testing.assert_allclose(beam, wanted, atol=1e-7)
+
+
+def test_queries_are_answered_from_its_snapshot(case: Case, started: EngineProcess) -> None:
+    settled = started.settle()
+    assert settled.settled
+    pair = case[1].pairs[3]
+    query = Track(pair.t, 0, pair.marker, (pair.look,))
+    reader = started.reader()
+    answer = fast_track(query, reader.snapshot())
+    assert answer.stage_rad is not None
+    assert answer.stage_rad == started.track(query).stage_rad
+    reader.close()
+
+
+def test_a_refused_event_is_refused_here_and_later_ones_work(case: Case, started: EngineProcess) -> None:
+    pair = case[1].pairs[-1]
+    late = started.refresh().t
+    with pytest.raises(EventRefused, match="before the last event"):
+        started.add(replace(pair, t=late - 50.0))
+    wrong = replace(pair, t=late + 1.0, look=replace(pair.look, range_mm=float("nan")))
+    with pytest.raises(EventRefused, match="range_mm"):
+        started.add(wrong)
+    assert started.add(replace(pair, t=late + 2.0, pm=77)).pairs >= 12
+
+
+def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:
+    engine = EngineProcess(case[0], SolveConfig(), None)
+    engine.add(case[1].aims[0])
+    pid = engine._process.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    engine._process.join()
+    with pytest.raises(EngineGone, match="open the session again"):
+        engine.add(case[1].aims[1])
+    began = time.monotonic()
+    engine.close()
+    assert not engine.alive
+    assert time.monotonic() - began < 3.0
+
+
+def test_it_ends_with_its_owner(case: Case) -> None:
+    engine = EngineProcess(case[0], SolveConfig(), None)
+    engine._connection.close()
+    engine._process.join(10.0)
+    assert engine._process.exitcode == 0
