@@ -1,0 +1,144 @@
+"""Records events and has them estimated, on a thread of its own: the loop hands over and goes on.
+
+Nothing that was handed over is dropped: what waits is counted, and what the disk refuses is said. Each event is on disk
+before it is counted as recorded (fgreg.session.journal).
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from fgreg.errors import EventRefused, FgregError
+from fgreg.estimate import Verdict
+from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent
+from fgreg.live import LiveSession
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.operation.view import Known
+
+REFRESH_S = 0.2
+"""Between looks at what was found out meanwhile."""
+
+Recorded = AimEvent | PairEvent | CameraMovedEvent | NoteEvent
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderState:
+    """What has become of the events.
+
+    Attributes:
+        known: of the estimate. estimate: itself.
+        aims, pairs: on disk and taken in. refused: on disk, and not taken in. waiting: handed over, not on disk yet.
+        trouble: the last thing that went wrong; empty where nothing is.
+    """
+
+    known: Known
+    estimate: OnlineEstimate | None = None
+    aims: int = 0
+    pairs: int = 0
+    refused: int = 0
+    waiting: int = 0
+    trouble: str = ""
+
+
+OnTaken = Callable[[Recorded, OnlineEstimate | None], None]
+
+
+class Recorder:
+    """One session's recorder.
+
+    Args:
+        session: opened; the recorder is the only one that adds to it from now on.
+        on_taken: called on the recorder's thread after each event that was taken in.
+    """
+
+    def __init__(self, session: LiveSession, on_taken: OnTaken | None = None) -> None:
+        self._session, self._on_taken = session, on_taken
+        self._waiting: queue.Queue[Recorded | None] = queue.Queue()
+        self._lock = threading.Lock()
+        taken = session.measurements()
+        self._state = RecorderState(
+            known_of(session.estimate), session.estimate, aims=len(taken.aims), pairs=len(taken.pairs)
+        )
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="recorder")
+        self._thread.start()
+
+    @property
+    def state(self) -> RecorderState:
+        """As it is now."""
+        with self._lock:
+            return replace(self._state, waiting=self._waiting.qsize())
+
+    def hand_over(self, event: Recorded) -> None:
+        """Have an event recorded, and return at once.
+
+        Raises:
+            RuntimeError: after :meth:`close`.
+        """
+        if self._ended:
+            raise RuntimeError("the recorder is closed")
+        self._waiting.put(event)
+
+    def close(self) -> None:
+        """Record what still waits, then end."""
+        if not self._ended:
+            self._ended = True
+            self._waiting.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                event = self._waiting.get(timeout=REFRESH_S)
+            except queue.Empty:
+                self._refresh()
+                continue
+            if event is None:
+                return
+            self._take(event)
+
+    def _take(self, event: Recorded) -> None:
+        aims = pairs = refused = 0
+        trouble, estimate = "", self._session.estimate
+        try:
+            if isinstance(event, NoteEvent):
+                self._session.record(event)
+            else:
+                estimate = self._session.add(event)
+                aims, pairs = int(isinstance(event, AimEvent)), int(isinstance(event, PairEvent))
+        except EventRefused as error:
+            refused, trouble = 1, f"an event was refused: {error.reason}"
+        except FgregError as error:
+            refused, trouble = 1, str(error)
+        with self._lock:
+            before = self._state
+            self._state = RecorderState(
+                known_of(estimate),
+                estimate,
+                before.aims + aims,
+                before.pairs + pairs,
+                before.refused + refused,
+                trouble=trouble,
+            )
+        if self._on_taken is not None and not refused:
+            self._on_taken(event, estimate)
+
+    def _refresh(self) -> None:
+        try:
+            estimate = self._session.refresh()
+        except FgregError as error:
+            with self._lock:
+                self._state = replace(self._state, trouble=str(error))
+            return
+        with self._lock:
+            self._state = replace(self._state, known=known_of(estimate), estimate=estimate)
+
+
+def known_of(estimate: OnlineEstimate | None) -> Known:
+    """What the conductor wants to know of an estimate."""
+    if estimate is None:
+        return Known(Verdict.REFUSED)
+    return Known(estimate.verdict, estimate.reasons, estimate.epoch, estimate.pairs, estimate.trus_T_camera is not None)

@@ -1,0 +1,184 @@
+"""What comes from camera and probe, made into poses and pulses on the host's clock.
+
+The marker is looked for in the newest frame only, older ones are dropped and counted. Pulses are never dropped: the
+source is located in a process of its own, and a pulse is handed on once the marker's poses about it are known.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.detection.find import NoSignal, PaFind
+from fgreg.detection.joint import NotFound
+from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
+from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.detection.photoacoustic import locate_in_frame
+from fgreg.drivers.base import PaFrame, StereoFrame
+from fgreg.models import ProbeModel, SessionModel
+from fgreg.operation.view import Heard
+from fgreg.pairing import DeviceClock, PairRefused, PoseHistory, TimedPose
+
+POOL_EVERY, POOL_OVER = 15, 60
+"""The corner noise is pooled anew after so many markers found, over so many."""
+GIVE_UP_S = 0.5
+"""A pulse waits for the poses about it no longer than this."""
+STOOD_RAD = 0.002
+"""The plane stands if it has turned by no more than this about the pulse."""
+
+
+class Eyes:
+    """Marker poses from frames."""
+
+    def __init__(self, model: SessionModel) -> None:
+        if model.camera is None or model.marker is None:
+            raise ValueError("the session has no camera or no marker")
+        self._rig, self._marker = model.camera, model.marker
+        self._clock = DeviceClock()
+        self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
+        self._noise: CornerNoise = pool_corner_noise(())
+        self._found = 0
+        self.poses = PoseHistory()
+        self.missing = ""
+        self.newest: StereoFrame | None = None
+
+    def see(self, frame: StereoFrame) -> TimedPose | None:
+        """The marker's pose at the frame's exposure; None, and ``missing`` says why, where it is not found."""
+        t_s = self._clock.host_time(frame.stamp)
+        fit = detect_marker(frame.left, frame.right, self._rig, self._marker)
+        self.newest = frame
+        if isinstance(fit, NotFound):
+            self.missing = fit.reason
+            return None
+        self.missing = ""
+        self._fits.append(fit)
+        if self._found % POOL_EVERY == 0:
+            self._noise = pool_corner_noise(f.pose for f in self._fits)
+        self._found += 1
+        pose = TimedPose(t_s, fit.camera_T_marker, marker_covariance(fit, self._noise))
+        return pose if self.poses.add(pose) else None
+
+
+@dataclass(slots=True, eq=False)
+class _Waiting:
+    """A pulse under way: its frame until that is looked into, where the plane stood, what is located."""
+
+    pulse_s: float
+    data: npt.NDArray[Any] | None
+    scan_rad: float | None = None
+    located: Future[PaFind | NoSignal] | None = None
+
+
+class Ears:
+    """Pulses with what was heard, where the plane stood, and where the marker was.
+
+    Attributes:
+        listening: whether anybody wants to know what is heard: locating a source takes time.
+        trouble: why nothing is located any more; empty where it is.
+    """
+
+    def __init__(self, model: SessionModel) -> None:
+        self._probe: ProbeModel = model.probe
+        self._clock = DeviceClock()
+        self._waiting: deque[_Waiting] = deque()
+        self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
+        self._pool = _pool()
+        self.listening, self.trouble = True, ""
+
+    @property
+    def waiting(self) -> int:
+        """Pulses that have not been handed on yet."""
+        return len(self._waiting)
+
+    def plane(self, at_s: float, scan_rad: float, moving: bool) -> None:
+        """Where the plane stands, as the stage reports it."""
+        if not self._planes or at_s > self._planes[-1][0]:
+            self._planes.append((at_s, scan_rad, moving))
+
+    def hear(self, frames: Sequence[PaFrame]) -> None:
+        """Take in pulses."""
+        for frame in frames:
+            self._waiting.append(_Waiting(self._clock.host_time(frame.stamp), frame.data if self.listening else None))
+
+    def heard(self, now_s: float, poses: PoseHistory) -> tuple[Heard, ...]:
+        """The pulses that are complete, in their order."""
+        out = []
+        for pulse in self._waiting:
+            self._look_into(pulse, now_s)
+        while self._waiting:
+            first = self._waiting[0]
+            overdue = now_s - first.pulse_s > GIVE_UP_S
+            looked = first.data is None and (first.located is None or first.located.done())
+            if not (looked and (poses.can_tell(first.pulse_s) or overdue)):
+                break
+            self._waiting.popleft()
+            out.append(self._complete(first, poses))
+        return tuple(out)
+
+    def _look_into(self, pulse: _Waiting, now_s: float) -> None:
+        """Have the source located, once it is known that the plane stood at the pulse; a turning one is of no use."""
+        if pulse.data is None:
+            return
+        if (not self._planes or self._planes[-1][0] <= pulse.pulse_s) and now_s - pulse.pulse_s < GIVE_UP_S:
+            return
+        data, pulse.data = pulse.data, None
+        pulse.scan_rad = self._stood(pulse.pulse_s)
+        if pulse.scan_rad is None:
+            return
+        try:
+            pulse.located = self._pool.submit(locate_in_frame, data, self._probe)
+        except BrokenProcessPool:
+            self._pool = _pool()
+            self.trouble = "the process that locates sources had ended; it was started again"
+
+    def _complete(self, pulse: _Waiting, poses: PoseHistory) -> Heard:
+        heard = Heard(pulse.pulse_s, pulse.scan_rad)
+        try:
+            heard = replace(heard, marker=poses.at(pulse.pulse_s))
+        except PairRefused as error:
+            heard = replace(heard, unpaired=str(error))
+        if pulse.located is None:
+            return heard
+        try:
+            found = pulse.located.result()
+        except Exception as error:  # of one frame: the next one may be as it should
+            self.trouble = f"a frame of the probe could not be looked into: {error}"
+            return heard
+        if isinstance(found, NoSignal):
+            return heard
+        return replace(
+            heard, x_mm=found.x_mm, range_mm=found.range_mm, covariance=found.covariance, amplitude=found.amplitude
+        )
+
+    def _stood(self, t_s: float) -> float | None:
+        """The plane's angle at a time; None where it turned then, or nobody knows."""
+        before = [plane for plane in self._planes if plane[0] <= t_s]
+        after = [plane for plane in self._planes if plane[0] > t_s]
+        if not before or not after:
+            return None
+        (t0, first, moved), (t1, second, moves) = before[-1], after[0]
+        if moved or moves or abs(second - first) > STOOD_RAD or t1 - t0 > 0.5:
+            return None
+        return float(np.interp(t_s, (t0, t1), (first, second)))
+
+    def close(self) -> None:
+        """End the process."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _pool() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_ignore_interrupt)
+
+
+def _ignore_interrupt() -> None:
+    """Ctrl-C is the main program's business."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
