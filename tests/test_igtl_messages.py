@@ -1,9 +1,10 @@
-"""OpenIGTLink on the wire, against bytes that this file packs and reads by the protocol's text, and the C library's CRC."""
+"""OpenIGTLink on the wire: against bytes packed and read by the protocol's text, and the C library's checksum."""
 
 from __future__ import annotations
 
 import ctypes
 import ctypes.util
+import itertools
 import struct
 from collections import Counter
 
@@ -18,7 +19,7 @@ from tests.igtl_bytes import crc64, image_body, message, read_message, transform
 
 pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
 
-from fgreg.drivers import igtl_messages as igtl  # noqa: E402
+from fgreg.drivers import igtl_messages as igtl
 
 MATRIX = np.array([[0.0, -1.0, 0.0, 10.5], [1.0, 0.0, 0.0, -20.25], [0.0, 0.0, 1.0, 33.0], [0.0, 0.0, 0.0, 1.0]])
 ALL = frozenset({("TRANSFORM", ""), ("IMAGE", ""), ("STRING", ""), ("STATUS", "")})
@@ -92,7 +93,7 @@ def test_how_the_stream_is_cut_into_pieces_does_not_matter(cuts: list[int]) -> N
     stream = b"".join(message("TRANSFORM", f"T{number}", transform_body(MATRIX), 1 + number % 2) for number in range(4))
     reader, rejections = decoder()
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    found = [m for a, b in zip(edges, edges[1:], strict=False) for m in reader.feed(stream[a:b], 0.0)]
+    found = [m for a, b in itertools.pairwise(edges) for m in reader.feed(stream[a:b], 0.0)]
     assert [m.device for m in found] == ["T0", "T1", "T2", "T3"]
     assert rejections.count == 0
     assert not reader.partial
@@ -201,6 +202,6 @@ def test_a_missing_pyigtl_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> No
         raise ModuleNotFoundError(name)
 
     igtl._pyigtl.cache_clear()
-    monkeypatch.setattr(igtl.importlib, "import_module", absent)
+    monkeypatch.setattr("importlib.import_module", absent)
     with pytest.raises(MissingExtraError, match=r"pip install 'fgreg\[igtl\]'"):
         igtl.require_pyigtl()

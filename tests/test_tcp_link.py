@@ -76,7 +76,13 @@ def test_a_client_that_finds_nobody_says_so_once_and_connects_when_there_is_some
     link = TcpLink(Endpoint("127.0.0.1", port), Lines)
     try:
         losses: list[str] = []
-        wait_for(lambda: losses.append(loss) or True if (loss := link.take_loss()) else False)
+
+        def said() -> bool:
+            loss = link.take_loss()
+            losses.extend([loss] if loss else [])
+            return bool(losses)
+
+        wait_for(said)
         assert losses == [f"127.0.0.1:{port}: Connection refused"]
         time.sleep(2.5 * tcp_link.RETRY_S)
         assert link.take_loss() is None
