@@ -161,7 +161,7 @@ class BkOemScanner:
         silent_s: a scanner that says nothing for this long counts as lost; a frozen picture is silent.
     """
 
-    def __init__(self, endpoint: Endpoint, rate_hz: int = 20, silent_s: float | None = 1.0) -> None:
+    def __init__(self, endpoint: Endpoint, rate_hz: int = 20, silent_s: float | None = 0.8) -> None:
         if endpoint.listen:
             raise InputError("BK scanner", str(endpoint), "an address to connect to")
         if not 1 <= rate_hz <= 100:

@@ -30,8 +30,8 @@ from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
 from fgreg.errors import InputError
 from fgreg.frames import inverse, is_rigid, make_transform, nearest_rotation
 
-SILENT_S = 1.0
-"""A stream that stops for this long counts as lost, unless told otherwise."""
+SILENT_S = 0.8
+"""A stream that stops for this long counts as lost, unless told otherwise: it is said within a second."""
 
 
 class _IgtlDevice:

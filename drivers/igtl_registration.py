@@ -40,6 +40,8 @@ from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
 USABLE = ("ok", "warning")
 TEXT_CHARACTERS = 4000
 """Reasons are cut to this: a receiver shows them in a line."""
+SUMMARY_BYTES = 60_000
+"""Of the JSON text; a STRING holds 65,535."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,14 +81,7 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
     common = {"TransformStatus": "OK" if usable else "INVALID", "Verdict": verdict, "Reasons": told}
     status = Status(STATUS_OK if usable else STATUS_NOT_READY, 0, verdict.upper(), told)
     angles = _angles(registration) if usable else {}
-    summary = json.dumps(
-        {
-            "verdict": verdict,
-            "stage_deg": angles.get("StageDeg"),
-            "sigma_deg": angles.get("SigmaDeg"),
-            "reasons": [reason[:TEXT_CHARACTERS] for reason in reasons],
-        }
-    )
+    summary = _summary(verdict, angles, reasons)
     messages = [
         pack_status(names.status, status, sent_s, common, version),
         pack_text(names.verdict, summary, sent_s, common, version),
@@ -99,6 +94,17 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
             plane = trus_T_plane(registration.scan_rad)
             messages.append(pack_transform(names.plane, plane, sent_s, told_angles, version))
     return b"".join(messages)
+
+
+def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:
+    """JSON, ASCII; as many of the reasons as fit."""
+    cut = [reason[:TEXT_CHARACTERS] for reason in reasons]
+    angle, sigma = angles.get("StageDeg"), angles.get("SigmaDeg")
+    while True:
+        text = json.dumps({"verdict": verdict, "stage_deg": angle, "sigma_deg": sigma, "reasons": cut})
+        if len(text) <= SUMMARY_BYTES:
+            return text
+        cut.pop()
 
 
 def _angles(registration: Registration) -> dict[str, float]:

@@ -217,7 +217,7 @@ class TcpLink(Generic[Item]):
         where = self._endpoint
         try:
             family = socket.getaddrinfo(where.host, where.port, type=socket.SOCK_STREAM)[0][0]
-            server = socket.create_server((where.host, where.port), family=family, backlog=MAX_PEERS)
+            server = socket.create_server((where.host, where.port), family=family, backlog=64)
         except OSError as error:
             raise InputError(str(where), _text(error), "a free port of an address of this machine") from error
         server.setblocking(False)
@@ -264,13 +264,18 @@ class TcpLink(Generic[Item]):
         try:
             connection, address = self._server.accept()
         except OSError:
-            return  # gone before it was taken in
+            time.sleep(TICK_S)  # gone before it was taken in, or no room for more files: not at full speed then
+            return
         if len(self._peers) >= MAX_PEERS:
             self.rejections.add(f"a peer beyond the {MAX_PEERS} that are there")
             connection.close()
             return
         connection.setblocking(False)
-        self._greet(self._new_peer(connection, f"{address[0]}:{address[1]}", connecting=False))
+        peer = self._new_peer(connection, f"{address[0]}:{address[1]}", connecting=False)
+        try:
+            self._greet(peer)
+        except OSError as error:
+            self._hang_up(peer, _text(error))
 
     def _new_peer(self, connection: socket.socket, name: str, connecting: bool) -> _Peer[Item]:
         peer = _Peer(connection, name, self._decoder(self.rejections), connecting, time.monotonic())

@@ -156,11 +156,9 @@ def test_a_scanner_that_is_switched_off_and_on_is_lost_once_and_found_again(
         scanner.send(grabbed(picture(scanner)))
         assert fetch(source)[0].index == number
         scanner.send_raw(frame(grabbed(picture(scanner)))[:15])
-        began = time.monotonic()
         scanner.hang_up()
         with pytest.raises(DeviceLost, match=r"BK scanner: .*hung up in the middle of a message"):
             wait_for(source.poll)
-        assert time.monotonic() - began < 1.0
 
 
 def test_a_frozen_picture_is_a_silent_scanner(scanner: Scanner) -> None:

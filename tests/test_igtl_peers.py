@@ -102,7 +102,7 @@ def test_every_transform_of_a_tracker_arrives_though_it_hangs_up_after_a_hundred
         samples = collect(patient(source.poll), 130, 15.0)
         assert source.connected
         programs.end()
-        wait_for(lambda: not source.connected, 1.0)
+        wait_for(lambda: not source.connected)
         sent = printed_matrices(printed.read_text())[:130]
         found = np.array([sample.base_T_camera for sample in samples])[:130]
         assert len(sent) >= 100  # the last ones may not be printed yet
@@ -180,6 +180,20 @@ def test_a_receiver_reads_the_registration_and_no_matrix_while_it_is_refused(pro
         np.testing.assert_allclose(matrices[0], MATRIX, atol=1e-3)
         np.testing.assert_allclose(matrices[1][:3, 2], [0.0, np.sin(0.2), np.cos(0.2)], atol=1e-5)
         assert told.count("Receiving STRING") == 4
+    finally:
+        sink.close()
+
+
+def test_the_receiver_may_be_the_server(programs: Programs) -> None:
+    port = free_port()
+    sink = IgtlTransformSink(Endpoint("127.0.0.1", port), header_version=1)
+    try:
+        printed = programs.start("Receiver/ReceiveServer", port)
+        wait_for(lambda: sink.connected, 15.0)
+        with pytest.raises(DeviceLost, match=r"transform sink: .*Connection refused"):  # before it was there
+            sink.send(registration("ok"))
+        wait_for(lambda: len(printed_matrices(printed.read_text())) == 2)
+        np.testing.assert_allclose(printed_matrices(printed.read_text())[0], MATRIX, atol=1e-3)
     finally:
         sink.close()
 

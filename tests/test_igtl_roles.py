@@ -126,7 +126,7 @@ def test_hostile_senders_do_not_end_the_source(
         source.close()
 
 
-def test_a_stream_that_stops_is_lost_within_a_second(scanner: tuple[socket.socket, Endpoint]) -> None:
+def test_a_stream_that_stops_is_lost_and_back_with_its_next_message(scanner: tuple[socket.socket, Endpoint]) -> None:
     server, endpoint = scanner
     source = IgtlPhotoacoustic(endpoint, "Image_Probe")
     try:
@@ -136,9 +136,9 @@ def test_a_stream_that_stops_is_lost_within_a_second(scanner: tuple[socket.socke
             collect(source.poll, 1)
             peer.sendall(message("TRANSFORM", "ProbeToTracker", transform_body(MATRIX)))  # does not count
             began = time.monotonic()
-            with pytest.raises(DeviceLost, match="nothing heard for 1 s"):
+            with pytest.raises(DeviceLost, match=r"nothing heard for 0\.8 s"):
                 wait_for(source.poll)
-            assert time.monotonic() - began < 1.2
+            assert time.monotonic() - began >= 0.7
             peer.sendall(image(1))
             (frame,) = collect(source.poll, 1)
             assert (frame.index, source.connected) == (1, True)
@@ -297,7 +297,8 @@ def test_reasons_of_any_length_and_script_go_out_as_ascii(
     sink_and_receiver: tuple[IgtlTransformSink, Callable[[int], list[Told]]],
 ) -> None:
     sink, receive = sink_and_receiver
-    sink.send(Registration(Stamp(0.0, 0.0), "refused", None, None, reasons=("σ = 3°\n", "x" * 100_000)))
+    reasons = ("σ = 3°\n", *["x" * 100_000, "🙂" * 3000] * 4)
+    sink.send(Registration(Stamp(0.0, 0.0), "refused", None, None, reasons=reasons))
     status, verdict = receive(2)
     assert status.content[30:].startswith(b"\\u03c3 = 3\\xb0\n; xxx")
     assert len(status.content) < 10_000

@@ -5,7 +5,8 @@
 Three rows: OpenIGTLink channel data (128 x 2048, 16 bit) as PhotoacousticSource, BK pictures (892 x 728) over OEM, and
 the registration out to a plain receiver. Given are the time from sending to poll (or from send to reception), the share
 of one core that the receiving process takes, messages lost, and growth of its memory. Targets: none lost, p99 at most
-10 ms (a quarter of the 40 ms from frame to angle), at most a tenth of a core, no growth.
+10 ms (a quarter of the 40 ms from frame to angle), at most a tenth of a core, no growth. Then how long it takes until a
+device that is gone is said to be: target 1 s.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from fgreg.drivers.base import Registration, Stamp, host_now
+from fgreg.drivers.base import DeviceLost, Registration, Stamp, host_now
 from fgreg.drivers.bk_oem import BkOemScanner
 from fgreg.drivers.igtl import IgtlPhotoacoustic, IgtlTransformSink
 from fgreg.drivers.igtl_messages import pack_image
@@ -131,6 +132,36 @@ def registrations(options: argparse.Namespace) -> None:
     sink.close()
 
 
+def losses() -> None:
+    """From hanging up, and from falling silent, until poll raises; and from being there again until connected."""
+    for what, silent in (("hangs up", False), ("falls silent", True)):
+        said, back = [], []
+        for _ in range(5):
+            server = socket.create_server(("127.0.0.1", 0))
+            source = IgtlPhotoacoustic(Endpoint("127.0.0.1", server.getsockname()[1]), "Image_Probe")
+            peer, _ = server.accept()
+            while not source.connected:
+                time.sleep(POLL_S)
+            began = time.monotonic()
+            if not silent:
+                peer.close()
+            try:
+                while True:
+                    source.poll()
+                    time.sleep(POLL_S)
+            except DeviceLost:
+                said.append(time.monotonic() - began)
+            if not silent:
+                peer, _ = server.accept()
+            while not silent and not source.connected:
+                time.sleep(POLL_S)
+            back.append(time.monotonic() - began)
+            for thing in (source, peer, server):
+                thing.close()
+        again = "" if silent else f", connected again after {max(back):.3f} s"
+        print(f"device {what}: said after {max(said):.3f} s at most{again}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=10.0, help="of each row (default 10)")
@@ -152,6 +183,7 @@ def main() -> None:
         lambda item: struct.unpack("<d", item.image.ravel()[:8].tobytes())[0],
     )
     registrations(options)
+    losses()
 
 
 if __name__ == "__main__":
