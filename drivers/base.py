@@ -33,6 +33,8 @@ from fgreg.motion.device import RotationStage, StageError, StageLost, StageStatu
 from fgreg.pairing import Stamp
 
 __all__ = [
+    "BmodeFrame",
+    "BmodeSource",
     "Command",
     "DeviceLost",
     "MotionSample",
@@ -92,6 +94,25 @@ class PaFrame:
     stamp: Stamp
     data: npt.NDArray[Any]
     index: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BmodeFrame:
+    """One B-mode picture, to show with the rest; nothing is measured in it.
+
+    Attributes:
+        stamp: when it was taken, as well as the device knows it.
+        image: 8 bit, (depth, lateral) grey or (depth, lateral, 3) BGR.
+        index: counts the device's pictures, so that what was dropped shows.
+        pixel_mm: size of a pixel along depth and laterally, where the device tells it.
+        origin_mm: depth and lateral position of the centre of pixel [0, 0], where the device tells it.
+    """
+
+    stamp: Stamp
+    image: npt.NDArray[np.uint8]
+    index: int
+    pixel_mm: tuple[float, float] | None = None
+    origin_mm: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,6 +214,13 @@ class PhotoacousticSource(Device, Protocol):
 
     def poll(self) -> Sequence[PaFrame]:
         """Frames since the last call. Raises DeviceLost."""
+
+
+class BmodeSource(Device, Protocol):
+    """A scanner's pictures for overlay."""
+
+    def poll(self) -> Sequence[BmodeFrame]:
+        """Pictures since the last call. Raises DeviceLost."""
 
 
 class MotionSource(Device, Protocol):

@@ -1,0 +1,288 @@
+"""B-mode pictures of a BK scanner over its OEM interface, for overlay. There is no channel data on it.
+
+A message on the wire is ``0x01 payload 0x04``; the bytes 01, 04 and 1B of a payload are sent as ``1B`` and their
+inverse. Payloads are text that ends in ``;``, but for grabbed frames: ``DATA:GRAB_FRAME #6307204`` (one digit: how many
+digits follow; those: how many bytes follow), four bytes of a time stamp of no documented unit, the pixels row by row,
+``;``.
+
+What is asked: the window's size and geometry (and to hear of changes), then frames at a given rate. Queries and replies
+are those that PLUS (vtkPlusBkProFocusOemVideoSource) uses with ProFocus and bk5000; tested against an emulator only.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.drivers.base import BmodeFrame, DeviceLost, Stamp
+from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
+from fgreg.errors import InputError, one_line
+
+PORT = 7915
+START, END, ESCAPE = b"\x01", b"\x04", b"\x1b"
+ESCAPED = {bytes([byte]): ESCAPE + bytes([byte ^ 0xFF]) for byte in (0x01, 0x04, 0x1B)}
+INVERTED = np.array([pair[1] for pair in ESCAPED.values()], dtype=np.uint8)
+MAX_MESSAGE_BYTES = 16 << 20
+"""As sent, escapes included: a colour picture of 1920 x 1080 has 6.2 million bytes."""
+STAMP_BYTES = 4
+MAX_SIDE = 8192
+SUBSCRIBED = ("US_WIN_SIZE", "B_GEOMETRY_PIXEL", "B_GEOMETRY_TISSUE", "B_GEOMETRY_US_FRAME_GRAB")
+ASKED = ("US_WIN_SIZE", "B_GEOMETRY_PIXEL:A", "B_GEOMETRY_TISSUE:A", "B_GEOMETRY_US_FRAME_GRAB:A")
+FRAME = re.compile(rb"DATA:GRAB_FRAME #([1-9])")
+VALUES = re.compile(r"S?DATA:([A-Z_]+)(?::A)? (.*);")
+ASK_AGAIN_S = 1.0
+
+
+def encode(payload: str) -> bytes:
+    """A message as sent."""
+    body = payload.encode("ascii").replace(ESCAPE, ESCAPED[ESCAPE])
+    for byte in (START, END):
+        body = body.replace(byte, ESCAPED[byte])
+    return START + body + END
+
+
+def unescape(body: bytes) -> bytes:
+    """A payload from what was between 01 and 04. Raises ValueError: an escape that is none."""
+    raw = np.frombuffer(body, dtype=np.uint8)
+    at = np.flatnonzero(raw == ESCAPE[0])
+    if not at.size:
+        return body
+    if at[-1] == raw.size - 1 or not np.isin(raw[at + 1], INVERTED).all():
+        raise ValueError("an escape that is none")
+    plain = raw.copy()
+    plain[at + 1] = ~raw[at + 1]
+    return np.delete(plain, at).tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class OemMessage:
+    """One payload; ``index`` counts the grabbed frames, -1 for the others."""
+
+    payload: bytes
+    host_s: float
+    index: int
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, about."""
+        return 256 + len(self.payload)
+
+
+class OemDecoder:
+    """One connection's bytes to payloads. What is outside of a message, or cut off by the next one, is left out.
+
+    Args:
+        rejections: counts that.
+        counter: numbers the grabbed frames; goes on from one connection to the next.
+    """
+
+    def __init__(self, rejections: Rejections, counter: Iterator[int]) -> None:
+        self._rejections, self._counter = rejections, counter
+        self._buffer = bytearray()
+
+    @property
+    def partial(self) -> bool:
+        """Whether a message has begun and is not complete."""
+        return bool(self._buffer)
+
+    def feed(self, data: bytes, host_s: float) -> list[OemMessage]:
+        """Messages completed by these bytes. Raises StreamBroken: one that is too long."""
+        messages = []
+        *complete, rest = data.split(END)
+        for piece in complete:
+            whole, self._buffer = bytes(self._buffer) + piece, bytearray()
+            before, start, body = whole.rpartition(START)
+            if before or not start:
+                self._rejections.add("bytes outside of a message")
+            if not start:
+                continue
+            try:
+                payload = unescape(body)
+            except ValueError as error:
+                self._rejections.add(str(error))
+                continue
+            grabbed = payload.startswith(b"DATA:GRAB_FRAME")
+            messages.append(OemMessage(payload, host_s, next(self._counter) if grabbed else -1))
+        self._buffer += rest
+        if self._buffer and START not in self._buffer:
+            self._rejections.add("bytes outside of a message")
+            self._buffer.clear()
+        if len(self._buffer) > MAX_MESSAGE_BYTES:
+            raise StreamBroken(f"no end of a message within {MAX_MESSAGE_BYTES} bytes")
+        return messages
+
+
+@dataclass(frozen=True, slots=True)
+class _Geometry:
+    """What the scanner tells of its window: pixels of the screen, and metres of tissue."""
+
+    window: tuple[int, int] | None = None  # columns, rows
+    screen: tuple[float, ...] | None = None  # left, top, right, bottom of the tissue rectangle
+    tissue_m: tuple[float, ...] | None = None  # the same
+    grabbed: tuple[float, ...] | None = None  # the same of what is sent
+
+    def pixel_mm(self) -> tuple[float, float] | None:
+        """Along depth, laterally; None where it was not told, or cannot be."""
+        if self.screen is None or self.tissue_m is None:
+            return None
+        columns, rows = self.screen[2] - self.screen[0], self.screen[3] - self.screen[1]
+        if not (columns and rows):
+            return None
+        size = (
+            1e3 * abs((self.tissue_m[3] - self.tissue_m[1]) / rows),
+            1e3 * abs((self.tissue_m[2] - self.tissue_m[0]) / columns),
+        )
+        return size if all(0.0 < side < 10.0 for side in size) else None
+
+    def origin_mm(self) -> tuple[float, float] | None:
+        """Depth and lateral position of the first grabbed pixel's centre, if all rectangles count the same pixels."""
+        size = self.pixel_mm()
+        if size is None or self.screen is None or self.tissue_m is None or self.grabbed is None:
+            return None
+        down, right = self.grabbed[1] - self.screen[1], self.grabbed[0] - self.screen[0]
+        lateral = math.copysign(size[1], self.tissue_m[2] - self.tissue_m[0])
+        return 1e3 * self.tissue_m[1] + down * size[0], 1e3 * self.tissue_m[0] + right * lateral
+
+
+class BkOemScanner:
+    """BmodeSource: a scanner that is asked for its pictures.
+
+    The time stamps on the wire have no documented unit: both times are the host's.
+
+    Args:
+        endpoint: the scanner's address; its OEM port is 7915 as a rule.
+        rate_hz: pictures per second to ask for.
+        silent_s: a scanner that says nothing for this long counts as lost; a frozen picture is silent.
+    """
+
+    def __init__(self, endpoint: Endpoint, rate_hz: int = 20, silent_s: float | None = 0.8) -> None:
+        if endpoint.listen:
+            raise InputError("BK scanner", str(endpoint), "an address to connect to")
+        if not 1 <= rate_hz <= 100:
+            raise InputError("BK scanner: rate_hz", str(rate_hz), "1 to 100")
+        watched = ",".join(f'"{name}"' for name in SUBSCRIBED)
+        greeting = [f"QUERY:{name};" for name in ASKED]
+        greeting += [f"CONFIG:DATA:SUBSCRIBE {watched};", f'QUERY:GRAB_FRAME "ON",{rate_hz};']
+        counter = itertools.count()
+        self._link: TcpLink[OemMessage] = TcpLink(
+            endpoint,
+            lambda rejections: OemDecoder(rejections, counter),
+            greeting=b"".join(encode(text) for text in greeting),
+            farewell=encode('QUERY:GRAB_FRAME "OFF";'),
+            silent_s=silent_s,
+        )
+        self._geometry = _Geometry()
+        self._asked_s = -math.inf
+
+    @property
+    def name(self) -> str:
+        """Its address."""
+        return str(self._link.endpoint)
+
+    @property
+    def connected(self) -> bool:
+        """Whether it is there and sends."""
+        return self._link.connected
+
+    @property
+    def dropped(self) -> int:
+        """Pictures dropped because nobody fetched them in time."""
+        return self._link.dropped
+
+    @property
+    def rejected(self) -> int:
+        """Messages left out: cut off, of the wrong size, not understood."""
+        return self._link.rejections.count
+
+    @property
+    def last_rejection(self) -> str:
+        """Why the last one was left out."""
+        return self._link.rejections.last
+
+    def close(self) -> None:
+        """Stop the pictures and end the connection."""
+        self._link.close()
+
+    def poll(self) -> Sequence[BmodeFrame]:
+        """Pictures since the last call. Raises DeviceLost."""
+        messages = self._link.poll()
+        if not messages:
+            loss = self._link.take_loss()
+            if loss is not None:
+                raise DeviceLost(f"BK scanner: {loss}")
+        frames = []
+        for message in messages:
+            try:
+                if message.index >= 0:
+                    frames.append(self._picture(message))
+                else:
+                    self._text(message.payload)
+            except ValueError as error:
+                self._link.rejections.add(str(error))
+        return frames
+
+    def _picture(self, message: OemMessage) -> BmodeFrame:
+        begin = FRAME.match(message.payload)
+        if begin is None:
+            raise ValueError("a grabbed frame without its size")
+        digits = message.payload[begin.end() : begin.end() + int(begin.group(1))]
+        if not (digits.isdigit() and len(digits) == int(begin.group(1))):
+            raise ValueError("a grabbed frame without its size")
+        data = memoryview(message.payload)[begin.end() + len(digits) :]
+        told = int(digits)
+        if told > len(data):
+            raise ValueError(f"a grabbed frame of {told} bytes of which {len(data)} arrived")
+        window = self._geometry.window
+        if window is None:
+            raise ValueError("a grabbed frame before the size of the window")
+        columns, rows = window
+        grey = told - STAMP_BYTES == columns * rows
+        if not grey and told - STAMP_BYTES != 3 * columns * rows:
+            self._ask_again()
+            raise ValueError(f"a grabbed frame of {told} bytes for a window of {columns} x {rows}")
+        pixels = np.frombuffer(data[STAMP_BYTES:told], dtype=np.uint8)
+        image = pixels.reshape((rows, columns) if grey else (rows, columns, 3)).copy()
+        stamp = Stamp(message.host_s, message.host_s)
+        return BmodeFrame(stamp, image, message.index, self._geometry.pixel_mm(), self._geometry.origin_mm())
+
+    def _ask_again(self) -> None:
+        """The window has changed and the scanner did not say so."""
+        now = time.monotonic()
+        if now - self._asked_s > ASK_AGAIN_S:
+            self._asked_s = now
+            self._link.offer(b"".join(encode(f"QUERY:{name};") for name in ASKED))
+
+    def _text(self, payload: bytes) -> None:
+        text = payload.decode("ascii", "replace")
+        if text.startswith(("ACK", "EVENT", "ALIVE")):
+            return
+        told = VALUES.fullmatch(text)
+        if told is None:
+            raise ValueError(f"not understood: {one_line(text, 60)}")
+        known = self._geometry
+        name, values = told.group(1), told.group(2)
+        if name == "US_WIN_SIZE":
+            columns, rows = (int(value) for value in _numbers(values, 2))
+            if not (1 <= columns <= MAX_SIDE and 1 <= rows <= MAX_SIDE):
+                raise ValueError(f"a window of {columns} x {rows}")
+            self._geometry = _Geometry((columns, rows), known.screen, known.tissue_m, known.grabbed)
+        elif name == "B_GEOMETRY_PIXEL":
+            self._geometry = _Geometry(known.window, _numbers(values, 4), known.tissue_m, known.grabbed)
+        elif name == "B_GEOMETRY_TISSUE":
+            self._geometry = _Geometry(known.window, known.screen, _numbers(values, 4), known.grabbed)
+        elif name == "B_GEOMETRY_US_FRAME_GRAB":
+            self._geometry = _Geometry(known.window, known.screen, known.tissue_m, _numbers(values, 4))
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...]:
+    """The first ``count`` of a list of numbers. Raises ValueError."""
+    numbers = tuple(float(value) for value in text.split(",")[:count])
+    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+        raise ValueError(f"not {count} numbers: {one_line(text, 60)}")
+    return numbers

@@ -1,0 +1,271 @@
+"""OpenIGTLink devices in the roles of drivers.base: pulses and motion in, the registration out; transforms and texts.
+
+PLUS and most scanners are servers: give their address as ``Endpoint("127.0.0.1", 18944)``. 3D Slicer can be either; for
+a client there is ``Endpoint.listening(18944)``, on loopback unless another address is given. Messages come with the
+sender's time stamp, which becomes ``Stamp.device_s``; a sender that gives none is stamped with the host's time.
+
+pyigtl is needed: ``pip install 'fgreg[igtl]'``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.drivers.base import BmodeFrame, DeviceLost, MotionSample, PaFrame, Registration, Stamp, host_now
+from fgreg.drivers.igtl_messages import (
+    Image,
+    Message,
+    MessageDecoder,
+    Transform,
+    check_name,
+    require_pyigtl,
+)
+from fgreg.drivers.igtl_registration import DeviceNames, registration_messages
+from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
+from fgreg.errors import InputError
+from fgreg.frames import inverse, is_rigid, make_transform, nearest_rotation
+
+SILENT_S = 0.8
+"""A stream that stops for this long counts as lost, unless told otherwise: it is said within a second."""
+
+
+class _IgtlDevice:
+    """What all of them have in common: the link, its losses, its counts."""
+
+    _role = "OpenIGTLink"
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        wanted: Iterable[tuple[str, str]] = (),
+        silent_s: float | None = None,
+        keep_latest: bool = False,
+    ) -> None:
+        require_pyigtl()
+        chosen = frozenset(wanted)
+        for _, device in chosen:
+            if device:
+                check_name(device)
+
+        counts: Counter[tuple[str, str]] = Counter()
+
+        def decoder(rejections: Rejections) -> MessageDecoder:
+            return MessageDecoder(rejections, chosen, counts)
+
+        self._link: TcpLink[Message] = TcpLink(endpoint, decoder, silent_s=silent_s, keep_latest=keep_latest)
+
+    @property
+    def name(self) -> str:
+        """Its address."""
+        return str(self._link.endpoint)
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """Its address, with the port that was taken."""
+        return self._link.endpoint
+
+    @property
+    def connected(self) -> bool:
+        """Whether anybody is at the other end, and not silent."""
+        return self._link.connected
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped because nobody fetched or took them in time."""
+        return self._link.dropped
+
+    @property
+    def rejected(self) -> int:
+        """Messages left out: wrong checksum, broken content, not usable in this role."""
+        return self._link.rejections.count
+
+    @property
+    def last_rejection(self) -> str:
+        """Why the last one was left out."""
+        return self._link.rejections.last
+
+    def close(self) -> None:
+        """End the connection."""
+        self._link.close()
+
+    def _messages(self) -> list[Message]:
+        """What came; a loss is raised once what came before it is fetched."""
+        messages = self._link.poll()
+        if not messages:
+            self._raise_loss()
+        return messages
+
+    def _raise_loss(self) -> None:
+        loss = self._link.take_loss()
+        if loss is not None:
+            raise DeviceLost(f"{self._role}: {loss}")
+
+    def _leave_out(self, message: Message, why: str) -> None:
+        self._link.rejections.add(f"{message.device}: {why}")
+
+
+class IgtlReceiver(_IgtlDevice):
+    """All transforms, images, texts and states that arrive, or those of some devices, in order.
+
+    Args:
+        endpoint: the sender.
+        wanted: pairs of type (``TRANSFORM``, ``IMAGE``, ``STRING``, ``STATUS``) and device; an empty device takes all.
+        silent_s: as for the sources below; None where a silent sender is fine.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        wanted: Iterable[tuple[str, str]] = (("TRANSFORM", ""), ("STRING", ""), ("STATUS", "")),
+        silent_s: float | None = None,
+    ) -> None:
+        super().__init__(endpoint, wanted, silent_s)
+
+    def poll(self) -> Sequence[Message]:
+        """Messages since the last call. Raises DeviceLost."""
+        return self._messages()
+
+
+class _Images(_IgtlDevice):
+    """Two-dimensional images of one device, counted."""
+
+    def __init__(self, endpoint: Endpoint, device: str, silent_s: float | None) -> None:
+        super().__init__(endpoint, [("IMAGE", check_name(device))], silent_s)
+
+    def _pictures(self) -> list[tuple[Stamp, npt.NDArray[np.generic], Image, int]]:
+        pictures = []
+        for message in self._messages():
+            content = message.content
+            if not isinstance(content, Image) or content.pixels.shape[0] != 1:
+                self._leave_out(message, "not a single slice")
+                continue
+            pictures.append((_stamp(message), content.pixels[0], content, message.index))
+        return pictures
+
+
+class IgtlPhotoacoustic(_Images):
+    """PhotoacousticSource: each IMAGE of a device is what the probe heard after one laser pulse.
+
+    Args:
+        endpoint: PLUS or the scanner.
+        device: e.g. ``Image_Probe``.
+        transposed: where the sender's rows are what the session's frames have as columns. A session wants channel data
+            with one row per element, envelope images with one row per depth.
+        silent_s: None where the laser may pause.
+    """
+
+    _role = "photoacoustic source"
+
+    def __init__(
+        self, endpoint: Endpoint, device: str, transposed: bool = False, silent_s: float | None = SILENT_S
+    ) -> None:
+        super().__init__(endpoint, device, silent_s)
+        self._transposed = transposed
+
+    def poll(self) -> Sequence[PaFrame]:
+        """Pulses since the last call. Raises DeviceLost."""
+        frames = []
+        for stamp, pixels, _, index in self._pictures():
+            if pixels.ndim != 2:
+                self._link.rejections.add(f"an image of {pixels.shape[-1]} components, expected 1")
+                continue
+            frames.append(PaFrame(stamp, np.ascontiguousarray(pixels.T if self._transposed else pixels), index))
+        return frames
+
+
+class IgtlBmode(_Images):
+    """BmodeSource: 8-bit B-mode images of a device, for overlay; rows are depths."""
+
+    _role = "B-mode source"
+
+    def __init__(self, endpoint: Endpoint, device: str, silent_s: float | None = SILENT_S) -> None:
+        super().__init__(endpoint, device, silent_s)
+
+    def poll(self) -> Sequence[BmodeFrame]:
+        """Images since the last call. Raises DeviceLost."""
+        frames = []
+        for stamp, pixels, image, index in self._pictures():
+            if pixels.dtype != np.uint8 or pixels.shape[2:] not in ((), (3,)):
+                self._link.rejections.add(f"an image of {pixels.shape} {pixels.dtype}, expected uint8, grey or RGB")
+                continue
+            along_i, along_j = (float(np.linalg.norm(image.world_T_ijk[:3, axis])) for axis in (0, 1))
+            bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+            frames.append(BmodeFrame(stamp, np.array(bgr, dtype=np.uint8), index, (along_j, along_i)))
+        return frames
+
+
+class IgtlMotion(_IgtlDevice):
+    """MotionSource: TRANSFORM messages of the endoscope's holder, millimetres.
+
+    Args:
+        endpoint: the sender.
+        device: e.g. ``CameraToBase``: the matrix maps camera points to the holder's base.
+        inverted: where the sender has it the other way round, ``BaseToCamera``.
+
+    Left out and counted: transforms that PLUS marks with a ``TransformStatus`` other than ``OK``, and matrices that are
+    not rigid.
+    """
+
+    _role = "motion source"
+
+    def __init__(
+        self, endpoint: Endpoint, device: str, inverted: bool = False, silent_s: float | None = SILENT_S
+    ) -> None:
+        super().__init__(endpoint, [("TRANSFORM", check_name(device))], silent_s)
+        self._inverted = inverted
+
+    def poll(self) -> Sequence[MotionSample]:
+        """Samples since the last call. Raises DeviceLost."""
+        samples = []
+        for message in self._messages():
+            status = message.metadata.get("TransformStatus", "OK")
+            if not isinstance(message.content, Transform) or status != "OK":
+                self._leave_out(message, f"status {status}")
+                continue
+            matrix = message.content.to_T_from
+            if not is_rigid(matrix):
+                self._leave_out(message, "not a rigid transform")
+                continue
+            clean = make_transform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])  # single precision on the wire
+            samples.append(MotionSample(_stamp(message), inverse(clean) if self._inverted else clean))
+        return samples
+
+
+class IgtlTransformSink(_IgtlDevice):
+    """TransformSink: see ``igtl_registration`` for what goes out, and what a refused registration looks like.
+
+    Args:
+        endpoint: ``Endpoint.listening(18944)`` for receivers that connect (several may), or a receiver's address. Who
+            connects later gets the newest registration at once.
+        names: of the devices.
+        header_version: 2 for 3D Slicer and PLUS of 2017 and later; 1, without metadata, for receivers of OpenIGTLink 1
+            and 2, which lose the stream at a header they do not know.
+    """
+
+    _role = "transform sink"
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        names: DeviceNames | None = None,
+        header_version: int = 2,
+    ) -> None:
+        if header_version not in (1, 2):
+            raise InputError("OpenIGTLink header version", str(header_version), "1 or 2")
+        self._names, self._version = names or DeviceNames(), header_version
+        super().__init__(endpoint, keep_latest=True)
+
+    def send(self, registration: Registration) -> None:
+        """Hand it on; where a receiver is slow only the newest is kept. Raises DeviceLost."""
+        sent_s = time.time() - (host_now() - registration.stamp.host_s)
+        self._link.offer(registration_messages(registration, max(sent_s, 0.0), self._names, self._version))
+        self._raise_loss()
+
+
+def _stamp(message: Message) -> Stamp:
+    return Stamp(message.host_s if message.sent_s is None else message.sent_s, message.host_s)

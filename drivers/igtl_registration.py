@@ -1,0 +1,119 @@
+"""What a registration looks like on an OpenIGTLink connection.
+
+| message | device | when | content |
+|---|---|---|---|
+| STATUS | `RegistrationStatus` | always | code 1, `OK` or `WARNING`, or code 13 (not ready), `REFUSED`; the reasons |
+| STRING | `RegistrationVerdict` | always | JSON: `verdict`, `stage_deg`, `sigma_deg` (null where not told), `reasons` |
+| TRANSFORM | `CameraToTrus` | usable | maps camera points to TRUS points, mm; metadata below |
+| TRANSFORM | `PlaneToTrus` | usable, angle known | the image plane (its z axis) turned to where the beam points |
+
+**Refused means no TRANSFORM at all.** 3D Slicer puts the matrix of every TRANSFORM into its node, whatever the status
+in the metadata, so a matrix that must not be used must not be sent; PLUS, with `SendValidTransformsOnly`, does the
+same. Receivers keep the last valid matrix meanwhile: that it is out of date shows in the STATUS and STRING messages, in
+its time stamp, and in SlicerIGT's Watchdog module, which marks a transform that is no longer updated.
+
+Metadata (header version 2 only): `TransformStatus`, the key that PLUS reads and Slicer hands on (`OK`; `INVALID` on the
+STATUS and STRING of a refused registration), `Verdict`, `Reasons`, and for a transform `Covariance` (36 numbers, row by
+row, rad and mm, over the right tangent: rotation, then translation) with `CovarianceFrame`; `StageDeg`, `SigmaDeg`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.drivers.base import Registration
+from fgreg.drivers.igtl_messages import (
+    STATUS_NOT_READY,
+    STATUS_OK,
+    Status,
+    check_name,
+    pack_status,
+    pack_text,
+    pack_transform,
+)
+from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
+
+USABLE = ("ok", "warning")
+TEXT_CHARACTERS = 4000
+"""Reasons are cut to this: a receiver shows them in a line."""
+SUMMARY_BYTES = 60_000
+"""Of the JSON text; a STRING holds 65,535."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceNames:
+    """What the messages are called; each 1 to 20 ASCII characters. Raises InputError."""
+
+    registration: str = "CameraToTrus"
+    plane: str = "PlaneToTrus"
+    status: str = "RegistrationStatus"
+    verdict: str = "RegistrationVerdict"
+
+    def __post_init__(self) -> None:
+        for name in (self.registration, self.plane, self.status, self.verdict):
+            check_name(name)
+
+
+def trus_T_plane(scan_rad: float) -> FloatArray:
+    """The image plane at a stage angle: turned about x so that its z axis is (0, sin t, cos t)."""
+    return make_transform(exp_so3(np.array([-scan_rad, 0.0, 0.0])), np.zeros(3))
+
+
+def registration_messages(registration: Registration, sent_s: float, names: DeviceNames, version: int = 2) -> bytes:
+    """All messages for one registration, in one block: STATUS first.
+
+    Args:
+        registration: without a matrix, or with one that is not rigid, it counts as refused.
+        sent_s: of the data behind it, s since 1970.
+        version: of the header; 1 for receivers of OpenIGTLink 1 and 2, without metadata.
+    """
+    reasons = registration.reasons
+    matrix = registration.trus_T_camera
+    usable = registration.verdict in USABLE and matrix is not None
+    if usable and matrix is not None and not (np.isfinite(matrix).all() and is_rigid(matrix)):
+        usable, reasons = False, ("the transform is not rigid", *reasons)
+    verdict = registration.verdict if usable else "refused"
+    told = "; ".join(reasons)[:TEXT_CHARACTERS]
+    common = {"TransformStatus": "OK" if usable else "INVALID", "Verdict": verdict, "Reasons": told}
+    status = Status(STATUS_OK if usable else STATUS_NOT_READY, 0, verdict.upper(), told)
+    angles = _angles(registration) if usable else {}
+    summary = _summary(verdict, angles, reasons)
+    messages = [
+        pack_status(names.status, status, sent_s, common, version),
+        pack_text(names.verdict, summary, sent_s, common, version),
+    ]
+    if usable and matrix is not None:
+        with_covariance = {**common, **_covariance(registration.covariance)}
+        messages.append(pack_transform(names.registration, matrix, sent_s, with_covariance, version))
+        if registration.scan_rad is not None and "StageDeg" in angles:
+            told_angles = {**common, **{key: f"{value:.6f}" for key, value in angles.items()}}
+            plane = trus_T_plane(registration.scan_rad)
+            messages.append(pack_transform(names.plane, plane, sent_s, told_angles, version))
+    return b"".join(messages)
+
+
+def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:
+    """JSON, ASCII; as many of the reasons as fit."""
+    cut = [reason[:TEXT_CHARACTERS] for reason in reasons]
+    angle, sigma = angles.get("StageDeg"), angles.get("SigmaDeg")
+    while True:
+        text = json.dumps({"verdict": verdict, "stage_deg": angle, "sigma_deg": sigma, "reasons": cut})
+        if len(text) <= SUMMARY_BYTES:
+            return text
+        cut.pop()
+
+
+def _angles(registration: Registration) -> dict[str, float]:
+    given = {"StageDeg": registration.scan_rad, "SigmaDeg": registration.sigma_rad}
+    return {key: math.degrees(value) for key, value in given.items() if value is not None and math.isfinite(value)}
+
+
+def _covariance(covariance: FloatArray | None) -> dict[str, str]:
+    if covariance is None:
+        return {}
+    numbers = " ".join(f"{value:.9g}" for value in np.asarray(covariance).ravel())
+    return {"Covariance": numbers, "CovarianceFrame": "right tangent, rad and mm"}

@@ -1,0 +1,428 @@
+"""TCP to a device, run by a thread of its own: bounded in memory and in time, whatever the other side sends.
+
+One class for both ends. As a client it connects, and connects again after a loss; as a server it takes a few peers.
+What comes in goes through a decoder (one for each peer) into a queue that keeps the newest; what goes out is one block
+of bytes per peer at a time, and a block that a slow peer has not begun to take is replaced by the newer one. Nothing a
+peer does ends the thread: a broken stream, a stall in the middle of a message or of a block ends that peer's connection
+only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import selectors
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Generic, Literal, Protocol, TypeVar
+
+from fgreg.errors import InputError, one_line
+
+CHUNK_BYTES = 1 << 18
+TICK_S = 0.05
+"""The thread looks at its clocks at least this often."""
+RETRY_S, CONNECT_S = 0.5, 2.0
+"""Between two attempts to connect, and how long one may take."""
+MESSAGE_S = 5.0
+"""A message has to be complete, and a block taken, this long after its first byte: a slow sender holds nothing up."""
+MAX_PEERS = 8
+QUEUE_ITEMS, QUEUE_BYTES = 256, 128 << 20
+
+
+class StreamBroken(Exception):  # noqa: N818
+    """What arrived cannot be followed any further: hang up. The text says why."""
+
+
+class Sized(Protocol):
+    """Anything that says how much memory it holds."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+
+
+Item = TypeVar("Item", bound=Sized)
+
+
+class Decoder(Protocol[Item]):
+    """Bytes of one connection to messages."""
+
+    def feed(self, data: bytes, host_s: float) -> list[Item]:
+        """Messages completed by ``data``, which arrived at ``host_s``. Raises StreamBroken."""
+
+    @property
+    def partial(self) -> bool:
+        """Whether a message has begun and is not complete."""
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Where to connect to, or to listen.
+
+    Listening is on loopback unless another address is given; port 0 takes a free one.
+    """
+
+    host: str
+    port: int
+    listen: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.host or not self.host.isprintable() or " " in self.host:
+            raise InputError("address", repr(self.host), "a host name or an IP address")
+        if not (0 if self.listen else 1) <= self.port <= 65535:
+            raise InputError("port", str(self.port), "a number from 1 to 65535")
+
+    @classmethod
+    def listening(cls, port: int, bind: str = "127.0.0.1") -> Endpoint:
+        """A server; ``bind="0.0.0.0"`` lets other machines in: the protocols here know no passwords."""
+        return cls(bind, port, listen=True)
+
+    def __str__(self) -> str:
+        return f"{'listening on ' if self.listen else ''}{self.host}:{self.port}"
+
+
+@dataclass(slots=True)
+class Rejections:
+    """Messages that were left out, and why the last one was."""
+
+    count: int = 0
+    last: str = ""
+
+    def add(self, reason: str) -> None:
+        """One more."""
+        self.count += 1
+        self.last = one_line(reason, 200)
+
+
+@dataclass(slots=True, eq=False)
+class _Peer(Generic[Item]):
+    socket: socket.socket
+    name: str
+    decoder: Decoder[Item]
+    connecting: bool
+    since_s: float  # when connecting began
+    partial_since_s: float | None = None
+    block: memoryview = field(default_factory=lambda: memoryview(b""))  # being sent
+    block_since_s: float = 0.0
+    next_block: bytes | None = None
+
+
+class TcpLink(Generic[Item]):
+    """A connection that is kept alive.
+
+    Args:
+        endpoint: the other side, or where to listen.
+        decoder: makes a peer's decoder; it counts what it leaves out in the Rejections given.
+        greeting: sent to every new peer first.
+        farewell: sent on close, as far as the peer takes it at once.
+        keep_latest: whether a new peer gets the block that was offered last.
+        silent_s: a peer that sends no message for this long counts as lost; None: it may be silent.
+
+    Raises:
+        InputError: listening where it is not possible.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        decoder: Callable[[Rejections], Decoder[Item]],
+        *,
+        greeting: bytes = b"",
+        farewell: bytes = b"",
+        keep_latest: bool = False,
+        silent_s: float | None = None,
+    ) -> None:
+        self._decoder, self._greeting, self._farewell = decoder, greeting, farewell
+        self._keep_latest, self._silent_s = keep_latest, silent_s
+        self._endpoint = endpoint
+        self.rejections = Rejections()
+        self._lock = threading.Lock()
+        self._items: deque[Item] = deque()
+        self._bytes = 0
+        self._dropped = 0
+        self._latest: bytes | None = None
+        self._offered: bytes | None = None
+        self._losses: deque[str] = deque(maxlen=1)
+        self._state: Literal["new", "there", "silent", "gone"] = "new"
+        # The rest is the thread's own.
+        self._peers: list[_Peer[Item]] = []
+        self._next_try_s = 0.0
+        self._heard_s = 0.0
+        self._server = self._listen() if endpoint.listen else None
+        self._selector = selectors.DefaultSelector()
+        self._wake, self._woken = socket.socketpair()
+        for end in (self._wake, self._woken):
+            end.setblocking(False)
+        self._selector.register(self._woken, selectors.EVENT_READ)
+        if self._server is not None:
+            self._selector.register(self._server, selectors.EVENT_READ)
+        self._stop = False
+        self._thread = threading.Thread(target=self._run, name=f"tcp {endpoint}", daemon=True)
+        self._thread.start()
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """As given, with the port that was taken."""
+        return self._endpoint
+
+    @property
+    def connected(self) -> bool:
+        """Whether anybody is at the other end, and not silent."""
+        return self._state == "there"
+
+    @property
+    def dropped(self) -> int:
+        """Messages nobody fetched in time and blocks nobody took in time."""
+        return self._dropped
+
+    def poll(self) -> list[Item]:
+        """Messages since the last call, oldest first; at once."""
+        with self._lock:
+            items = list(self._items)
+            self._items.clear()
+            self._bytes = 0
+        return items
+
+    def take_loss(self) -> str | None:
+        """Why the last peer was lost; once for each loss, None where there was none since the last call."""
+        with self._lock:
+            return self._losses.popleft() if self._losses else None
+
+    def offer(self, block: bytes) -> None:
+        """Send this to every peer; at once, whatever they do."""
+        with self._lock:
+            self._offered = block
+            if self._keep_latest:
+                self._latest = block
+        self._wake_up()
+
+    def close(self) -> None:
+        """End the thread and all connections."""
+        self._stop = True
+        self._wake_up()
+        self._thread.join(timeout=2.0 * CONNECT_S)
+
+    def _wake_up(self) -> None:
+        with contextlib.suppress(OSError):  # full: it wakes up anyway; closed: nobody to wake
+            self._wake.send(b"\0")
+
+    # What follows runs in the thread, but for _listen.
+
+    def _listen(self) -> socket.socket:
+        where = self._endpoint
+        try:
+            family = socket.getaddrinfo(where.host, where.port, type=socket.SOCK_STREAM)[0][0]
+            server = socket.create_server((where.host, where.port), family=family, backlog=64)
+        except OSError as error:
+            raise InputError(str(where), _text(error), "a free port of an address of this machine") from error
+        server.setblocking(False)
+        self._endpoint = Endpoint(where.host, server.getsockname()[1], listen=True)
+        return server
+
+    def _run(self) -> None:
+        try:
+            while not self._stop:
+                now = time.monotonic()
+                if self._server is None and not self._peers and now >= self._next_try_s:
+                    self._connect(now)
+                for key, events in self._selector.select(TICK_S):
+                    if key.fileobj is self._woken:
+                        with contextlib.suppress(OSError):
+                            self._woken.recv(4096)
+                    elif key.fileobj is self._server:
+                        self._accept()
+                    else:
+                        self._serve(key.data, events)
+                self._distribute()
+                self._expire(time.monotonic())
+        finally:
+            self._shut()
+
+    def _connect(self, now: float) -> None:
+        self._next_try_s = now + RETRY_S
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(
+                self._endpoint.host, self._endpoint.port, type=socket.SOCK_STREAM
+            )[0]
+            connection = socket.socket(family, kind, protocol)
+        except OSError as error:
+            self._lost("gone", f"{self._endpoint}: {_text(error)}")
+            return
+        connection.setblocking(False)
+        result = connection.connect_ex(address)
+        peer = self._new_peer(connection, str(self._endpoint), connecting=True)
+        if result not in (0, errno.EINPROGRESS):
+            self._hang_up(peer, os.strerror(result))
+
+    def _accept(self) -> None:
+        assert self._server is not None
+        try:
+            connection, address = self._server.accept()
+        except OSError:
+            time.sleep(TICK_S)  # gone before it was taken in, or no room for more files: not at full speed then
+            return
+        if len(self._peers) >= MAX_PEERS:
+            self.rejections.add(f"a peer beyond the {MAX_PEERS} that are there")
+            connection.close()
+            return
+        connection.setblocking(False)
+        peer = self._new_peer(connection, f"{address[0]}:{address[1]}", connecting=False)
+        try:
+            self._greet(peer)
+        except OSError as error:
+            self._hang_up(peer, _text(error))
+
+    def _new_peer(self, connection: socket.socket, name: str, connecting: bool) -> _Peer[Item]:
+        peer = _Peer(connection, name, self._decoder(self.rejections), connecting, time.monotonic())
+        self._peers.append(peer)
+        self._selector.register(connection, selectors.EVENT_READ | selectors.EVENT_WRITE, peer)
+        return peer
+
+    def _greet(self, peer: _Peer[Item]) -> None:
+        """The connection stands."""
+        peer.connecting = False
+        with contextlib.suppress(OSError):
+            peer.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            peer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for option, value in (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3)):
+                if hasattr(socket, option):  # a pulled cable shows after 4 s
+                    peer.socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        with self._lock:
+            latest = self._latest if self._offered is None else None  # else it is about to be sent to all
+            self._state = "there"
+        self._heard_s = time.monotonic()
+        first = self._greeting + (latest or b"")
+        if first:
+            peer.next_block = first
+        self._write(peer)
+
+    def _serve(self, peer: _Peer[Item], events: int) -> None:
+        if peer not in self._peers:
+            return  # hung up by an event before this one
+        try:
+            if peer.connecting:
+                failed = peer.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+                if failed:
+                    raise StreamBroken(os.strerror(failed))
+                if peer.socket.getsockname() == peer.socket.getpeername():
+                    raise StreamBroken("nobody listens there")  # the system connected the socket to itself
+                self._greet(peer)
+            elif events & selectors.EVENT_READ:
+                self._read(peer)
+            elif events & selectors.EVENT_WRITE:
+                self._write(peer)
+        except (OSError, StreamBroken) as error:
+            self._hang_up(peer, _text(error))
+        except Exception as error:  # a decoder that fails on hostile bytes must not take the others with it
+            self.rejections.add(repr(error))
+            self._hang_up(peer, repr(error))
+
+    def _read(self, peer: _Peer[Item]) -> None:
+        try:
+            data = peer.socket.recv(CHUNK_BYTES)
+        except BlockingIOError:
+            return
+        if not data:
+            inside = " in the middle of a message" if peer.decoder.partial else ""
+            raise StreamBroken(f"the other side hung up{inside}")
+        now = time.monotonic()
+        items = peer.decoder.feed(data, now)
+        if not peer.decoder.partial:
+            peer.partial_since_s = None
+        elif items or peer.partial_since_s is None:
+            peer.partial_since_s = now
+        if items:
+            self._heard_s = now
+            self._take_in(items)
+
+    def _take_in(self, items: list[Item]) -> None:
+        with self._lock:
+            self._state = "there"
+            for item in items:
+                self._items.append(item)
+                self._bytes += item.nbytes
+            while len(self._items) > QUEUE_ITEMS or (self._bytes > QUEUE_BYTES and len(self._items) > 1):
+                self._bytes -= self._items.popleft().nbytes
+                self._dropped += 1
+
+    def _write(self, peer: _Peer[Item]) -> None:
+        while True:
+            if not peer.block:
+                if peer.next_block is None:
+                    self._selector.modify(peer.socket, selectors.EVENT_READ, peer)
+                    return
+                peer.block, peer.next_block = memoryview(peer.next_block), None
+                peer.block_since_s = time.monotonic()
+            try:
+                sent = peer.socket.send(peer.block)
+            except BlockingIOError:
+                self._selector.modify(peer.socket, selectors.EVENT_READ | selectors.EVENT_WRITE, peer)
+                return
+            peer.block = peer.block[sent:]
+
+    def _distribute(self) -> None:
+        with self._lock:
+            block, self._offered = self._offered, None
+        if block is None:
+            return
+        for peer in list(self._peers):
+            if peer.connecting:
+                continue
+            self._dropped += peer.next_block is not None
+            peer.next_block = block
+            try:
+                self._write(peer)
+            except OSError as error:
+                self._hang_up(peer, _text(error))
+
+    def _expire(self, now: float) -> None:
+        for peer in list(self._peers):
+            if peer.connecting:
+                if now - peer.since_s > CONNECT_S:
+                    self._hang_up(peer, f"no answer for {CONNECT_S:g} s")
+            elif peer.partial_since_s is not None and now - peer.partial_since_s > MESSAGE_S:
+                self._hang_up(peer, f"a message was not complete after {MESSAGE_S:g} s")
+            elif peer.block and now - peer.block_since_s > MESSAGE_S:
+                self._hang_up(peer, f"did not take what was sent for {MESSAGE_S:g} s")
+        if self._silent_s is not None and self._state == "there" and now - self._heard_s > self._silent_s:
+            self._lost("silent", f"{self._endpoint}: nothing heard for {self._silent_s:g} s")
+
+    def _hang_up(self, peer: _Peer[Item], reason: str) -> None:
+        self._peers.remove(peer)
+        self._selector.unregister(peer.socket)
+        peer.socket.close()
+        if not any(not other.connecting for other in self._peers):
+            self._lost("gone", f"{peer.name}: {reason}")
+
+    def _lost(self, state: Literal["silent", "gone"], reason: str) -> None:
+        """Nobody is there any more: said once, however many attempts to connect fail after it.
+
+        A client that cannot connect in the first place says so, too; a server waits for its first peer in silence.
+        """
+        with self._lock:
+            if self._state == "there" or (self._state == "new" and self._server is None):
+                self._losses.append(one_line(reason, 200))
+            if self._state != "new" or self._server is None:
+                self._state = state
+
+    def _shut(self) -> None:
+        for peer in self._peers:
+            with contextlib.suppress(OSError):
+                if self._farewell and not peer.connecting and not peer.block:
+                    peer.socket.send(self._farewell)
+            peer.socket.close()
+        self._state = "gone"
+        for end in (self._server, self._wake, self._woken):
+            if end is not None:
+                end.close()
+        self._selector.close()
+
+
+def _text(error: Exception) -> str:
+    """What went wrong, without error numbers."""
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
