@@ -12,7 +12,7 @@ import yaml
 
 from fgreg.drivers.calibration_files import read_calibration
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray
+from fgreg.frames import FloatArray, as_float_array
 from fgreg.models import StereoRig
 
 # Left turned by asin(0.6) about z against the rectified frame, right not at all: figures one can check by hand.
@@ -78,14 +78,14 @@ def test_ros_camera_info_with_hand_computed_numbers(tmp_path: Path) -> None:
     assert rig.left.image_size == (640, 480)
     np.testing.assert_array_equal(rig.left.matrix, [[800, 0, 320.5], [0, 810, 240.25], [0, 0, 1]])
     np.testing.assert_array_equal(rig.left.distortion, [-0.25, 0.125, 0.001, -0.002, 0.5])
-    expected = np.array([[0.8, -0.6, 0, -5], [0.6, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    expected = as_float_array([[0.8, -0.6, 0, -5], [0.6, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     np.testing.assert_allclose(transform_of(rig), expected, atol=1e-12)
 
 
 def test_a_turned_right_camera_moves_the_baseline_into_its_axes(tmp_path: Path) -> None:
     # right_T_left = [R_right', R_right' b]: R' (-5, 0, 0) = (-4, 3, 0) where R is TURNED.
     files = [info(tmp_path, "left"), info(tmp_path, "right", r=TURNED, p3=-3.5)]
-    expected = [[0.8, 0.6, 0, -4], [-0.6, 0.8, 0, 3], [0, 0, 1, 0], [0, 0, 0, 1]]
+    expected = as_float_array([[0.8, 0.6, 0, -4], [-0.6, 0.8, 0, 3], [0, 0, 1, 0], [0, 0, 0, 1]])
     np.testing.assert_allclose(transform_of(read_calibration(files).rig), expected, atol=1e-12)
 
 
@@ -95,7 +95,8 @@ def test_rectified_images_have_the_projection_matrix_no_distortion_and_parallel_
     assert rig.right is not None
     np.testing.assert_array_equal(rig.left.matrix, [[700, 0, 300], [0, 700, 230], [0, 0, 1]])
     np.testing.assert_array_equal(rig.left.distortion, np.zeros(5))
-    np.testing.assert_allclose(transform_of(rig), [[1, 0, 0, -5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
+    expected = as_float_array([[1, 0, 0, -5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.testing.assert_allclose(transform_of(rig), expected, atol=1e-12)
 
 
 def test_an_echoed_camera_info_message_is_read_as_well(tmp_path: Path) -> None:
@@ -169,11 +170,11 @@ def test_kalibr_camchain_in_metres(tmp_path: Path) -> None:
     path = tmp_path / "camchain.yaml"
     path.write_text(yaml.safe_dump(kalibr()), encoding="utf-8")
     rig = read_calibration([path]).rig
-    np.testing.assert_allclose(rig.left.matrix, [[461.5, 0, 362.5], [0, 460.25, 246.5], [0, 0, 1]])
+    matrix = as_float_array([[461.5, 0, 362.5], [0, 460.25, 246.5], [0, 0, 1]])
+    np.testing.assert_allclose(rig.left.matrix, matrix)
     np.testing.assert_allclose(rig.left.distortion, [-0.2, 0.05, 0.0001, -0.0002, 0])
-    np.testing.assert_allclose(
-        rig.right_T_left, [[0, -1, 0, -4], [1, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12
-    )
+    expected = as_float_array([[0, -1, 0, -4], [1, 0, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.testing.assert_allclose(transform_of(rig), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
