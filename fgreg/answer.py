@@ -19,10 +19,10 @@ from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.graph.sites import inverse_hessian, propagate
+from fgreg.minima import targets_moved
 from fgreg.posterior import MOST_TRANSLATION_MM, Doubted, Mode, Posterior, gaussian_posterior, sample_posterior
 from fgreg.registration import Registration, Shots
 from fgreg.robust import log_junk
-from fgreg.search import targets_moved
 
 RIVALS = 3
 """At most so many other minima enter the posterior."""

@@ -1,6 +1,6 @@
 """Calibration and registration in the one graph, from no guess: all minima worth knowing, best first.
 
-1. Beam and minima of each camera epoch (fgreg.search).
+1. Beam and minima of each camera epoch (fgreg.minima).
 2. All epochs together from the best of each: Levenberg-Marquardt on the reduced graph.
 3. Where a shot does not fit (its innovation is beyond what the stated noise explains), who is kept is settled on the
    joint problem (fgreg.robust), and the answer is the plain least squares optimum of those.
@@ -22,6 +22,16 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
 from fgreg.measurements import EpochStart, Measurements
+from fgreg.minima import (
+    MIN_KEPT_AIMS,
+    MIN_KEPT_PMS,
+    EpochSearch,
+    Minimum,
+    calibrate_beam,
+    choose_minimum,
+    search_epoch,
+    targets_moved,
+)
 from fgreg.models import SessionModel
 from fgreg.robust import (
     FEW,
@@ -34,16 +44,6 @@ from fgreg.robust import (
     plausible_cost,
     predicted_pms,
     sort_shots,
-)
-from fgreg.search import (
-    MIN_KEPT_AIMS,
-    MIN_KEPT_PMS,
-    EpochSearch,
-    Minimum,
-    calibrate_beam,
-    choose_minimum,
-    search_epoch,
-    targets_moved,
 )
 
 __all__ = [
