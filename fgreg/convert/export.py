@@ -6,8 +6,8 @@ way to say so:
 - PLUS: ``<Transform From="Camera" To="Trus" Matrix=...>``, millimetres, rows one after another.
 - ROS 2: a ``TransformStamped`` with the target as ``header.frame_id`` and the source as ``child_frame_id``, metres.
 - Slicer: a node ``CameraToTrus`` whose matrix *to its parent* is ``trus_T_camera`` in Slicer's RAS numbers, as it comes
-  by OpenIGTLink. An ITK transform file holds the *resampling* direction, parent to node, in LPS: ``F inverse(M) F`` with
-  ``F = diag(-1, -1, 1)``.
+  by OpenIGTLink. An ITK transform file holds the *resampling* direction, parent to node, in LPS: ``F inverse(M) F``
+  with ``F = diag(-1, -1, 1)``.
 - JSON: with the covariance, the verdict and its reasons.
 """
 
@@ -127,13 +127,13 @@ def plus_xml(found: Registration) -> str:
 
 
 def ros_yaml(found: Registration) -> str:
-    """A ``geometry_msgs/TransformStamped`` in ROS's axes of meaning: metres, unit quaternion, target frame as parent."""
+    """A ``geometry_msgs/TransformStamped``: metres, unit quaternion, the target frame as parent."""
     x, y, z = (float(value) / 1000.0 for value in found.trus_T_camera[:3, 3])
     qx, qy, qz, qw = quaternion(found.trus_T_camera[:3, :3])
     numbers = f"--x {x:.9f} --y {y:.9f} --z {z:.9f} --qx {qx:.12f} --qy {qy:.12f} --qz {qz:.12f} --qw {qw:.12f}"
     lines = [
         *(f"# {line}" for line in found.warning_lines),
-        f"# {one_line(found.session)}, epoch {found.epoch}, solved {found.solved:%Y-%m-%dT%H:%M:%SZ}, fgreg {__version__}",
+        f"# {one_line(found.session)}, epoch {found.epoch}, solved {_iso(found.solved)}, fgreg {__version__}",
         f"# ros2 run tf2_ros static_transform_publisher {numbers} --frame-id trus --child-frame-id camera",
         "header:",
         f"  stamp: {{sec: {int(found.solved.timestamp())}, nanosec: 0}}",
@@ -171,7 +171,7 @@ def as_json(found: Registration) -> str:
         "fgreg": __version__,
         "session": found.session,
         "epoch": found.epoch,
-        "solved": f"{found.solved:%Y-%m-%dT%H:%M:%SZ}",
+        "solved": _iso(found.solved),
         "verdict": found.verdict.value,
         "reasons": list(found.reasons),
         "forced": found.refused,
@@ -202,6 +202,10 @@ def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
     axis = vector / angle if angle > 1e-12 else np.zeros(3)
     x, y, z = (float(value) for value in np.sin(angle / 2.0) * axis)
     return x, y, z, float(np.cos(angle / 2.0))
+
+
+def _iso(moment: datetime) -> str:
+    return f"{moment:%Y-%m-%dT%H:%M:%SZ}"
 
 
 def _number(value: float) -> str:
