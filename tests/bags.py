@@ -1,4 +1,4 @@
-"""ROS 2 recordings for tests: by the writer of ``rosbags``, and by the ``mcap`` library from messages packed by hand."""
+"""ROS 2 recordings for tests: by the writer of ``rosbags``, and by the ``mcap`` library, packed by hand."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import shutil
 from collections.abc import Mapping
@@ -57,7 +58,7 @@ def read_table(path: Path, mapping: RecordingMapping) -> Imported:
             drafts.append(_Row(table, cells, line, frames).draft())
     except csv.Error as error:
         raise InputError(f"{path.name}: line {start + reader.line_num}", str(error), "a row of a CSV table") from None
-    for before, after in zip(drafts, drafts[1:], strict=False):
+    for before, after in itertools.pairwise(drafts):
         if after.t < before.t:
             where = before.where.removeprefix(f"{path.name}: ")
             raise InputError(f"{after.where}: t", f"{after.t:.17g}", f"at least {before.t:.17g}, the time on {where}")
