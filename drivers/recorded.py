@@ -11,7 +11,7 @@ import numpy as np
 
 from fgreg.drivers.base import DeviceLost, MotionSample, Stamp, StereoFrame, host_now
 from fgreg.drivers.recordings import ECM_POSE, Recorded, Recording
-from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES, picture_of, pose_of, stamp_s
+from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES, picture_of, pose_of, stamp_ns
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import Grabbed
 from fgreg.errors import InputError
@@ -37,7 +37,7 @@ class Pace:
     def of(cls, path: Path, speed: float = 1.0) -> Pace:
         """A recording that starts now."""
         with Recording(path) as recording:
-            return cls(recording.start_s, host_now(), speed)
+            return cls(recording.start_ns / 1e9, host_now(), speed)
 
     def due_s(self, bag_s: float) -> float:
         """Host time at which a message is due."""
@@ -62,7 +62,7 @@ class _Player:
         """What is due, each with its number on its topic; raises DeviceLost once at the end of the recording."""
         found: dict[str, deque[tuple[Recorded, int]]] = {}
         now = host_now()
-        while not self.ended and self._next is not None and self._pace.due_s(self._next.bag_s) <= now:
+        while not self.ended and self._next is not None and self._pace.due_s(self._next.bag_ns / 1e9) <= now:
             topic = self._next.topic
             waiting = found.setdefault(topic, deque())
             waiting.append((self._next, self._counts[topic]))
@@ -71,7 +71,7 @@ class _Player:
                 waiting.popleft()
                 self.dropped += 1
             self._next = next(self._messages, None)
-        out = sorted((message for waiting in found.values() for message in waiting), key=lambda m: m[0].bag_s)
+        out = sorted((message for waiting in found.values() for message in waiting), key=lambda m: m[0].bag_ns)
         if self._next is None:
             self.ended = True
             if not out and not self._told:
@@ -108,7 +108,7 @@ class RecordedMotion:
         try:
             name = topic or recording.endoscope_pose_topic() or f"/{ECM_POSE}"
             recording.topic(name, POSE_TYPES, "the endoscope's pose")
-            pace = pace or Pace(recording.start_s, host_now())
+            pace = pace or Pace(recording.start_ns / 1e9, host_now())
             self._player = _Player(path, recording, [name], pace, room)
         except BaseException:
             recording.close()
@@ -144,7 +144,7 @@ class RecordedMotion:
                 continue
             if covariance is not None:
                 covariance = as_float_array(tip_from_camera @ covariance @ tip_from_camera.T)
-            stamp = Stamp(stamp_s(message, recorded.bag_s), host_now())
+            stamp = Stamp(stamp_ns(message, recorded.bag_ns) / 1e9, host_now())
             out.append(MotionSample(stamp, as_float_array(transform @ self._tip_T_camera), covariance))
         return out
 
@@ -182,7 +182,7 @@ class RecordedCamera:
             topics = [first] if second is None else [first, second]
             for name in topics:
                 recording.topic(name, IMAGE_TYPES, "images")
-            self._player = _Player(path, recording, topics, pace or Pace(recording.start_s, host_now()), room)
+            self._player = _Player(path, recording, topics, pace or Pace(recording.start_ns / 1e9, host_now()), room)
         except BaseException:
             recording.close()
             raise
@@ -215,7 +215,7 @@ class RecordedCamera:
             except ValueError:
                 self._bad += 1
                 continue
-            stamp = Stamp(stamp_s(message, recorded.bag_s), host_now())
+            stamp = Stamp(stamp_ns(message, recorded.bag_ns) / 1e9, host_now())
             grabbed[recorded.topic].append(Grabbed(stamp, picture, index))
         rights = [] if self._right is None else grabbed[self._right]
         expected = self._right is not None and not self._player.ended

@@ -36,11 +36,11 @@ class Topic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """One message: when it was recorded (s, recorder's clock), and its bytes."""
+    """One message: when it was recorded (ns, recorder's clock), and its bytes."""
 
     topic: str
     kind: str
-    bag_s: float
+    bag_ns: int
     raw: bytes | memoryview
 
 
@@ -78,7 +78,7 @@ class Recording:
             name: Topic(str(kind), sum(int(c.msgcount) for c in connections if c.topic == name))
             for name, kind in sorted({(c.topic, c.msgtype) for c in connections})
         }
-        self.start_s: float = reader.start_time / 1e9 if reader.message_count else 0.0
+        self.start_ns: int = int(reader.start_time) if reader.message_count else 0
 
     def __enter__(self) -> Self:
         return self
@@ -105,7 +105,7 @@ class Recording:
             return
         try:
             for connection, bag_ns, raw in self._reader.messages(connections=connections):
-                yield Recorded(connection.topic, connection.msgtype, bag_ns / 1e9, raw)
+                yield Recorded(connection.topic, connection.msgtype, int(bag_ns), raw)
         except GeneratorExit:
             raise
         except Exception as error:

@@ -43,13 +43,14 @@ _BAYER |= {"bayer_gbrg8": cv2.COLOR_BayerGR2BGR, "bayer_grbg8": cv2.COLOR_BayerG
 _ARRAYS: dict[str, str] = {"32FC1": "f4", "16SC1": "i2", "16UC1": "u2", "mono16": "u2", "8UC1": "u1", "mono8": "u1"}
 
 
-def stamp_s(message: Any, recorded_s: float) -> float:
-    """Time in a message's header (s); that of recording where it has none, or zero."""
+def stamp_ns(message: Any, recorded_ns: int) -> int:
+    """Time in a message's header (ns: as seconds since 1970 a double would round it to 0.2 us); that of recording
+    where it has none, or zero."""
     header = getattr(message, "header", None)
     if header is None:
-        return recorded_s
-    found = float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec)
-    return found if found > 0.0 else recorded_s
+        return recorded_ns
+    found = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    return found if found > 0 else recorded_ns
 
 
 def pose_of(message: Any) -> tuple[FloatArray, FloatArray | None]:

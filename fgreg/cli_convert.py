@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,7 +91,7 @@ def add_convert(app: typer.Typer) -> None:
         _import(source, out, setup, mapping, calibration or [], unit, rectified, overwrite, quiet)
 
 
-def _refuse(options: dict[str, object], given: str, of: str) -> None:
+def _refuse(options: Mapping[str, object], given: str, of: str) -> None:
     for name, value in options.items():
         if value is not None:
             raise InputError(name, f"it with {given}", f"it with {of} only")

@@ -3,7 +3,8 @@
 What becomes an event:
 
 - with a ``mark`` topic (std_msgs/String, each a JSON object with an event's fields, such as ``{"type": "pair", "pm": 3,
-  "sweep": 1}`` or ``{"type": "aim", "corner": [4, 2]}``): each mark; a pair takes the look nearest to it;
+  "sweep": 1}`` or ``{"type": "aim", "corner": [4, 2]}``): each mark; a pair takes the look nearest to it, a track one
+  that comes with it;
 - without: each look (``look``: PointStamped, x lateral and z range; or ``frame``: the probe's data) is a pair.
 
 The marker is the pose at the look's time, interpolated, or the nearest images. Where the recording has the endoscope
@@ -44,7 +45,7 @@ from fgreg.drivers.ros_messages import (
     picture_of,
     pose_of,
     scan_deg_of,
-    stamp_s,
+    stamp_ns,
 )
 from fgreg.errors import InputError
 from fgreg.frames import FloatArray, inverse, log_so3
@@ -109,7 +110,7 @@ def read_bag(path: Path, mapping: RecordingMapping) -> Imported:
     left_out = [
         f"{len(reasons)} messages on {topic} are not used: {reasons[0]}" for topic, reasons in streams.bad.items()
     ]
-    source = f"recording {path.name}, t = 0 at {recording.start_s:.6f} s of its clock"
+    source = f"recording {path.name}, t = 0 at {recording.start_ns / 1e9:.6f} s of its clock"
 
     def write(folder: Path) -> None:
         _write_frames(path, topics, joined.frames, folder)
@@ -157,10 +158,10 @@ def _read_streams(recording: Recording, topics: dict[str, str], mapping: Recordi
         index = counts[recorded.topic]
         counts[recorded.topic] += 1
         message = recording.decode(recorded)
-        time_s = stamp_s(message, recorded.bag_s) if mapping.by_header else recorded.bag_s
+        time_ns = stamp_ns(message, recorded.bag_ns) if mapping.by_header else recorded.bag_ns
         for role in roles[recorded.topic]:
             try:
-                _take(streams, role, message, time_s - recording.start_s, index, mapping)
+                _take(streams, role, message, (time_ns - recording.start_ns) / 1e9, index, mapping)
             except ValueError as error:
                 streams.bad.setdefault(recorded.topic, []).append(str(error))
             except InputError as error:
@@ -256,18 +257,29 @@ class _Join:
                 marker = self._marker(t) | (self._images(t) if "corner" in mark else {})
                 return {**mark, "t": t, "marker": marker}
             case "track":
-                return {"scan_deg": self._scan(t), **mark, "t": t, "marker": self._marker(t)}
+                rest = {key: value for key, value in mark.items() if key not in _OF_LOOK}
+                return {**rest, "t": t, "marker": self._marker(t), **self._heard(t, mark)}
             case _:
                 return {**mark, "t": t}
 
-    def _pair(self, t: float, look: _Look, told: Document) -> Document:
+    def _heard(self, t: float, mark: Document) -> Document:
+        """What a query has of the probe: the look that comes with it, else where the stage is."""
+        try:
+            look_s, look = _nearest(self._streams.looks, t, self._mapping.max_gap_s, "look")
+        except PairRefused:
+            return {"scan_deg": self._scan(t)}
+        return {"trus": self._trus(look_s, look, mark)}
+
+    def _trus(self, t: float, look: _Look, told: Document) -> Document:
         trus: Document = {"scan_deg": self._scan(t)}
         if look.position_mm is not None:
             trus |= {"x_mm": look.position_mm[0], "range_mm": look.position_mm[1]}
-        marker = self._marker(t)
         if look.frame is not None:
             trus["frame"] = self._name("frame", look.frame, ".npy")
-        trus |= {key: told[key] for key in _OF_LOOK if key in told}
+        return trus | {key: told[key] for key in _OF_LOOK if key in told}
+
+    def _pair(self, t: float, look: _Look, told: Document) -> Document:
+        marker, trus = self._marker(t), self._trus(t, look, told)
         rest = {key: value for key, value in told.items() if key not in (*_OF_LOOK, "type", "t")}
         return {"type": "pair", "t": t, **rest, "marker": marker, "trus": trus}
 
