@@ -143,6 +143,7 @@ class Endoscope:
             2 * config.queue,
         )
         self._losses: list[DeviceLost] = []
+        self._held: list[StereoFrame] = []
         self._told_right = False
         self._cadence = _Cadence()
 
@@ -188,9 +189,10 @@ class Endoscope:
             pairs = self._matcher.take(grabbed[0], grabbed[1], right_expected=not self._told_right)
         else:
             pairs = [(entry, None) for entry in grabbed[0]]
-        frames = [frame for left, right in pairs for frame in self._frames(left, right)]
-        if self._losses and not frames:
-            raise self._losses.pop(0)
+        self._held += [frame for left, right in pairs for frame in self._frames(left, right)]
+        if self._losses:
+            raise self._losses.pop(0)  # what came meanwhile comes with the next call
+        frames, self._held = self._held, []
         return frames
 
     def _remaining(self, lost: int) -> str:

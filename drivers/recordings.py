@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -55,7 +56,6 @@ class Recording:
     def __init__(self, path: Path) -> None:
         try:
             from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
         except ImportError:
             raise MissingExtraError("rosbags", "ros") from None
         self.path = path
@@ -68,7 +68,7 @@ class Recording:
         # Files that bring no definitions of their messages have those of ROS 2 itself.
         self._reader: Any = None
         try:
-            reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            reader: Any = AnyReader([path], default_typestore=_common_types())
             reader.open()
         except Exception as error:  # a damaged file makes the parsers under it raise whatever they run into
             raise self._damaged(error) from None
@@ -165,6 +165,13 @@ class Recording:
 
     def _damaged(self, error: Exception) -> InputError:
         return InputError(str(self.path), f"a recording that cannot be read ({_words(error)})", "a whole one")
+
+
+@functools.cache
+def _common_types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _words(error: BaseException) -> str:

@@ -6,7 +6,6 @@ import csv
 import io
 import itertools
 import math
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -248,12 +247,12 @@ class _Row:
 def _copy_frames(frames: Mapping[str, Path], folder: Path) -> None:
     """Copies files; pictures that are no PNG become one."""
     for name, path in frames.items():
+        data = read_bounded(path, str(path), _MAX_BYTES)
+        if path.suffix.lower() not in (".npy", ".png"):
+            picture = read_picture(path)
+            if picture is None:
+                raise InputError(str(path), "something that is no picture", "a picture (PNG, JPEG, BMP, TIFF)")
+            data = png_bytes(picture)
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix.lower() in (".npy", ".png"):
-            shutil.copyfile(path, target)
-            continue
-        picture = read_picture(path)
-        if picture is None:
-            raise InputError(str(path), "something that is no picture", "a picture (PNG, JPEG, BMP, TIFF)")
-        target.write_bytes(png_bytes(picture))
+        target.write_bytes(data)
