@@ -26,7 +26,7 @@ from fgreg.drivers.image_folder import FolderCapture
 from fgreg.drivers.interlaced import Fields, Picture, split
 from fgreg.drivers.rectification import Rectification
 from fgreg.drivers.stereo_matching import StereoMatcher
-from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Timing, VideoInput
+from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Origin, Timing, VideoInput
 from fgreg.errors import InputError
 
 _VIDEO_DEVICE = re.compile(r"/dev/video[0-9]+")
@@ -135,7 +135,8 @@ class Endoscope:
     def __init__(self, config: EndoscopeConfig, rectified: Rectification | None = None) -> None:
         self._config, self._rectified = config, rectified
         sources = [_Source.of(entry) for entry in (config.left, config.right) if entry is not None]
-        self._inputs = [VideoInput(s.name, s.open, s.timing, config.queue) for s in sources]
+        origin = Origin()
+        self._inputs = [VideoInput(s.name, s.open, s.timing, config.queue, origin) for s in sources]
         one_clock = len({source.clock for source in sources}) == 1 and sources[0].clock != "host"
         self._matcher = StereoMatcher(
             config.max_gap_s,

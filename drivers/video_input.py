@@ -69,6 +69,21 @@ class Grabbed:
     index: int
 
 
+class Origin:
+    """Where played time begins: shared by inputs that play together, set by the first frame of either."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._at: tuple[float, float] | None = None
+
+    def due_s(self, device_s: float, host_s: float) -> float:
+        """How long (s) after ``host_s`` a frame of ``device_s`` is due."""
+        with self._lock:
+            if self._at is None:
+                self._at = device_s, host_s
+            return self._at[1] + (device_s - self._at[0]) - host_s
+
+
 class VideoInput:
     """A capture, kept open.
 
@@ -77,10 +92,16 @@ class VideoInput:
         open_capture: makes the capture; None, or one that is not opened, where the device is not there.
         timing: of its frames.
         queue: frames that may wait.
+        origin: of played time, where inputs play together.
     """
 
     def __init__(
-        self, name: str, open_capture: Callable[[], Capture | None], timing: Timing | None = None, queue: int = 8
+        self,
+        name: str,
+        open_capture: Callable[[], Capture | None],
+        timing: Timing | None = None,
+        queue: int = 8,
+        origin: Origin | None = None,
     ) -> None:
         if queue < 1:
             raise ValueError(f"queue is {queue}, expected at least 1")
@@ -96,7 +117,7 @@ class VideoInput:
         self._ended = False  # a file at its end
         self._why = "it could not be opened"
         self._heard_s = host_now()
-        self._clock = _Clock(self._timing)
+        self._clock = _Clock(self._timing, origin or Origin())
         self._thread = threading.Thread(target=self._run, name=f"video {name}", daemon=True)
         self._thread.start()
 
@@ -220,13 +241,12 @@ class VideoInput:
 class _Clock:
     """Times of an input's frames, and how long a played one has to wait for its own."""
 
-    def __init__(self, timing: Timing) -> None:
-        self._timing = timing
+    def __init__(self, timing: Timing, origin: Origin) -> None:
+        self._timing, self._origin = timing, origin
         self._trust = timing.device_clock
         self._last_s = -math.inf
         self._shift_s = 0.0
         self._period_s = _PERIOD_S
-        self._began: tuple[float, float] | None = None
 
     def restart(self) -> None:
         """The capture was opened anew: a file starts at zero again, a device's clock goes on or does not."""
@@ -249,9 +269,5 @@ class _Clock:
         else:
             self._trust = False
             device_s = host_s
-        due_s = 0.0
-        if self._timing.paced and self._trust:
-            if self._began is None:
-                self._began = device_s, host_s
-            due_s = self._began[1] + (device_s - self._began[0]) - host_s
+        due_s = self._origin.due_s(device_s, host_s) if self._timing.paced and self._trust else 0.0
         return Stamp(device_s - self._timing.delay_s, host_s), due_s
