@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -276,16 +277,23 @@ class _Source:
 def _open_device(path: str, config: InputConfig) -> Capture | None:
     if not os.path.exists(path):  # noqa: PTH110  (OpenCV would complain on standard error at each attempt)
         return None
-    wanted: list[int] = []
-    if config.fourcc is not None:
-        wanted += [cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc)]
-    for key, value in ((cv2.CAP_PROP_FRAME_WIDTH, config.width), (cv2.CAP_PROP_FRAME_HEIGHT, config.height)):
-        if value is not None:
-            wanted += [key, value]
-    if config.fps is not None:
-        wanted += [cv2.CAP_PROP_FPS, round(config.fps)]
     backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
-    return _quietly(lambda: cv2.VideoCapture(int(path.removeprefix("/dev/video")), backend, wanted))
+    capture = _quietly(lambda: cv2.VideoCapture(int(path.removeprefix("/dev/video")), backend))
+    # The kind of pixels first: it decides which sizes and rates the device has.
+    if config.fourcc is not None:
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
+    for key, value in (
+        (cv2.CAP_PROP_FRAME_WIDTH, config.width),
+        (cv2.CAP_PROP_FRAME_HEIGHT, config.height),
+        (cv2.CAP_PROP_FPS, config.fps),
+    ):
+        if value is not None:
+            capture.set(key, value)
+    width, height = (round(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if capture.isOpened() and (config.width or width, config.height or height) != (width, height):
+        capture.release()
+        raise OSError(f"it delivers {width} x {height} px, not {config.width} x {config.height}")
+    return capture
 
 
 def _open_stream(url: str, silence_s: float) -> Capture | None:
@@ -294,20 +302,38 @@ def _open_stream(url: str, silence_s: float) -> Capture | None:
     return _quietly(lambda: cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits))
 
 
+class _Quiet:
+    """Holds back OpenCV's own warnings while anything is being opened: absent devices are looked for all the time."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = self._before = 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            self._inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                cv2.utils.logging.setLogLevel(self._before)
+
+
+_QUIET = _Quiet()
+
+
 def _quietly(make: Callable[[], cv2.VideoCapture]) -> cv2.VideoCapture:
-    """Opens without OpenCV's own warnings: an absent device is looked for several times a second."""
-    before = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
+    with _QUIET:
         return make()
-    finally:
-        cv2.utils.logging.setLogLevel(before)
 
 
-def video_devices() -> list[tuple[str, str]]:
+def video_devices(known: Path = Path("/sys/class/video4linux")) -> list[tuple[str, str]]:
     """The V4L2 devices of this machine: path, and what the driver calls it."""
     out = []
-    for entry in sorted(Path("/sys/class/video4linux").glob("video*"), key=lambda p: (len(p.name), p.name)):
+    for entry in sorted(known.glob("video*"), key=lambda p: (len(p.name), p.name)):
         try:
             label = (entry / "name").read_text(encoding="utf-8", errors="replace").strip()
         except OSError:

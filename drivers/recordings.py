@@ -164,7 +164,8 @@ class Recording:
         return found[0] if len(found) == 1 else None
 
     def _damaged(self, error: Exception) -> InputError:
-        return InputError(str(self.path), f"a recording that cannot be read ({_words(error)})", "a whole one")
+        hint = "; of a recorder that was cut off, mcap recover makes one" if self.path.suffix == ".mcap" else ""
+        return InputError(str(self.path), f"a recording that cannot be read ({_words(error)})", f"a whole one{hint}")
 
 
 @functools.cache

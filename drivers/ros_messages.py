@@ -18,6 +18,7 @@ from fgreg.drivers.calibration_files import CameraInfo
 from fgreg.drivers.interlaced import Picture
 from fgreg.errors import InputError
 from fgreg.frames import FloatArray, as_float_array, make_transform, right_from_parent_covariance
+from fgreg.quaternions import rotation_from_quaternion, turn_about_x
 
 IMAGE_TYPES = frozenset({"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
 INFO_TYPES = frozenset({"sensor_msgs/msg/CameraInfo"})
@@ -32,7 +33,6 @@ ARRAY_TYPES = frozenset(
 TEXT_TYPES = frozenset({"std_msgs/msg/String"})
 
 MM_PER_M = 1000.0
-_UNIT_TOLERANCE = 1e-3
 
 _CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3, "bgra8": 4, "8UC4": 4, "rgba8": 4}
 _TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "bgra8": cv2.COLOR_BGRA2BGR, "8UC4": cv2.COLOR_BGRA2BGR}
@@ -67,7 +67,7 @@ def pose_of(message: Any) -> tuple[FloatArray, FloatArray | None]:
             covariance = np.asarray(pose.covariance, dtype=np.float64).reshape(6, 6)
             pose = pose.pose
         position, turn = pose.position, pose.orientation
-    rotation = rotation_of(turn.x, turn.y, turn.z, turn.w)
+    rotation = rotation_from_quaternion(turn.x, turn.y, turn.z, turn.w)
     shift_mm = MM_PER_M * np.array([position.x, position.y, position.z], dtype=np.float64)
     if not np.isfinite(shift_mm).all():
         raise ValueError("a position that is not finite")
@@ -77,33 +77,6 @@ def pose_of(message: Any) -> tuple[FloatArray, FloatArray | None]:
     order, scale = [3, 4, 5, 0, 1, 2], np.repeat([1.0, MM_PER_M], 3)
     parent = covariance[np.ix_(order, order)] * np.outer(scale, scale)
     return transform, as_float_array(right_from_parent_covariance(rotation, parent))
-
-
-def rotation_of(x: float, y: float, z: float, w: float) -> FloatArray:
-    """(3, 3) rotation of a unit quaternion."""
-    q = np.array([x, y, z, w], dtype=np.float64)
-    length = float(np.linalg.norm(q))
-    if not abs(length - 1.0) <= _UNIT_TOLERANCE:
-        raise ValueError(f"a quaternion of length {length:.4g}, not 1")
-    x, y, z, w = (float(value) for value in q / length)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def turn_about_x(rotation: FloatArray) -> float:
-    """Stage angle (rad) of a probe's rotation in its holder's frame: t where its z axis is along (0, sin t, cos t).
-
-    Raises:
-        ValueError: the probe is turned about another axis than x, by more than a degree.
-    """
-    if math.degrees(math.acos(min(1.0, max(-1.0, float(rotation[0, 0]))))) > 1.0:
-        raise ValueError("a turn that is not about x")
-    return math.atan2(float(rotation[1, 2]), float(rotation[2, 2]))
 
 
 def scan_deg_of(message: Any, joint: str | None, unit: str) -> float:

@@ -14,9 +14,9 @@ import yaml
 from typer.testing import CliRunner
 
 from fgreg.cli import app
-from fgreg.convert.export import quaternion
 from fgreg.errors import FgregError
 from fgreg.pipeline import SolveRequest, solve_session
+from fgreg.quaternions import quaternion_from_rotation
 from fgreg.session.reading import read_session
 from tests import bags, session_files
 
@@ -58,7 +58,7 @@ def mapping(folder: Path, **content: Any) -> Path:
 
 def pose_message(t: float, matrix: Any) -> Any:
     matrix = np.array(matrix)
-    return bags.pose_stamped(t, matrix[:3, 3] / 1000.0, quaternion(matrix[:3, :3]))
+    return bags.pose_stamped(t, matrix[:3, 3] / 1000.0, quaternion_from_rotation(matrix[:3, :3]))
 
 
 def test_a_session_recorded_on_ros_topics_comes_back_and_is_solved_the_same(pose_session: Path, tmp_path: Path) -> None:
@@ -157,6 +157,18 @@ def test_looks_without_a_stage_angle_or_images_near_them_are_left_out_and_told(t
     assert "1 pair" in done.stdout
     assert "look at 1.995 s is left out: the nearest left image is 0.500 s away, at most 0.1 s allowed" in done.stderr
     assert "look at 1.995 s is left out" in events(tmp_path / "s")[0]["text"]
+
+
+def test_of_positions_and_frames_only_one_is_taken(tmp_path: Path) -> None:
+    messages = [*room(), ("/fgreg/look", 1.04, bags.point_stamped(1.04, (0.001, 0.0, 0.030)))]
+    path, where = bags.write_bag(tmp_path / "bag", messages), setup(tmp_path)
+    assert convert(path, tmp_path / "a", "--setup", where).exit_code == 0
+    assert all("frame" in event["trus"] for event in events(tmp_path / "a")[1:])
+    told = mapping(tmp_path, topics={"look": "/fgreg/look"})
+    assert convert(path, tmp_path / "b", "--setup", where, "--map", told).exit_code == 0
+    assert [event["trus"]["range_mm"] for event in events(tmp_path / "b")[1:]] == [30.0]
+    both = mapping(tmp_path, topics={"look": "/fgreg/look", "frame": "/fgreg/frame"})
+    assert "found look and frame, both" in refused(path, tmp_path / "c", "--setup", where, "--map", both)
 
 
 def test_consecutive_looks_are_at_one_pm_where_the_mapping_says_so(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ import yaml
 from typer.testing import CliRunner
 
 from fgreg.cli import app
-from fgreg.convert.export import quaternion
 from fgreg.errors import FgregError, InputError
 from fgreg.frames import exp_so3
 from tests import session_files
@@ -183,8 +182,3 @@ def test_what_cannot_be_converted_is_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "r.yaml").write_text("format: other\n", encoding="utf-8")
     assert "fgreg-result/1" in refused(tmp_path / "r.yaml", tmp_path / "r.xml")
     assert isinstance(convert(folder, "nowhere/x/r.xml").exception, InputError)
-
-
-def test_quaternions_of_half_a_turn_and_of_none() -> None:
-    assert quaternion(np.eye(3)) == (0.0, 0.0, 0.0, 1.0)
-    np.testing.assert_allclose(np.abs(quaternion(np.diag([-1.0, 1.0, -1.0]))), [0, 1, 0, 0], atol=1e-12)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pytest
 
 from fgreg.drivers.base import DeviceLost, Stamp, StereoFrame
-from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout
+from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout, video_devices
 from fgreg.drivers.interlaced import Fields
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Grabbed, Timing, VideoInput
@@ -356,6 +356,15 @@ def test_a_capture_that_raises_is_looked_for_again() -> None:
         time.sleep(0.005)
     device.close()
     assert found
+
+
+def test_video_devices_are_listed_by_number_with_their_drivers_names(tmp_path: Path) -> None:
+    for name, label in (("video10", "Capture B\n"), ("video2", "Capture A\n"), ("video3", None)):
+        (tmp_path / name).mkdir()
+        if label is not None:
+            (tmp_path / name / "name").write_text(label)
+    assert video_devices(tmp_path) == [("/dev/video2", "Capture A"), ("/dev/video3", ""), ("/dev/video10", "Capture B")]
+    assert video_devices(tmp_path / "none") == []
 
 
 def at(*times_s: float) -> list[Grabbed]:

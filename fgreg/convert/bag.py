@@ -133,6 +133,12 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
             beside = f"{found[side].removesuffix('/compressed').rpartition('/')[0]}/camera_info"
             if beside in recording.topics and recording.topics[beside].kind in INFO_TYPES:
                 found[f"{side}_info"] = beside
+    if {"look", "frame"} <= found.keys():
+        told = {"look", "frame"} & mapping.topics.keys()
+        if len(told) == 2:
+            raise InputError("topics", "look and frame, both", "one of them: each would be a look at the same PM")
+        # The probe's data say more than a position that somebody took from them.
+        del found["frame" if told == {"look"} else "look"]
     if "ecm" not in found and (name := recording.endoscope_pose_topic()) is not None:
         found["ecm"] = name
     where = recording.path.name

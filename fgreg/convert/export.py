@@ -26,7 +26,8 @@ import numpy as np
 from fgreg import __version__
 from fgreg.errors import InputError, one_line
 from fgreg.estimate import SessionEstimate, Verdict
-from fgreg.frames import FloatArray, inverse, log_so3
+from fgreg.frames import FloatArray, inverse
+from fgreg.quaternions import quaternion_from_rotation
 
 JSON_FORMAT = "fgreg-transform/1"
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -129,7 +130,7 @@ def plus_xml(found: Registration) -> str:
 def ros_yaml(found: Registration) -> str:
     """A ``geometry_msgs/TransformStamped``: metres, unit quaternion, the target frame as parent."""
     x, y, z = (float(value) / 1000.0 for value in found.trus_T_camera[:3, 3])
-    qx, qy, qz, qw = quaternion(found.trus_T_camera[:3, :3])
+    qx, qy, qz, qw = quaternion_from_rotation(found.trus_T_camera[:3, :3])
     numbers = f"--x {x:.9f} --y {y:.9f} --z {z:.9f} --qx {qx:.12f} --qy {qy:.12f} --qz {qz:.12f} --qw {qw:.12f}"
     lines = [
         *(f"# {line}" for line in found.warning_lines),
@@ -193,15 +194,6 @@ WRITERS: dict[str, Callable[[Registration], str]] = {
     ".json": as_json,
 }
 """What each ending of a file's name is written by."""
-
-
-def quaternion(rotation: FloatArray) -> tuple[float, float, float, float]:
-    """(x, y, z, w) of a rotation matrix, w >= 0."""
-    vector = log_so3(rotation)
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle > 1e-12 else np.zeros(3)
-    x, y, z = (float(value) for value in np.sin(angle / 2.0) * axis)
-    return x, y, z, float(np.cos(angle / 2.0))
 
 
 def _iso(moment: datetime) -> str:

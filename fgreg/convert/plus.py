@@ -19,10 +19,10 @@ import numpy.typing as npt
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.sequence_file import SequenceFile, read_sequence
-from fgreg.drivers.ros_messages import turn_about_x
 from fgreg.errors import InputError
 from fgreg.frames import FloatArray, is_rigid
 from fgreg.pairing import PairRefused
+from fgreg.quaternions import turn_about_x
 from fgreg.session.schema import shown
 
 _DEFAULTS = {

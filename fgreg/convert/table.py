@@ -14,9 +14,9 @@ import numpy as np
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import COLUMNS, Column, RecordingMapping
 from fgreg.drivers.frame_files import png_bytes, read_picture
-from fgreg.drivers.ros_messages import rotation_of
 from fgreg.errors import InputError
 from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
+from fgreg.quaternions import rotation_from_quaternion
 from fgreg.session.safe_yaml import read_bounded
 from fgreg.session.schema import shown
 
@@ -212,7 +212,7 @@ class _Row:
         if quaternion is None:
             raise AssertionError("one of the two is there")
         try:
-            return rotation_of(*quaternion)
+            return rotation_from_quaternion(*quaternion)
         except ValueError as error:
             raise InputError(f"{self.where}: marker_qx", str(error), "a unit quaternion") from None
 
