@@ -297,6 +297,8 @@ def _open_device(path: str, config: InputConfig) -> Capture | None:
 
 
 def _open_stream(url: str, silence_s: float) -> Capture | None:
+    # FFMPEG has a log of its own, which would fill standard error while a stream is looked for.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     patience_ms = max(1, round(1000.0 * silence_s))
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, patience_ms]
     return _quietly(lambda: cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits))

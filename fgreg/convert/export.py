@@ -34,7 +34,7 @@ _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Registration:
+class Exported:
     """One epoch of a result, to be exported.
 
     Attributes:
@@ -67,13 +67,14 @@ class Registration:
         """What a reader of the file has to know first: nothing where the verdict is ``ok``."""
         if self.verdict is Verdict.OK:
             return []
-        say = "REFUSED by fgreg, exported with --force: DO NOT USE for navigation" if self.refused else "fgreg: warning"
+        forced = "REFUSED by fgreg, exported with --force: DO NOT USE for navigation"
+        say = forced if self.refused else "verdict: warning"
         return [say, *(one_line(reason, 300) for reason in self.reasons)]
 
 
 def registration_of(
     estimate: SessionEstimate, path: Path, *, epoch: int | None = None, force: bool = False
-) -> Registration:
+) -> Exported:
     """The epoch of a result that is to be exported: the last one unless told.
 
     Args:
@@ -100,7 +101,7 @@ def registration_of(
     if chosen.trus_T_camera is None:
         raise InputError(where, "no transform", "one that could be computed")
     tre = chosen.predicted_tre
-    return Registration(
+    return Exported(
         session=estimate.session,
         epoch=chosen.index,
         verdict=verdict,
@@ -112,7 +113,7 @@ def registration_of(
     )
 
 
-def plus_xml(found: Registration) -> str:
+def plus_xml(found: Exported) -> str:
     """A PLUS configuration with the transform; ``Error`` is the mean predicted error at the session's targets, mm."""
     error = "" if found.tre_mm is None else f' Error="{found.tre_mm[0]:.3f}"'
     matrix = " ".join(_number(value) for value in found.trus_T_camera.ravel())
@@ -127,7 +128,7 @@ def plus_xml(found: Registration) -> str:
     )
 
 
-def ros_yaml(found: Registration) -> str:
+def ros_yaml(found: Exported) -> str:
     """A ``geometry_msgs/TransformStamped``: metres, unit quaternion, the target frame as parent."""
     x, y, z = (float(value) / 1000.0 for value in found.trus_T_camera[:3, 3])
     qx, qy, qz, qw = quaternion_from_rotation(found.trus_T_camera[:3, :3])
@@ -147,7 +148,7 @@ def ros_yaml(found: Registration) -> str:
     return "\n".join(lines) + "\n"
 
 
-def slicer_tfm(found: Registration) -> str:
+def slicer_tfm(found: Exported) -> str:
     """An ITK transform file; Slicer shows it as a linear transform from Camera to Trus."""
     stored = _LPS @ inverse(found.trus_T_camera) @ _LPS
     parameters = [*stored[:3, :3].ravel(), *stored[:3, 3]]
@@ -165,7 +166,7 @@ def slicer_tfm(found: Registration) -> str:
     )
 
 
-def as_json(found: Registration) -> str:
+def as_json(found: Exported) -> str:
     """Everything about the registration, with units in the names."""
     document: dict[str, Any] = {
         "format": JSON_FORMAT,
@@ -185,7 +186,7 @@ def as_json(found: Registration) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
-WRITERS: dict[str, Callable[[Registration], str]] = {
+WRITERS: dict[str, Callable[[Exported], str]] = {
     ".xml": plus_xml,
     ".yaml": ros_yaml,
     ".yml": ros_yaml,
@@ -201,7 +202,7 @@ def _iso(moment: datetime) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{float(value):.17g}"
+    return repr(float(value))
 
 
 def _comment(text: str) -> str:
