@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fgreg.drivers.base import DeviceLost, Stamp, StereoFrame
+from fgreg.drivers.base import DeviceLost, Stamp, StereoCamera, StereoFrame
 from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout, video_devices
 from fgreg.drivers.interlaced import Fields
 from fgreg.drivers.stereo_matching import StereoMatcher
@@ -41,7 +41,7 @@ def video(path: Path, pictures: list[Picture], fps: float = 50.0) -> str:
 
 
 def collect(
-    endoscope: Endoscope,
+    endoscope: StereoCamera,
     enough: Callable[[list[StereoFrame], list[str]], bool],
     limit_s: float = 8.0,
     pause_s: float = 0.003,

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgreg.drivers.base import DeviceLost
+from fgreg.drivers.base import DeviceLost, MotionSource, StereoCamera
 from fgreg.drivers.recorded import Pace, RecordedCamera, RecordedMotion
 from fgreg.drivers.recordings import Recording
 from fgreg.drivers.ros_messages import array_of, info_of, picture_of, pose_of, scan_deg_of
@@ -26,7 +26,7 @@ QUARTER_MM = np.array([[1.0, 0, 0, 10], [0, 0, -1, -20], [0, 1, 0, 150], [0, 0, 
 QUARTER = (0.010, -0.020, 0.150, HALF, 0.0, 0.0, HALF)
 
 
-def play(device: Any, limit_s: float = 5.0) -> list[Any]:
+def play(device: MotionSource | StereoCamera, limit_s: float = 5.0) -> list[Any]:
     """Everything until the end is told."""
     out: list[Any] = []
     until = time.monotonic() + limit_s

@@ -46,7 +46,7 @@ def read_table(path: Path, mapping: RecordingMapping) -> Imported:
     delimiter = mapping.delimiter or max(_DELIMITERS, key=lines[start].count)
     reader = csv.reader(io.StringIO("".join(lines[start:])), delimiter=delimiter, strict=True)
     table = _Table(path, mapping)
-    frames: dict[str, Path] = {}
+    frames: dict[Path, str] = {}
     drafts: list[Draft] = []
     try:
         table.take_header([name.strip() for name in next(reader)])
@@ -102,7 +102,7 @@ class _Table:
 class _Row:
     """One row: its cells by role."""
 
-    def __init__(self, table: _Table, cells: list[str], line: int, frames: dict[str, Path]) -> None:
+    def __init__(self, table: _Table, cells: list[str], line: int, frames: dict[Path, str]) -> None:
         self._table, self._cells, self._frames = table, cells, frames
         self.where = f"{table.path.name}: line {line}"
         if len(cells) != table.width:
@@ -235,18 +235,17 @@ class _Row:
             raise InputError(f"{self.where}: {role}", f"{shown(name)}: no such file", "a file relative to the table")
         if suffix == ".npy" and path.suffix.lower() != ".npy":
             raise InputError(f"{self.where}: {role}", shown(name), "an NPY array")
-        known = next((key for key, other in self._frames.items() if other == path), None)
-        if known is not None:
-            return known
+        if path in self._frames:
+            return self._frames[path]
         stem = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in path.stem)[:60]
         new = f"frames/{len(self._frames):04d}-{stem}{suffix}"
-        self._frames[new] = path
+        self._frames[path] = new
         return new
 
 
-def _copy_frames(frames: Mapping[str, Path], folder: Path) -> None:
+def _copy_frames(frames: Mapping[Path, str], folder: Path) -> None:
     """Copies files; pictures that are no PNG become one."""
-    for name, path in frames.items():
+    for path, name in frames.items():
         data = read_bounded(path, str(path), _MAX_BYTES)
         if path.suffix.lower() not in (".npy", ".png"):
             picture = read_picture(path)
