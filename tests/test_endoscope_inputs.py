@@ -76,8 +76,8 @@ def test_two_video_files_come_out_as_stereo_frames_with_their_own_times_and_end_
             assert float(frame.left.mean()) == pytest.approx(10 * i, abs=2)
             assert float(frame.right.mean()) == pytest.approx(10 * i + 5, abs=2)
             assert frame.stamp.device_s == pytest.approx(i / 50.0)
-        # Played at their own pace: the last one arrives nine periods after the first.
-        assert frames[-1].stamp.host_s - frames[0].stamp.host_s == pytest.approx(9 / 50.0, abs=0.1)
+        # Played at their own pace: the last one does not come before nine periods have passed.
+        assert frames[-1].stamp.host_s - frames[0].stamp.host_s >= 8.5 / 50.0
         assert all("played to its end" in loss for loss in losses)
         assert endoscope.ended
         assert not endoscope.connected
