@@ -23,3 +23,11 @@ def read_array(path: Path) -> npt.NDArray[Any] | None:
         return np.asarray(np.load(path, allow_pickle=False))
     except (ValueError, OSError, EOFError):
         return None
+
+
+def png_bytes(picture: npt.NDArray[np.uint8]) -> bytes:
+    """A picture, (h, w) grey or (h, w, 3) BGR, as a PNG file."""
+    done, data = cv2.imencode(".png", picture)
+    if not done:
+        raise ValueError(f"a picture of shape {picture.shape} cannot be encoded")
+    return data.tobytes()

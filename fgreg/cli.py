@@ -1,4 +1,4 @@
-"""The command line: ``fgreg solve``, ``check``, ``simulate``; others are in fgreg.cli_evaluate and fgreg.cli_replay.
+"""The command line: ``fgreg solve``, ``check``, ``simulate``; others are in fgreg.cli_*.
 
 Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
 starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from fgreg import __version__
+from fgreg.cli_convert import add_convert
 from fgreg.cli_evaluate import add_commands
 from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
@@ -262,6 +263,7 @@ def simulate(
 
 add_commands(app, _progress)
 add_replay(app, _summary_extras)
+add_convert(app)
 
 
 if __name__ == "__main__":

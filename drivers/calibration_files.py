@@ -1,0 +1,400 @@
+"""Calibrations that users have: ROS ``camera_info``, OpenCV FileStorage, Kalibr camchains; read as a StereoRig.
+
+What each says, and what becomes of it (``right_T_left`` maps left coordinates to right ones, mm):
+
+- ROS: ``K``, ``D``, ``R``, ``P`` of each camera, metres. The rectified cameras are parallel, apart by
+  ``b = P_right[:, 3] / f - P_left[:, 3] / f``; so ``right_T_left = [R_right' R_left, R_right' b]``.
+- OpenCV: matrices ``M1 D1 M2 D2`` (or ``K1``, ``cameraMatrix1``, ...) with ``R``, ``T`` of ``stereoCalibrate``, which
+  are ``right_T_left`` itself, in the units of the board; read as millimetres.
+- Kalibr: ``cam0`` is left, ``cam1`` right, ``T_cn_cnm1`` of cam1 is ``right_T_left``, metres.
+
+A session's camera has five distortion parameters (plumb_bob, radtan). Files of other models are refused unless their
+further parameters are zero. ``rectified`` reads the model of images that were rectified already: the matrix out of
+``P``, no distortion, cameras parallel. The ``camera`` frame is then the *rectified* left camera, turned by ``R_left``
+against the real one, and so is everything that is registered with it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgreg.drivers.opencv_storage import is_storage, read_storage
+from fgreg.errors import InputError
+from fgreg.frames import FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
+from fgreg.models import CameraModel, StereoRig
+from fgreg.session.safe_yaml import load_yaml, read_bounded
+from fgreg.session.schema import Fields, Place, shown
+
+MM_PER = {"m": 1000.0, "mm": 1.0}
+"""Units that a calibration's lengths can have."""
+
+PLUMB_BOB = ("plumb_bob", "radtan", "none", "")
+_BASELINE_MM = (0.5, 500.0)
+_MAX_BYTES = 4_000_000
+_ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """An endoscope's calibration, and what of it is allowed but hardly meant."""
+
+    rig: StereoRig
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraInfo:
+    """One ROS ``camera_info``: size (w, h) px, K (3, 3), D (n,) of a named model, R (3, 3), P (3, 4)."""
+
+    where: str
+    image_size: tuple[int, int]
+    matrix: FloatArray
+    distortion: FloatArray
+    distortion_model: str
+    rectification: FloatArray
+    projection: FloatArray
+
+
+def read_calibration(
+    files: Sequence[Path],
+    *,
+    unit: str | None = None,
+    rectified: bool = False,
+    image_size: tuple[int, int] | None = None,
+) -> Calibration:
+    """An endoscope's calibration from one file or two.
+
+    Args:
+        files: one (one camera, or both in one file) or two: left, then right ``camera_info``; or OpenCV's intrinsics
+            and extrinsics in any order.
+        unit: of the file's lengths, ``m`` or ``mm``. Default: metres for ROS and Kalibr, millimetres for OpenCV.
+        rectified: the images were rectified with this calibration.
+        image_size: (width, height) px, for OpenCV files that do not say.
+
+    Raises:
+        InputError: what is wrong, with file and key.
+    """
+    if not 1 <= len(files) <= 2:
+        raise InputError("calibration", f"{len(files)} files", "one file, or two: left and right")
+    if unit is not None and unit not in MM_PER:
+        raise InputError("calibration: unit", unit, "m or mm")
+    storage = [is_storage(read_bounded(path, path.name, _MAX_BYTES)) for path in files]
+    if all(storage):
+        rig = _from_storage(files, MM_PER[unit or "mm"], rectified, image_size)
+        return _checked(rig, files[0].name, unit or "mm")
+    if any(storage):
+        raise InputError(files[storage.index(True)].name, "an OpenCV file beside another kind", "two of one kind")
+    documents = [load_yaml(path, path.name, max_bytes=_MAX_BYTES) for path in files]
+    chains = ["cam0" in document for document in documents]
+    scale = MM_PER[unit or "m"]
+    if any(chains):
+        if len(files) > 1:
+            raise InputError(files[1].name, "a second file", "a Kalibr camchain alone, which has both cameras")
+        if rectified:
+            raise InputError(files[0].name, "a Kalibr camchain", "a calibration with projection matrices (ROS, OpenCV)")
+        rig = _from_kalibr(documents[0], files[0].name, scale)
+    else:
+        infos = [_camera_info(document, path.name) for document, path in zip(documents, files, strict=True)]
+        rig = rig_of_infos(infos[0], infos[1] if len(infos) == 2 else None, scale, rectified)
+    return _checked(rig, files[-1].name, unit or "m")
+
+
+def rig_of_infos(left: CameraInfo, right: CameraInfo | None, mm_per_unit: float, rectified: bool = False) -> StereoRig:
+    """A rig of two ``camera_info``.
+
+    Raises:
+        InputError: another distortion model, different sizes, or no baseline in the right projection matrix.
+    """
+    left_model = _info_model(left, rectified)
+    if right is None:
+        return StereoRig(left_model)
+    right_model = _info_model(right, rectified)
+    if left.image_size != right.image_size:
+        found = "{} x {} px".format(*right.image_size)
+        raise InputError(right.where, found, "{} x {} px, as the left camera".format(*left.image_size))
+    offset = _rectified_offset(right) - _rectified_offset(left)
+    if np.linalg.norm(offset) * mm_per_unit < 1e-3:
+        found = "a projection matrix without a baseline"
+        raise InputError(right.where, found, "P[0][3] = -fx times the baseline, of a stereo calibration")
+    if rectified:
+        transform = make_transform(np.eye(3), offset * mm_per_unit)
+    else:
+        back = right.rectification.T
+        transform = make_transform(nearest_rotation(back @ left.rectification), back @ offset * mm_per_unit)
+    return StereoRig(left_model, right_model, as_float_array(transform))
+
+
+def _rectified_offset(info: CameraInfo) -> FloatArray:
+    p = info.projection
+    return np.array([p[0, 3] / p[0, 0], p[1, 3] / p[1, 1], 0.0])
+
+
+def _info_model(info: CameraInfo, rectified: bool) -> CameraModel:
+    for name, matrix in (("K", info.matrix), ("P", info.projection)):
+        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
+            raise InputError(f"{info.where}: {name}", "focal lengths that are not > 0", "a calibrated camera")
+    r = info.rectification
+    if np.abs(r.T @ r - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(r) < 0:
+        raise InputError(f"{info.where}: R", "a matrix that is no rotation", "a rotation")
+    if rectified:
+        return _camera(info.image_size, info.projection[:, :3], np.zeros(5), f"{info.where}: P")
+    distortion = five_parameters(info.distortion, info.distortion_model, f"{info.where}: D")
+    return _camera(info.image_size, info.matrix, distortion, f"{info.where}: K")
+
+
+def five_parameters(values: FloatArray, model: str, where: str) -> FloatArray:
+    """OpenCV's (k1, k2, p1, p2, k3) of a file's distortion parameters.
+
+    Raises:
+        InputError: a model, or parameters, that these five cannot say.
+    """
+    values = np.asarray(values, dtype=np.float64).ravel()
+    expected = "plumb_bob or radtan with up to 5 parameters k1, k2, p1, p2, k3; calibrate with these"
+    if model not in PLUMB_BOB and not (model == "rational_polynomial" and not values[5:].any()):
+        raise InputError(where, f"the distortion model {shown(model)}", expected)
+    if values.size not in (0, 4, 5, 8, 12, 14):
+        raise InputError(where, f"{values.size} parameters", expected)
+    if values[5:].any():
+        raise InputError(where, f"{values.size} parameters, not all beyond the fifth zero", expected)
+    out = np.zeros(5)
+    out[: min(5, values.size)] = values[:5]
+    return out
+
+
+def _camera(size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, where: str) -> CameraModel:
+    try:
+        matrix, distortion = as_float_array(matrix, 3, 3), as_float_array(distortion, 5)
+    except ValueError as error:
+        raise InputError(where, str(error), "a camera matrix of 3 x 3 numbers") from None
+    off = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1.0)
+    if not (matrix[0, 0] > 0 and matrix[1, 1] > 0) or np.abs(off).max() > 1e-9:
+        raise InputError(where, "another matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0")
+    if not all(1 <= n <= 32768 for n in size):
+        raise InputError(where, f"an image of {size[0]} x {size[1]} px", "width and height of the images")
+    return CameraModel(size, matrix, distortion)
+
+
+def _checked(rig: StereoRig, name: str, unit: str) -> Calibration:
+    """The rig, where its baseline can be an endoscope's: metres taken for millimetres end here."""
+    if rig.right_T_left is None:
+        return Calibration(rig)
+    shift = rig.right_T_left[:3, 3]
+    baseline = float(np.linalg.norm(shift))
+    low, high = _BASELINE_MM
+    if not low <= baseline <= high:
+        other = "mm" if unit == "m" else "m"
+        found = f"cameras {baseline:.4g} mm apart, where lengths are in {unit}"
+        raise InputError(name, found, f"{low:g} to {high:g} mm; say so where lengths are in {other}")
+    if shift[0] > 0.0 and abs(shift[0]) > 0.5 * baseline:
+        text = f"{name}: the camera called right is {shift[0]:.3g} mm to the left of the other; are the two swapped?"
+        return Calibration(rig, (text,))
+    return Calibration(rig)
+
+
+# ROS camera_info
+
+
+def _camera_info(document: Mapping[str, object], name: str) -> CameraInfo:
+    """A ``camera_info`` file: of camera_calibration (nested matrices) or an echoed message (flat lists)."""
+    problems: list[InputError] = []
+    fields = Fields(document, tuple(document), Place(name), problems)
+    nested = fields.has("camera_matrix")
+    if not nested and not (fields.has("k") or fields.has("K")):
+        kinds = "ROS camera_info, OpenCV FileStorage or Kalibr camchain"
+        raise InputError(name, "no camera_matrix, K or cam0", f"a calibration: {kinds}")
+    width, height = (fields.integer(f"image_{key}" if nested else key, 1, 32768) for key in ("width", "height"))
+
+    def matrix(long: str, letter: str, count: int | None) -> FloatArray:
+        if nested:
+            inner = fields.child(long, ("rows", "cols", "data"))
+            return as_float_array([]) if inner is None else _data(inner, count)
+        key = letter if fields.has(letter) else letter.upper()
+        if count is None and fields.raw(key) == []:
+            return as_float_array([])
+        return fields.numbers(key, count)
+
+    model = fields.text("distortion_model", "the name of a distortion model", default="plumb_bob")
+    k, d = matrix("camera_matrix", "k", 9), matrix("distortion_coefficients", "d", None)
+    r, p = matrix("rectification_matrix", "r", 9), matrix("projection_matrix", "p", 12)
+    _refuse_cropped(fields, (width, height))
+    if problems:
+        raise problems[0]
+    return CameraInfo(name, (width, height), k.reshape(3, 3), d, model, r.reshape(3, 3), p.reshape(3, 4))
+
+
+def _data(fields: Fields, count: int | None) -> FloatArray:
+    return as_float_array([]) if count is None and fields.raw("data") == [] else fields.numbers("data", count)
+
+
+def _refuse_cropped(fields: Fields, size: tuple[int, int]) -> None:
+    for key in ("binning_x", "binning_y"):
+        if fields.raw(key) not in (None, 0, 1):
+            fields.fail(key, shown(fields.raw(key)), "0 or 1: images without binning")
+    roi = fields.raw("roi")
+    if isinstance(roi, Mapping) and (roi.get("width") or 0, roi.get("height") or 0) not in ((0, 0), size):
+        fields.fail("roi", "a part of the image", "the whole image")
+
+
+# OpenCV FileStorage
+
+_LEFT_MATRIX = ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "camera_matrix_left", "left_camera_matrix", "M_left")
+_LEFT_DISTORTION = (
+    "D1",
+    "distCoeffs1",
+    "dist_coeffs_1",
+    "distortion_1",
+    "distortion_left",
+    "left_distortion",
+    "D_left",
+)
+_ONE_MATRIX = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsic", "camera_intrinsics")
+_ONE_DISTORTION = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "distortion")
+_ROTATION, _TRANSLATION = ("R", "rotation", "R_stereo"), ("T", "translation", "t", "T_stereo")
+
+
+def _right_names(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(re.sub("1$", "2", name).replace("left", "right") for name in names)
+
+
+def _from_storage(
+    files: Sequence[Path], mm_per_unit: float, rectified: bool, image_size: tuple[int, int] | None
+) -> StereoRig:
+    """OpenCV's own files: both cameras by numbered names, or one camera a file and R, T in either."""
+    contents = [read_storage(path, path.name) for path in files]
+    merged: dict[str, object] = {}
+    for content in contents:
+        merged |= content
+    name = " and ".join(path.name for path in files)
+    size = image_size or _storage_size(merged, name)
+    both = any(key in merged for key in _LEFT_MATRIX)
+    if both:
+        left = _storage_camera(merged, name, _LEFT_MATRIX, _LEFT_DISTORTION, size)
+        right = _storage_camera(merged, name, _right_names(_LEFT_MATRIX), _right_names(_LEFT_DISTORTION), size)
+    else:
+        cameras = [
+            _storage_camera(content, path.name, _ONE_MATRIX, _ONE_DISTORTION, size)
+            for content, path in zip(contents, files, strict=True)
+        ]
+        if len(cameras) == 1:
+            if rectified:
+                raise InputError(name, "one camera", "a stereo calibration with P1 and P2, for rectified images")
+            return StereoRig(cameras[0])
+        left, right = cameras
+    if rectified:
+        return _storage_rectified(merged, name, size, mm_per_unit)
+    rotation = _array(merged, _ROTATION, name, 9).reshape(3, 3)
+    shift = _array(merged, _TRANSLATION, name, 3)
+    transform = make_transform(rotation, shift * mm_per_unit)
+    if not is_rigid(transform, _ROTATION_TOLERANCE):
+        raise InputError(f"{name}: R", "a matrix that is no rotation", "the rotation of stereoCalibrate")
+    return StereoRig(left, right, as_float_array(make_transform(nearest_rotation(rotation), transform[:3, 3])))
+
+
+def _storage_rectified(
+    content: Mapping[str, object], name: str, size: tuple[int, int], mm_per_unit: float
+) -> StereoRig:
+    infos = []
+    for key in ("P1", "P2"):
+        p = _array(content, (key,), name, 12).reshape(3, 4)
+        infos.append(CameraInfo(f"{name}: {key}", size, p[:, :3], np.zeros(5), "plumb_bob", np.eye(3), p))
+    return rig_of_infos(infos[0], infos[1], mm_per_unit, rectified=True)
+
+
+def _storage_camera(
+    content: Mapping[str, object], name: str, matrix: Sequence[str], distortion: Sequence[str], size: tuple[int, int]
+) -> CameraModel:
+    values = _array(content, matrix, name, 9).reshape(3, 3)
+    found = next((key for key in distortion if key in content), None)
+    parameters = np.zeros(5) if found is None else _array(content, (found,), name, None)
+    return _camera(size, values, five_parameters(parameters, "", f"{name}: {found}"), f"{name}: {matrix[0]}")
+
+
+def _array(content: Mapping[str, object], names: Sequence[str], file: str, count: int | None) -> FloatArray:
+    key = next((name for name in names if name in content), None)
+    if key is None:
+        kind = "a matrix" if count is None else f"{count} numbers"
+        raise InputError(f"{file}: {names[0]}", "nothing", f"{kind} called {', '.join(names)}")
+    value = content[key]
+    if not isinstance(value, np.ndarray) or (count is not None and value.size != count):
+        found = f"{value.size} numbers" if isinstance(value, np.ndarray) else shown(value)
+        raise InputError(f"{file}: {key}", found, "a matrix" if count is None else f"{count} numbers")
+    if not np.isfinite(value).all():
+        raise InputError(f"{file}: {key}", "an entry that is not finite", "finite numbers")
+    return np.asarray(value, dtype=np.float64).ravel()
+
+
+def _storage_size(content: Mapping[str, object], name: str) -> tuple[int, int]:
+    for across, down in (("image_width", "image_height"), ("width", "height"), ("imageWidth", "imageHeight")):
+        pair = content.get(across), content.get(down)
+        if isinstance(pair[0], float) and isinstance(pair[1], float):
+            return _whole(pair[0], pair[1], f"{name}: {across}")
+    for key in ("image_size", "imageSize", "size", "resolution"):
+        value = content.get(key)
+        if isinstance(value, np.ndarray) and value.size == 2:
+            return _whole(float(value.ravel()[0]), float(value.ravel()[1]), f"{name}: {key}")
+    raise InputError(name, "no size of the images", "image_width and image_height, or the size given besides")
+
+
+def _whole(width: float, height: float, where: str) -> tuple[int, int]:
+    if not (width == int(width) and height == int(height)):
+        raise InputError(where, f"{width:g} x {height:g} px", "whole numbers")
+    return int(width), int(height)
+
+
+# Kalibr
+
+
+def _from_kalibr(document: Mapping[str, object], name: str, mm_per_unit: float) -> StereoRig:
+    problems: list[InputError] = []
+    top = Fields(document, tuple(document), Place(name), problems)
+    if any(key.startswith("cam") and key not in ("cam0", "cam1") for key in document):
+        raise InputError(name, "more than two cameras", "cam0, the left one, and cam1, the right one")
+    cameras = []
+    for key in ("cam0", "cam1")[: 1 + top.has("cam1")]:
+        value = top.raw(key)
+        known = tuple(value) if isinstance(value, Mapping) else ("intrinsics", "resolution")
+        fields = top.child(key, known)
+        if fields is None:
+            break
+        cameras.append(_kalibr_camera(fields, name, key))
+    right_T_left = None
+    if len(cameras) == 2:
+        inner = top.raw("cam1")
+        known = tuple(inner) if isinstance(inner, Mapping) else ()
+        fields = Fields(inner if isinstance(inner, Mapping) else {}, known, Place(name, "cam1"), problems)
+        matrix = fields.matrix("T_cn_cnm1", 4)
+        if matrix is not None and not is_rigid(matrix, _ROTATION_TOLERANCE):
+            fields.fail("T_cn_cnm1", "a matrix that is not rigid", "the transform from cam0 to cam1")
+        elif matrix is not None:
+            right_T_left = make_transform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3] * mm_per_unit)
+    if problems:
+        raise problems[0]
+    if right_T_left is None:
+        return StereoRig(cameras[0])
+    if cameras[0].image_size != cameras[1].image_size:
+        raise InputError(f"{name}: cam1.resolution", "another one than cam0's", "two cameras of one size")
+    return StereoRig(cameras[0], cameras[1], as_float_array(right_T_left))
+
+
+def _kalibr_camera(fields: Fields, name: str, key: str) -> CameraModel:
+    before = len(fields.problems)
+    model = fields.text("camera_model", "pinhole", default="pinhole")
+    if model != "pinhole":
+        fields.fail("camera_model", shown(model), "pinhole")
+    intrinsics = fields.numbers("intrinsics", 4)
+    resolution = fields.numbers("resolution", 2)
+    distortion_model = fields.text("distortion_model", "radtan", default="none")
+    has = fields.has("distortion_coeffs") and fields.raw("distortion_coeffs") != []
+    distortion = fields.numbers("distortion_coeffs", None) if has else np.zeros(0)
+    if len(fields.problems) > before:
+        raise fields.problems[before]
+    fu, fv, pu, pv = (float(v) for v in intrinsics)
+    matrix = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+    size = _whole(float(resolution[0]), float(resolution[1]), f"{name}: {key}.resolution")
+    parameters = five_parameters(distortion, distortion_model, f"{name}: {key}.distortion_coeffs")
+    return _camera(size, matrix, parameters, f"{name}: {key}.intrinsics")

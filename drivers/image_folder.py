@@ -1,0 +1,81 @@
+"""A folder of pictures played as a video: the same few methods as cv2.VideoCapture.
+
+Pictures go by the last number in their names, where all have one, else by their names. The number is also the time, at
+``fps`` numbers a second from the lowest one: a picture that is missing in one of two folders then shifts nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from fgreg.drivers.frame_files import read_picture
+from fgreg.errors import InputError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+_NUMBER = re.compile(r"(\d+)(?!.*\d)")
+_MAX_GAP = 100_000
+
+
+@dataclass(slots=True)
+class FolderCapture:
+    """Pictures in order, and the time of each (s)."""
+
+    pictures: list[Path]
+    times_s: list[float]
+    _next: int = field(default=0)
+
+    @classmethod
+    def of(cls, where: Path, fps: float) -> FolderCapture:
+        """All pictures of a folder, or those that a pattern names, such as ``left/*.png``.
+
+        Raises:
+            InputError: no folder, or no pictures in it.
+        """
+        folder, pattern = (where, "*") if where.is_dir() else (where.parent, where.name)
+        if not folder.is_dir():
+            raise InputError(str(where), "no such folder", "a folder of pictures")
+        found = [path for path in folder.glob(pattern) if path.suffix.lower() in SUFFIXES and path.is_file()]
+        if not found:
+            raise InputError(str(where), "no pictures", f"files that end in {', '.join(SUFFIXES)}")
+        numbers = [int(match[1]) if (match := _NUMBER.search(path.stem)) else None for path in found]
+        whole = [number for number in numbers if number is not None]
+        spread = max(whole, default=0) - min(whole, default=0)
+        if len(set(whole)) == len(found) and spread < _MAX_GAP + len(found):
+            order = sorted(zip(whole, found, strict=True))
+            return cls([path for _, path in order], [number / fps for number, _ in order])
+        return cls(sorted(found), [i / fps for i in range(len(found))])
+
+    def again(self) -> FolderCapture:
+        """The same from its beginning."""
+        return FolderCapture(self.pictures, self.times_s)
+
+    def isOpened(self) -> bool:
+        """Always: the folder was read."""
+        return True
+
+    def read(self) -> tuple[bool, Any]:
+        """The next picture; one that cannot be decoded is left out."""
+        while self._next < len(self.pictures):
+            try:
+                picture = read_picture(self.pictures[self._next])
+            except OSError:
+                picture = None
+            self._next += 1
+            if picture is not None:
+                return True, picture
+        return False, None
+
+    def get(self, property_id: int, /) -> float:
+        """Time of the last picture, ms; nothing else is known."""
+        if property_id == cv2.CAP_PROP_POS_MSEC and self._next:
+            return 1000.0 * self.times_s[self._next - 1]
+        return float(np.nan)
+
+    def release(self) -> None:
+        """Nothing is held."""

@@ -1,0 +1,179 @@
+"""ROS 2 recordings (rosbag2 folders, MCAP and SQLite files) read without ROS, by ``rosbags`` (extra ``[ros]``)."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES
+from fgreg.errors import InputError, MissingExtraError
+
+STORAGE_SUFFIXES = (".mcap", ".db3")
+ECM_POSE = "ECM/measured_cp"
+"""The endoscope holder's pose as CRTK names it, below whatever namespace."""
+
+_EXPECTED = "a ROS 2 recording: a rosbag2 folder, .mcap or .db3"
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path looks like a ROS 2 recording."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in STORAGE_SUFFIXES
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a recording: message type such as ``sensor_msgs/msg/Image``, number of messages."""
+
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """One message: when it was recorded (ns, recorder's clock), and its bytes."""
+
+    topic: str
+    kind: str
+    bag_ns: int
+    raw: bytes | memoryview
+
+
+class Recording:
+    """An open recording. Use as a context manager, or close it.
+
+    Raises:
+        MissingExtraError: ``rosbags`` is not installed.
+        InputError: no recording, or a damaged one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from rosbags.highlevel import AnyReader
+        except ImportError:
+            raise MissingExtraError("rosbags", "ros") from None
+        self.path = path
+        if not path.exists():
+            raise InputError(str(path), "nothing", _EXPECTED)
+        if not is_recording(path):
+            raise InputError(
+                str(path), "a folder without metadata.yaml" if path.is_dir() else "another file", _EXPECTED
+            )
+        # Files that bring no definitions of their messages have those of ROS 2 itself.
+        self._reader: Any = None
+        try:
+            reader: Any = AnyReader([path], default_typestore=_common_types())
+            reader.open()
+        except Exception as error:  # a damaged file makes the parsers under it raise whatever they run into
+            raise self._damaged(error) from None
+        self._reader = reader
+        connections: list[Any] = reader.connections
+        self.topics: Mapping[str, Topic] = {
+            name: Topic(str(kind), sum(int(c.msgcount) for c in connections if c.topic == name))
+            for name, kind in sorted({(c.topic, c.msgtype) for c in connections})
+        }
+        self.start_ns: int = int(reader.start_time) if reader.message_count else 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files; twice does no harm."""
+        reader, self._reader = self._reader, None
+        if reader is not None:
+            reader.close()
+
+    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
+        """Messages of some topics in the order of recording.
+
+        Raises:
+            InputError: a damaged file.
+        """
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:
+            return
+        try:
+            for connection, bag_ns, raw in self._reader.messages(connections=connections):
+                yield Recorded(connection.topic, connection.msgtype, int(bag_ns), raw)
+        except GeneratorExit:
+            raise
+        except Exception as error:
+            raise self._damaged(error) from None
+
+    def decode(self, recorded: Recorded) -> Any:
+        """The message as an object with ROS's fields.
+
+        Raises:
+            InputError: its bytes are not what its type says.
+        """
+        try:
+            return self._reader.deserialize(recorded.raw, recorded.kind)
+        except Exception as error:
+            where = f"{self.path.name}: {recorded.topic}"
+            raise InputError(where, f"a message that cannot be read ({_words(error)})", recorded.kind) from None
+
+    def topic(self, name: str, kinds: Collection[str], what: str) -> str:
+        """A topic that has to be there and be of one of some types.
+
+        Raises:
+            InputError: absent (names what is there), or of another type.
+        """
+        found = self.topics.get(name)
+        where = f"{self.path.name}: {name}"
+        if found is None:
+            near = ", ".join(n for n, t in self.topics.items() if t.kind in kinds) or "none of its type"
+            raise InputError(where, "no such topic", f"{what}; there is {near}")
+        if found.kind not in kinds:
+            raise InputError(where, found.kind, f"{what}: {' or '.join(sorted(kinds))}")
+        return name
+
+    def image_topic(self, side: str) -> str | None:
+        """The topic of one camera's images by its name, or None; unrectified before others, raw before compressed.
+
+        Args:
+            side: ``left`` or ``right``.
+
+        Raises:
+            InputError: several cameras' could be meant.
+        """
+        word = re.compile(rf"(?:^|[/_]){side}(?=[/_]|$)", re.IGNORECASE)
+        found = [n for n, t in self.topics.items() if t.kind in IMAGE_TYPES and t.count and word.search(n)]
+        if not found:
+            return None
+        ranked = sorted((("rect" in name, "compressed" in name.lower()), name) for name in found)
+        best = [name for rank, name in ranked if rank == ranked[0][0]]
+        if len(best) > 1:
+            raise InputError(f"{self.path.name}: {side} camera", ", ".join(best), "one, named in the mapping (topics)")
+        return best[0]
+
+    def endoscope_pose_topic(self) -> str | None:
+        """The topic of the endoscope holder's pose (CRTK), or None where there is none, or more than one."""
+        found = [n for n, t in self.topics.items() if t.kind in POSE_TYPES and f"/{n}".endswith(f"/{ECM_POSE}")]
+        found = [name for name in found if "local" not in name]
+        return found[0] if len(found) == 1 else None
+
+    def _damaged(self, error: Exception) -> InputError:
+        hint = "; of a recorder that was cut off, mcap recover makes one" if self.path.suffix == ".mcap" else ""
+        return InputError(str(self.path), f"a recording that cannot be read ({_words(error)})", f"a whole one{hint}")
+
+
+@functools.cache
+def _common_types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def _words(error: BaseException) -> str:
+    return (" ".join(str(error).split()) or type(error).__name__)[:160]

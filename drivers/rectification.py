@@ -1,0 +1,108 @@
+"""Rectified stereo pictures: without distortion, both cameras parallel, the same line for the same point.
+
+What that means for everything behind it: the ``camera`` frame is then the *rectified* left camera, turned about the
+same centre: ``rectified_p = rectified_R_left * left_p``. A registration from rectified pictures maps rectified
+coordinates; ``trus_T_left = trus_T_rectified * [rectified_R_left, 0]``. Marker detection does not need rectified
+pictures, it takes the model with distortion; rectify where another program wants it, and never in one half of a chain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from fgreg.drivers.interlaced import Picture
+from fgreg.errors import InputError
+from fgreg.frames import FloatArray, as_float_array, exp_so3, log_so3, make_transform
+from fgreg.models import CameraModel, StereoRig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rectification:
+    """How to rectify an endoscope's pictures.
+
+    Attributes:
+        rig: the model of the rectified pictures: one camera matrix for both, no distortion, right at (-b, 0, 0).
+        rectified_R_left, rectified_R_right: (3, 3) turns from the real cameras.
+        left_maps, right_maps: for cv2.remap.
+    """
+
+    rig: StereoRig
+    rectified_R_left: FloatArray
+    rectified_R_right: FloatArray
+    left_maps: tuple[FloatArray, FloatArray]
+    right_maps: tuple[FloatArray, FloatArray]
+
+    def left(self, picture: Picture) -> Picture:
+        """The left picture, rectified."""
+        return _remapped(picture, self.left_maps, self.rig.left.image_size)
+
+    def right(self, picture: Picture) -> Picture:
+        """The right picture, rectified."""
+        return _remapped(picture, self.right_maps, self.rig.left.image_size)
+
+
+def rectification(rig: StereoRig) -> Rectification:
+    """Rectification of a rig whose cameras stand side by side.
+
+    Each camera is turned by half of the turn between them, then both so that the baseline lies along x. ``fx`` and
+    ``fy`` are each the mean of the two cameras': fields of interlaced video keep their geometry (OpenCV's own
+    ``stereoRectify`` makes pixels square). One centre for both, so that infinitely far points have no disparity.
+
+    Raises:
+        InputError: one camera only, or cameras that do not stand side by side.
+    """
+    if rig.right is None or rig.right_T_left is None:
+        raise InputError("camera.right", "nothing", "two cameras, to rectify their pictures")
+    shift = rig.right_T_left[:3, 3]
+    if abs(shift[0]) <= np.linalg.norm(shift[1:]):
+        found = "cameras " + ", ".join(f"{v:.3g}" for v in shift) + " mm apart along x, y, z"
+        raise InputError("camera.right_T_left", found, "cameras side by side, apart along x")
+    half = exp_so3(0.5 * log_so3(rig.right_T_left[:3, :3]))
+    # Both cameras after half a turn towards each other are parallel; the baseline in their axes:
+    baseline = half.T @ shift
+    x = np.sign(baseline[0]) * baseline / np.linalg.norm(baseline)
+    y = np.cross([0.0, 0.0, 1.0], x)
+    y /= np.linalg.norm(y)
+    level = np.stack([x, y, np.cross(x, y)])
+    turn_left, turn_right = level @ half, level @ half.T
+    matrix = _common_matrix(((rig.left, turn_left), (rig.right, turn_right)))
+    size = rig.left.image_size
+    model = CameraModel(size, matrix, as_float_array(np.zeros(5)))
+    transform = make_transform(np.eye(3), level @ baseline)
+    transform[1:3, 3] = 0.0  # by construction; rounding only
+    return Rectification(
+        StereoRig(model, model, as_float_array(transform)),
+        as_float_array(turn_left),
+        as_float_array(turn_right),
+        _maps(rig.left, turn_left, matrix),
+        _maps(rig.right, turn_right, matrix),
+    )
+
+
+def _common_matrix(cameras: tuple[tuple[CameraModel, FloatArray], ...]) -> FloatArray:
+    """One matrix for both: mean focal lengths, and the pictures' corners centred on average."""
+    fx, fy = (float(np.mean([camera.matrix[i, i] for camera, _ in cameras])) for i in (0, 1))
+    width, height = cameras[0][0].image_size
+    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+    middles = []
+    for camera, turn in cameras:
+        normal = cv2.undistortPoints(corners[:, None, :], camera.matrix, camera.distortion, R=turn)
+        middles.append(np.asarray(normal).reshape(-1, 2).mean(axis=0))
+    middle = np.mean(middles, axis=0)
+    cx, cy = (width - 1) / 2.0 - fx * middle[0], (height - 1) / 2.0 - fy * middle[1]
+    return as_float_array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _maps(camera: CameraModel, turn: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    x, y = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, matrix, camera.image_size, cv2.CV_32FC1)
+    return np.asarray(x), np.asarray(y)
+
+
+def _remapped(picture: Picture, maps: tuple[FloatArray, FloatArray], size: tuple[int, int]) -> Picture:
+    if picture.shape[1::-1] != size:
+        found = f"a picture of {picture.shape[1]} x {picture.shape[0]} px"
+        raise InputError("endoscope", found, f"{size[0]} x {size[1]} px, as its calibration")
+    return np.asarray(cv2.remap(picture, maps[0], maps[1], cv2.INTER_LINEAR), dtype=np.uint8)

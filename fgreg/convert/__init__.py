@@ -1,0 +1,1 @@
+"""Recordings of other programs made sessions, and results made files that other programs read."""

@@ -1,0 +1,82 @@
+"""Output files: whole or not at all, and nothing that is there is lost without being asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.session.reading import SETUP_FILE
+
+_SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml", "result.yaml"})
+
+
+def write_whole(path: Path, text: str, *, overwrite: bool = False) -> None:
+    """A text file under its name only when all of it is on disk.
+
+    Raises:
+        InputError: the file is there and ``overwrite`` is not set, it is one of a session's own, or the disk refuses.
+    """
+    if path.name in _SESSION_FILES:
+        raise InputError(str(path), "the name of a session's own file", "another name")
+    if path.is_dir():
+        raise InputError(str(path), "a folder", "the name of a file")
+    if os.path.lexists(path) and not overwrite:
+        raise InputError(str(path), "a file of this name", "a new name, or --overwrite")
+    part = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
+    try:
+        try:
+            with part.open("x", encoding="utf-8", newline="\n") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(str(path), f"a place that refuses files ({error.strerror})", "a writable one") from None
+
+
+@contextmanager
+def whole_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to fill, which takes its name when the block ends well, and is gone where it does not.
+
+    Args:
+        folder: new, or empty; with ``overwrite`` also one that holds a session, which goes only when the new one is
+            complete.
+
+    Raises:
+        InputError: something else is there, or the disk refuses.
+    """
+    folder = Path(os.path.abspath(folder))  # noqa: PTH100  (a link to a folder stays what the user named)
+    if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
+        if not overwrite:
+            raise InputError(str(folder), "something that is no empty folder", "a new or empty one, or --overwrite")
+        if not (folder / SETUP_FILE).is_file():
+            raise InputError(str(folder), "no session to overwrite", f"a folder with a {SETUP_FILE}")
+    token = secrets.token_hex(6)
+    part, older = (folder.with_name(f".{folder.name[:100]}.{token}.{kind}") for kind in ("part", "older"))
+    try:
+        part.mkdir(parents=True)
+        try:
+            yield part
+            if os.path.lexists(folder):
+                folder.rename(older)
+            try:
+                part.rename(folder)
+            except OSError:
+                if older.exists():
+                    older.rename(folder)
+                raise
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(older, ignore_errors=True)
+    except OSError as error:
+        raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from None

@@ -1,0 +1,138 @@
+"""PLUS sequence files: MetaImage (``.mha``, ``.mhd``) with one image and many fields for each frame.
+
+A header of ``key = value`` lines that ends with ``ElementDataFile``, then pixels, raw or as one zlib stream. Fields of
+frame 12 are called ``Seq_Frame0012_...``.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.errors import InputError
+from fgreg.session.safe_yaml import read_bounded
+from fgreg.session.schema import shown
+
+_TYPES = {"UCHAR": "u1", "CHAR": "i1", "USHORT": "u2", "SHORT": "i2", "UINT": "u4", "INT": "i4", "FLOAT": "f4"}
+_TYPES |= {"DOUBLE": "f8"}
+_FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{1,9})_(\w{1,200})")
+_MAX_BYTES = 4_000_000_000
+_MAX_HEADER = 256_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SequenceFile:
+    """A sequence as stored.
+
+    Attributes:
+        name: of the file, for messages.
+        fields: of the whole file, such as ``UltrasoundImageOrientation``.
+        frames: fields of each frame without their prefix, such as ``ProbeToTrackerTransform``, ``Timestamp``.
+        images: (frames, height, width) as stored, or None where the sequence has no images.
+    """
+
+    name: str
+    fields: Mapping[str, str]
+    frames: tuple[Mapping[str, str], ...]
+    images: npt.NDArray[Any] | None
+
+
+def read_sequence(path: Path) -> SequenceFile:
+    """Reads a sequence whole.
+
+    Raises:
+        InputError: not a MetaImage of three dimensions, or cut off.
+    """
+    name = path.name
+    data = read_bounded(path, name, _MAX_BYTES)
+    fields, start = _header(data, name)
+    if fields.get("ObjectType") != "Image":
+        raise InputError(name, "another file", "a PLUS sequence (MetaImage, .mha)")
+    frames: dict[int, dict[str, str]] = {}
+    for key, value in fields.items():
+        if match := _FRAME_FIELD.fullmatch(key):
+            frames.setdefault(int(match[1]), {})[match[2]] = value
+    sizes = _numbers(fields, "DimSize", name)
+    if len(sizes) == 2:
+        sizes.append(1)
+    if len(sizes) != 3 or min(sizes) < 0:
+        raise InputError(f"{name}: DimSize", shown(fields["DimSize"]), "width, height, number of frames")
+    width, height, count = sizes
+    if frames and max(frames) >= max(count, 1) and width and height:
+        raise InputError(f"{name}: Seq_Frame{max(frames):04d}", "it", f"frames below {count}, as DimSize says")
+    images = _images(fields, data[start:], path, (count, height, width)) if width and height and count else None
+    known = max(count if images is not None else 0, 1 + max(frames, default=-1))
+    if known > 10_000_000:
+        raise InputError(name, f"frame {known - 1}", "a frame number that can be")
+    return SequenceFile(name, fields, tuple(frames.get(i, {}) for i in range(known)), images)
+
+
+def _header(data: bytes, name: str) -> tuple[dict[str, str], int]:
+    """Fields in order, and where the pixels start."""
+    fields: dict[str, str] = {}
+    at = 0
+    while at < min(len(data), _MAX_HEADER):
+        end = data.find(b"\n", at)
+        if end < 0:
+            break
+        line = data[at:end]
+        at = end + 1
+        key, equals, value = line.partition(b"=")
+        if not line.strip():
+            continue
+        if not equals or len(key) > 300 or b"\0" in key:
+            raise InputError(name, "no header of key = value lines", "a PLUS sequence (MetaImage, .mha)")
+        field = key.strip().decode("latin-1")
+        fields[field] = value.strip().decode("latin-1")
+        if field == "ElementDataFile":
+            return fields, at
+    raise InputError(name, "a header without ElementDataFile", "a whole PLUS sequence (MetaImage, .mha)")
+
+
+def _numbers(fields: Mapping[str, str], key: str, name: str) -> list[int]:
+    text = fields.get(key, "")
+    words = text.split()
+    if not words or not all(word.isdecimal() and len(word) < 10 for word in words):
+        raise InputError(f"{name}: {key}", shown(text) if text else "nothing", "whole numbers")
+    return [int(word) for word in words]
+
+
+def _images(fields: Mapping[str, str], data: bytes, path: Path, shape: tuple[int, int, int]) -> npt.NDArray[Any]:
+    name = path.name
+    kind = _TYPES.get(fields.get("ElementType", "").removeprefix("MET_"))
+    if kind is None:
+        raise InputError(f"{name}: ElementType", shown(fields.get("ElementType", "")), f"MET_ and {', '.join(_TYPES)}")
+    if fields.get("ElementNumberOfChannels", "1") != "1":
+        raise InputError(f"{name}: ElementNumberOfChannels", fields["ElementNumberOfChannels"], "1: grey images")
+    if fields.get("BinaryData", "True").lower() != "true":
+        raise InputError(f"{name}: BinaryData", shown(fields["BinaryData"]), "True")
+    stored = fields["ElementDataFile"]
+    if stored.upper() != "LOCAL":
+        if Path(stored).name != stored:
+            raise InputError(f"{name}: ElementDataFile", shown(stored), "LOCAL, or a file beside it")
+        data = read_bounded(path.with_name(stored), stored, _MAX_BYTES)
+    item = np.dtype(kind).newbyteorder(">" if _big(fields) else "<")
+    needed = item.itemsize * int(np.prod(shape, dtype=np.int64))
+    if needed > _MAX_BYTES:
+        raise InputError(f"{name}: DimSize", f"{needed} bytes", f"at most {_MAX_BYTES}")
+    if fields.get("CompressedData", "False").lower() == "true":
+        try:
+            data = zlib.decompressobj().decompress(data, needed + 1)
+        except zlib.error as error:
+            raise InputError(name, f"compressed data that are damaged ({error})", "a zlib stream") from None
+    if len(data) < needed:
+        raise InputError(name, f"{len(data)} bytes of pixels", f"{needed}, as DimSize says")
+    pixels = np.frombuffer(data, dtype=item, count=needed // item.itemsize).reshape(shape)
+    return pixels.astype(item.newbyteorder("="), copy=False)
+
+
+def _big(fields: Mapping[str, str]) -> bool:
+    keys = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+    return any(fields.get(key, "False").lower() == "true" for key in keys)

@@ -1,0 +1,257 @@
+"""CSV tables: one row, one event. Columns under their own names, or as a mapping says."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from fgreg.convert.drafts import Document, Draft, Imported, rows
+from fgreg.convert.mapping import COLUMNS, Column, RecordingMapping
+from fgreg.drivers.frame_files import png_bytes, read_picture
+from fgreg.errors import InputError
+from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
+from fgreg.quaternions import rotation_from_quaternion
+from fgreg.session.safe_yaml import read_bounded
+from fgreg.session.schema import shown
+
+_MAX_BYTES = 256_000_000
+_DELIMITERS = (",", ";", "\t")
+_POSITION = ("marker_x_mm", "marker_y_mm", "marker_z_mm")
+_QUATERNION = ("marker_qx", "marker_qy", "marker_qz", "marker_qw")
+_TURN = ("marker_rx_rad", "marker_ry_rad", "marker_rz_rad")
+_SPOT = ("spot_x_mm", "spot_y_mm", "spot_z_mm")
+_WITH_MARKER = ("aim", "pair", "track")
+
+
+def read_table(path: Path, mapping: RecordingMapping) -> Imported:
+    """Reads a table; frames that it names are files relative to its folder.
+
+    Raises:
+        InputError: the first cell that is not what its column should be, with its line.
+    """
+    try:
+        text = read_bounded(path, path.name, _MAX_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(path.name, "bytes that are not UTF-8", "a CSV table in UTF-8") from None
+    lines = text.splitlines(keepends=True)
+    start = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
+    if start is None:
+        raise InputError(path.name, "nothing", "a table with a line of column names")
+    delimiter = mapping.delimiter or max(_DELIMITERS, key=lines[start].count)
+    reader = csv.reader(io.StringIO("".join(lines[start:])), delimiter=delimiter, strict=True)
+    table = _Table(path, mapping)
+    frames: dict[Path, str] = {}
+    drafts: list[Draft] = []
+    try:
+        table.take_header([name.strip() for name in next(reader)])
+        for cells in reader:
+            line = start + reader.line_num
+            if not any(cell.strip() for cell in cells) or cells[0].startswith("#"):
+                continue
+            drafts.append(_Row(table, cells, line, frames).draft())
+    except csv.Error as error:
+        raise InputError(f"{path.name}: line {start + reader.line_num}", str(error), "a row of a CSV table") from None
+    for before, after in itertools.pairwise(drafts):
+        if after.t < before.t:
+            where = before.where.removeprefix(f"{path.name}: ")
+            raise InputError(f"{after.where}: t", f"{after.t:.17g}", f"at least {before.t:.17g}, the time on {where}")
+    notes = [f"columns that are not used: {', '.join(table.unused)}"] if table.unused else []
+    return Imported(drafts, lambda folder: _copy_frames(frames, folder), f"CSV table {path.name}", notes)
+
+
+class _Table:
+    """The header of a table: where each value is."""
+
+    def __init__(self, path: Path, mapping: RecordingMapping) -> None:
+        self.path, self._mapping = path, mapping
+        self.places: dict[str, int] = {}
+        self.columns: dict[str, Column] = {}
+        self.width = 0
+        self.unused: list[str] = []
+
+    def take_header(self, names: list[str]) -> None:
+        twice = sorted({name for name in names if name and names.count(name) > 1})
+        if twice:
+            raise InputError(f"{self.path.name}: header", f"the column {shown(twice[0])} twice", "each name once")
+        self.width = len(names)
+        for role in COLUMNS:
+            column = self._mapping.columns.get(role)
+            if column is None:
+                if role in names:
+                    column = Column(role)
+                else:
+                    continue
+            if column.value is None:
+                if column.column not in names:
+                    found = f"no column {shown(column.column)}, which the mapping has for {role}"
+                    raise InputError(f"{self.path.name}: header", found, f"one of {', '.join(names)[:200]}")
+                self.places[role] = names.index(column.column)
+            self.columns[role] = column
+        taken = {names[place] for place in self.places.values()}
+        self.unused = [name for name in names if name and name not in taken]
+        if "t" not in self.columns:
+            raise InputError(f"{self.path.name}: header", ", ".join(names)[:200] or "nothing", "a column t, in seconds")
+
+
+class _Row:
+    """One row: its cells by role."""
+
+    def __init__(self, table: _Table, cells: list[str], line: int, frames: dict[Path, str]) -> None:
+        self._table, self._cells, self._frames = table, cells, frames
+        self.where = f"{table.path.name}: line {line}"
+        if len(cells) != table.width:
+            raise InputError(self.where, f"{len(cells)} cells", f"{table.width}, as the header has")
+
+    def draft(self) -> Draft:
+        """The row as an event; what it lacks is told when it is read as one."""
+        kind = self.text("type") or "pair"
+        document: Document = {"type": kind, "t": self.need("t")}
+        if kind == "pair":
+            document["pm"] = self.whole("pm")
+        if kind in _WITH_MARKER:
+            document["marker"] = self._marker()
+        if kind == "pair":
+            document["trus"] = self._trus()
+        elif kind == "track":
+            heard = any(self.text(key) for key in ("x_mm", "range_mm", "frame"))
+            document |= {"trus": self._trus()} if heard else {"scan_deg": self.need("scan_deg")}
+        elif kind == "aim":
+            spot = self.three(_SPOT)
+            if spot is not None:
+                document["camera_p_spot_mm"] = spot
+            if self.text("corner_column") or self.text("corner_row"):
+                document["corner"] = [self.whole("corner_column"), self.whole("corner_row")]
+        elif kind == "camera_moved":
+            moved = self.transform("camera_new_T_camera_old")
+            if moved is not None:
+                document["camera_new_T_camera_old"] = rows(moved)
+        elif kind == "note":
+            document["text"] = self.text("text")
+        return Draft(document, self.where)
+
+    def text(self, role: str) -> str:
+        """A cell, stripped; empty where there is none."""
+        column = self._table.columns.get(role)
+        if column is None:
+            return ""
+        return column.value if column.value is not None else self._cells[self._table.places[role]].strip()
+
+    def number(self, role: str) -> float | None:
+        """A number, or None where the cell is empty."""
+        text = self.text(role)
+        if not text:
+            return None
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{self.where}: {role}", shown(text), "a finite number, with a decimal point")
+        column = self._table.columns[role]
+        return value * column.scale + column.offset
+
+    def need(self, role: str) -> float:
+        """A number that has to be there."""
+        value = self.number(role)
+        if value is None:
+            raise InputError(f"{self.where}: {role}", "nothing", "a number")
+        return value
+
+    def whole(self, role: str) -> int:
+        """A whole number that has to be there."""
+        value = self.need(role)
+        if value != round(value):
+            raise InputError(f"{self.where}: {role}", f"{value:g}", "a whole number")
+        return round(value)
+
+    def three(self, roles: tuple[str, ...]) -> list[float] | None:
+        """Numbers that are all there, or none of them."""
+        if not any(self.text(role) for role in roles):
+            return None
+        return [self.need(role) for role in roles]
+
+    def transform(self, role: str) -> FloatArray | None:
+        """A 4x4 matrix in one cell, row by row."""
+        text = self.text(role)
+        if not text:
+            return None
+        try:
+            values = np.array([float(word) for word in text.replace(";", " ").replace(",", " ").split()])
+        except ValueError:
+            values = np.zeros(0)
+        if values.size != 16 or not np.isfinite(values).all() or not is_rigid(values.reshape(4, 4)):
+            raise InputError(f"{self.where}: {role}", shown(text), "a rigid 4x4 matrix: 16 numbers, row by row")
+        return values.reshape(4, 4)
+
+    def _marker(self) -> Document:
+        marker: Document = {}
+        pose = self.transform("camera_T_marker")
+        position = self.three(_POSITION)
+        if pose is None and position is not None:
+            pose = make_transform(self._rotation(), np.array(position))
+        if pose is not None:
+            marker["camera_T_marker"] = rows(pose)
+        for side in ("left", "right"):
+            if name := self.text(side):
+                marker[side] = self._frame(side, name, ".png")
+        return marker
+
+    def _rotation(self) -> FloatArray:
+        quaternion, turn = self.three(_QUATERNION), self.three(_TURN)
+        if (quaternion is None) == (turn is None):
+            found = "neither a quaternion nor a turn" if turn is None else "a quaternion and a turn"
+            raise InputError(self.where, found, f"{', '.join(_QUATERNION)} or {', '.join(_TURN)}")
+        if turn is not None:
+            return exp_so3(np.array(turn))
+        if quaternion is None:
+            raise AssertionError("one of the two is there")
+        try:
+            return rotation_from_quaternion(*quaternion)
+        except ValueError as error:
+            raise InputError(f"{self.where}: marker_qx", str(error), "a unit quaternion") from None
+
+    def _trus(self) -> Document:
+        trus: Document = {"scan_deg": self.need("scan_deg")}
+        for role in ("x_mm", "range_mm", "amplitude"):
+            value = self.number(role)
+            if value is not None:
+                trus[role] = value
+        if self.text("sweep"):
+            trus["sweep"] = self.whole("sweep")
+        if name := self.text("frame"):
+            trus["frame"] = self._frame("frame", name, ".npy")
+        return trus
+
+    def _frame(self, role: str, name: str, suffix: str) -> str:
+        """The name that a file gets in the session; the same file has one name."""
+        path = self._table.path.parent / name
+        if not path.is_file():
+            raise InputError(f"{self.where}: {role}", f"{shown(name)}: no such file", "a file relative to the table")
+        if suffix == ".npy" and path.suffix.lower() != ".npy":
+            raise InputError(f"{self.where}: {role}", shown(name), "an NPY array")
+        if path in self._frames:
+            return self._frames[path]
+        stem = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in path.stem)[:60]
+        new = f"frames/{len(self._frames):04d}-{stem}{suffix}"
+        self._frames[path] = new
+        return new
+
+
+def _copy_frames(frames: Mapping[Path, str], folder: Path) -> None:
+    """Copies files; pictures that are no PNG become one."""
+    for path, name in frames.items():
+        data = read_bounded(path, str(path), _MAX_BYTES)
+        if path.suffix.lower() not in (".npy", ".png"):
+            picture = read_picture(path)
+            if picture is None:
+                raise InputError(str(path), "something that is no picture", "a picture (PNG, JPEG, BMP, TIFF)")
+            data = png_bytes(picture)
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)

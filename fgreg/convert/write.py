@@ -1,0 +1,141 @@
+"""Events and frames of a recording, written as a session that is whole and checked, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fgreg.convert.drafts import Draft, Imported
+from fgreg.convert.files import whole_folder
+from fgreg.errors import InputError, one_line
+from fgreg.frames import FloatArray
+from fgreg.models import CameraModel, StereoRig
+from fgreg.session.event_document import event_line
+from fgreg.session.event_log import read_line
+from fgreg.session.frames_named import FrameUse, check_frames
+from fgreg.session.reading import EVENTS_FILE, SETUP_FILE, check_session
+from fgreg.session.safe_yaml import load_yaml, read_bounded
+from fgreg.session.setup import Setup, read_setup
+
+_MAX_SETUP = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """What became of a recording: number of events by type, frames, and plain sentences on what did not."""
+
+    events: Mapping[str, int]
+    frames: int
+    left_out: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def write_session(
+    imported: Imported, setup: Path, out: Path, *, rig: StereoRig | None = None, overwrite: bool = False
+) -> Written:
+    """Writes a session folder.
+
+    Args:
+        imported: the recording.
+        setup: a ``session.yaml``, or a folder with one: how things were set up. Copied as it is.
+        out: the folder.
+        rig: the endoscope's calibration, where the setup has none.
+        overwrite: replace a session that is there.
+
+    Raises:
+        InputError: an event that the format does not take, with its place in the recording; nothing is written then.
+    """
+    if not imported.drafts:
+        why = f"; {imported.left_out[0]}" if imported.left_out else ""
+        raise InputError(imported.source, f"no events{why}", "at least one")
+    file = setup / SETUP_FILE if setup.is_dir() else setup
+    text = read_bounded(file, str(file), _MAX_SETUP).decode("utf-8", errors="replace")
+    rig = rig or imported.rig
+    if rig is not None and "camera" not in load_yaml(file, str(file)):
+        text = text.rstrip("\n") + "\n" + camera_yaml(rig)
+    with whole_folder(out, overwrite=overwrite) as folder:
+        (folder / SETUP_FILE).write_text(text, encoding="utf-8")
+        read = _read_setup(folder / SETUP_FILE, str(file), out.resolve().name)
+        imported.write_frames(folder)
+        lines, frames = _lines(imported.drafts, folder, read)
+        note = {"type": "note", "t": imported.drafts[0].t, "text": _summary(imported)}
+        (folder / EVENTS_FILE).write_bytes(b"".join([event_line(note, "note"), *lines]))
+        problems, warnings = check_session(folder)
+        if problems:
+            raise problems[0]
+    counts: dict[str, int] = {}
+    for draft in imported.drafts:
+        kind = str(draft.document["type"])
+        counts[kind] = counts.get(kind, 0) + 1
+    return Written(counts, frames, tuple(imported.left_out), tuple(warnings))
+
+
+def _summary(imported: Imported) -> str:
+    """For the record: what the session was made of."""
+    missing = "; ".join(one_line(reason, 200) for reason in imported.left_out[:20])
+    more = len(imported.left_out) - 20
+    tail = f" and {more} more" if more > 0 else ""
+    return f"converted from {one_line(imported.source, 300)}" + (f"; {missing}{tail}" if missing else "")
+
+
+def _read_setup(path: Path, name: str, session: str) -> Setup:
+    problems: list[InputError] = []
+    found = read_setup(load_yaml(path, name), name, session or "session", problems)
+    if problems:
+        raise problems[0]
+    return found
+
+
+def _lines(drafts: list[Draft], folder: Path, setup: Setup) -> tuple[list[bytes], int]:
+    """The events' lines, each read back as a reader of the session will; number of frames."""
+    out: list[bytes] = []
+    uses: dict[Path, FrameUse] = {}
+    last: tuple[float, int] | None = None
+    for draft in drafts:
+        line = event_line(draft.document, draft.where)
+        read = read_line(line, len(out) + 2, EVENTS_FILE, folder.resolve(), setup, last)
+        if read.problems:
+            problem = read.problems[0]
+            raise InputError(_place(draft, problem), problem.found, problem.expected)
+        last = (draft.t, len(out) + 2)
+        out.append(line)
+        size = None if setup.camera is None else setup.camera.left.image_size
+        fresh = [use for use in read.frames if use.path not in uses]
+        if wrong := check_frames(fresh, setup.probe, size):
+            raise InputError(_place(draft, wrong[0]), wrong[0].found, wrong[0].expected)
+        uses |= {use.path: use for use in fresh}
+    return out, len(uses)
+
+
+def _place(draft: Draft, problem: InputError) -> str:
+    """The place in the recording instead of the line that was never written."""
+    inner = problem.where.split(": ", 2)
+    return f"{draft.where}: {inner[2]}" if len(inner) == 3 else draft.where
+
+
+def camera_yaml(rig: StereoRig) -> str:
+    """The ``camera`` section of a ``session.yaml``."""
+    width, height = rig.left.image_size
+    lines = ["camera:", f"  image_size: [{width}, {height}]", f"  left: {_camera(rig.left)}"]
+    if rig.right is not None and rig.right_T_left is not None:
+        lines += [f"  right: {_camera(rig.right)}", f"  right_T_left: {_matrix(rig.right_T_left)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _camera(model: CameraModel) -> str:
+    return f"{{matrix: {_matrix(model.matrix)}, distortion: {_row(model.distortion)}}}"
+
+
+def _matrix(values: FloatArray) -> str:
+    return "[" + ", ".join(_row(row) for row in values) + "]"
+
+
+def _row(values: FloatArray) -> str:
+    return "[" + ", ".join(_number(float(value)) for value in values) + "]"
+
+
+def _number(value: float) -> str:
+    # YAML 1.1 takes 1e-05 for a text.
+    text = repr(value)
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text

@@ -1,0 +1,239 @@
+"""PLUS sequences as sessions: written by SimpleITK, and by hand after PLUS's description of the format."""
+
+from __future__ import annotations
+
+import json
+import math
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from fgreg.cli import app
+from fgreg.convert.plus import oriented
+from fgreg.convert.sequence_file import read_sequence
+from fgreg.errors import FgregError, InputError
+from tests import session_files
+
+RUNNER = CliRunner()
+POSE = "1 0 0 10 0 0 -1 20 0 1 0 150 0 0 0 1"
+IMAGES = np.arange(3 * 5 * 4, dtype=np.uint8).reshape(3, 5, 4)
+HEADER = """\
+ObjectType = Image
+NDims = 3
+AnatomicalOrientation = RAI
+BinaryData = True
+BinaryDataByteOrderMSB = False
+CenterOfRotation = 0 0 0
+CompressedData = {compressed}
+DimSize = {size}
+ElementSpacing = 1 1 1
+Kinds = domain domain list
+Offset = 0 0 0
+TransformMatrix = 1 0 0 0 1 0 0 0 1
+UltrasoundImageOrientation = {orientation}
+UltrasoundImageType = {kind}
+ElementType = {element}
+{fields}ElementDataFile = LOCAL
+"""
+
+
+def frame_fields(index: int, **fields: object) -> dict[str, str]:
+    """Fields of a frame: time, a marker pose, a stage angle; ``None`` leaves one out."""
+    found: dict[str, object] = {"FrameNumber": 100 + index, "Timestamp": 8151.5 + 0.25 * index, "ImageStatus": "OK"}
+    found |= {"MarkerToCameraTransform": POSE, "MarkerToCameraTransformStatus": "OK", "StageAngle": 2.0 * index}
+    found |= fields
+    return {f"Seq_Frame{index:04d}_{key}": str(value) for key, value in found.items() if value is not None}
+
+
+def by_hand(
+    path: Path,
+    fields: dict[str, str],
+    images: Any = IMAGES,
+    *,
+    orientation: str = "MFA",
+    kind: str = "BRIGHTNESS",
+    compressed: bool = False,
+) -> Path:
+    element = {"uint8": "MET_UCHAR", "int16": "MET_SHORT", "float32": "MET_FLOAT"}[images.dtype.name]
+    text = "".join(f"{key} = {value}\n" for key, value in fields.items())
+    size = " ".join(map(str, images.shape[::-1]))
+    head = HEADER.format(
+        compressed=compressed, size=size, orientation=orientation, kind=kind, element=element, fields=text
+    )
+    data = images.tobytes()
+    path.write_bytes(head.encode() + (zlib.compress(data) if compressed else data))
+    return path
+
+
+def three(**last: object) -> dict[str, str]:
+    return frame_fields(0) | frame_fields(1) | frame_fields(2, **last)
+
+
+def by_simpleitk(path: Path, fields: dict[str, str], images: Any = IMAGES, *, compressed: bool = False) -> Path:
+    sitk = pytest.importorskip("SimpleITK", reason="SimpleITK is not installed")
+    image = sitk.GetImageFromArray(images)
+    for key, value in {**fields, "UltrasoundImageOrientation": "MFA", "UltrasoundImageType": "BRIGHTNESS"}.items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(path), useCompression=compressed)
+    return path
+
+
+def setup(folder: Path) -> Path:
+    path = folder / "setup.yaml"
+    path.write_text(yaml.safe_dump(session_files.setup()), encoding="utf-8")
+    return path
+
+
+def convert(*words: object) -> Any:
+    return RUNNER.invoke(app, ["convert", *map(str, words)])
+
+
+def refused(*words: object) -> str:
+    done = convert(*words)
+    assert isinstance(done.exception, FgregError), done.output
+    assert str(done.exception).isprintable()
+    return str(done.exception)
+
+
+def events(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+@pytest.mark.parametrize("writer", ["hand", "hand-compressed", "SimpleITK", "SimpleITK-compressed"])
+def test_each_frame_becomes_a_pair_with_its_image(tmp_path: Path, writer: str) -> None:
+    make: Any = by_hand if writer.startswith("hand") else by_simpleitk
+    path = make(tmp_path / "scan.mha", three(), compressed=writer.endswith("compressed"))
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    assert done.exit_code == 0, done.output
+    note, *pairs = events(tmp_path / "s")
+    assert note["text"] == "converted from PLUS sequence scan.mha"
+    assert [pair["pm"] for pair in pairs] == [0, 1, 2]
+    assert [pair["t"] for pair in pairs] == [8151.5, 8151.75, 8152.0]
+    assert [pair["trus"]["scan_deg"] for pair in pairs] == [0.0, 2.0, 4.0]
+    assert pairs[1]["marker"]["camera_T_marker"] == session_files.QUARTER
+    stored = np.load(tmp_path / "s" / pairs[1]["trus"]["frame"])
+    np.testing.assert_array_equal(stored, IMAGES[1])
+    assert stored.dtype == np.float32
+
+
+def test_fields_say_type_pm_sweep_and_position_and_a_mapping_names_others(tmp_path: Path) -> None:
+    turned = math.radians(15.0)  # the probe's z axis along (0, sin 15, cos 15) deg
+    stage = f"1 0 0 0 0 {math.cos(turned)} {math.sin(turned)} 0 0 {-math.sin(turned)} {math.cos(turned)} 0 0 0 0 1"
+    fields = frame_fields(0, StageAngle=None, ProbeToStageTransform=stage, FgregX=3.5, FgregRange=31.25, Spot=7)
+    fields |= frame_fields(1, FgregType="track", StageAngle=-3)
+    fields |= frame_fields(2, FgregType="note", FgregText="moved the table", MarkerToCameraTransform=None)
+    fields["Seq_Frame0000_FgregSweep"] = "-1"
+    path = by_hand(tmp_path / "scan.mha", fields)
+    mapped = tmp_path / "map.yaml"
+    mapped.write_text("format: fgreg-mapping/1\nfields: {pm: Spot}\nframes: [0, 1, 2]\n")
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", mapped)
+    assert done.exit_code == 0, done.output
+    _, pair, track, note = events(tmp_path / "s")
+    assert pair["pm"] == 7
+    assert pair["trus"].pop("scan_deg") == pytest.approx(15.0)
+    assert pair["trus"] == {"x_mm": 3.5, "range_mm": 31.25, "sweep": -1}
+    assert (track["type"], track["scan_deg"]) == ("track", -3.0)
+    assert note["text"] == "moved the table"
+    mapped.write_text("format: fgreg-mapping/1\nframes: [1]\n")
+    assert convert(path, tmp_path / "t", "--setup", setup(tmp_path), "--map", mapped).exit_code == 0
+    assert [event["type"] for event in events(tmp_path / "t")] == ["note", "track"]
+
+
+def test_frames_in_which_the_marker_was_not_tracked_are_left_out_and_told(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "scan.mha", three(MarkerToCameraTransformStatus="MISSING"))
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    assert done.exit_code == 0, done.output
+    assert "2 pair" in done.stdout
+    assert "frame 2 is left out: MarkerToCameraTransform is MISSING" in done.stderr
+    path = by_hand(tmp_path / "scan.mha", three(ImageStatus="INVALID"))
+    done = convert(path, tmp_path / "t", "--setup", setup(tmp_path))
+    assert "frame 2 is left out: ImageStatus is INVALID" in done.stderr
+
+
+def test_images_are_turned_to_depth_and_lateral_whatever_their_orientation() -> None:
+    depth_lateral = np.arange(12, dtype=np.uint8).reshape(4, 3)  # far is down, marked is right
+    views = {
+        "MFA": depth_lateral,
+        "UFA": depth_lateral[:, ::-1],
+        "MN": depth_lateral[::-1],
+        "UN": depth_lateral[::-1, ::-1],
+        "FMA": depth_lateral.T,
+        "FU": depth_lateral[:, ::-1].T,
+        "NM": depth_lateral[::-1].T,
+    }
+    for letters, stored in views.items():
+        np.testing.assert_array_equal(oriented(stored, letters, False, "f"), depth_lateral, err_msg=letters)
+    waves = np.arange(12, dtype=np.int16).reshape(3, 4)  # stored with x along the samples: elements, samples
+    channels = oriented(waves, "FMA", True, "f")
+    np.testing.assert_array_equal(channels, waves)
+    assert channels.dtype == np.int16
+    with pytest.raises(InputError, match="UltrasoundImageOrientation: found 'XX'"):
+        oriented(stored, "XX", False, "f")
+
+
+def test_radio_frequency_frames_become_channel_data(tmp_path: Path) -> None:
+    waves = np.random.default_rng(1).integers(-999, 999, (3, 128, 20)).astype(np.int16)
+    path = by_hand(tmp_path / "rf.mha", three(), waves, orientation="FMA", kind="RF_REAL")
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    assert done.exit_code == 0, done.output
+    stored = np.load(tmp_path / "s" / events(tmp_path / "s")[2]["trus"]["frame"])
+    np.testing.assert_array_equal(stored, waves[1])
+    assert stored.dtype == np.int16
+
+
+def test_a_header_with_its_pixels_in_a_file_beside_it(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "scan.mhd", three())
+    head, _, data = path.read_bytes().partition(b"LOCAL\n")
+    path.write_bytes(head + b"scan.raw\n")
+    (tmp_path / "scan.raw").write_bytes(data)
+    images = read_sequence(path).images
+    assert images is not None
+    np.testing.assert_array_equal(images, IMAGES)
+    path.write_bytes(head + b"../scan.raw\n")
+    with pytest.raises(InputError, match="expected LOCAL, or a file beside it"):
+        read_sequence(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"ObjectType = Image", b"\x89PNG", "found no header of key = value lines"),
+        (b"ObjectType = Image", b"ObjectType = Tube", "found another file"),
+        (b"ElementDataFile = LOCAL\n", b"", "found no header of key = value lines"),
+        (b"DimSize = 4 5 3", b"DimSize = 4 5", "scan.mha: Seq_Frame0002: found it, expected frames below 1"),
+        (b"DimSize = 4 5 3", b"DimSize = 4 x 3", "DimSize: found '4 x 3'"),
+        (b"DimSize = 4 5 3", b"DimSize = 4 50 3", "found 60 bytes of pixels, expected 600"),
+        (b"DimSize = 4 5 3", b"DimSize = 99999999 99999999 3", "DimSize: found"),
+        (b"MET_UCHAR", b"MET_STRING", "ElementType: found 'MET_STRING'"),
+        (b"CompressedData = False", b"CompressedData = True", "compressed data that are damaged"),
+        (b"Frame0001_Timestamp = 8151.75", b"Frame0001_Timestamp = soon", "Seq_Frame0001_Timestamp: found 'soon'"),
+        (b"Seq_Frame0001_Timestamp = 8151.75\n", b"", "Seq_Frame0001_Timestamp: found nothing"),
+        (b"Frame0001_MarkerToCameraTransform = 1", b"Frame0001_MarkerToCameraTransform = 3", "a rigid 4x4 matrix"),
+        (b"MarkerToCameraTransform =", b"NeedleToCameraTransform =", "no field MarkerToCameraTransform, expected it"),
+        (b"StageAngle", b"Angle", "Seq_Frame0000_StageAngle: found nothing"),
+        (b"StageAngle = 4.0", b"StageAngle = 900", "scan.mha: frame 2: trus.scan_deg: found 900"),
+    ],
+)
+def test_a_bad_sequence_is_one_line_and_leaves_nothing(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    path = by_hand(tmp_path / "scan.mha", three())
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    assert message in refused(path, tmp_path / "s", "--setup", setup(tmp_path))
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.mha", "setup.yaml"]
+
+
+def test_a_mapping_that_names_what_no_frame_has_is_told_with_what_there_is(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "scan.mha", three())
+    mapped = tmp_path / "map.yaml"
+    mapped.write_text("format: fgreg-mapping/1\nfields: {scan: Winkel}\n")
+    message = refused(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", mapped)
+    assert "'Winkel' in no frame, expected a field of the frames, for scan" in message
+    assert "StageAngle" in message
+    mapped.write_text("format: fgreg-mapping/1\nframes: [1, 9]\n")
+    assert "frame 9: found no such frame" in refused(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", mapped)
