@@ -32,15 +32,23 @@ ANGLES = st.one_of(
     st.sampled_from([*LIMITS_DEG, *SWEEP_DEG, 0.0, -35.1, 30.1, 40.01, -60.01, 1e9, math.nan, math.inf]),
 )
 SPEEDS = st.one_of(st.floats(0.1, 13.0), st.sampled_from([8.0, 10.0, 12.0, 0.0, -1.0, math.nan, math.inf]))
-STANDS = st.sampled_from([0.0, -34.9, 29.9, -35.6, 30.6, 38.0, 40.45, 40.6, -60.6, -50.0])
-TARGETS = st.sampled_from(
-    [0.0, -35.0, 30.0, -35.1, 30.1, 40.0, 40.1, -60.0, -60.1, 70.0, math.nan, math.inf, -20.0, 20.0]
-)
+STANDS = st.sampled_from([0.0, -34.9, 29.9, 10.0])
+TARGETS = st.sampled_from([0.0, -35.0, 30.0, -20.0, 20.0])
+Table = dict[str, float | None]
+STANDS_BADLY: Table = {"stands out": 40.6, "stands below": -60.6, "stands out of the sweep": 30.6, "stands at 38": 38.0}
+TARGETS_BADLY: Table = {
+    **{"target 40.1": 40.1, "target -60.1": -60.1, "target 70": 70.0, "target 30.1": 30.1, "target -35.1": -35.1},
+    **{"target nan": math.nan, "target inf": math.inf, "target 40": 40.0, "target -60": -60.0},
+}
+MARKERS: Table = {"marker old": 0.201, "marker older": 0.35, "marker ahead": -0.05, "no marker": None}
+VERDICTS = {"refused": "refused", "no registration": None, "odd verdict": "perhaps"}
+BAD_SPEEDS: Table = {"too fast": 12.5, "bit too fast": 10.01, "bit faster": 8.01, "no speed": math.nan, "back": -3.0}
+SIGMAS: Table = {"sigma": 2.01, "no sigma": None, "sigma nan": math.nan, "sigma below 0": -0.1}
+AGES: Table = {"late": 0.21, "later": 3.0, "ahead": -0.1}
 FAULTS = [
     *("not homed", "another request", "stopped", "emergency", "clock back", "clock ahead", "clock back, old beats"),
-    *("heartbeat gap", "silent", "marker old", "marker older", "marker ahead", "no marker", "refused"),
-    *("no registration", "odd verdict", "old beat after", "beat again", "too fast", "slightly too fast", "no speed"),
-    *("back", "sigma", "no sigma", "sigma nan", "sigma below 0", "late", "later", "ahead", "home with target", "twice"),
+    *("heartbeat gap", "silent", "old beat after", "beat again", "home with target", "twice", "0.3 s", "unwatched"),
+    *(*STANDS_BADLY, *TARGETS_BADLY, *MARKERS, *VERDICTS, *BAD_SPEEDS, *SIGMAS, *AGES),
 ]
 DISTURBANCES = [
     *("silent", "zero lost", "out of limits", "heartbeat from ahead", "no marker", "marker old", "marker ahead"),
@@ -175,15 +183,16 @@ class GateMachine(RuleBasedStateMachine):
         self.reset()
         self.request(kind)
 
-    @rule(
-        kind=KINDS, at=STANDS, to=TARGETS, faults=st.sets(st.sampled_from(FAULTS), max_size=2), gap=st.floats(0.0, 0.3)
-    )
-    def nearly_good_command(self, kind: MotionKind, at: float, to: float, faults: set[str], gap: float) -> None:
+    @rule(kind=KINDS, at=STANDS, to=TARGETS, faults=st.sets(st.sampled_from(FAULTS), max_size=2))
+    def nearly_good_command(self, kind: MotionKind, at: float, to: float, faults: set[str]) -> None:
         """All as it should be, but for up to two things."""
-        self._recover(kind, at, "not homed" not in faults)
-        others = [other for other in MotionKind if other is not kind]
+
+        def pick(table: Table, otherwise: float | None) -> float | None:
+            return next((table[fault] for fault in sorted(faults) if fault in table), otherwise)
+
+        self._recover(kind, pick(STANDS_BADLY, at) or 0.0, "not homed" not in faults)
         if "another request" in faults:
-            self.request(others[0])
+            self.request(next(other for other in MotionKind if other is not kind))
         if "stopped" in faults:
             self.stop(False)
         if "emergency" in faults:
@@ -203,35 +212,23 @@ class GateMachine(RuleBasedStateMachine):
             self._live()
         if "silent" in faults:
             self.silent = True
-        marker = {"marker old": 0.201, "marker older": 0.35, "marker ahead": -0.05, "no marker": None}
-        verdict = {"refused": "refused", "no registration": None, "odd verdict": "perhaps"}
-        self._beat(
-            0.0,
-            next((marker[f] for f in sorted(faults) if f in marker), 0.02),
-            next((verdict[f] for f in sorted(faults) if f in verdict), "ok"),
-        )
+        verdict = next((VERDICTS[fault] for fault in sorted(faults) if fault in VERDICTS), "ok")
+        self._beat(0.0, pick(MARKERS, 0.02), verdict)
         if "old beat after" in faults:
             self._beat(0.24, 0.0, "ok")
-        self.now += gap
-        self._tick()
+        if "0.3 s" in faults:
+            for _ in range(15):
+                self.now += 0.021
+                self._beat(0.0, pick(MARKERS, 0.02), verdict)
+                self._tick()
+        if "unwatched" in faults:
+            self.now += 0.31
         if "beat again" in faults:
-            self._beat(0.0, 0.02 + gap, "ok")
-        target = None if kind is MotionKind.HOME else to
-        speed = {
-            "too fast": 12.5,
-            "slightly too fast": SPEED_DEG_S[str(kind)] + 0.01,
-            "no speed": math.nan,
-            "back": -3.0,
-        }
-        sigma = {"sigma": 2.01, "no sigma": None, "sigma nan": math.nan, "sigma below 0": -0.1}
-        age = {"late": 0.21, "later": 3.0, "ahead": -0.1}
-        self.command(
-            kind,
-            0.0 if "home with target" in faults else target,
-            next((speed[f] for f in sorted(faults) if f in speed), 5.0),
-            next((sigma[f] for f in sorted(faults) if f in sigma), 0.5),
-            next((age[f] for f in sorted(faults) if f in age), 0.0),
-        )
+            self._beat(0.0, 0.02, "ok")
+        target = None if kind is MotionKind.HOME else pick(TARGETS_BADLY, to)
+        if "home with target" in faults:
+            target = 0.0
+        self.command(kind, target, pick(BAD_SPEEDS, 5.0) or 0.0, pick(SIGMAS, 0.5), pick(AGES, 0.0) or 0.0)
         if "twice" in faults:
             self.command(kind, target, 5.0, 0.5, 0.0)
 
@@ -320,8 +317,8 @@ class GateMachine(RuleBasedStateMachine):
 
 
 GateMachine.TestCase.settings = settings(
-    max_examples=250,
-    stateful_step_count=30,
+    max_examples=300,
+    stateful_step_count=25,
     deadline=None,
     derandomize=True,
     suppress_health_check=list(HealthCheck),

@@ -150,7 +150,7 @@ def decode(line: bytes) -> Message:
         if set(document) != names:
             raise ValueError(f"fields {sorted(document)}, expected {sorted(names)}")
         return kind(**{name: _checked(name, value) for name, value in document.items()})
-    except (UnicodeDecodeError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise MessageError(f"a message that cannot be read: {type(error).__name__}: {error}"[:MAX_TEXT]) from error
 
 

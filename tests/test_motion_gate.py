@@ -1,0 +1,407 @@
+"""The gate lets good motion out, and stops it for each thing that can go wrong, with the reason."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fgreg.drivers.simulated_stage import SimulatedStage
+from fgreg.models import StageModel
+from fgreg.motion.gate import Gate
+from fgreg.motion.limits import MotionKind, MotionLimits
+from fgreg.motion.messages import (
+    MAX_TEXT,
+    Action,
+    Arrived,
+    Beat,
+    Command,
+    Drive,
+    Halt,
+    Message,
+    MessageError,
+    Refusal,
+    Request,
+    Reset,
+    Stop,
+    decode,
+    encode,
+)
+
+STAGE = StageModel(math.radians(2.0), (math.radians(-30.0), math.radians(70.0)), -1, math.radians(10.0))
+LIMITS = MotionLimits.of_session(STAGE, sweep_rad=(math.radians(-35.0), math.radians(30.0)))
+
+
+@dataclass
+class _Room:
+    """A gate with a simulated stage behind it and a main program that beats."""
+
+    gate: Gate
+    stage: SimulatedStage
+    now: float = 50.0
+    marker_s: float | None = 50.0
+    registration: str | None = "ok"
+    beating: bool = True
+    hearing: bool = True
+    number: int = 0
+    limits: MotionLimits = LIMITS
+
+    def do(self, actions: list[Action]) -> list[Action]:
+        for action in actions:
+            match action:
+                case Drive() if action.scan_rad is None:
+                    self.stage.home(action.speed_rad_s)
+                case Drive():
+                    assert action.scan_rad is not None
+                    self.stage.move_to(action.scan_rad, action.speed_rad_s)
+                case Halt():
+                    self.stage.stop()
+        return actions
+
+    def run(self, seconds: float, marker: bool = True) -> list[Action]:
+        """Let time pass in ticks; what the gate did."""
+        actions = []
+        for _ in range(round(seconds / 0.02)):
+            self.now += 0.02
+            if marker:
+                self.marker_s = self.now - 0.03
+            if self.beating:
+                actions += self.do(self.gate.handle(Beat(self.now, self.marker_s, self.registration), self.now))
+            actions += self.do(self.gate.tick(self.now, self.stage.status() if self.hearing else None))
+        return actions
+
+    def request(self, kind: MotionKind) -> list[Action]:
+        return self.do(self.gate.handle(Request(self.now, kind, "pedal"), self.now))
+
+    def command(
+        self, kind: MotionKind, deg: float | None, speed_deg_s: float = 10.0, sigma_deg: float = 0.5
+    ) -> list[Action]:
+        self.number += 1
+        scan = None if deg is None else math.radians(deg)
+        speed, sigma = math.radians(speed_deg_s), math.radians(sigma_deg)
+        return self.do(self.gate.handle(Command(self.now, self.number, kind, scan, speed, sigma, "test"), self.now))
+
+    def go(self, kind: MotionKind, deg: float | None, **more: float) -> list[Action]:
+        assert self.request(kind) == []
+        return self.command(kind, deg, **more)
+
+
+def _room(homed: bool = True, device_deg: float = 10.0, limits: MotionLimits = LIMITS) -> _Room:
+    stage = SimulatedStage(STAGE, device_rad=math.radians(device_deg), homed=homed)
+    room = _Room(Gate(limits), stage, limits=limits)
+    stage._clock, stage._at = (lambda: room.now), room.now
+    room.run(0.1)
+    return room
+
+
+def _halts(actions: list[Action]) -> list[str]:
+    return [action.reason for action in actions if isinstance(action, Halt)]
+
+
+def _refused(actions: list[Action], says: str) -> None:
+    assert len(actions) == 1
+    assert isinstance(actions[0], Refusal)
+    assert says in actions[0].reason
+
+
+def test_homing_then_search_then_tracking_all_arrive() -> None:
+    room = _room(homed=False, device_deg=25.0)
+    assert isinstance(room.go(MotionKind.HOME, None)[0], Drive)
+    assert Arrived(1) in room.run(5.0)
+    assert math.degrees(room.stage.status().scan_rad) == pytest.approx(10.0, abs=1e-3)  # device 0, zero at 10, reversed
+    assert isinstance(room.go(MotionKind.SEARCH, -30.0)[0], Drive)
+    assert Arrived(2) in room.run(6.0)
+    assert math.degrees(room.stage.device_rad) == pytest.approx(40.0, abs=1e-3)
+    assert isinstance(room.go(MotionKind.TRACK, 35.0)[0], Drive)
+    assert Arrived(3) in room.run(8.0)
+    assert math.degrees(room.stage.status().scan_rad) == pytest.approx(35.0, abs=1e-3)
+    assert room.gate.latched is None
+
+
+def test_tracking_may_be_retargeted_while_it_turns_and_turned_about() -> None:
+    room = _room()
+    room.go(MotionKind.TRACK, 30.0)
+    for target in (25.0, -20.0, -19.5, 10.0, 10.3, 10.0):
+        assert not _halts(room.run(0.7))
+        assert isinstance(room.command(MotionKind.TRACK, target)[0], Drive), target
+    assert Arrived(room.number) in room.run(5.0)
+    assert room.gate.latched is None
+
+
+def test_held_tracking_goes_on_when_the_marker_is_back_even_the_other_way() -> None:
+    room = _room()
+    room.go(MotionKind.TRACK, 30.0)
+    room.run(1.0)
+    assert any("tracking held: the marker is" in reason for reason in _halts(room.run(0.4, marker=False)))
+    _refused(room.command(MotionKind.TRACK, 30.0), "the marker is")
+    room.run(0.02)
+    assert isinstance(room.command(MotionKind.TRACK, -10.0)[0], Drive)
+    assert Arrived(room.number) in room.run(6.0)
+    assert room.gate.latched is None
+
+
+def test_tracking_that_cannot_go_on_stops_and_does_not_search() -> None:
+    room = _room()
+    room.go(MotionKind.TRACK, 30.0)
+    room.run(0.5)
+    room.registration = "refused"
+    actions = room.run(3.0)
+    assert _halts(actions) == ["tracking held: the registration is refused"]
+    assert not [action for action in actions if isinstance(action, Drive)]
+    _refused(room.command(MotionKind.SEARCH, 0.0), "the operator has not asked to search")
+
+
+@pytest.mark.parametrize(
+    ("kind", "deg", "more", "says"),
+    [
+        (MotionKind.TRACK, 40.5, {}, "outside the stage's limits"),
+        (MotionKind.TRACK, -60.5, {}, "outside the stage's limits"),
+        (MotionKind.SEARCH, 31.0, {}, "outside the sweep range"),
+        (MotionKind.SEARCH, math.nan, {}, "no target"),
+        (MotionKind.SEARCH, None, {}, "no target"),
+        (MotionKind.HOME, 3.0, {}, "homing has no target"),
+        (MotionKind.TRACK, 3.0, {"speed_deg_s": 10.1}, "speed 10.1 deg/s"),
+        (MotionKind.TRACK, 3.0, {"speed_deg_s": -1.0}, "speed -1.0 deg/s"),
+        (MotionKind.TRACK, 3.0, {"speed_deg_s": math.nan}, "speed nan"),
+        (MotionKind.TRACK, 3.0, {"sigma_deg": 2.1}, "sigma is 2.10 deg"),
+        (MotionKind.TRACK, 3.0, {"sigma_deg": math.nan}, "sigma is nan"),
+    ],
+)
+def test_order_that_is_not_allowed_is_refused_with_the_reason(
+    kind: MotionKind, deg: float | None, more: dict[str, float], says: str
+) -> None:
+    _refused(_room().go(kind, deg, **more), says)
+
+
+def test_without_the_operator_nothing_moves_and_one_request_serves_one_kind() -> None:
+    room = _room()
+    for kind in MotionKind:
+        _refused(room.command(kind, None if kind is MotionKind.HOME else 0.0), "the operator has not asked")
+    room.request(MotionKind.SEARCH)
+    _refused(room.command(MotionKind.TRACK, 0.0), "the operator has not asked to track")
+    assert isinstance(room.go(MotionKind.HOME, None)[0], Drive)
+    room.run(5.0)
+    _refused(room.command(MotionKind.HOME, None), "the operator has not asked to home")
+
+
+def test_request_runs_out() -> None:
+    room = _room(limits=replace(LIMITS, request_s=2.0))
+    room.go(MotionKind.TRACK, 40.0, speed_deg_s=5.0)
+    assert "the operator's request has run out" in _halts(room.run(3.0))
+
+
+def test_not_homed_stage_neither_searches_nor_tracks() -> None:
+    room = _room(homed=False)
+    _refused(room.go(MotionKind.SEARCH, 0.0), "not homed")
+    _refused(room.go(MotionKind.TRACK, 0.0), "not homed")
+
+
+def test_stalled_main_program_stops_the_stage_and_needs_a_new_request() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 30.0)
+    room.run(0.5)
+    room.beating = False
+    began = room.now
+    while not _halts(room.run(0.02)):
+        assert room.now - began < 0.5
+    assert room.now - began <= LIMITS.heartbeat_s + 0.041
+    room.run(2.0)
+    assert not room.stage.status().moving
+    room.beating = True
+    room.run(0.1)
+    _refused(room.command(MotionKind.SEARCH, 0.0), "the operator has not asked")
+    assert isinstance(room.go(MotionKind.SEARCH, 0.0)[0], Drive)
+
+
+def test_backlog_of_a_stall_is_worth_nothing() -> None:
+    room = _room()
+    room.request(MotionKind.SEARCH)
+    late = Command(room.now, 9, MotionKind.SEARCH, 0.1, 0.1, None, "before the stall")
+    beats = [Beat(room.now + 0.02 * i, room.now, "ok") for i in range(5)]
+    room.beating = False
+    room.run(0.4)
+    for beat in beats:
+        room.do(room.gate.handle(beat, room.now))
+    _refused(room.do(room.gate.handle(late, room.now)), "the operator has not asked")
+    room.beating = True
+    room.run(0.02)
+    room.request(MotionKind.SEARCH)
+    _refused(room.do(room.gate.handle(late, room.now)), "on its way")
+
+
+@pytest.mark.parametrize(
+    ("happens", "says"),
+    [
+        (lambda room: room.do(room.gate.handle(Stop(room.now, True, "button"), room.now)), "emergency stop: button"),
+        (lambda room: room.do(room.gate.tick(room.now - 0.01, None)), "the clock went back by 0.010 s"),
+        (lambda room: room.do(room.gate.tick(room.now + 0.6, None)), "the clock leapt by 0.600 s"),
+        (lambda room: room.do(room.gate.tick(math.nan, None)), "the clock shows no time"),
+        (lambda room: room.do(room.gate.fault("unplugged", room.now)), "unplugged"),
+        (lambda room: room.do(room.gate.handle(Beat(room.now + 1.0), room.now)), "heartbeat from the future"),
+    ],
+)
+def test_trouble_latches_until_the_operator_resets(happens: Any, says: str) -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 30.0)
+    room.run(0.5)
+    actions = happens(room)
+    assert says in _halts(actions)[0]
+    assert actions[-1] == Halt(_halts(actions)[-1], latched=True)
+    room.run(3.0)
+    assert not room.stage.status().moving
+    _refused(room.request(MotionKind.SEARCH), "latched")
+    _refused(room.command(MotionKind.SEARCH, 0.0), "latched")
+    assert room.gate.handle(Reset(room.now, "nurse"), room.now) == []
+    assert isinstance(room.go(MotionKind.SEARCH, 0.0)[0], Drive)
+    assert Arrived(room.number) in room.run(6.0)
+
+
+def test_reset_is_refused_while_the_stage_moves_or_is_silent() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 30.0)
+    room.run(1.0)
+    room.do(room.gate.fault("test", room.now))
+    room.run(0.1)
+    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "still moves")
+    room.run(2.0)
+    room.hearing = False
+    room.run(0.4)
+    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "the stage is silent")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "value", "says"),
+    [
+        ("speed_factor", 2.5, "too fast"),
+        ("reversed", True, "off its way"),
+        ("frozen", True, "silent"),
+    ],
+)
+def test_stage_that_misbehaves_is_stopped_and_latched(wrong: str, value: Any, says: str) -> None:
+    room = _room()
+    setattr(room.stage.wrong, wrong, value)
+    room.go(MotionKind.SEARCH, 25.0)
+    reasons = _halts(room.run(2.0))
+    assert reasons
+    assert says in reasons[0]
+    assert room.gate.latched is not None
+
+
+def test_silent_stage_is_stopped() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 30.0)
+    room.run(0.5)
+    room.hearing = False
+    assert _halts(room.run(0.5))[0] == "the stage is silent"
+
+
+def test_stage_that_does_not_stop_is_told_again_and_again() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 30.0, speed_deg_s=5.0)
+    room.run(0.5)
+    room.stage.wrong.deaf = True
+    room.do(room.gate.handle(Stop(room.now, False, "test"), room.now))
+    assert len(_halts(room.run(3.0))) > 20
+    assert room.gate.latched == "the stage moves, and should not"
+
+
+def test_stage_that_is_turned_by_its_own_knob_is_stopped() -> None:
+    room = _room()
+    room.stage.move_to(math.radians(20.0), math.radians(3.0))
+    assert _halts(room.run(0.1))[0] == "the stage moves, and should not"
+
+
+def test_stage_that_stops_by_itself_ends_the_request() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 30.0)
+    room.run(0.5)
+    room.stage.stop()
+    assert "stopped by itself" in _halts(room.run(3.0))[0]
+    assert room.gate.latched is None
+    assert room.gate.requested is None
+
+
+def test_homing_that_finds_no_zero_within_the_limits_span_is_stopped() -> None:
+    room = _room(homed=False, device_deg=200.0)
+    room.go(MotionKind.HOME, None)
+    assert "zero position not found within 100 deg" in _halts(room.run(15.0))[0]
+    assert abs(math.degrees(room.stage.device_rad) - 200.0) < 104.0
+
+
+def test_messages_come_back_as_they_went() -> None:
+    messages: list[Message] = [
+        Beat(1.5, None, None),
+        Beat(1.5, 1.25, "ok"),
+        Request(2.0, MotionKind.HOME, "pédale"),
+        Command(2.0, 3, MotionKind.TRACK, -0.1, 0.2, 0.01, "a\nb"),
+        Command(2.0, 4, MotionKind.HOME, None, 0.2, None, ""),
+        Stop(3.0, True, "x"),
+        Reset(4.0, "y"),
+    ]
+    for message in messages:
+        line = encode(message)
+        assert line.count(b"\n") == 1
+        assert decode(line) == message
+    assert len(encode(Stop(0.0, True, "x" * 9999))) < MAX_TEXT + 200
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        encode(Command(2.0, 3, MotionKind.TRACK, math.nan, 0.2, 0.01, ""))
+
+
+_COMMAND = {**json.loads(encode(Command(2.0, 3, MotionKind.TRACK, 0.1, 0.2, 0.01, "why")))}
+
+
+_WRONG: dict[str, list[Any]] = {
+    "number": [True, 1.0, "1", None],
+    "scan_rad": [True, "1", [], 10**400],
+    "speed_rad_s": [None, False, {}],
+    "kind": ["fly", None, ["home"]],
+    "message": ["drive", None, [], 3],
+    "reason": [None, 3, "x" * 301],
+    "more": [1],
+}
+
+
+@pytest.mark.parametrize("change", [{name: value} for name, values in _WRONG.items() for value in values])
+def test_message_with_a_wrong_field_is_none(change: dict[str, Any]) -> None:
+    with pytest.raises(MessageError):
+        decode(json.dumps(_COMMAND | change).encode())
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"{", b"[]", b"null", b"\xff\xfe", b'{"message": "beat"}', b"[" * 3000, b'{"a": NaN}']
+)
+def test_line_that_is_no_message_is_none(line: bytes) -> None:
+    with pytest.raises(MessageError):
+        decode(line)
+
+
+@settings(max_examples=200, derandomize=True, deadline=None)
+@given(st.binary(max_size=200))
+def test_garbage_never_becomes_a_message(line: bytes) -> None:
+    with pytest.raises(MessageError):
+        decode(line)
+
+
+def test_limits_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(ValueError, match="leaves the stage's limits"):
+        MotionLimits.of_session(STAGE, sweep_rad=(-1.5, 0.0))
+    with pytest.raises(ValueError, match="zero position"):
+        MotionLimits.of_session(StageModel(0.1, (0.5, 1.0)))
+    with pytest.raises(ValueError, match="heartbeat_s"):
+        MotionLimits.of_session(STAGE, heartbeat_s=math.inf)
+    with pytest.raises(ValueError, match="overspeed"):
+        MotionLimits.of_session(STAGE, overspeed=0.9)
+    with pytest.raises(ValueError, match="increasing"):
+        MotionLimits.of_session(STAGE, sweep_rad=(0.1, 0.0))
+
+
+def test_limits_survive_being_handed_over() -> None:
+    document = json.loads(json.dumps(LIMITS.document()))
+    assert MotionLimits.from_document(document) == LIMITS
+    with pytest.raises(TypeError):
+        MotionLimits.from_document(document | {"more": 1})
