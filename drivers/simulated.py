@@ -24,6 +24,7 @@ import numpy as np
 from fgreg.drivers.base import Command, DeviceLost, PaFrame, Said, StereoFrame, host_now
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
+from fgreg.models import StageModel
 from fgreg.motion.device import MAX_CALL_S, StageLost, StageStatus
 from fgreg.pairing import Stamp
 
@@ -279,6 +280,11 @@ class RoomStage:
     def close(self) -> None:
         """Let go of it."""
         self._connection.close()
+
+
+def open_stage(_model: StageModel, path: str) -> RoomStage:
+    """The stage of the room whose socket is at ``path``, for the watchdog; it knows direction and zero itself."""
+    return RoomStage(Path(path))
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:

@@ -35,6 +35,8 @@ STAGE_BEGINS_RAD = math.radians(-17.0)
 """Where the stage stands when the room begins; it does not know."""
 SETTLE_S = 0.4
 """The surgeon says that he aims once the fibre has been still for so long."""
+SAY_AGAIN_S = 3.0
+"""And says so again while nothing comes of it."""
 ROAM_S = 4.0
 """Where he roams, the surgeon goes on by himself after so long at one place."""
 
@@ -231,7 +233,8 @@ class RoomServer:
         roams = self._roam and room.place.corner is None and rested > ROAM_S
         if (go_on and rested > 0) or roams:
             room.proceed(now_s)
-        elif rested > SETTLE_S and self._said_s < room.arrives_s() and room.place.corner is not None:
+            self._said_s = -math.inf
+        elif rested > SETTLE_S and now_s - self._said_s > SAY_AGAIN_S and room.place.corner is not None:
             self._said_s = now_s
             self._say({"says": "aim", "corner": list(room.place.corner)})
 

@@ -50,6 +50,7 @@ class Engine(Protocol):
     def add(self, event: OnlineEvent) -> OnlineEstimate: ...
     def track(self, query: Track) -> TrackEstimate: ...
     def settle(self) -> OnlineEstimate: ...
+    def refresh(self) -> OnlineEstimate: ...
     def measurements(self) -> Measurements: ...
     def marker_T_laser(self) -> FloatArray | None: ...
     def catching_up(self) -> AbstractContextManager[None]: ...
@@ -88,9 +89,13 @@ class EpochFeed:
             self.epoch = estimate.epoch
             return estimate
         estimate = self._engine.add(replace(event, epoch=self.epoch) if isinstance(event, Pair) else event)
+        self.notice(estimate)
+        return estimate
+
+    def notice(self, estimate: OnlineEstimate) -> None:
+        """Epochs that the engine began by itself."""
         self.noticed += max(0, estimate.epoch - self.epoch)
         self.epoch = estimate.epoch
-        return estimate
 
     def starts(self) -> tuple[EpochStart, ...]:
         """Where the epochs begin, as the engine has it."""
@@ -104,18 +109,27 @@ class LiveSession:
         journal: what is on disk.
         estimate: after the last event that was taken in; None before the first.
         config: of the estimate.
+        late: events may be handed over later than others that happened after them: they get the last one's time.
     """
 
     def __init__(self, journal: Journal, engine: Engine, config: SolveConfig) -> None:
         self.journal, self.config = journal, config
         self.estimate: OnlineEstimate | None = None
+        self.late = False
         self._engine, self._feed = engine, EpochFeed(engine)
         self._recogniser = EventRecogniser(journal.model)
         self._untaken: list[Event] = []  # on disk, not in the estimate yet: an interrupt came between
         self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
 
     @classmethod
-    def open(cls, folder: Path, config: SolveConfig | None = None, make_engine: MakeEngine | None = None) -> Self:
+    def open(
+        cls,
+        folder: Path,
+        config: SolveConfig | None = None,
+        make_engine: MakeEngine | None = None,
+        *,
+        late: bool = False,
+    ) -> Self:
         """Open a session's folder (with its ``session.yaml``); what was recorded before is taken in again.
 
         Raises:
@@ -126,6 +140,7 @@ class LiveSession:
         journal = Journal.open(folder)
         try:
             found = cls(journal, (make_engine or online_engine)(journal.model, config, None), config)
+            found.late = late
             found._take_recorded()
         except BaseException:
             journal.close()
@@ -169,7 +184,7 @@ class LiveSession:
         """
         self._catch_up()
         try:
-            kept = self.journal.append(event).event
+            kept = self.journal.append(event, late=self.late).event
         except InputError as error:
             self._refuse(event, None, str(error))
             self._write_waiting()
@@ -206,7 +221,19 @@ class LiveSession:
             JournalError: the disk refuses.
         """
         self._catch_up()
-        self.journal.append(event)
+        self.journal.append(event, late=self.late)
+
+    def refresh(self) -> OnlineEstimate | None:
+        """What the engine has found out since, without an event; a move of the camera that it found is recorded."""
+        self._catch_up()
+        before = self._feed.epoch
+        estimate = self._engine.refresh()
+        if self.estimate is not None or estimate.epoch > before:
+            self.estimate = estimate
+        self._feed.notice(estimate)
+        self._tell_moves()
+        self._write_waiting()
+        return self.estimate
 
     def settle(self) -> OnlineEstimate:
         """The full judgement of all that was taken in, now."""
@@ -294,7 +321,7 @@ class LiveSession:
         while self._unwritten:
             event = self._unwritten[0]
             try:
-                self.journal.append(event)
+                self.journal.append(event, late=self.late)
             except JournalError:
                 if patient:
                     return

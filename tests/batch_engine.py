@@ -51,6 +51,11 @@ class BatchEngine:
         self.estimate = found = self._estimate(event)
         return found
 
+    def refresh(self) -> OnlineEstimate:
+        if self.estimate is None:
+            raise AssertionError("nothing is known yet")
+        return self.estimate
+
     def _move(self, moved: CameraMoved) -> None:
         since, epoch = moved.t if moved.since_t is None else moved.since_t, len(self.all.epochs)
         pairs = tuple(replace(p, epoch=epoch) if moved.detected and p.t >= since else p for p in self.all.pairs)

@@ -128,8 +128,10 @@ class AppendFile:
             raise JournalError(self._name, found, "mend that and open it again") from None
         self._size = size
 
-    def append(self, line: bytes) -> int:
-        """Write one line; it is on disk when this returns.
+    def append(self, line: bytes, *, durable: bool = True) -> int:
+        """Write one line; it is on disk when this returns, or, where not ``durable``, with the next one that is.
+
+        What is not durable survives this program's end at any moment, though not the machine's.
 
         Returns:
             The offset at which the line starts.
@@ -145,7 +147,8 @@ class AppendFile:
             done = _write(self._handle, line)
             if done != len(line):
                 raise OSError(0, f"only {done} of {len(line)} bytes were written")
-            _sync(self._handle)
+            if durable:
+                _sync(self._handle)
         except OSError as error:
             self._restore()
             found = f"an event could not be recorded ({error.strerror})"

@@ -11,7 +11,7 @@ import contextlib
 import json
 import os
 import secrets
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
@@ -100,16 +100,22 @@ class Journal:
         events, self._recorded = self._recorded, ()
         return events
 
-    def append(self, event: Event) -> Appended:
+    def append(self, event: Event, *, durable: bool = True, late: bool = False) -> Appended:
         """Put an event on disk, behind all others; its ``line`` is given to it here.
 
         Frames that it names have to be there: they are checked, and put on disk first.
+
+        Args:
+            durable: on disk when this returns; False: with the next event that is (for what no estimate depends on).
+            late: one that happened before the last one was recorded gets that one's time, as the file wants it.
 
         Raises:
             InputError: it goes back in time, has a number that is not finite, or is otherwise not what a reader takes.
             JournalError: the disk refuses; nothing is recorded, and the file is as it was.
         """
         with self._lock:
+            if late and self._last is not None and event.t < self._last[0]:
+                event = replace(event, t=self._last[0])
             number = self.lines + 1
             place = f"{type_of(event)} event"
             line = event_line(event_document(event, self.folder), place)
@@ -124,7 +130,7 @@ class Journal:
             if read.event is None:
                 raise AssertionError("no event and no problem")
             self._sync_frames({use.path for use in read.frames})
-            offset = self._file.append(line)
+            offset = self._file.append(line, durable=durable)
             self._last = (read.event.t, number)
             return Appended(offset, read.event)
 

@@ -1,0 +1,161 @@
+"""Everything that a live session needs, put together and taken apart again: folder, engine, devices, stage, loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fgreg.config import SolveConfig
+from fgreg.drivers.base import host_now
+from fgreg.errors import InputError
+from fgreg.live import LiveSession
+from fgreg.models import SessionModel
+from fgreg.motion.limits import MotionLimits
+from fgreg.motion.link import StageLink, StageRecord
+from fgreg.online.engine_process import EngineProcess
+from fgreg.operation.conductor import Conductor, ConductorSettings
+from fgreg.operation.loop import Devices, LiveLoop
+from fgreg.operation.recorder import OnTaken, Recorder
+from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
+
+WATCHDOG_LOG = "stage-orders.log"
+
+
+OpenDevices = Callable[[ExitStack, SessionModel], Devices]
+"""Opens the devices but the stage; what it opens is closed with the stack."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageSetup:
+    """The stage's driver (``package.module:factory``), its options, and limits beyond the session's."""
+
+    driver: str
+    options: Mapping[str, Any]
+    limits: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveSetup:
+    """A session to be conducted.
+
+    Attributes:
+        setup: the content of its ``session.yaml``, as text.
+        open_devices: all but the stage.
+        stage: None where there is none: then nothing turns.
+        settings: of the conductor.
+    """
+
+    setup: str
+    open_devices: OpenDevices
+    stage: StageSetup | None
+    settings: ConductorSettings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Running:
+    """A session under way."""
+
+    folder: Path
+    model: SessionModel
+    loop: LiveLoop
+    recorder: Recorder
+    session: LiveSession
+
+
+def make_folder(folder: Path, setup: str) -> None:
+    """A new session's folder with its ``session.yaml``; an existing session goes on if that is the same.
+
+    Raises:
+        InputError: the folder holds something else, or cannot be made.
+    """
+    path = folder / SETUP_FILE
+    try:
+        if path.is_file():
+            if path.read_text(encoding="utf-8") != setup:
+                raise InputError(str(path), "another set-up", f"the same as now, or a new folder for {EVENTS_FILE}")
+            return
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(str(folder), "a folder that is not empty", "a new or empty folder, or a session")
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(setup, encoding="utf-8")
+    except OSError as error:
+        raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from None
+
+
+def setup_text(document: Mapping[str, Any]) -> str:
+    """A ``session.yaml`` of a mapping."""
+    return str(yaml.safe_dump(dict(document), sort_keys=False, width=200, default_flow_style=None))
+
+
+@contextmanager
+def running(
+    live: LiveSetup,
+    folder: Path,
+    config: SolveConfig | None = None,
+    on_taken: OnTaken | None = None,
+    say: Callable[[str], None] = lambda _text: None,
+) -> Iterator[Running]:
+    """A session with everything started; all is ended when the block is left, the stage first.
+
+    Args:
+        live: what to conduct.
+        folder: of the session; made where it is not there.
+        config: of the estimate.
+        on_taken: called after each event that was taken in, on the recorder's thread.
+        say: told what is being started.
+
+    Raises:
+        InputError: bad input.
+        FgregError: something did not start.
+    """
+    make_folder(folder, live.setup)
+    with ExitStack() as stack:
+        say("starting the registration")
+        engines: list[EngineProcess] = []
+
+        def make_engine(model: SessionModel, settings: SolveConfig, prior: Any) -> EngineProcess:
+            engines.append(stack.enter_context(EngineProcess(model, settings, prior)))
+            return engines[-1]
+
+        session = stack.enter_context(LiveSession.open(folder, config, make_engine, late=True))
+        model = session.journal.model
+        last_t = session.journal.last_t
+        start_s = host_now() - (0.0 if last_t is None else max(last_t, 0.0) + 1.0)
+        say("opening the devices")
+        devices = live.open_devices(stack, model)
+        if live.stage is not None:
+            say("starting the stage's watchdog")
+            devices.stage = stack.enter_context(_open_stage(live.stage, model, session, start_s, folder))
+        recorder = Recorder(session, on_taken)
+        stack.callback(recorder.close)
+        taken = session.measurements()
+        conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
+        reader = engines[-1].reader()
+        stack.callback(reader.close)
+        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s)
+        stack.callback(loop.close)
+        yield Running(folder, model, loop, recorder, session)
+        if devices.stage is not None:
+            devices.stage.close()  # first of all; the rest follows in the stack's order
+
+
+def _open_stage(
+    stage: StageSetup, model: SessionModel, session: LiveSession, start_s: float, folder: Path
+) -> StageLink:
+    def log(record: StageRecord) -> None:
+        t = max(0.0, record.host_s - start_s)
+        session.journal.append(record.event(t, model.stage), durable=False, late=True)
+
+    limits = MotionLimits.of_session(model.stage, **stage.limits)
+    return StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG)
+
+
+def default_folder() -> Path:
+    """A new folder in the working directory, named by the time."""
+    return Path(time.strftime("fgreg-live-%Y%m%d-%H%M%S"))
