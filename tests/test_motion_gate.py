@@ -32,6 +32,9 @@ from fgreg.motion.messages import (
     decode,
     encode,
 )
+from fgreg.search.hearing import HearingModel
+from fgreg.search.planner import Found, SearchPlanner, Turn
+from tests.forward import make_session
 
 STAGE = StageModel(math.radians(2.0), (math.radians(-30.0), math.radians(70.0)), -1, math.radians(10.0))
 LIMITS = MotionLimits.of_session(STAGE, sweep_rad=(math.radians(-35.0), math.radians(30.0)))
@@ -331,6 +334,27 @@ def test_homing_that_finds_no_zero_within_the_limits_span_is_stopped() -> None:
     room.go(MotionKind.HOME, None)
     assert "zero position not found within 100 deg" in _halts(room.run(15.0))[0]
     assert abs(math.degrees(room.stage.device_rad) - 200.0) < 104.0
+
+
+@pytest.mark.parametrize("pm_deg", [-33.0, -8.0, 28.0])
+def test_whole_search_passes_the_gate(pm_deg: float) -> None:
+    room = _room()
+    low, high = LIMITS.sweep_rad
+    planner = SearchPlanner(
+        HearingModel.of_session(make_session(curve=True).probe.sensitivity, 1.0),
+        low,
+        high,
+        room.stage.status().scan_rad,
+    )
+    room.request(MotionKind.SEARCH)
+    while isinstance(step := planner.next(), Turn):
+        assert isinstance(room.command(MotionKind.SEARCH, math.degrees(step.scan_rad))[0], Drive)
+        assert Arrived(room.number) in room.run(8.0)
+        stands = room.stage.status().scan_rad
+        amplitude = 4.0 * 2.0 ** (-(((math.degrees(stands) - pm_deg) / 6.0) ** 2))
+        planner.listened(stands, amplitude if amplitude >= 1.0 else None)
+    assert isinstance(step, Found)
+    assert math.degrees(step.scan_rad) == pytest.approx(pm_deg, abs=0.5)
 
 
 def test_messages_come_back_as_they_went() -> None:

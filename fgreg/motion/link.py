@@ -27,7 +27,6 @@ import subprocess
 import sys
 import threading
 import time
-import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -341,10 +340,7 @@ class StageLink:
         """Let go: the watchdog brings the stage to rest and ends. May be called twice."""
         if self._closed:
             return
-        self._closed = True
-        _LINKS.discard(self)
-        self._socket.close()
-        os.close(self._emergency_fd)
+        self._let_go()
         try:
             self._process.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
@@ -352,11 +348,18 @@ class StageLink:
             self._process.wait()
 
     def _abandon(self) -> None:
-        self._closed = True
-        self._socket.close()
-        os.close(self._emergency_fd)
+        self._let_go()
         self._process.kill()
         self._process.wait()
+
+    def _let_go(self) -> None:
+        global _links
+        self._closed = True
+        with _GUARDED:
+            _links = tuple(link for link in _links if link is not self)
+        emergency_fd, self._emergency_fd = self._emergency_fd, -1  # the number may soon be somebody else's
+        self._socket.close()
+        os.close(emergency_fd)
 
     def __enter__(self) -> Self:
         return self
@@ -369,22 +372,26 @@ class StageLink:
         self.close()
 
 
-_LINKS: weakref.WeakSet[StageLink] = weakref.WeakSet()
+_links: tuple[StageLink, ...] = ()
+"""Those that are open; replaced, never changed, so that a signal handler can go through it at any time."""
 _GUARDED = threading.Lock()
 _guards_set = False
 
 
 def emergency_stop_all(_reason: str = "") -> None:
-    """Emergency stop of every stage of this program; takes no lock, writes no log, never raises."""
-    for link in list(_LINKS):
+    """Emergency stop of every stage of this program; takes no lock, writes no log, never raises.
+
+    A program that sets a handler of its own for SIGINT after opening a link calls this from it.
+    """
+    for link in _links:
         link._press()
 
 
 def _guard(link: StageLink) -> None:
     """Have the stage stopped on Ctrl-C, on an uncaught exception of any thread, and at the interpreter's end."""
-    global _guards_set
-    _LINKS.add(link)
+    global _guards_set, _links
     with _GUARDED:
+        _links = (*_links, link)
         if _guards_set:
             return
         _guards_set = True
@@ -418,5 +425,5 @@ def _guard_interrupt() -> None:
 
 def _at_exit() -> None:
     emergency_stop_all()
-    for link in list(_LINKS):
+    for link in _links:
         link.close()
