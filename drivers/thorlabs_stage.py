@@ -33,7 +33,7 @@ ASK_AGAIN_S = 0.06
 """A question not answered by then is asked again."""
 LOST_S = 1.0
 """A cube that says nothing for this long is gone."""
-OPEN_S = 0.3
+OPEN_S = 0.2
 """How long the cube may take for each of the questions at the start."""
 _SETTLE_S = 0.05
 _WRITE_S = 0.05

@@ -232,7 +232,8 @@ class StageLink:
             self._number += 1
             number = self._number
         self._log(StageRecord(time.monotonic(), str(kind), scan_rad, reason))
-        speed = self.limits.speed(kind) if speed is None else speed
+        scan_rad, sigma = (None if value is None else float(value) for value in (scan_rad, sigma))
+        speed = self.limits.speed(kind) if speed is None else float(speed)
         self._send(Command(time.monotonic(), number, kind, scan_rad, speed, sigma, reason))
         return number
 
