@@ -16,6 +16,7 @@ import pytest
 from fgreg.motion.device import StageError, StageLost
 from fgreg.motion.limits import MotionKind
 from fgreg.motion.link import Report, StageLink, StageRecord
+from fgreg.pairing import scan_at
 from fgreg.session.event_document import event_document
 from tests.stage_ends import DEADLINE_S, is_gone, main_program, stopped_after, wait_until
 from tests.stage_main import LIMITS, STAGE, beat_for
@@ -150,6 +151,10 @@ def test_orders_are_written_down_before_they_are_given_and_arrivals_come_back(se
         return math.inf if view is None or view.status is None else math.degrees(view.status.scan_rad)
 
     session.until(lambda: abs(stands() - 3.0) < 0.01)
+    times, angles = zip(*session.link.readings, strict=True)
+    assert list(times) == sorted(times)
+    assert scan_at(session.link.readings, times[-1]) == angles[-1]
+    assert min(angles) == pytest.approx(0.0, abs=0.01)
 
 
 def test_order_that_cannot_be_logged_is_not_given_but_a_stop_is(session: _Session) -> None:

@@ -27,6 +27,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +48,8 @@ SEND_S = 0.5
 """How long a message may wait for the watchdog to take it."""
 CLOSE_S = 5.0
 """How long the watchdog may take to bring the stage to rest when it is let go."""
+READINGS = 100
+"""Stage angles that are kept, one every 50 ms."""
 SILENT_S = 1.0
 """A watchdog that says nothing for this long is gone."""
 
@@ -102,7 +105,13 @@ class StageView:
 
 
 class StageLink:
-    """See the module. Made by :meth:`open`; may be used from several threads."""
+    """See the module. Made by :meth:`open`; may be used from several threads.
+
+    Attributes:
+        view: the newest status, as of the last :meth:`poll`.
+        readings: (host time s, plane angle rad) of the last statuses of a homed stage, oldest first: for
+            ``fgreg.pairing.scan_at``.
+    """
 
     def __init__(
         self,
@@ -114,6 +123,7 @@ class StageLink:
     ) -> None:
         self.limits = limits
         self.view: StageView | None = None
+        self.readings: deque[tuple[float, float]] = deque(maxlen=READINGS)
         self._process, self._socket, self._emergency_fd, self._log = process, link, emergency_fd, log
         self._turn = threading.Lock()
         self._in = b""
@@ -312,6 +322,11 @@ class StageLink:
                 None if document[name] is None else MotionKind(document[name]) for name in ("moving", "requested")
             )
             latched = document["latched"]
+            if status is not None and status.homed:
+                if not self.readings or status.stamp.host_s > self.readings[-1][0]:
+                    self.readings.append((status.stamp.host_s, status.scan_rad))
+            else:
+                self.readings.clear()
             self.view = StageView(document["at_s"], document["connected"], status, moving, requested, latched)
             return None
         if what == "ready":
