@@ -32,6 +32,7 @@ from fgreg.motion.messages import (
     decode,
     encode,
 )
+from fgreg.pairing import Stamp
 from fgreg.search.hearing import HearingModel
 from fgreg.search.planner import Found, SearchPlanner, Turn
 from tests.forward import make_session
@@ -293,6 +294,42 @@ def test_stage_that_misbehaves_is_stopped_and_latched(wrong: str, value: Any, sa
     assert reasons
     assert says in reasons[0]
     assert room.gate.latched is not None
+
+
+def test_reset_without_a_heartbeat_is_refused() -> None:
+    room = _room()
+    room.do(room.gate.fault("test", room.now))
+    room.beating = False
+    room.run(0.4)
+    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "heartbeat is missing")
+
+
+def test_stage_that_leaps_within_its_way_is_stopped() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 25.0)
+    room.run(0.5)
+    room.stage.device_rad -= math.radians(3.0)
+    assert "the stage turned by 3." in _halts(room.run(0.04))[0]
+
+
+def test_stage_that_creeps_is_stopped_in_the_end() -> None:
+    room = _room()
+    room.stage.wrong.speed_factor = 0.05
+    room.go(MotionKind.SEARCH, 25.0)
+    assert _halts(room.run(8.0))[0] == "the motion takes longer than it can"
+    assert room.gate.latched is not None
+
+
+def test_status_of_another_clock_latches_and_an_old_one_is_passed_over() -> None:
+    room = _room()
+    newest = room.stage.status()
+    earlier = Stamp(newest.stamp.host_s - 0.1, newest.stamp.host_s - 0.1)
+    assert room.gate.tick(room.now, replace(newest, stamp=earlier, homed=False, moving=True)) == []
+    assert isinstance(room.go(MotionKind.SEARCH, 25.0)[0], Drive)  # by the newer one, which was homed
+    later = Stamp(room.now + 0.1, room.now + 0.1)
+    assert _halts(room.do(room.gate.tick(room.now, replace(newest, stamp=later)))) == [
+        "a status from the future: the clocks disagree"
+    ]
 
 
 def test_silent_stage_is_stopped() -> None:

@@ -48,18 +48,8 @@ SIGMAS: Table = {"sigma": 2.01, "no sigma": None, "sigma nan": math.nan, "sigma 
 AGES: Table = {"late": 0.21, "later": 3.0, "ahead": -0.1}
 FAULTS = [
     *("not homed", "another request", "stopped", "emergency", "clock back", "clock ahead", "clock back, old beats"),
-    *(
-        "fault",
-        "requested again",
-        "heartbeat gap",
-        "silent",
-        "old beat after",
-        "beat again",
-        "home with target",
-        "twice",
-        "0.3 s",
-        "unwatched",
-    ),
+    *("fault", "requested again", "heartbeat gap", "silent", "old beat after", "beat again", "home with target"),
+    *("twice", "0.3 s", "unwatched", "unheard"),
     *(*STANDS_BADLY, *TARGETS_BADLY, *MARKERS, *VERDICTS, *BAD_SPEEDS, *SIGMAS, *AGES),
 ]
 DISTURBANCES = [
