@@ -4,7 +4,8 @@ Conventions for all of them:
 
 - **Time.** Everything that comes in carries a :class:`Stamp`: the device's time and the host's, seconds. Host times are
   ``time.monotonic()`` (:func:`host_now`). ``fgreg.pairing.DeviceClock`` brings device times onto the host's clock,
-  ``fgreg.pairing.PoseHistory`` interpolates marker poses to a laser pulse. Devices without a clock stamp both alike.
+  ``fgreg.pairing.PoseHistory`` and ``scan_at`` interpolate marker poses and stage angles to a laser pulse. Devices
+  without a clock stamp both alike.
 - **Never wait.** ``poll`` returns what is there, oldest first, or nothing, at once. What was not fetched in time is
   dropped by the driver, oldest first, and counted in ``dropped``: queues do not grow.
 - **Loss.** A device that is gone raises :class:`DeviceLost` from ``poll`` or ``send``, once; after that the driver

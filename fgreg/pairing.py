@@ -98,31 +98,54 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
         PairRefused: no pose on one side, or the two are farther apart than ``max_gap_s``.
         ValueError: poses out of order.
     """
-    times = [pose.t_s for pose in poses]
-    if any(later < earlier for earlier, later in itertools.pairwise(times)):
-        raise ValueError("poses are not in time order")
-    if not math.isfinite(t_s):
-        raise PairRefused(f"the pulse's time is {t_s}")
-    after = int(np.searchsorted(times, t_s, side="left"))
-    if after < len(poses) and times[after] == t_s:
-        return poses[after]
-    if after == 0 or after == len(poses):
-        if not poses:
-            raise PairRefused("no marker pose at all")
-        side, nearest = ("before", times[0]) if after == 0 else ("after", times[-1])
-        raise PairRefused(f"no marker pose {side} the pulse: the nearest is {1e3 * abs(nearest - t_s):.0f} ms away")
-    first, second = poses[after - 1], poses[after]
+    before, after, share = _bracket([pose.t_s for pose in poses], t_s, max_gap_s, "marker pose")
+    first, second = poses[before], poses[after]
+    if before == after:
+        return first
     gap = second.t_s - first.t_s
-    if gap > max_gap_s:
-        raise PairRefused(
-            f"the marker poses around the pulse are {1e3 * gap:.0f} ms apart, at most {1e3 * max_gap_s:.0f} ms allowed"
-        )
-    share = (t_s - first.t_s) / gap
     transform, from_first, from_second = interpolate(first.parent_T_child, second.parent_T_child, share)
     covariance = from_first @ first.covariance @ from_first.T + from_second @ second.covariance @ from_second.T
     off = 0.5 * gap * gap * share * (1.0 - share)
     covariance += np.diag(np.repeat([(UNSTEADY_RAD_S2 * off) ** 2, (UNSTEADY_MM_S2 * off) ** 2], 3))
     return TimedPose(t_s, transform, np.asarray(0.5 * (covariance + covariance.T)))
+
+
+def scan_at(readings: Sequence[tuple[float, float]], t_s: float, max_gap_s: float = MAX_GAP_S) -> float:
+    """Stage angle (rad) at a time, linear between the reading before and the reading after.
+
+    Args:
+        readings: (host time s, angle rad), in time order.
+        t_s: the moment, host time.
+        max_gap_s: longest time between the two readings used.
+
+    Raises:
+        PairRefused: no reading on one side, or the two are farther apart than ``max_gap_s``.
+        ValueError: readings out of order.
+    """
+    before, after, share = _bracket([t for t, _ in readings], t_s, max_gap_s, "stage reading")
+    return (1.0 - share) * readings[before][1] + share * readings[after][1]
+
+
+def _bracket(times: Sequence[float], t_s: float, max_gap_s: float, what: str) -> tuple[int, int, float]:
+    """Indices before and after a moment, and its share of the way; twice the same where it is met exactly."""
+    if any(later < earlier for earlier, later in itertools.pairwise(times)):
+        raise ValueError(f"{what}s are not in time order")
+    if not math.isfinite(t_s):
+        raise PairRefused(f"the pulse's time is {t_s}")
+    after = int(np.searchsorted(times, t_s, side="left"))
+    if after < len(times) and times[after] == t_s:
+        return after, after, 0.0
+    if not times:
+        raise PairRefused(f"no {what} at all")
+    if after == 0 or after == len(times):
+        side, nearest = ("before", times[0]) if after == 0 else ("after", times[-1])
+        raise PairRefused(f"no {what} {side} the pulse: the nearest is {1e3 * abs(nearest - t_s):.0f} ms away")
+    gap = times[after] - times[after - 1]
+    if gap > max_gap_s:
+        raise PairRefused(
+            f"the {what}s around the pulse are {1e3 * gap:.0f} ms apart, at most {1e3 * max_gap_s:.0f} ms allowed"
+        )
+    return after - 1, after, (t_s - times[after - 1]) / gap
 
 
 def interpolate(p_T_a: FloatArray, p_T_b: FloatArray, share: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -32,6 +32,10 @@ from fgreg.motion.messages import (
     decode,
     encode,
 )
+from fgreg.pairing import Stamp
+from fgreg.search.hearing import HearingModel
+from fgreg.search.planner import Found, SearchPlanner, Turn
+from tests.forward import make_session
 
 STAGE = StageModel(math.radians(2.0), (math.radians(-30.0), math.radians(70.0)), -1, math.radians(10.0))
 LIMITS = MotionLimits.of_session(STAGE, sweep_rad=(math.radians(-35.0), math.radians(30.0)))
@@ -292,6 +296,42 @@ def test_stage_that_misbehaves_is_stopped_and_latched(wrong: str, value: Any, sa
     assert room.gate.latched is not None
 
 
+def test_reset_without_a_heartbeat_is_refused() -> None:
+    room = _room()
+    room.do(room.gate.fault("test", room.now))
+    room.beating = False
+    room.run(0.4)
+    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "heartbeat is missing")
+
+
+def test_stage_that_leaps_within_its_way_is_stopped() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 25.0)
+    room.run(0.5)
+    room.stage.device_rad -= math.radians(3.0)
+    assert "the stage turned by 3." in _halts(room.run(0.04))[0]
+
+
+def test_stage_that_creeps_is_stopped_in_the_end() -> None:
+    room = _room()
+    room.stage.wrong.speed_factor = 0.05
+    room.go(MotionKind.SEARCH, 25.0)
+    assert _halts(room.run(8.0))[0] == "the motion takes longer than it can"
+    assert room.gate.latched is not None
+
+
+def test_status_of_another_clock_latches_and_an_old_one_is_passed_over() -> None:
+    room = _room()
+    newest = room.stage.status()
+    earlier = Stamp(newest.stamp.host_s - 0.1, newest.stamp.host_s - 0.1)
+    assert room.gate.tick(room.now, replace(newest, stamp=earlier, homed=False, moving=True)) == []
+    assert isinstance(room.go(MotionKind.SEARCH, 25.0)[0], Drive)  # by the newer one, which was homed
+    later = Stamp(room.now + 0.1, room.now + 0.1)
+    assert _halts(room.do(room.gate.tick(room.now, replace(newest, stamp=later)))) == [
+        "a status from the future: the clocks disagree"
+    ]
+
+
 def test_silent_stage_is_stopped() -> None:
     room = _room()
     room.go(MotionKind.SEARCH, 30.0)
@@ -331,6 +371,27 @@ def test_homing_that_finds_no_zero_within_the_limits_span_is_stopped() -> None:
     room.go(MotionKind.HOME, None)
     assert "zero position not found within 100 deg" in _halts(room.run(15.0))[0]
     assert abs(math.degrees(room.stage.device_rad) - 200.0) < 104.0
+
+
+@pytest.mark.parametrize("pm_deg", [-33.0, -8.0, 28.0])
+def test_whole_search_passes_the_gate(pm_deg: float) -> None:
+    room = _room()
+    low, high = LIMITS.sweep_rad
+    planner = SearchPlanner(
+        HearingModel.of_session(make_session(curve=True).probe.sensitivity, 1.0),
+        low,
+        high,
+        room.stage.status().scan_rad,
+    )
+    room.request(MotionKind.SEARCH)
+    while isinstance(step := planner.next(), Turn):
+        assert isinstance(room.command(MotionKind.SEARCH, math.degrees(step.scan_rad))[0], Drive)
+        assert Arrived(room.number) in room.run(8.0)
+        stands = room.stage.status().scan_rad
+        amplitude = 4.0 * 2.0 ** (-(((math.degrees(stands) - pm_deg) / 6.0) ** 2))
+        planner.listened(stands, amplitude if amplitude >= 1.0 else None)
+    assert isinstance(step, Found)
+    assert math.degrees(step.scan_rad) == pytest.approx(pm_deg, abs=0.5)
 
 
 def test_messages_come_back_as_they_went() -> None:

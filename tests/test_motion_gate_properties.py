@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -47,7 +48,8 @@ SIGMAS: Table = {"sigma": 2.01, "no sigma": None, "sigma nan": math.nan, "sigma 
 AGES: Table = {"late": 0.21, "later": 3.0, "ahead": -0.1}
 FAULTS = [
     *("not homed", "another request", "stopped", "emergency", "clock back", "clock ahead", "clock back, old beats"),
-    *("heartbeat gap", "silent", "old beat after", "beat again", "home with target", "twice", "0.3 s", "unwatched"),
+    *("fault", "requested again", "heartbeat gap", "silent", "old beat after", "beat again", "home with target"),
+    *("twice", "0.3 s", "unwatched", "unheard"),
     *(*STANDS_BADLY, *TARGETS_BADLY, *MARKERS, *VERDICTS, *BAD_SPEEDS, *SIGMAS, *AGES),
 ]
 DISTURBANCES = [
@@ -210,6 +212,10 @@ class GateMachine(RuleBasedStateMachine):
                 self.now += 0.02
                 self._tick()
             self._live()
+        if "fault" in faults:
+            self.watchdog_finds_a_fault()
+        if "requested again" in faults:  # but not reset
+            self.request(kind)
         if "silent" in faults:
             self.silent = True
         verdict = next((VERDICTS[fault] for fault in sorted(faults) if fault in VERDICTS), "ok")
@@ -223,6 +229,8 @@ class GateMachine(RuleBasedStateMachine):
                 self._tick()
         if "unwatched" in faults:
             self.now += 0.31
+        if "unheard" in faults:  # the heartbeat is too old, the status is not, and no tick has noticed
+            self.now += 0.27
         if "beat again" in faults:
             self._beat(0.0, 0.02, "ok")
         target = None if kind is MotionKind.HOME else pick(TARGETS_BADLY, to)
@@ -316,8 +324,35 @@ class GateMachine(RuleBasedStateMachine):
         assert (self.driving is None) == (self.gate.moving is None)
 
 
+def _machine() -> GateMachine:
+    machine = GateMachine()
+    machine.start(True, 0.0)
+    return machine
+
+
+@pytest.mark.parametrize("kind", list(MotionKind))
+def test_good_command_gets_out_and_one_fault_or_two_let_no_illegal_one_out(kind: MotionKind) -> None:
+    machine = _machine()
+    machine.nearly_good_command(kind, 0.0, 20.0, set())
+    assert machine.driving is not None
+    troubles = ["emergency", "fault", "clock back", "clock ahead", "clock back, old beats", "stopped", "heartbeat gap"]
+    pairs = [{trouble, more} for trouble in troubles for more in ("requested again", "beat again")]
+    pairs += [{"unwatched", "beat again"}, {"silent", "0.3 s"}, {"marker old", "old beat after"}]
+    for faults in [*({fault} for fault in FAULTS), *pairs]:
+        machine = _machine()
+        machine.nearly_good_command(kind, 10.0, -20.0, faults)
+        machine.motion_under_way_is_legal()
+
+
+@pytest.mark.parametrize("kind", list(MotionKind))
+@pytest.mark.parametrize("disturbance", DISTURBANCES)
+def test_motion_that_is_disturbed_is_stopped(kind: MotionKind, disturbance: str) -> None:
+    for before in (0, 1, 5):
+        _machine().motion_is_disturbed(kind, 25.0, disturbance, before)
+
+
 GateMachine.TestCase.settings = settings(
-    max_examples=300,
+    max_examples=200,
     stateful_step_count=25,
     deadline=None,
     derandomize=True,

@@ -6,85 +6,29 @@ import json
 import math
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fgreg.motion.device import MAX_CALL_S, StageError, StageLost
+from fgreg.motion.device import StageError, StageLost
 from fgreg.motion.limits import MotionKind
 from fgreg.motion.link import Report, StageLink, StageRecord
-from fgreg.motion.watchdog import TICK_S
+from fgreg.pairing import scan_at
+from fgreg.session.event_document import event_document
+from tests.stage_ends import DEADLINE_S, is_gone, main_program, stopped_after, wait_until
 from tests.stage_main import LIMITS, STAGE, beat_for
 from tests.traced_stage import read_trace
 
-ROOT = Path(__file__).resolve().parents[1]
-DEADLINE_S = LIMITS.heartbeat_s + MAX_CALL_S + 2.0 * TICK_S
-"""From the main program's last sign of life to the order to stop."""
-
-
-@contextmanager
-def _main_program(folder: Path, end: str) -> Iterator[tuple[subprocess.Popen[str], int, float]]:
-    """A main program whose stage turns: process, the watchdog's id, time at which its end begins."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.stage_main", str(folder), end],
-        cwd=folder,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        assert process.stdout is not None
-        began = process.stdout.readline().split()
-        assert began[:1] == ["moving"], "the main program did not come so far"
-        watchdog = int(began[1])
-        yield process, watchdog, float(process.stdout.readline())
-    finally:
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
-
-
-def _wait(condition: Callable[[], object], seconds: float = 10.0) -> None:
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "did not happen"
-        time.sleep(0.02)
-
-
-def _is_gone(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-def _stopped_after(trace: Path, since_s: float) -> float:
-    """Seconds from a moment to the first order to stop after it; the stage stands in the end and got no other order."""
-    _wait(lambda: any(line["what"] == "stop" and line["t"] >= since_s for line in read_trace(trace)))
-    _wait(lambda: [line for line in read_trace(trace) if line["what"] == "status"][-1]["moving"] is False)
-    after = [line for line in read_trace(trace) if line["t"] >= since_s]
-    assert not [line for line in after if line["what"] in ("move", "home")]
-    last = [line for line in after if line["what"] == "status"][-1]
-    assert last["deg"] < 50.0, "it went all the way"
-    return float(next(line["t"] for line in after if line["what"] == "stop")) - since_s
-
 
 def test_killed_main_program_stops_the_stage_within_the_deadline(tmp_path: Path) -> None:
-    with _main_program(tmp_path, "wait") as (process, watchdog, _):
+    with main_program(tmp_path, "wait") as (process, watchdog, _):
         killed = time.monotonic()
         process.send_signal(signal.SIGKILL)
-        assert _stopped_after(tmp_path / "trace", killed) <= DEADLINE_S
-        _wait(lambda: _is_gone(watchdog))
+        assert stopped_after(tmp_path / "trace", killed) <= DEADLINE_S
+        wait_until(lambda: is_gone(watchdog))
     log = [json.loads(line) for line in (tmp_path / "watchdog.log").read_text(encoding="utf-8").splitlines()]
     assert [line["command"] for line in log] == ["stop", "search", "stop"]
     assert log[1]["reason"] == "a long way"
@@ -93,48 +37,48 @@ def test_killed_main_program_stops_the_stage_within_the_deadline(tmp_path: Path)
 
 
 def test_killed_main_program_whose_child_lives_on_stops_the_stage_by_its_heartbeat(tmp_path: Path) -> None:
-    with _main_program(tmp_path, "fork and die") as (_, watchdog, began):
-        took = _stopped_after(tmp_path / "trace", began)
+    with main_program(tmp_path, "fork and die") as (_, watchdog, began):
+        took = stopped_after(tmp_path / "trace", began)
         assert took <= DEADLINE_S
-        assert not _is_gone(watchdog)
+        assert not is_gone(watchdog)
         log = (tmp_path / "watchdog.log").read_text(encoding="utf-8")
         assert json.loads(log.splitlines()[-1])["reason"] == "the main program's heartbeat is missing"
 
 
 @pytest.mark.parametrize("end", ["stall", "crash", "exit", "thread crash", "emergency", "fall off the end"])
 def test_stage_stops_however_the_main_program_ends(tmp_path: Path, end: str) -> None:
-    with _main_program(tmp_path, end) as (_, _watchdog, began):
-        assert _stopped_after(tmp_path / "trace", began) <= DEADLINE_S
+    with main_program(tmp_path, end) as (_, _watchdog, began):
+        assert stopped_after(tmp_path / "trace", began) <= DEADLINE_S
 
 
 def test_suspended_main_program_stops_the_stage_and_finds_it_stopped_when_it_goes_on(tmp_path: Path) -> None:
-    with _main_program(tmp_path, "wait") as (process, watchdog, _):
+    with main_program(tmp_path, "wait") as (process, watchdog, _):
         process.send_signal(signal.SIGSTOP)
-        assert _stopped_after(tmp_path / "trace", time.monotonic()) <= DEADLINE_S
+        assert stopped_after(tmp_path / "trace", time.monotonic()) <= DEADLINE_S
         process.send_signal(signal.SIGCONT)
-        _wait(lambda: "heartbeat is missing" in (tmp_path / "events.txt").read_text(encoding="utf-8"))
-        assert not _is_gone(watchdog)
+        wait_until(lambda: "heartbeat is missing" in (tmp_path / "events.txt").read_text(encoding="utf-8"))
+        assert not is_gone(watchdog)
 
 
 def test_ctrl_c_stops_the_stage_and_does_not_reach_the_watchdog(tmp_path: Path) -> None:
-    with _main_program(tmp_path, "wait") as (process, watchdog, _):
+    with main_program(tmp_path, "wait") as (process, watchdog, _):
         pressed = time.monotonic()
         os.killpg(process.pid, signal.SIGINT)
-        assert _stopped_after(tmp_path / "trace", pressed) <= DEADLINE_S
+        assert stopped_after(tmp_path / "trace", pressed) <= DEADLINE_S
         assert process.wait(10.0) == -signal.SIGINT
-        _wait(lambda: _is_gone(watchdog))
+        wait_until(lambda: is_gone(watchdog))
     log = (tmp_path / "watchdog.log").read_text(encoding="utf-8").splitlines()
     assert json.loads(log[2])["reason"] == "emergency stop"
 
 
 @pytest.mark.parametrize("number", [signal.SIGUSR1, signal.SIGTERM])
 def test_signal_to_the_watchdog_is_an_emergency_stop(tmp_path: Path, number: signal.Signals) -> None:
-    with _main_program(tmp_path, "wait") as (_, watchdog, _):
+    with main_program(tmp_path, "wait") as (_, watchdog, _):
         sent = time.monotonic()
         os.kill(watchdog, number)
-        assert _stopped_after(tmp_path / "trace", sent) <= DEADLINE_S
+        assert stopped_after(tmp_path / "trace", sent) <= DEADLINE_S
         if number is signal.SIGTERM:
-            _wait(lambda: _is_gone(watchdog))
+            wait_until(lambda: is_gone(watchdog))
 
 
 class _Session:
@@ -200,12 +144,17 @@ def test_orders_are_written_down_before_they_are_given_and_arrivals_come_back(se
     event = session.log[1].event(12.0, STAGE)
     assert (event.t, event.command, event.reason) == (12.0, "search", "sweep, position 1")
     assert event.scan_deg == pytest.approx(3.0)
+    assert event_document(event, session.folder)["type"] == "stage"
 
     def stands() -> float:
         view = session.link.view
         return math.inf if view is None or view.status is None else math.degrees(view.status.scan_rad)
 
     session.until(lambda: abs(stands() - 3.0) < 0.01)
+    times, angles = zip(*session.link.readings, strict=True)
+    assert list(times) == sorted(times)
+    assert scan_at(session.link.readings, times[-1]) == angles[-1]
+    assert min(angles) == pytest.approx(0.0, abs=0.01)
 
 
 def test_order_that_cannot_be_logged_is_not_given_but_a_stop_is(session: _Session) -> None:

@@ -27,7 +27,7 @@ import subprocess
 import sys
 import threading
 import time
-import weakref
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +48,8 @@ SEND_S = 0.5
 """How long a message may wait for the watchdog to take it."""
 CLOSE_S = 5.0
 """How long the watchdog may take to bring the stage to rest when it is let go."""
+READINGS = 100
+"""Stage angles that are kept, one every 50 ms."""
 SILENT_S = 1.0
 """A watchdog that says nothing for this long is gone."""
 
@@ -103,7 +105,13 @@ class StageView:
 
 
 class StageLink:
-    """See the module. Made by :meth:`open`; may be used from several threads."""
+    """See the module. Made by :meth:`open`; may be used from several threads.
+
+    Attributes:
+        view: the newest status, as of the last :meth:`poll`.
+        readings: (host time s, plane angle rad) of the last statuses of a homed stage, oldest first: for
+            ``fgreg.pairing.scan_at``.
+    """
 
     def __init__(
         self,
@@ -115,6 +123,7 @@ class StageLink:
     ) -> None:
         self.limits = limits
         self.view: StageView | None = None
+        self.readings: deque[tuple[float, float]] = deque(maxlen=READINGS)
         self._process, self._socket, self._emergency_fd, self._log = process, link, emergency_fd, log
         self._turn = threading.Lock()
         self._in = b""
@@ -233,7 +242,8 @@ class StageLink:
             self._number += 1
             number = self._number
         self._log(StageRecord(time.monotonic(), str(kind), scan_rad, reason))
-        speed = self.limits.speed(kind) if speed is None else speed
+        scan_rad, sigma = (None if value is None else float(value) for value in (scan_rad, sigma))
+        speed = self.limits.speed(kind) if speed is None else float(speed)
         self._send(Command(time.monotonic(), number, kind, scan_rad, speed, sigma, reason))
         return number
 
@@ -312,6 +322,11 @@ class StageLink:
                 None if document[name] is None else MotionKind(document[name]) for name in ("moving", "requested")
             )
             latched = document["latched"]
+            if status is not None and status.homed:
+                if not self.readings or status.stamp.host_s > self.readings[-1][0]:
+                    self.readings.append((status.stamp.host_s, status.scan_rad))
+            else:
+                self.readings.clear()
             self.view = StageView(document["at_s"], document["connected"], status, moving, requested, latched)
             return None
         if what == "ready":
@@ -341,10 +356,7 @@ class StageLink:
         """Let go: the watchdog brings the stage to rest and ends. May be called twice."""
         if self._closed:
             return
-        self._closed = True
-        _LINKS.discard(self)
-        self._socket.close()
-        os.close(self._emergency_fd)
+        self._let_go()
         try:
             self._process.wait(CLOSE_S)
         except subprocess.TimeoutExpired:
@@ -352,11 +364,18 @@ class StageLink:
             self._process.wait()
 
     def _abandon(self) -> None:
-        self._closed = True
-        self._socket.close()
-        os.close(self._emergency_fd)
+        self._let_go()
         self._process.kill()
         self._process.wait()
+
+    def _let_go(self) -> None:
+        global _links
+        self._closed = True
+        with _GUARDED:
+            _links = tuple(link for link in _links if link is not self)
+        emergency_fd, self._emergency_fd = self._emergency_fd, -1  # the number may soon be somebody else's
+        self._socket.close()
+        os.close(emergency_fd)
 
     def __enter__(self) -> Self:
         return self
@@ -369,22 +388,26 @@ class StageLink:
         self.close()
 
 
-_LINKS: weakref.WeakSet[StageLink] = weakref.WeakSet()
+_links: tuple[StageLink, ...] = ()
+"""Those that are open; replaced, never changed, so that a signal handler can go through it at any time."""
 _GUARDED = threading.Lock()
 _guards_set = False
 
 
 def emergency_stop_all(_reason: str = "") -> None:
-    """Emergency stop of every stage of this program; takes no lock, writes no log, never raises."""
-    for link in list(_LINKS):
+    """Emergency stop of every stage of this program; takes no lock, writes no log, never raises.
+
+    A program that sets a handler of its own for SIGINT after opening a link calls this from it.
+    """
+    for link in _links:
         link._press()
 
 
 def _guard(link: StageLink) -> None:
     """Have the stage stopped on Ctrl-C, on an uncaught exception of any thread, and at the interpreter's end."""
-    global _guards_set
-    _LINKS.add(link)
+    global _guards_set, _links
     with _GUARDED:
+        _links = (*_links, link)
         if _guards_set:
             return
         _guards_set = True
@@ -418,5 +441,5 @@ def _guard_interrupt() -> None:
 
 def _at_exit() -> None:
     emergency_stop_all()
-    for link in list(_LINKS):
+    for link in _links:
         link.close()

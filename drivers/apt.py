@@ -1,0 +1,145 @@
+"""The part of Thorlabs' APT protocol that one DC servo cube with a rotation stage needs: packing, and a parser.
+
+A message is six bytes (id, then two parameters or the length of what follows, destination, source), little endian, with
+bit 7 of the destination set where data follow. There is no checksum. Source: Thorlabs, "APT Communications Protocol".
+
+The parser is made for a serial line on which bytes get lost: what cannot be a message is skipped byte by byte, and so
+is a message that names another channel or is followed by what cannot begin one: its end was lost, and it has swallowed
+the beginning of the next.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+HOST, CUBE, CHANNEL = 0x01, 0x50, 1
+
+NO_FLASH, SET_ENABLE, REQ_INFO, GET_INFO = 0x0018, 0x0210, 0x0005, 0x0006
+SET_VELOCITY, REQ_VELOCITY, GET_VELOCITY = 0x0413, 0x0414, 0x0415
+SET_HOME, REQ_HOME, GET_HOME = 0x0440, 0x0441, 0x0442
+MOVE_HOME, HOMED, MOVE_ABSOLUTE, MOVE_COMPLETED, MOVE_STOP, STOPPED = 0x0443, 0x0444, 0x0453, 0x0464, 0x0465, 0x0466
+REQ_STATUS, GET_STATUS = 0x0490, 0x0491
+STOP_AT_ONCE = 1
+
+MOVING_BITS, HOMING_BIT, HOMED_BIT = 0x000000F0, 0x00000200, 0x00000400
+MOTION_ERROR_BIT, OVERLOAD_BIT, ENABLED_BIT = 0x00004000, 0x01000000, 0x80000000
+
+_CHANNEL_BYTES = 14
+_DATA_BYTES: dict[int, tuple[int, ...]] = {
+    **{GET_INFO: (84,), GET_VELOCITY: (_CHANNEL_BYTES,), GET_HOME: (_CHANNEL_BYTES,), GET_STATUS: (_CHANNEL_BYTES,)},
+    **{MOVE_COMPLETED: (0, _CHANNEL_BYTES), STOPPED: (0, _CHANNEL_BYTES), HOMED: (0,)},
+}
+"""Messages of the cube that are understood, and how many bytes of data they come with."""
+
+
+@dataclass(frozen=True, slots=True)
+class AptMessage:
+    """One message of the cube: ``data`` is empty for the short ones."""
+
+    id: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class CubeStatus:
+    """Position in encoder counts, and the status bits."""
+
+    position: int
+    bits: int
+
+
+@dataclass(frozen=True, slots=True)
+class HomeSettings:
+    """How the cube looks for its zero, in its own units."""
+
+    direction: int
+    switch: int
+    velocity: int
+    offset: int
+
+
+def short(message_id: int, first: int = 0, second: int = 0) -> bytes:
+    """A message without data."""
+    return struct.pack("<HBBBB", message_id, first, second, CUBE, HOST)
+
+
+def long(message_id: int, data: bytes) -> bytes:
+    """A message with data."""
+    return struct.pack("<HHBB", message_id, len(data), CUBE | 0x80, HOST) + data
+
+
+def move_absolute(position: int) -> bytes:
+    """Turn to a position (counts)."""
+    return long(MOVE_ABSOLUTE, struct.pack("<Hi", CHANNEL, position))
+
+
+def set_velocity(acceleration: int, velocity: int) -> bytes:
+    """Acceleration and highest velocity, the cube's units."""
+    return long(SET_VELOCITY, struct.pack("<Hiii", CHANNEL, 0, acceleration, velocity))
+
+
+def set_home(settings: HomeSettings) -> bytes:
+    """How to look for the zero position."""
+    fields = (settings.direction, settings.switch, settings.velocity, settings.offset)
+    return long(SET_HOME, struct.pack("<HHHii", CHANNEL, *fields))
+
+
+def read_status(data: bytes) -> CubeStatus:
+    """Of a status message's data."""
+    _, position, _, _, bits = struct.unpack("<HiHHI", data)
+    return CubeStatus(position, bits)
+
+
+def read_velocity(data: bytes) -> tuple[int, int]:
+    """Acceleration and highest velocity."""
+    _, _, acceleration, velocity = struct.unpack("<Hiii", data)
+    return acceleration, velocity
+
+
+def read_home(data: bytes) -> HomeSettings:
+    """How the cube looks for its zero position."""
+    _, direction, switch, velocity, offset = struct.unpack("<HHHii", data)
+    return HomeSettings(direction, switch, velocity, offset)
+
+
+def read_model(data: bytes) -> str:
+    """Model of the cube, as it calls itself."""
+    return data[4:12].split(b"\0")[0].decode("ascii", "replace").strip()
+
+
+class AptParser:
+    """Bytes in, messages out; keeps what is not complete yet."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self.skipped = 0
+
+    def feed(self, data: bytes) -> list[AptMessage]:
+        """Messages that are complete now."""
+        self._buffer += data
+        found = []
+        while len(self._buffer) >= 6:
+            message_id, length, destination, source = struct.unpack_from("<HHBB", self._buffer)
+            follows = length if destination & 0x80 else 0
+            known = follows in _DATA_BYTES.get(message_id, ()) and source == CUBE and destination & 0x7F in (0, HOST)
+            if known and len(self._buffer) < 6 + follows:
+                break
+            data, rest = self._buffer[6 : 6 + follows], self._buffer[6 + follows :]
+            whole = known and _names_channel(data) and _may_begin(rest)
+            if whole:
+                found.append(AptMessage(message_id, data))
+                self._buffer = rest
+            else:
+                self._buffer = self._buffer[1:]
+                self.skipped += 1
+        return found
+
+
+def _names_channel(data: bytes) -> bool:
+    return len(data) != _CHANNEL_BYTES or struct.unpack_from("<H", data)[0] == CHANNEL
+
+
+def _may_begin(rest: bytes) -> bool:
+    """Whether bytes can be the beginning of a message, as far as they go; none can."""
+    return not rest or any(struct.pack("<H", known).startswith(rest[:2]) for known in _DATA_BYTES)

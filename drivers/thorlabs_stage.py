@@ -1,0 +1,266 @@
+"""Thorlabs PRM1Z8 rotation stage on a KDC101 or TDC001 cube, over its USB serial line.
+
+The cube is asked for its status at every call of :meth:`ThorlabsStage.status`; nothing ever waits for it but the
+opening. Cubes sometimes leave a question unanswered: it is asked again, and only when nothing was heard for a while the
+stage counts as lost. Speeds are the cube's to keep, so it is asked what it took in after every order.
+
+Before it is homed, its angle counts from where it was switched on.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from fgreg.drivers import apt
+from fgreg.errors import MissingExtraError
+from fgreg.models import StageModel
+from fgreg.motion.device import StageError, StageLost, StageStatus
+from fgreg.pairing import Stamp
+
+if TYPE_CHECKING:
+    import serial
+
+COUNTS_PER_RAD = 1919.6418578623391 * 180.0 / math.pi
+VELOCITY_PER_RAD_S = 42941.66 * 180.0 / math.pi
+ACCELERATION_PER_RAD_S2 = 14.66 * 180.0 / math.pi
+MODELS = ("KDC101", "TDC001")
+USB_ID = (0x0403, 0xFAF0)
+
+ASK_AGAIN_S = 0.06
+"""A question not answered by then is asked again."""
+LOST_S = 1.0
+"""A cube that says nothing for this long is gone."""
+OPEN_S = 0.2
+"""How long the cube may take for each of the questions at the start."""
+_SETTLE_S = 0.05
+_WRITE_S = 0.05
+_VELOCITY_SLACK = 0.02
+
+
+class ThorlabsStage:
+    """See ``fgreg.motion.device.RotationStage``.
+
+    Args:
+        model: direction and zero.
+        port: serial port.
+        acceleration_rad_s2: of every motion.
+
+    Raises:
+        StageLost: the port cannot be opened, or nobody answers there.
+        StageError: somebody else answers.
+        MissingExtraError: pyserial is not installed.
+    """
+
+    def __init__(self, model: StageModel, port: str, acceleration_rad_s2: float = math.radians(20.0)) -> None:
+        self._model, self._name = model, f"stage at {port}"
+        self._acceleration = round(acceleration_rad_s2 * ACCELERATION_PER_RAD_S2)
+        self._parser = apt.AptParser()
+        self._lost: str | None = None
+        self._status: apt.CubeStatus | None = None
+        self._home: apt.HomeSettings | None = None
+        self._model_name = ""
+        self._heard_s = self._asked_s = -math.inf
+        self._before: tuple[float, int] | None = None
+        self._velocity = 0.0
+        self._told: int | None = None
+        self._fault = ""
+        self._port = _open_port(port)
+        try:
+            self._start()
+        except BaseException:
+            self._port.close()
+            raise
+
+    def home(self, speed_rad_s: float) -> None:
+        """Look for the zero position, as the cube is set up to, but no faster than this."""
+        if self._home is None:
+            raise StageError(f"{self._name} has not told how it looks for its zero position")
+        velocity = min(self._home.velocity, _velocity(speed_rad_s))
+        settings = apt.HomeSettings(self._home.direction, self._home.switch, velocity, self._home.offset)
+        self._told = None
+        self._write(apt.set_home(settings) + apt.short(apt.MOVE_HOME, apt.CHANNEL))
+
+    def move_to(self, scan_rad: float, speed_rad_s: float) -> None:
+        """Turn to a plane angle."""
+        position = round(self._model.device_from_scan(scan_rad) * COUNTS_PER_RAD)
+        self._told = _velocity(speed_rad_s)
+        self._write(
+            apt.set_velocity(self._acceleration, self._told)
+            + apt.move_absolute(position)
+            + apt.short(apt.REQ_VELOCITY, apt.CHANNEL)
+        )
+
+    def stop(self) -> None:
+        """Stop at once, without a profile."""
+        self._write(apt.short(apt.MOVE_STOP, apt.CHANNEL, apt.STOP_AT_ONCE))
+
+    def status(self) -> StageStatus:
+        """The newest that the cube told, with the time at which it came; asks for a newer one."""
+        self._read()
+        now = time.monotonic()
+        if now - self._heard_s > LOST_S:
+            raise self._give_up(f"has said nothing for {LOST_S:.0f} s: is it switched on, is its cable in?")
+        if now - self._asked_s > ASK_AGAIN_S or self._heard_s >= self._asked_s:
+            self._asked_s = now
+            self._write(apt.short(apt.REQ_STATUS, apt.CHANNEL))
+        return self._as_status()
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._lost = self._lost or f"{self._name} is closed"
+        try:
+            self._port.close()
+        except OSError:
+            return
+
+    # -- the line
+
+    def _start(self) -> None:
+        """What the cube wants first, and what has to be known of it."""
+        time.sleep(_SETTLE_S)
+        self._port.reset_input_buffer()
+        self._write(apt.short(apt.NO_FLASH))
+        self._ask(apt.REQ_INFO, 0, lambda: bool(self._model_name))
+        if not self._model_name.startswith(MODELS):
+            raise StageError(f"{self._name} is a {self._model_name!r}, expected one of {', '.join(MODELS)}")
+        self._write(apt.short(apt.SET_ENABLE, apt.CHANNEL, 1))
+        self._ask(apt.REQ_HOME, apt.CHANNEL, lambda: self._home is not None)
+        self._ask(apt.REQ_STATUS, apt.CHANNEL, lambda: self._status is not None)
+
+    def _ask(self, question: int, parameter: int, answered: Callable[[], bool]) -> None:
+        until = time.monotonic() + OPEN_S
+        asked = -math.inf
+        while not answered():
+            now = time.monotonic()
+            if now > until:
+                raise self._give_up("does not answer: is it switched on, is it a KDC101 or TDC001?")
+            if now - asked > ASK_AGAIN_S:
+                asked = now
+                self._write(apt.short(question, parameter))
+            time.sleep(0.002)
+            self._read()
+
+    def _write(self, data: bytes) -> None:
+        self._check()
+        try:
+            self._port.write(data)
+        except OSError as error:  # SerialException and its timeout are OSErrors
+            raise self._give_up(f"takes nothing in: {error}") from error
+
+    def _read(self) -> None:
+        self._check()
+        try:
+            data = self._port.read(4096)
+        except (OSError, TypeError) as error:  # TypeError: pyserial's answer to a port that was closed meanwhile
+            raise self._give_up(f"is gone: {error}") from error
+        for message in self._parser.feed(data):
+            self._take(message)
+
+    def _take(self, message: apt.AptMessage) -> None:
+        now = time.monotonic()
+        match message.id:
+            case apt.GET_STATUS | apt.MOVE_COMPLETED | apt.STOPPED if message.data:
+                status = apt.read_status(message.data)
+                if self._status is not None and (status.bits ^ self._status.bits) & apt.HOMED_BIT:
+                    self._before, self._velocity = None, 0.0  # the zero was set: the position leaps, the stage does not
+                self._follow(now, status.position)
+                self._status, self._heard_s = status, now
+            case apt.GET_HOME:
+                self._home = apt.read_home(message.data)
+            case apt.GET_INFO:
+                self._model_name = apt.read_model(message.data)
+            case apt.GET_VELOCITY if self._told is not None:
+                _, velocity = apt.read_velocity(message.data)
+                if velocity > self._told * (1.0 + _VELOCITY_SLACK) + 1.0:
+                    turned = math.degrees(velocity / VELOCITY_PER_RAD_S)
+                    told = math.degrees(self._told / VELOCITY_PER_RAD_S)
+                    self._fault = f"{self._name} is set to {turned:.1f} deg/s, was told {told:.1f} deg/s"
+                else:
+                    self._fault = ""
+            case _:
+                pass
+
+    def _follow(self, now: float, position: int) -> None:
+        """Velocity from the positions: what the cube reports of it differs from model to model."""
+        if self._before is None:
+            self._before = (now, position)
+            return
+        took = now - self._before[0]
+        if took >= _SETTLE_S:
+            turned = (position - self._before[1]) / COUNTS_PER_RAD
+            self._velocity = self._model.direction * turned / took
+            self._before = (now, position)
+
+    def _as_status(self) -> StageStatus:
+        if self._status is None:
+            raise StageError(f"{self._name} has told no status yet")
+        bits = self._status.bits
+        fault = self._fault
+        if bits & apt.MOTION_ERROR_BIT:
+            fault = f"{self._name} reports a motion error: is something in its way?"
+        elif bits & apt.OVERLOAD_BIT:
+            fault = f"{self._name} reports too much current: is something in its way?"
+        elif not bits & apt.ENABLED_BIT:
+            fault = f"{self._name} has its motor switched off"
+        moving, homing = bool(bits & apt.MOVING_BITS), bool(bits & apt.HOMING_BIT)
+        return StageStatus(
+            Stamp(self._heard_s, self._heard_s),
+            self._model.scan_from_device(self._status.position / COUNTS_PER_RAD),
+            self._velocity if moving else 0.0,
+            moving,
+            homing,
+            bool(bits & apt.HOMED_BIT) and not homing,
+            fault,
+        )
+
+    def _check(self) -> None:
+        if self._lost is not None:
+            raise StageLost(self._lost)
+
+    def _give_up(self, reason: str) -> StageLost:
+        self._lost = f"{self._name} {reason}"
+        return StageLost(self._lost)
+
+
+def open_stage(model: StageModel, *, port: str | None = None, acceleration_deg_s2: float = 20.0) -> ThorlabsStage:
+    """The stage at a port; without one, the only cube that is plugged in.
+
+    Raises:
+        StageLost: none is there, or it does not answer. StageError: several are there, or it is something else.
+        MissingExtraError: pyserial is not installed.
+    """
+    if port is None:
+        ports = find_ports()
+        if not ports:
+            raise StageLost("no Thorlabs cube is plugged in: plug one in, or name its serial port")
+        if len(ports) > 1:
+            raise StageError(f"several Thorlabs cubes are plugged in, name one: {', '.join(ports)}")
+        port = ports[0]
+    return ThorlabsStage(model, port, math.radians(acceleration_deg_s2))
+
+
+def find_ports() -> list[str]:
+    """Serial ports of the Thorlabs cubes that are plugged in."""
+    try:
+        from serial.tools import list_ports
+    except ImportError as error:
+        raise MissingExtraError("pyserial", "stage") from error
+    return sorted(found.device for found in list_ports.comports() if (found.vid, found.pid) == USB_ID)
+
+
+def _velocity(speed_rad_s: float) -> int:
+    return max(1, math.floor(speed_rad_s * VELOCITY_PER_RAD_S))
+
+
+def _open_port(port: str) -> serial.Serial:
+    try:
+        import serial
+    except ImportError as error:
+        raise MissingExtraError("pyserial", "stage") from error
+    try:
+        return serial.Serial(port, 115200, rtscts=True, timeout=0, write_timeout=_WRITE_S, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise StageLost(f"stage at {port} cannot be opened: {error}") from error
