@@ -10,7 +10,7 @@ import numpy as np
 from fgreg.frames import FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.measurements import Aim, EpochStart, Pair
-from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered
+from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered, settled_anew
 from fgreg.online.shared import Layout, small_step
 from fgreg.online.state import (
     RECENT,
@@ -44,6 +44,8 @@ FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
+JUDGED_PAIRS = 80
+"""Up to so many, where some do not count, who does is settled anew near the estimate when a PM is in that should be out."""
 NEAR_PAIRS = 160
 """Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
 VISIT, VISIT_EARLIER = 8, 64
@@ -61,7 +63,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
         return replace(found, nis=None, used=is_kept(found, place), recent=())
     try:
         return _one_more(state, state.window, state.layout, pair, tools)
-    except ArithmeticError:
+    except (ArithmeticError, RuntimeError):  # the second is GTSAM's word for a system that is indeterminate
         if state.epoch_pairs >= FEW_PAIRS:
             raise
     # Among few pairs that contradict each other full steps may lead anywhere: begin anew, with damped ones.
@@ -124,10 +126,29 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
         if first or not fits or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=is_kept(found, place), recent=state.recent)
+        if _has_junk(state):
+            return _judged_anew(state, pair, tools)
         return state
+    if state.epoch_pairs <= JUDGED_PAIRS and _has_junk(state) and odd_ones(state, setting):
+        return _judged_anew(state, pair, tools)
     if state.steps % VISIT == 3:
         state = _toggled(state, setting)
     return state
+
+
+def _has_junk(state: State) -> bool:
+    """Whether a PM of the epoch that lasts does not count."""
+    groups = state.window.groups if state.window is not None else ()
+    chunks = state.now.shelf.chunks
+    return not all(group.kept for group in groups) or any(chunk.count < len(chunk.kept) for chunk in chunks)
+
+
+def _judged_anew(state: State, pair: Pair, tools: Tools) -> State:
+    """The state with its last pair, after who counts was settled anew by what the batch solve settles it by."""
+    found = settled_anew(state, tools, pair)
+    if found is None or found.window is None:
+        return state
+    return replace(found, nis=state.nis, used=is_kept(found, state.pairs - 1), recent=state.recent)
 
 
 def pms_in_epoch(state: State) -> int:
