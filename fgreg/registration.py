@@ -30,7 +30,6 @@ from fgreg.robust import (
     deviant,
     graduated_or_near,
     innovations_at,
-    junk_p,
     plausible_cost,
     predicted_pms,
     sort_shots,
@@ -310,7 +309,7 @@ def _solve_jointly(
     if clean and aim_kept.all():
         optimum = optimize(whole, start, tolerance=1e-9)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
-        beyond = deviant(whole, found)
+        beyond = deviant(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
         if plausible and not (beyond.pm.any() or beyond.aim.any()):
             shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
@@ -335,7 +334,7 @@ def _solve_jointly(
     problem = packed(chosen)
     optimum = optimize(problem, judged.state, tolerance=1e-9)
     found = innovations_at(whole, optimum.state, *kept)
-    deviants = deviant(whole, found, junk_p(kept[0]))
+    deviants = deviant(whole, found, kept[0])
     private = initial_private(whole, optimum.state)
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)

@@ -69,6 +69,15 @@ def pm_limits(problem: PackedProblem, p: float = JUNK_P) -> FloatArray:
     return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), p))
 
 
+def limits_among(problem: PackedProblem, pm_kept: BoolArray, kept: int, count: int) -> FloatArray:
+    """(J,) chi square beyond which PMs, of which ``pm_kept`` count, are junk, where ``kept`` of ``count`` PMs count.
+
+    One that does not count is judged as if it did: one at the border is in, whether it was in before or not.
+    """
+    inside, outside = pm_limits(problem, junk_p_of(kept, count)), pm_limits(problem, junk_p_of(kept + 1, count))
+    return np.where(pm_kept, inside, outside)
+
+
 AIM_LIMIT = float(chdtri(2, JUNK_P))
 
 
@@ -453,9 +462,13 @@ class Deviants:
     aim: BoolArray
 
 
-def deviant(problem: PackedProblem, found: Innovations, p: float = JUNK_P) -> Deviants:
-    """Shots that deviate more than a good one may. Infinite innovations say nothing: the rest predicted nothing."""
-    pm, aim = found.pm > pm_limits(problem, p), found.aim > AIM_LIMIT
+def deviant(problem: PackedProblem, found: Innovations, pm_kept: BoolArray) -> Deviants:
+    """Shots that deviate more than a good one may, where these PMs (J,) count.
+
+    Infinite innovations say nothing: the rest predicted nothing.
+    """
+    limits = limits_among(problem, pm_kept, int(pm_kept.sum()), len(pm_kept))
+    pm, aim = found.pm > limits, found.aim > AIM_LIMIT
     return Deviants(pm & np.isfinite(found.pm), aim & np.isfinite(found.aim))
 
 
@@ -496,7 +509,7 @@ def sort_shots(
         descent.settle()
         state = descent.state
         found = innovations(descent.parts, pm_kept, aim_kept)
-        beyond = deviant(problem, found, junk_p(pm_kept))
+        beyond = deviant(problem, found, pm_kept)
         pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
         aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
         settled = bool((pm_next == pm_kept).all() and (aim_next == aim_kept).all())
@@ -516,4 +529,5 @@ def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted)
     _, hessian = _weighted(kept, _repeated(judged.pm_kept, kept.pm), _repeated(judged.aim_kept, kept.aim))
     none = np.zeros(len(others.pms), dtype=bool)
     innovation = _innovation(_Descent(others, judged.state).parts.pm, hessian[0], none)
-    return np.asarray(innovation < pm_limits(others, junk_p(judged.pm_kept)))
+    limits = limits_among(others, none, int(judged.pm_kept.sum()), len(judged.pm_kept))
+    return np.asarray(innovation <= limits)

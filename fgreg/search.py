@@ -147,7 +147,7 @@ def _is_clean(problem: PackedProblem, found: Optimum) -> bool:
         return False
     state, private = found.state.take([best]), found.evaluation.private.take([best])
     pm, aim = np.ones(len(problem.pms), dtype=bool), np.ones(len(problem.aims.rotation), dtype=bool)
-    beyond = deviant(problem, innovations_at(problem, state, pm, aim, private))
+    beyond = deviant(problem, innovations_at(problem, state, pm, aim, private), pm)
     return not (beyond.pm.any() or beyond.aim.any())
 
 

@@ -304,7 +304,7 @@ def kept_by_place(state: State) -> BoolArray:
 
 
 def limit_of(degrees_of_freedom: int, kept: int, count: int) -> float:
-    """Chi square beyond which a PM is junk, as in fgreg.robust."""
+    """Chi square beyond which a PM is junk, as in fgreg.robust: where ``kept`` of ``count`` count, it among them."""
     return float(chdtri(max(degrees_of_freedom, 1), junk_p_of(kept, count)))
 
 

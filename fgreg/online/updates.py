@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -38,16 +38,20 @@ from fgreg.online.state import (
 from fgreg.online.summary import carried_over, chunk_of, joined, make_chunk
 from fgreg.online.summary import settled as settled_parts
 from fgreg.online.window import Bundle, Change, Group, Window, open_window, prepare
-from fgreg.robust import AIM_LIMIT, innovations_of, junk_p_of, pm_limits
+from fgreg.robust import AIM_LIMIT, innovations_of, limits_among
 
 FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
 JUDGED_PAIRS = 80
-"""Up to so many, where some do not count, who does is settled anew near the estimate when a PM is in that should be out."""
+"""Up to so many, where there is junk, who counts is settled anew near the estimate when a PM is in or out wrongly."""
 NEAR_PAIRS = 160
-"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
+"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much, and where
+there is junk all PMs are judged after every pair."""
+JUNK_PMS = 2
+"""There is junk where so many PMs of the epoch do not count: one of a thousand good ones does not, either."""
+MOST_FLIPS, FLIP_ROUNDS = 4, 4
 VISIT, VISIT_EARLIER = 8, 64
 """A chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
@@ -92,7 +96,7 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     known = same.prepared.quadratic.at(window.state, layout.columns) if same is not None and same.kept else None
     nis = innovation(prepared, window.covariance, known)
     kept, every = counts(state)
-    limit = limit_of(len(prepared.rows), kept, every)
+    limit = limit_of(len(prepared.rows), kept + (same is None or not same.kept), every + (same is None))
     fits = nis <= limit
     state = replace(state, pairs=place + 1)
     recent = Recent(place, prepared.quadratic, before.state, before.covariance, nis, fits)
@@ -126,21 +130,21 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
         if first or not fits or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=is_kept(found, place), recent=state.recent)
-        if _has_junk(state):
-            return _judged_anew(state, pair, tools)
-        return state
-    if state.epoch_pairs <= JUDGED_PAIRS and _has_junk(state) and odd_ones(state, setting):
-        return _judged_anew(state, pair, tools)
+        return _judged_anew(state, pair, tools) if _has_junk(state) else state
+    if near and _has_junk(state):
+        if state.epoch_pairs > JUDGED_PAIRS:
+            return _flipped_while_odd(state, setting)
+        return _judged_anew(state, pair, tools) if odd_ones(state, setting) else state
     if state.steps % VISIT == 3:
         state = _toggled(state, setting)
     return state
 
 
 def _has_junk(state: State) -> bool:
-    """Whether a PM of the epoch that lasts does not count."""
+    """Whether some PMs of the epoch that lasts do not count."""
     groups = state.window.groups if state.window is not None else ()
-    chunks = state.now.shelf.chunks
-    return not all(group.kept for group in groups) or any(chunk.count < len(chunk.kept) for chunk in chunks)
+    out = sum(not group.kept for group in groups) + sum(len(c.kept) - c.count for c in state.now.shelf.chunks)
+    return out >= JUNK_PMS
 
 
 def _judged_anew(state: State, pair: Pair, tools: Tools) -> State:
@@ -199,7 +203,7 @@ def odd_ones(state: State, setting: Setting) -> frozenset[int]:
     counted = np.array(kept)
     parts = settled_parts(problem, window.state)
     found = innovations_of(parts.pm, _information(window), counted)
-    limits = pm_limits(problem, junk_p_of(*counts(state)))
+    limits = limits_among(problem, counted, *counts(state))
     known = np.isfinite(found)
     odd = known & (counted == (found > limits))
     return frozenset(label for label, is_odd in zip(problem.pms, odd, strict=True) if is_odd)
@@ -217,7 +221,7 @@ def visited_chunks(state: State, window: Window, setting: Setting) -> tuple[Stat
         chunk = shelf.chunks[place]
         parts = settled_parts(chunk.problem, window.state, chunk.private, rounds=1)
         found = innovations_of(parts.pm, _information(window), chunk.kept)
-        limits = pm_limits(chunk.problem, junk_p_of(*counts(state)))
+        limits = limits_among(chunk.problem, chunk.kept, *counts(state))
         kept = np.where(np.isfinite(found), found <= limits, chunk.kept)
         new = chunk_of(chunk.places, chunk.problem, kept, window.state, parts)
         if place == len(shelf.full):
@@ -263,28 +267,74 @@ def _visit_earlier(state: State, window: Window, setting: Setting) -> State:
 
 def _toggled(state: State, setting: Setting) -> State:
     """The window's pairs judged anew: at most one that deviates goes out, at most one that fits comes in."""
-    window, layout = state.window, state.layout
-    if window is None or layout is None or not window.groups:
+    window = state.window
+    if window is None or not window.groups:
         return state
     found = _window_innovations(window.groups, window, setting)
     kept, every = counts(state)
     out, back = None, None
     for group, value in zip(window.groups, found, strict=True):
-        fits = value <= limit_of(len(group.prepared.rows), kept, every)
+        fits = value <= limit_of(len(group.prepared.rows), kept + (not group.kept), every)
         if group.kept and not fits and out is None:
             out = group
         if not group.kept and fits and back is None:
             back = group
-    if out is None and back is None:
-        return state
-    taken: tuple[Group, ...] = ()
+    labels = {group.label for group in (out, back) if group is not None}
+    return _flipped(state, window, labels, setting, SETTLED_MANY) if labels else state
+
+
+def _flipped_while_odd(state: State, setting: Setting) -> State:
+    """The epoch's PMs judged anew, those that deviate out and those that fit in, until none is odd.
+
+    A few at a time, and at last only in: one that is in when out, and out when in, counts, as in fgreg.robust.
+    """
+    for turn in range(FLIP_ROUNDS):
+        window = state.window
+        odd = odd_ones(state, setting)
+        if turn >= FLIP_ROUNDS // 2:
+            odd -= _counting(state)
+        if window is None or not odd:
+            break
+        state = _flipped(state, window, set(sorted(odd)[:MOST_FLIPS]), setting, SETTLED_NEAR)
+    return state
+
+
+def _counting(state: State) -> frozenset[int]:
+    """Labels of the epoch's PMs that count."""
+    groups = state.window.groups if state.window is not None else ()
+    found = {group.label for group in groups if group.kept}
+    for chunk in state.now.shelf.chunks:
+        found.update(label for label, kept in zip(chunk.problem.pms, chunk.kept.tolist(), strict=True) if kept)
+    return frozenset(found)
+
+
+def _flipped(state: State, window: Window, labels: Set[int], setting: Setting, settled: float) -> State:
+    """The state in which those of some PMs of the epoch that count no longer do, and the others do."""
+    layout, columns = state.layout, setting.columns
+    if layout is None:
+        raise ValueError("no shared variables yet")
+    shelf, changed = state.now.shelf, False
+    for place, chunk in enumerate(shelf.chunks):
+        mine = np.isin(chunk.problem.pms, list(labels))
+        if mine.any():
+            new = make_chunk(chunk.places, chunk.problem, chunk.kept ^ mine, window.state, chunk.private, rounds=1)
+            full = place < len(shelf.full)
+            shelf = shelf.with_full(place, new, columns) if full else replace(shelf, open=new)
+            changed = True
+    state = state.with_now(shelf=shelf)
+    taken: list[Group] = []
     numbers = window.numbers
-    if back is not None:
-        fresh = prepare(back.bundle.pairs, layout, window.state, state.epoch, setting.model, numbers)
-        numbers += len(back.bundle.pairs)
-        taken = (Group(replace(back.bundle, kept=True), fresh),)
-    change = Change(take_in=taken, leave_out=() if out is None else (out.label,))
-    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, SETTLED_MANY)
+    for group in window.groups:
+        if group.label in labels and not group.kept:
+            fresh = prepare(group.bundle.pairs, layout, window.state, state.epoch, setting.model, numbers)
+            numbers += len(group.bundle.pairs)
+            taken.append(Group(replace(group.bundle, kept=True), fresh))
+    change = Change(
+        take_in=tuple(taken),
+        leave_out=tuple(group.label for group in window.groups if group.label in labels and group.kept),
+        summary=summary(state, window.state, setting) if changed else None,
+    )
+    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, settled)
     return replace(state.with_now(state=window.state), window=window)
 
 
