@@ -11,7 +11,7 @@ from fgreg.frames import FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.measurements import Aim, EpochStart, Pair
 from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered, settled_anew
-from fgreg.online.shared import Layout, small_step
+from fgreg.online.shared import Layout, Quadratic, small_step
 from fgreg.online.state import (
     RECENT,
     SETTLED_FEW,
@@ -79,7 +79,7 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     """:func:`with_pair` where there is a registration to begin with."""
     setting, place = tools.setting, state.pairs
     before = window
-    earlier = tools.store.looks_at(pair.pm, state.now.first)
+    earlier = [p for p in tools.store.looks_at(pair.pm, state.now.first) if not _is_apart(state, p, pair.pm)]
     bundle = Bundle(
         pair.pm,
         (*earlier, place),
@@ -98,14 +98,23 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     kept, every = counts(state)
     limit = limit_of(len(prepared.rows), kept + (same is None or not same.kept), every + (same is None))
     fits = nis <= limit
+    group = Group(replace(bundle, kept=fits), prepared)
+    change = Change(take_in=(group,) if fits else (), set_aside=() if fits else (group,))
+    apart = None if fits or not earlier else _one_look_apart(state, bundle, layout, window, tools, known)
+    if apart is not None:
+        group, junk = apart
+        numbers += 1
+        change = Change(take_in=(group,), set_aside=(junk,))
+        fits, prepared = place in group.bundle.places, group.prepared
     state = replace(state, pairs=place + 1)
     recent = Recent(place, prepared.quadratic, before.state, before.covariance, nis, fits)
-    forget = () if same is None else (same.label,)
-    group = Group(replace(bundle, kept=fits), prepared)
-    change = Change(take_in=(group,) if fits else (), set_aside=() if fits else (group,), forget=forget)
+    if same is not None:
+        change = replace(change, forget=(same.label,))
     few, near = state.epoch_pairs <= FEW_PAIRS, state.epoch_pairs <= NEAR_PAIRS
     settled = SETTLED_FEW if few else SETTLED_NEAR if near else SETTLED_MANY
-    state, gone = popped(state, window, setting)
+    # Looks that the new one is summed up with do not go onto the shelf beside.
+    others = replace(window, groups=tuple(group for group in window.groups if group is not same))
+    state, gone = popped(state, others, setting)
     if gone:
         if near:
             state = refreshed(state, window.state, setting)
@@ -127,7 +136,7 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     )
     if few:
         first = pms_in_epoch(state) <= FIRST_PAIRS or state.is_open
-        if first or not fits or odd_ones(state, setting):
+        if first or nis > limit or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=is_kept(found, place), recent=state.recent)
         return _judged_anew(state, pair, tools) if _has_junk(state) else state
@@ -138,6 +147,49 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     if state.steps % VISIT == 3:
         state = _toggled(state, setting)
     return state
+
+
+def _is_apart(state: State, place: int, label: int) -> bool:
+    """Whether a look at a PM was split off from it as junk."""
+    for group in state.window.groups if state.window is not None else ():
+        if place in group.bundle.places:
+            return group.label != label
+    for chunk in state.now.shelf.chunks:
+        found = np.flatnonzero(chunk.places == place)
+        if len(found):
+            return chunk.problem.pms[chunk.problem.look_pm[found[0]]] != label
+    return False
+
+
+def _one_look_apart(
+    state: State, bundle: Bundle, layout: Layout, window: Window, tools: Tools, known: Quadratic | None
+) -> tuple[Group, Group] | None:
+    """Looks at a PM that do not fit together, without the one that is junk, and that one as a PM of its own.
+
+    Only where leaving out one look, and no other one, makes the rest fit, as in the batch solve; None else.
+    """
+    kept, every = counts(state)
+    first, model = window.numbers, tools.setting.model
+    fitting: list[tuple[int, Group]] = []
+    for left in range(len(bundle.pairs)):
+        rest = Bundle(
+            bundle.label,
+            bundle.places[:left] + bundle.places[left + 1 :],
+            bundle.pairs[:left] + bundle.pairs[left + 1 :],
+            kept=True,
+        )
+        prepared = prepare(rest.pairs, layout, window.state, state.epoch, model, first)
+        limit = limit_of(len(prepared.rows), kept + (known is None), every)
+        if innovation(prepared, window.covariance, known) <= limit:
+            fitting.append((left, Group(rest, prepared)))
+    if len(fitting) != 1:
+        return None
+    left, group = fitting[0]
+    labels = [0, *(g.label for g in window.groups), *(min(c.problem.pms) for c in state.now.shelf.chunks)]
+    alone = Bundle(min(labels) - 1, (bundle.places[left],), (bundle.pairs[left],), kept=False)
+    return group, Group(
+        alone, prepare(alone.pairs, layout, window.state, state.epoch, model, first + len(bundle.pairs))
+    )
 
 
 def _has_junk(state: State) -> bool:
