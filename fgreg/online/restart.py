@@ -216,7 +216,7 @@ def _from_registration(
             after = state.with_now(shelf=shelved(Shelf(), mine, here, setting))
             known = _at_rest(found, state.epoch, here) if whole else summary(after, here, setting)
             window = open_window((), known, layout, state.epoch, numbers)
-        except (ArithmeticError, RuntimeError):  # the second is GTSAM's word for a system that is indeterminate
+        except RuntimeError:  # GTSAM's word for a system that is indeterminate, as three pairs can leave it
             return replace(state, why_none="these pairs leave the registration undetermined: take more")
     return replace(after.with_now(state=window.state), window=window)
 
