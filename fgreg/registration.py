@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,6 @@ from fgreg.robust import (
     deviant,
     graduated_or_near,
     innovations_at,
-    junk_p,
     plausible_cost,
     predicted_pms,
     sort_shots,
@@ -54,6 +53,7 @@ __all__ = [
     "calibrate_beam",
     "choose_minimum",
     "register",
+    "register_near",
     "restrict_epochs",
     "search_epoch",
     "targets_moved",
@@ -309,7 +309,7 @@ def _solve_jointly(
     if clean and aim_kept.all():
         optimum = optimize(whole, start, tolerance=1e-9)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
-        beyond = deviant(whole, found)
+        beyond = deviant(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
         if plausible and not (beyond.pm.any() or beyond.aim.any()):
             shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
@@ -334,7 +334,7 @@ def _solve_jointly(
     problem = packed(chosen)
     optimum = optimize(problem, judged.state, tolerance=1e-9)
     found = innovations_at(whole, optimum.state, *kept)
-    deviants = deviant(whole, found, junk_p(kept[0]))
+    deviants = deviant(whole, found, kept[0])
     private = initial_private(whole, optimum.state)
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)
@@ -377,6 +377,56 @@ def register(
         # A nominal beam given the wrong way round, and no aim to tell: +z is where the spots are.
         start = _turned(optimum.state, model)
         kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+    ambiguous = tuple(k for k, (_, is_open) in choices.items() if is_open)
+    return _registration(model, tuple(solvable), searches, ambiguous, (kept, problem, optimum, shots))
+
+
+def register_near(
+    measurements: Measurements,
+    model: SessionModel,
+    config: SolveConfig,
+    start: SharedState,
+    epochs: Sequence[int],
+    sound_speed: SoundSpeedPrior | None = None,
+) -> Registration:
+    """:func:`register` where it is known about where the optimum is: who is kept is settled anew, without a search.
+
+    What the wide losses and the narrow one lead to from ``start`` is what they lead :func:`register` to from the best
+    of all minima, where ``start`` is nearest to that one: which shots counted before has no say in it.
+
+    Args:
+        measurements: of the session.
+        model, config, sound_speed: as of :func:`register`.
+        start: one hypothesis, with the registrations of ``epochs``.
+        epochs: those to be solved.
+
+    Raises:
+        EstimationError: the shots leave the registration undetermined.
+    """
+
+    def packed(of: Measurements) -> PackedProblem:
+        return pack_session(of, model, config, sound_speed)
+
+    mine = restrict_epochs(measurements, list(epochs))
+    aims = np.ones(len(mine.aims), dtype=bool)
+    found = _solve_jointly(mine, packed, start, aims, clean=False)
+    searches = tuple(EpochSearch((), None, clean=False) for _ in measurements.epochs)
+    return _registration(model, tuple(epochs), searches, (), found)
+
+
+def _registration(
+    model: SessionModel,
+    epochs: tuple[int, ...],
+    searches: tuple[EpochSearch, ...],
+    ambiguous: tuple[int, ...],
+    found: tuple[Measurements, PackedProblem, Optimum, Shots],
+) -> Registration:
+    """What was found, with its covariance.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    kept, problem, optimum, shots = found
     hessian = optimum.evaluation.hessian[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     try:
@@ -387,11 +437,11 @@ def register(
     return Registration(
         model=model,
         measurements=kept,
-        epochs=tuple(solvable),
+        epochs=epochs,
         problem=problem,
         optimum=optimum,
         searches=searches,
-        ambiguous=tuple(k for k, (_, is_open) in choices.items() if is_open),
+        ambiguous=ambiguous,
         covariance=np.asarray(covariance, dtype=np.float64),
         shots=shots,
     )

@@ -32,7 +32,7 @@ from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
 from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
 from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
-from fgreg.online.state import EpochData, Recent, State, make_setting
+from fgreg.online.state import EpochData, Recent, State, kept_by_place, make_setting
 from fgreg.online.store import MeasurementStore
 from fgreg.online.tracking import online_snapshot
 from fgreg.online.updates import with_aim, with_move, with_pair
@@ -229,15 +229,7 @@ class OnlineRegistration:
     @property
     def kept(self) -> tuple[bool, ...]:
         """Whether each pair counts, in the order in which they came."""
-        out = [False] * self._state.pairs
-        for data in self._state.epochs:
-            for chunk in data.shelf.chunks:
-                for place, pm in zip(chunk.places.tolist(), chunk.problem.look_pm.tolist(), strict=True):
-                    out[place] = bool(chunk.kept[pm])
-        for group in self._state.window.groups if self._state.window is not None else ():
-            for place in group.bundle.places:
-                out[place] = group.kept
-        return tuple(out)
+        return tuple(kept_by_place(self._state).tolist())
 
     def measurements(self) -> Measurements:
         """All that was taken in, as the batch solve takes it."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray
+from fgreg.frames import BoolArray, FloatArray
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
@@ -292,8 +292,19 @@ def counts(state: State) -> tuple[int, int]:
     return kept + sum(group.kept for group in groups), every + len(groups)
 
 
+def kept_by_place(state: State) -> BoolArray:
+    """(P,) whether each pair counts, in the session's order."""
+    out = np.zeros(state.pairs, dtype=bool)
+    for data in state.epochs:
+        for chunk in data.shelf.chunks:
+            out[chunk.places] = chunk.kept[chunk.problem.look_pm]
+    for group in state.window.groups if state.window is not None else ():
+        out[list(group.bundle.places)] = group.kept
+    return out
+
+
 def limit_of(degrees_of_freedom: int, kept: int, count: int) -> float:
-    """Chi square beyond which a PM is junk, as in fgreg.robust."""
+    """Chi square beyond which a PM is junk, as in fgreg.robust: where ``kept`` of ``count`` count, it among them."""
     return float(chdtri(max(degrees_of_freedom, 1), junk_p_of(kept, count)))
 
 
