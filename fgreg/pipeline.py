@@ -115,16 +115,17 @@ def solve_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        moves = find_moves(recognised.measurements, session.model, config) if request.detect_moves else ()
+        prior = sound_speed_prior(recognised, config)
+        moves = find_moves(recognised.measurements, session.model, config, prior) if request.detect_moves else ()
         recognised = with_moves(recognised, moves)
-        conditions = [Condition(Verdict.WARNING, move.text) for move in moves]
+        conditions = move_conditions(moves)
         solution = solve(
             recognised.measurements,
             recognised.tracks,
             session.model,
             config,
             [*conditions, *detection_conditions(recognised, config)],
-            sound_speed_prior(recognised, config),
+            prior,
         )
         estimate = session_estimate(session, recognised, solution)
         same_epochs = truth is not None and (not moves or len(truth.trus_T_camera) == len(estimate.epochs))
@@ -158,6 +159,11 @@ def with_moves(recognised: Recognised, moves: Sequence[DetectedMove]) -> Recogni
         tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
         epoch_of=epoch_of,
     )
+
+
+def move_conditions(moves: Sequence[DetectedMove]) -> list[Condition]:
+    """What moves that were found out mean for the verdict."""
+    return [Condition(Verdict.WARNING, move.text) for move in moves]
 
 
 def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:

@@ -1,0 +1,100 @@
+"""What finds out untold camera moves, as the engine uses it: the watch on pairs, the guard on tags, and what was found."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from fgreg.config import SolveConfig
+from fgreg.models import SessionModel
+from fgreg.online.events import StaticTags
+from fgreg.online.evidence import MoveFound, move_case
+from fgreg.online.moves import MoveSettings
+from fgreg.online.state import Setting, State
+from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
+from fgreg.online.tags import TagSettings
+from fgreg.online.watch import InlineWatch, ProcessWatch, Watch
+from fgreg.registration import SoundSpeedPrior
+
+WatchKind = Literal["inline", "process"]
+
+
+class MoveGuard:
+    """Watches for moves.
+
+    Args:
+        kind: how pairs are tested (fgreg.online.watch); None: neither pairs nor tags are looked at.
+        model, config, sound_speed: of the session.
+        setting: of the engine.
+
+    Raises:
+        ValueError: another kind.
+    """
+
+    def __init__(
+        self,
+        kind: WatchKind | None,
+        model: SessionModel,
+        config: SolveConfig,
+        sound_speed: SoundSpeedPrior | None,
+        setting: Setting,
+    ) -> None:
+        if kind not in ("inline", "process", None):
+            raise ValueError(f"watch is {kind!r}, expected 'inline', 'process' or None")
+        self._settings, self._tag_settings, self._setting = MoveSettings(), TagSettings(), setting
+        self._watch: Watch | None = None
+        if kind is not None:
+            make = InlineWatch if kind == "inline" else ProcessWatch
+            self._watch = make(model, config, sound_speed, self._settings)
+        self._tags = TagGuard()
+        self._paused = False
+
+    @property
+    def failure(self) -> str:
+        """Why nothing is watched though it should be; empty where it is."""
+        return "" if self._watch is None else self._watch.failure
+
+    def look(self, state: State, serial: int) -> None:
+        """A pair more: ask for the proper test where the cheap look says so."""
+        if self._watch is None or self._paused:
+            return
+        case = move_case(state, serial, self._setting, self._settings)
+        if case is not None:
+            self._watch.ask(case)
+
+    def pause(self) -> None:
+        """Look at nothing for a while."""
+        self._paused = True
+
+    def resume(self, state: State, serial: int) -> bool:
+        """Look again, at once; whether there was something to look at."""
+        self._paused = False
+        self.look(state, serial)
+        return self._watch is not None
+
+    def alarm(self, state: State) -> MoveFound | None:
+        """An alarm about the epoch that lasts, if one has come."""
+        found = None if self._watch is None else self._watch.answer()
+        if found is None or found.epoch != state.epoch or not state.now.first < found.first < state.pairs:
+            return None
+        return found
+
+    def see(self, event: StaticTags) -> tuple[TagGuard, TagsMoved | TagsRest | None]:
+        """What a frame of tags says; the guard that comes of it counts once it is given to :meth:`keep`."""
+        return (self._tags, None) if self._watch is None else guarded(self._tags, event, self._tag_settings)
+
+    def keep(self, guard: TagGuard) -> None:
+        """Go on from here."""
+        self._tags = guard
+
+    def epoch_began(self, *, by_tags: bool = False) -> None:
+        """Another epoch: what was asked of the old one does not count; tags are compared with those seen from now."""
+        if self._watch is not None:
+            self._watch.forget()
+        if not by_tags:
+            self._tags = TagGuard()
+
+    def close(self) -> None:
+        """End what runs beside."""
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
