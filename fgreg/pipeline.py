@@ -128,8 +128,7 @@ def solve_session(
             prior,
         )
         estimate = session_estimate(session, recognised, solution)
-        same_epochs = truth is not None and (not moves or len(truth.trus_T_camera) == len(estimate.epochs))
-        errors = truth_errors(estimate, truth, session.model.targets_mm) if truth is not None and same_epochs else None
+        errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
         show(viewer, session, recognised, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -218,6 +217,15 @@ def session_estimate(session: Session, recognised: Recognised, solution: Solutio
         tracks=tuple(tracks[i] for i in sorted(tracks)),
         aims=tuple(aims[i] for i in sorted(aims)),
     )
+
+
+def errors_where_known(
+    estimate: SessionEstimate, truth: GroundTruth | None, moves: Sequence[DetectedMove], targets_mm: FloatArray
+) -> TruthErrors | None:
+    """:func:`truth_errors`; None without a truth, or where moves that were found make other epochs than it has."""
+    if truth is None or (moves and len(truth.trus_T_camera) != len(estimate.epochs)):
+        return None
+    return truth_errors(estimate, truth, targets_mm)
 
 
 def truth_errors(estimate: SessionEstimate, truth: GroundTruth, targets_mm: FloatArray) -> TruthErrors:

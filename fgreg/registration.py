@@ -38,6 +38,7 @@ from fgreg.robust import (
 from fgreg.search import (
     MIN_KEPT_AIMS,
     MIN_KEPT_PMS,
+    SAME_MINIMUM_MM,
     EpochSearch,
     Minimum,
     calibrate_beam,
@@ -184,6 +185,46 @@ def _best_start(
     problem = pack_session(restrict_epochs(measurements, solvable), model, config)
     found = [optimize(problem, start, max_iterations=30) for start in (own, carried)]
     return min(found, key=lambda optimum: float(optimum.evaluation.cost[0])).state
+
+
+def _told_apart(
+    measurements: Measurements,
+    searches: tuple[EpochSearch, ...],
+    is_open: set[int],
+    solvable: list[int],
+    start: SharedState,
+    model: SessionModel,
+    config: SolveConfig,
+) -> tuple[SharedState, set[int]]:
+    """Minima that an epoch's own pairs cannot tell apart, judged with all epochs: the start, and what stays open.
+
+    The other epochs know the beam and the window's edge better than the aims alone, and a measured motion rules out
+    all that is far from where it leads.
+    """
+    if len(solvable) < 2 or not is_open:
+        return start, is_open
+    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
+    left = set(is_open)
+    for epoch in sorted(is_open):
+        search, place = searches[epoch], solvable.index(epoch)
+        if not search.clean:
+            continue
+        rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
+        poses = [start.trus_T_camera(place)[0], *(rival.state.trus_T_camera()[0] for rival in rivals)]
+        many = start.take(np.zeros(len(poses), dtype=np.int64))
+        rotation, translation = many.rotation.copy(), many.translation_mm.copy()
+        rotation[:, place] = [pose[:3, :3] for pose in poses]
+        translation[:, place] = [pose[:3, 3] for pose in poses]
+        found = optimize(problem, replace(many, rotation=rotation, translation_mm=translation), max_iterations=30)
+        cost = np.where(np.isfinite(found.evaluation.cost), found.evaluation.cost, np.inf)
+        best = int(np.argmin(cost))
+        if not np.isfinite(cost[best]):
+            continue
+        start, ends = found.state.take([best]), found.state.trus_T_camera(place)
+        near = np.flatnonzero(cost - cost[best] < config.second_minimum_chi2)
+        if all(targets_moved(ends[best], ends[i], model.targets_mm) <= SAME_MINIMUM_MM for i in near):
+            left.discard(epoch)
+    return start, left
 
 
 def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
@@ -366,6 +407,8 @@ def register(
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
     start = _best_start(measurements, chosen, solvable, model, config)
+    is_open = {k for k, (_, undecided) in choices.items() if undecided}
+    start, is_open = _told_apart(fitting, searches, is_open, solvable, start, model, config)
     clean = all(search.clean for search in searches)
 
     def packed(of: Measurements) -> PackedProblem:
@@ -391,7 +434,7 @@ def register(
         problem=problem,
         optimum=optimum,
         searches=searches,
-        ambiguous=tuple(k for k, (_, is_open) in choices.items() if is_open),
+        ambiguous=tuple(sorted(is_open)),
         covariance=np.asarray(covariance, dtype=np.float64),
         shots=shots,
     )

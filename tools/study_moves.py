@@ -25,6 +25,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
@@ -34,7 +35,6 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import make_state
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
-from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 from fgreg.online.moves import ALARM, MoveSettings, MoveTest
 from fgreg.registration import pack_session, register
 

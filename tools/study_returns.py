@@ -24,13 +24,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.measurements import Aim, EpochStart, Measurements
 from fgreg.models import SessionModel
-from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 from fgreg.online.moves import relinearisation
 from fgreg.online.returns import default_return_settings, fits_again
 from fgreg.online.tags import TagFrame, TagSettings, TagWatch, watch_tags

@@ -53,8 +53,8 @@ LAST = 15
 """Last PMs among which a move is looked for."""
 MIN_BEFORE = 6
 """PMs that a registration takes; before so many there is nothing that could have moved."""
-GATE = 0.5
-"""Log score by the cheap look from which the proper test is made."""
+GATE = 2.5
+"""Log score by the cheap look from which the proper test is made: none that raises an alarm has less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

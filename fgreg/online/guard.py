@@ -1,4 +1,4 @@
-"""What finds out untold camera moves, as the engine uses it: the watch on pairs, the guard on tags, and what was found."""
+"""What finds out untold camera moves, as the engine uses it: the watch on pairs, and the guard on tags."""
 
 from __future__ import annotations
 

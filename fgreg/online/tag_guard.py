@@ -58,7 +58,7 @@ class TagGuard:
         moving: frames since then.
     """
 
-    watch: TagWatch = TagWatch()
+    watch: TagWatch = field(default_factory=TagWatch)
     times: tuple[float, ...] = ()
     before: Mapping[int, TagPose] = field(default_factory=dict)
     moving: tuple[TagFrame, ...] = ()
