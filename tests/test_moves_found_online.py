@@ -14,7 +14,7 @@ from fgreg.estimate import Verdict
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.measurements import EpochStart, Measurements, Track
 from fgreg.models import SessionModel
-from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags
+from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags, evidence
 from fgreg.online import engine as engine_module
 from fgreg.online import watch as watch_module
 from fgreg.online.detect import events_in_order, find_moves, split_epochs
@@ -113,7 +113,7 @@ def test_another_kind_of_watch_is_refused() -> None:
 
 def test_a_steady_stream_raises_no_alarm_and_mostly_needs_no_proper_test(monkeypatch: pytest.MonkeyPatch) -> None:
     cases: list[MoveCase] = []
-    proper = watch_module.proper_test
+    proper = evidence.proper_test
 
     def counted(case: MoveCase, *rest: object) -> object:
         cases.append(case)

@@ -48,6 +48,7 @@ class ReturnSettings:
         accept, reject: log Bayes factors of the same place from which it is (or below minus which it is not) re-used.
         junk_probability: of each pair.
         least_difference: turn (rad) and shift (mm) that matter.
+        tolerance: turn (rad) and shift (mm), sigmas, that a camera that is back may be off.
     """
 
     elsewhere: MoveScales
@@ -56,6 +57,7 @@ class ReturnSettings:
     reject: float = math.log(100.0)
     junk_probability: float = 0.04
     least_difference: tuple[float, float] = (math.radians(1.0), 2.0)
+    tolerance: tuple[float, float] = (math.radians(0.15), 0.3)
 
     def __post_init__(self) -> None:
         if not (self.accept > 0 and self.reject > 0 and self.least_pairs >= 1):
