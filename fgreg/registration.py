@@ -122,9 +122,9 @@ Pack = Callable[[Measurements], PackedProblem]
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
     """Epochs with minima of their own or tied to such a one by measured camera motions."""
     known = {k for k, search in enumerate(searches) if search.minima}
-    tied = {k for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
+    tied = {k: epoch.old(k) for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
     for _ in range(len(searches)):
-        known |= {k for k in tied if k - 1 in known} | {k - 1 for k in tied if k in known}
+        known |= {k for k, old in tied.items() if old in known} | {old for k, old in tied.items() if k in known}
     return sorted(known)
 
 
@@ -139,10 +139,11 @@ def joint_start(
             motion = epoch.camera_new_T_camera_old
             if not k or motion is None or not epoch.motion_known:
                 continue
-            if k not in transforms and k - 1 in transforms:
-                transforms[k] = transforms[k - 1] @ inverse(motion)
-            elif k in transforms and k - 1 in solvable and k - 1 not in transforms:
-                transforms[k - 1] = transforms[k] @ motion
+            old = epoch.old(k)
+            if k not in transforms and old in transforms:
+                transforms[k] = transforms[old] @ inverse(motion)
+            elif k in transforms and old in solvable and old not in transforms:
+                transforms[old] = transforms[k] @ motion
     most = max(chosen, key=lambda k: sum(pair.epoch == k for pair in measurements.pairs))
     beam = chosen[most].state
     # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
@@ -228,11 +229,13 @@ def _told_apart(
 
 
 def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
-    """Solvable epochs, grouped by measured motions between neighbours."""
+    """Solvable epochs, grouped by the measured motions between them."""
     out: list[list[int]] = []
     for k in solvable:
-        if out and out[-1][-1] == k - 1 and measurements.epochs[k].motion_known:
-            out[-1].append(k)
+        start = measurements.epochs[k]
+        chain = next((chain for chain in out if start.motion_known and start.old(k) in chain), None)
+        if chain is not None:
+            chain.append(k)
         else:
             out.append([k])
     return out
@@ -241,7 +244,12 @@ def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
 def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
     """The measurements of some epochs only, renumbered in order; a motion is kept where both its sides are."""
     place = {k: i for i, k in enumerate(epochs)}
-    starts = tuple(measurements.epochs[k] if k - 1 in place else EpochStart(measurements.epochs[k].t) for k in epochs)
+    starts = tuple(
+        replace(start, after=place[start.old(k)] if start.after is not None else None)
+        if start.old(k) in place
+        else EpochStart(start.t)
+        for k, start in ((k, measurements.epochs[k]) for k in epochs)
+    )
     pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
     return Measurements(measurements.aims, pairs, starts)
 

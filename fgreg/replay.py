@@ -21,8 +21,8 @@ from fgreg.estimate import Quantiles, Timing, TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, PairEvent, TrackEvent, refused_lines
 from fgreg.live import Engine, EpochFeed, MakeEngine, online_engine
 from fgreg.measurements import Aim, Pair, Track
+from fgreg.online.detect import EpochsFound
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import DetectedMove
 from fgreg.pipeline import (
     RESULT_FILE,
     Progress,
@@ -139,19 +139,19 @@ def replay_session(
         engine = (make_engine or online_engine)(session.model, config, prior)
         player = _Player(session, recognised, engine, viewer, request.speed)
         player.play(on_step)
-        taken, moves = player.taken(), player.moves()
+        taken, found = player.taken(), player.found()
         solution = solve(
             taken.measurements,
             (),
             session.model,
             config,
-            [*move_conditions(moves), *detection_conditions(recognised, config)],
+            [*move_conditions(found), *detection_conditions(recognised, config)],
             prior,
         )
         settled = engine.settle() if player.estimate is not None else None
         estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())
         estimate = replace(estimate, tracks=player.answers(estimate.tracks))
-        errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
+        errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         viewer.result(session.model, taken.measurements, estimate, truth, recognised.tracks)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -265,10 +265,11 @@ class _Player:
             unused=self._unused,
         )
 
-    def moves(self) -> tuple[DetectedMove, ...]:
-        """Moves that the engine found out and that the session does not tell."""
+    def found(self) -> EpochsFound:
+        """What the engine found out and the session does not tell."""
         told = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
-        return tuple(move for move in self._engine.moves if move.since_t not in told)
+        moves = tuple(move for move in self._engine.moves if move.since_t not in told)
+        return EpochsFound(moves, self._engine.returns)
 
     def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
         """One per track event, in order; ``unanswered`` has the reasons of those that were not put to the engine."""

@@ -15,7 +15,7 @@ from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.online.moves import relinearisation
-from fgreg.online.returns import ReturnSettings, ReturnTest, fits_again, which_epoch
+from fgreg.online.returns import ReturnSettings, ReturnTest, default_return_settings, fits_again, which_epoch
 from fgreg.online.shared import Quadratic
 from fgreg.online.state import Setting, State, passed_from, summary
 from fgreg.online.store import MeasurementStore
@@ -100,6 +100,12 @@ def return_tests(
             relinearise=relinearisation(problem, state),
         )
     return tests
+
+
+def back_to(start: EpochStart, epoch: int, settings: ReturnSettings | None = None) -> EpochStart:
+    """The start of an epoch in which the camera is where an earlier one had it, within the tolerance."""
+    tolerance = (settings or default_return_settings()).tolerance
+    return EpochStart(start.t, np.eye(4), np.diag(np.repeat(tolerance, 3) ** 2), epoch)
 
 
 def returned_by(case: ReturnCase, tests: dict[int, ReturnTest]) -> ReturnFound | None:

@@ -3,24 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
+from fgreg.online.back import back_to
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.events import CameraMoved, DetectedMove, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.registration import SoundSpeedPrior
 
 
-def find_moves(
+@dataclass(frozen=True, slots=True)
+class EpochsFound:
+    """What nobody told of the camera's epochs: moves, and that it is back (its epochs with the moves counted in)."""
+
+    moves: tuple[DetectedMove, ...] = ()
+    returns: tuple[DetectedReturn, ...] = ()
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """What to tell the user."""
+        return (*(move.text for move in self.moves), *(back.text for back in self.returns))
+
+
+def find_moves(measurements: Measurements, model: SessionModel, config: SolveConfig) -> tuple[DetectedMove, ...]:
+    """The moves of :func:`find_epochs`."""
+    return find_epochs(measurements, model, config).moves
+
+
+def find_epochs(
     measurements: Measurements,
     model: SessionModel,
     config: SolveConfig,
     sound_speed_prior: SoundSpeedPrior | None = None,
-) -> tuple[DetectedMove, ...]:
-    """Moves that nobody told, in the order of time: those that the online engine finds in the same events.
+) -> EpochsFound:
+    """What nobody told, in the order of time: what the online engine finds in the same events.
 
     None are found in sessions that there is no online form of (``config.estimate_radius``).
     """
@@ -42,7 +61,7 @@ def find_moves(
     for move in engine.moves:
         since = index_of[move.since]
         found.append(replace(move, since=since, epoch=pairs[since].epoch))
-    return tuple(found)
+    return EpochsFound(tuple(found), engine.returns)
 
 
 def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, OnlineEvent]]:
@@ -57,8 +76,12 @@ def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, On
         yield index, event
 
 
-def split_epochs(measurements: Measurements, moves: Sequence[DetectedMove]) -> Measurements:
+def split_epochs(
+    measurements: Measurements, moves: Sequence[DetectedMove], returns: Sequence[DetectedReturn] = ()
+) -> Measurements:
     """The measurements with an epoch more for every move found; motions told before stay between their sides.
+
+    Epochs in which the camera is back are tied to those that it is back to.
 
     All looks at a PM are of the epoch of its first.
     """
@@ -66,6 +89,8 @@ def split_epochs(measurements: Measurements, moves: Sequence[DetectedMove]) -> M
     for epoch, start in enumerate(measurements.epochs):
         starts.append(start)
         starts.extend(EpochStart(move.since_t) for move in moves if move.epoch == epoch)
+    for back in returns:
+        starts[back.epoch] = back_to(starts[back.epoch], back.to)
     first: dict[tuple[int, int], int] = {}
     for index, pair in enumerate(measurements.pairs):
         first.setdefault((pair.epoch, pair.pm), index)
@@ -93,4 +118,4 @@ def renumbered(epoch_of: Sequence[int], shots: Sequence[int], moves: Sequence[De
     return tuple(_with_moves(epoch, index, places) for index, epoch in enumerate(epoch_of))
 
 
-__all__ = ["DetectedMove", "events_in_order", "find_moves", "renumbered", "split_epochs"]
+__all__ = ["DetectedMove", "EpochsFound", "events_in_order", "find_epochs", "find_moves", "renumbered", "split_epochs"]

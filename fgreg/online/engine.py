@@ -27,10 +27,10 @@ from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.frames import FloatArray, make_transform, rotation_to_direction
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
+from fgreg.online.back import ReturnFound, back_to
 from fgreg.online.checks import check
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
-from fgreg.online.events import CameraMoved, DetectedMove, OnlineEvent, StaticTags
-from fgreg.online.evidence import MoveFound
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
 from fgreg.online.guard import MoveGuard, WatchKind
 from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
 from fgreg.online.restart import Tools, all_measurements
@@ -92,6 +92,7 @@ class OnlineRegistration:
             raise ValueError(f"judge is {judge!r}, expected 'inline', 'process' or None")
         self._guard = MoveGuard(watch, model, self._config, sound_speed_prior, self._tools.setting)
         self._moves: list[DetectedMove] = []
+        self._returns: list[DetectedReturn] = []
         self._noticed: dict[int, str] = {}
         self._suspicion = ""
         self._judge = None if judge is None else kinds[judge]()
@@ -122,7 +123,7 @@ class OnlineRegistration:
         """
         check(event, self._t)
         if not isinstance(event, CameraMoved):  # what is told comes before what is still being looked at
-            self._adopt_move(event.t)
+            self._adopt_found(event.t)
         guard, said = self._guard.see(event) if isinstance(event, StaticTags) else (None, None)
         before = self._state
         try:
@@ -149,8 +150,8 @@ class OnlineRegistration:
         if isinstance(said, TagsMoved):
             self._note_move(before, state.now.first, said.since_t, event.t, None)
         elif isinstance(event, Pair):
-            self._guard.look(state, self._serial)
-            moved = self._adopt_move(event.t) or moved
+            self._guard.look(state, self._serial, self._tools.store)
+            moved = self._adopt_found(event.t) or moved
         self._consult(ask=moved or isinstance(said, TagsRest) or isinstance(event, Pair | Aim))
         return self._estimate
 
@@ -205,12 +206,14 @@ class OnlineRegistration:
         self._guard.epoch_began()
         self._suspicion = ""
 
-    def _adopt_move(self, t: float) -> bool:
-        """Begin a new epoch where the watch has raised an alarm; whether it has."""
+    def _adopt_found(self, t: float) -> bool:
+        """Begin a new epoch, or tie the one that lasts to an earlier one, where the watch says so; whether it does."""
         before = self._state
-        found: MoveFound | None = self._guard.alarm(before)
+        found = self._guard.found(before)
         if found is None:
             return False
+        if isinstance(found, ReturnFound):
+            return self._go_back(found, t)
         since_t = self._tools.store.time(found.first)
         try:
             self._reassign(before.pairs - found.first, EpochStart(since_t))
@@ -219,6 +222,19 @@ class OnlineRegistration:
             self._estimate = self._report(before, self._estimate.t, self._judgement)
             return False
         self._note_move(before, found.first, since_t, t, found.log_bayes)
+        return True
+
+    def _go_back(self, found: ReturnFound, t: float) -> bool:
+        before = self._state
+        start = back_to(before.now.start, found.to)
+        try:
+            state = with_motion(replace(before, steps=before.steps + 1), start, self._tools)
+            state = replace(state, nis=before.nis, used=before.used)
+            self._estimate = self._report(state, self._estimate.t, None)
+        except Exception:  # it is the same camera epoch without it, only less well known
+            return False
+        self._returns.append(DetectedReturn(before.epoch, found.to, t, found.log_bayes))
+        self._state, self._serial, self._judgement = state, self._serial + 1, None
         return True
 
     def _note_move(self, before: State, first: int, since_t: float, t: float, log_bayes: float | None) -> None:
@@ -267,8 +283,8 @@ class OnlineRegistration:
             yield
         finally:
             self._judge = usual
-        if self._guard.resume(self._state, self._serial):
-            self._adopt_move(self._t)
+        if self._guard.resume(self._state, self._serial, self._tools.store):
+            self._adopt_found(self._t)
         if deferred.case is not None and deferred.case.epoch == self._state.epoch:
             found, _ = judge(deferred.case, self._model, self._config, self._prior)
             self._judgement = found
@@ -283,13 +299,18 @@ class OnlineRegistration:
 
     def refresh(self) -> OnlineEstimate:
         """Adopt what the judge, and the watch for moves, have found since, without an event."""
-        self._consult(ask=self._adopt_move(self._t))
+        self._consult(ask=self._adopt_found(self._t))
         return self._estimate
 
     @property
     def moves(self) -> tuple[DetectedMove, ...]:
         """Camera moves that were found out, in the order of time; their epochs are numbered as told."""
         return tuple(self._moves)
+
+    @property
+    def returns(self) -> tuple[DetectedReturn, ...]:
+        """Epochs in which the camera was found to be back where it was, in the order of time."""
+        return tuple(self._returns)
 
     @property
     def recent(self) -> tuple[Recent, ...]:
@@ -339,7 +360,7 @@ class OnlineRegistration:
 
     def track(self, query: Track) -> TrackEstimate:
         """Answer a query from the estimate as it is; the graph is not touched."""
-        self._adopt_move(self._t)
+        self._adopt_found(self._t)
         return fast_track(query, self.snapshot())
 
     def snapshot(self) -> Snapshot:

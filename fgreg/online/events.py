@@ -71,4 +71,24 @@ class DetectedMove:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class DetectedReturn:
+    """A camera that came back to where an earlier epoch had it, as the pairs say.
+
+    Attributes:
+        epoch: number of the epoch in which it is back. to: of the earlier one.
+        t: of the pair at which the evidence sufficed. log_bayes: of being back against being elsewhere.
+    """
+
+    epoch: int
+    to: int
+    t: float
+    log_bayes: float
+
+    @property
+    def text(self) -> str:
+        """What to tell the user."""
+        return f"in epoch {self.epoch} the camera is back where it was in epoch {self.to}: what that one knows counts"
+
+
 OnlineEvent = Aim | Pair | CameraMoved | StaticTags

@@ -6,13 +6,14 @@ from typing import Literal
 
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
+from fgreg.online.back import ReturnFound, return_case
 from fgreg.online.events import StaticTags
-from fgreg.online.evidence import MoveFound, move_case
-from fgreg.online.moves import MoveSettings
+from fgreg.online.evidence import move_case
 from fgreg.online.state import Setting, State
+from fgreg.online.store import MeasurementStore
 from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
 from fgreg.online.tags import TagSettings
-from fgreg.online.watch import InlineWatch, ProcessWatch, Watch
+from fgreg.online.watch import Case, Found, InlineWatch, ProcessWatch, Watch, WatchSettings
 from fgreg.registration import SoundSpeedPrior
 
 WatchKind = Literal["inline", "process"]
@@ -40,7 +41,7 @@ class MoveGuard:
     ) -> None:
         if kind not in ("inline", "process", None):
             raise ValueError(f"watch is {kind!r}, expected 'inline', 'process' or None")
-        self._settings, self._tag_settings, self._setting = MoveSettings(), TagSettings(), setting
+        self._settings, self._tag_settings, self._setting = WatchSettings(), TagSettings(), setting
         self._watch: Watch | None = None
         if kind is not None:
             make = InlineWatch if kind == "inline" else ProcessWatch
@@ -53,30 +54,33 @@ class MoveGuard:
         """Why nothing is watched though it should be; empty where it is."""
         return "" if self._watch is None else self._watch.failure
 
-    def look(self, state: State, serial: int) -> None:
-        """A pair more: ask for the proper test where the cheap look says so."""
+    def look(self, state: State, serial: int, store: MeasurementStore) -> None:
+        """A pair more: ask for the proper tests where the cheap look says so, and while the epoch is young."""
         if self._watch is None or self._paused:
             return
-        case = move_case(state, serial, self._setting, self._settings)
-        if case is not None:
-            self._watch.ask(case)
+        move = move_case(state, serial, self._setting, self._settings.moves)
+        back = return_case(state, self._setting, store, self._settings.returns)
+        if move is not None or back is not None:
+            self._watch.ask(Case(move, back))
 
     def pause(self) -> None:
         """Look at nothing for a while."""
         self._paused = True
 
-    def resume(self, state: State, serial: int) -> bool:
+    def resume(self, state: State, serial: int, store: MeasurementStore) -> bool:
         """Look again, at once; whether there was something to look at."""
         self._paused = False
-        self.look(state, serial)
+        self.look(state, serial, store)
         return self._watch is not None
 
-    def alarm(self, state: State) -> MoveFound | None:
-        """An alarm about the epoch that lasts, if one has come."""
+    def found(self, state: State) -> Found | None:
+        """What has been found about the epoch that lasts, if anything has."""
         found = None if self._watch is None else self._watch.answer()
-        if found is None or found.epoch != state.epoch or not state.now.first < found.first < state.pairs:
+        if found is None or found.epoch != state.epoch:
             return None
-        return found
+        if isinstance(found, ReturnFound):
+            return None if state.now.start.motion_known else found
+        return found if state.now.first < found.first < state.pairs else None
 
     def see(self, event: StaticTags) -> tuple[TagGuard, TagsMoved | TagsRest | None]:
         """What a frame of tags says; the guard that comes of it counts once it is given to :meth:`keep`."""

@@ -9,14 +9,48 @@ from __future__ import annotations
 
 import multiprocessing
 from contextlib import suppress
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Protocol
 
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
+from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
 from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test
 from fgreg.online.moves import MoveSettings
+from fgreg.online.returns import ReturnSettings, default_return_settings
 from fgreg.registration import SoundSpeedPrior
+
+Found = MoveFound | ReturnFound
+
+
+@dataclass(frozen=True, slots=True)
+class WatchSettings:
+    """How to test: for moves, and for the camera being back where it was."""
+
+    moves: MoveSettings = field(default_factory=MoveSettings)
+    returns: ReturnSettings = field(default_factory=default_return_settings)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """What is to be tested after a pair; a return is not asked about where the camera has just moved."""
+
+    move: MoveCase | None
+    back: ReturnCase | None
+
+
+def tested(
+    case: Case, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: WatchSettings
+) -> Found | None:
+    """What the tests of a case find."""
+    if case.move is not None:
+        found = found_by(case.move, proper_test(case.move, model, config, prior, settings.moves))
+        if found is not None:
+            return found
+    if case.back is None:
+        return None
+    return returned_by(case.back, return_tests(case.back, model, config, prior, settings.returns))
 
 
 class Watch(Protocol):
@@ -28,10 +62,10 @@ class Watch(Protocol):
 
     failure: str
 
-    def ask(self, case: MoveCase) -> None:
-        """Here is something that looks like a move."""
+    def ask(self, case: Case) -> None:
+        """Here is something to be tested."""
 
-    def answer(self) -> MoveFound | None:
+    def answer(self) -> Found | None:
         """The latest alarm that has not been fetched yet."""
 
     def forget(self) -> None:
@@ -45,20 +79,20 @@ class InlineWatch:
     """Tests at once."""
 
     def __init__(
-        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: MoveSettings
+        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: WatchSettings
     ) -> None:
         self._of = (model, config, sound_speed, settings)
-        self._found: MoveFound | None = None
+        self._found: Found | None = None
         self.failure = ""
 
-    def ask(self, case: MoveCase) -> None:
+    def ask(self, case: Case) -> None:
         """Test now."""
         try:
-            self._found, self.failure = found_by(case, proper_test(case, *self._of)), ""
+            self._found, self.failure = tested(case, *self._of), ""
         except Exception as error:  # the estimate stands without the test
             self.failure = f"{type(error).__name__}: {error}"
 
-    def answer(self) -> MoveFound | None:
+    def answer(self) -> Found | None:
         """What :meth:`ask` found."""
         found, self._found = self._found, None
         return found
@@ -76,7 +110,7 @@ def _serve(
     model: SessionModel,
     config: SolveConfig,
     sound_speed: SoundSpeedPrior | None,
-    settings: MoveSettings,
+    settings: WatchSettings,
 ) -> None:
     """Test what comes until the other end closes."""
     while True:
@@ -87,7 +121,7 @@ def _serve(
         if case is None:
             return
         try:
-            found: MoveFound | str | None = found_by(case, proper_test(case, model, config, sound_speed, settings))
+            found: Found | str | None = tested(case, model, config, sound_speed, settings)
         except Exception as error:  # the test's defects must not end the watch
             found = f"{type(error).__name__}: {error}"
         try:
@@ -100,7 +134,7 @@ class ProcessWatch:
     """Tests in a process of its own; what comes while it is busy waits, and only the latest of that is tested."""
 
     def __init__(
-        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: MoveSettings
+        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: WatchSettings
     ) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
@@ -110,11 +144,11 @@ class ProcessWatch:
         self._process.start()
         theirs.close()
         self._busy = False
-        self._waiting: MoveCase | None = None
+        self._waiting: Case | None = None
         self._stale = False
         self.failure = ""
 
-    def ask(self, case: MoveCase) -> None:
+    def ask(self, case: Case) -> None:
         """Send the case, as soon as the process is idle."""
         self._waiting = case
         if not self._busy:
@@ -134,7 +168,7 @@ class ProcessWatch:
             return
         self._busy, self._stale = True, False
 
-    def answer(self) -> MoveFound | None:
+    def answer(self) -> Found | None:
         """What has come back since."""
         try:
             if not (self._busy and self._connection.poll()):
@@ -146,7 +180,7 @@ class ProcessWatch:
         stale, self._busy = self._stale, False
         self._send()
         self.failure = found if isinstance(found, str) else ""
-        return found if isinstance(found, MoveFound) and not stale else None
+        return found if isinstance(found, Found) and not stale else None
 
     def forget(self) -> None:
         """What waits goes; an answer that is under way will not count."""
