@@ -10,7 +10,7 @@ import pytest
 from fgreg.batch import distance_to_explicit
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, inverse, make_transform
-from fgreg.measurements import EpochStart, Measurements, Pair
+from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.online.back import back_to
@@ -32,7 +32,9 @@ def _there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, M
     pairs: list[Pair] = []
     starts: list[EpochStart] = []
     truths: list[FloatArray] = []
-    model, aims, t = None, (), 0.0
+    model: SessionModel | None = None
+    aims: tuple[Aim, ...] = ()
+    t = 0.0
     for epoch, count in enumerate(counts):
         truths.append(home if epoch % 2 == 0 else home @ inverse(AWAY))
         # One seed, so that all have the same window edge; without aims all that follows is drawn anew.
