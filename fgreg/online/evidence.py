@@ -101,17 +101,21 @@ def size_of(state: State, window: Window) -> int:
 
 def move_case(
     state: State, serial: int, setting: Setting, settings: MoveSettings, gate: float = GATE
-) -> MoveCase | None:
-    """The case for the proper test; None where the cheap look says that there is nothing to it."""
+) -> tuple[MoveCase | None, float | None]:
+    """The case for the proper test, None where there is nothing to it; and the score by the cheap look, if it tells."""
     window = state.window
     if window is None or state.is_open:
-        return None
+        return None, None
     size = size_of(state, window)
-    if not size or looks_steady(window, size, setting.columns, settings, gate):
-        return None
+    if not size:
+        return None, None
+    score = cheap_score(window, size, setting.columns, settings)
+    if score is not None and score < gate:
+        return None, score
     bundles = tuple(group.bundle for group in window.groups)
     known = summary(state, window.state, setting)
-    return MoveCase(serial, state.epoch, bundles, size, known, window.state, _history(state, bundles[:-size]))
+    case = MoveCase(serial, state.epoch, bundles, size, known, window.state, _history(state, bundles[:-size]))
+    return case, score
 
 
 def _history(state: State, before: tuple[Bundle, ...]) -> BoolArray:
@@ -123,14 +127,14 @@ def _history(state: State, before: tuple[Bundle, ...]) -> BoolArray:
     return np.array(kept[-JUNK_MEMORY:], dtype=bool)
 
 
-def looks_steady(window: Window, size: int, columns: Columns, settings: MoveSettings, gate: float) -> bool:
-    """Whether the last ``size`` PMs all count and their rows show no trend: then the proper test is not worth it."""
+def cheap_score(window: Window, size: int, columns: Columns, settings: MoveSettings) -> float | None:
+    """:func:`fgreg.online.moves.quick_score` of the last ``size`` PMs; None where one of them does not count."""
     groups = window.groups[-size:]
     if not all(group.kept and not group.prepared.far for group in groups):
-        return False
+        return None
     terms = _terms(groups, window.state, columns)
     known = Gaussian(np.zeros(columns.size), window.covariance)
-    return quick_score(known, terms, settings.scales, pose_columns(0)) < gate
+    return quick_score(known, terms, settings.scales, pose_columns(0))
 
 
 def _terms(groups: tuple[Group, ...], state: SharedState, columns: Columns) -> WhiteTerms:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnFound, return_case
 from fgreg.online.events import StaticTags
-from fgreg.online.evidence import move_case
+from fgreg.online.evidence import GATE, move_case
 from fgreg.online.state import Setting, State
 from fgreg.online.store import MeasurementStore
 from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
 from fgreg.online.tags import TagSettings
+from fgreg.online.updates import FEW_PAIRS
 from fgreg.online.watch import Case, Found, InlineWatch, ProcessWatch, Watch, WatchSettings
 from fgreg.registration import SoundSpeedPrior
 
@@ -48,6 +50,7 @@ class MoveGuard:
             self._watch = make(model, config, sound_speed, self._settings)
         self._tags = TagGuard()
         self._paused = False
+        self._score: float | None = None
 
     @property
     def failure(self) -> str:
@@ -58,10 +61,23 @@ class MoveGuard:
         """A pair more: ask for the proper tests where the cheap look says so, and while the epoch is young."""
         if self._watch is None or self._paused:
             return
-        move = move_case(state, serial, self._setting, self._settings.moves)
+        move = None
+        if self._may_look_moved(state):
+            move, self._score = move_case(state, serial, self._setting, self._settings.moves)
         back = return_case(state, self._setting, store, self._settings.returns)
         if move is not None or back is not None:
             self._watch.ask(Case(move, back))
+
+    def _may_look_moved(self, state: State) -> bool:
+        """Whether a look could show more than the gate: a pair adds at most half its NIS to the log of any move's odds.
+
+        The odds of a move before it are those of none, so the sum of all grows to at most (sum + 1) times that. Among
+        few pairs others may be judged anew with it, and then that is no limit.
+        """
+        if state.nis is None or not state.used or self._score is None or state.epoch_pairs <= FEW_PAIRS:
+            return True
+        self._score = math.log1p(math.exp(min(self._score, 50.0))) + 0.5 * state.nis
+        return self._score >= GATE
 
     def pause(self) -> None:
         """Look at nothing for a while."""
@@ -92,6 +108,7 @@ class MoveGuard:
 
     def epoch_began(self, *, by_tags: bool = False) -> None:
         """Another epoch: what was asked of the old one does not count; tags are compared with those seen from now."""
+        self._score = None
         if self._watch is not None:
             self._watch.forget()
         if not by_tags:
