@@ -73,7 +73,7 @@ def test_an_epoch_tied_to_one_that_is_left_out_stands_alone() -> None:
     assert 1 in found.epochs
 
 
-@pytest.mark.parametrize("counts", [(14, 8, 4), (14, 3, 10), (10, 8, 4, 8)])
+@pytest.mark.parametrize("counts", [(12, 3, 6), (9, 7, 4, 6)])
 def test_the_engine_with_a_tie_is_at_the_batch_optimum(counts: tuple[int, ...]) -> None:
     model, measurements, _ = _there_and_back(5, counts)
     engine = OnlineRegistration(model, judge=None, watch=None)
@@ -96,27 +96,19 @@ def test_the_engine_with_a_tie_is_at_the_batch_optimum(counts: tuple[int, ...]) 
 
 
 def test_the_engine_finds_out_that_the_camera_is_back_and_the_batch_does_too() -> None:
-    returned = 0
-    for seed in (3, 5, 8):
-        model, measurements, truths = _there_and_back(seed, (18, 6, 14))
-        engine = OnlineRegistration(model, judge=None)
-        for _, event in events_in_order(measurements):
-            engine.add(event)
-        assert engine.moves == ()
-        found = find_epochs(measurements, model, CONFIG)
-        assert [(back.epoch, back.to, back.t) for back in found.returns] == [
-            (back.epoch, back.to, back.t) for back in engine.returns
-        ]
-        if not engine.returns:
-            continue
-        returned += 1
-        (back,) = engine.returns
-        assert (back.epoch, back.to) == (2, 0)
-        assert engine.measurements().epochs[2].after == 0
-        split = split_epochs(measurements, found.moves, found.returns)
-        assert split.epochs[2].after == 0
-        estimate = engine.estimate
-        assert estimate.epoch == 2
-        assert estimate.trus_T_camera is not None
-        assert tre_mm(estimate.trus_T_camera, truths[2], model.targets_mm).mean() < 2.5
-    assert returned >= 1
+    model, measurements, truths = _there_and_back(3, (25, 4, 16))
+    engine = OnlineRegistration(model, judge=None)
+    for _, event in events_in_order(measurements):
+        engine.add(event)
+    assert engine.moves == ()
+    (back,) = engine.returns
+    assert (back.epoch, back.to) == (2, 0)
+    assert back.t > measurements.pairs[25 + 4 + 6].t  # not before the eighth pair
+    assert engine.measurements().epochs[2].after == 0
+    estimate = engine.estimate
+    assert estimate.epoch == 2
+    assert estimate.trus_T_camera is not None
+    assert tre_mm(estimate.trus_T_camera, truths[2], model.targets_mm).mean() < 2.5
+    found = find_epochs(measurements, model, CONFIG)
+    assert [(b.epoch, b.to, b.t) for b in found.returns] == [(back.epoch, back.to, back.t)]
+    assert split_epochs(measurements, found.moves, found.returns).epochs[2].after == 0

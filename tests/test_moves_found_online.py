@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.estimate import Verdict
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
-from fgreg.measurements import EpochStart, Measurements, Track
+from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags, evidence
 from fgreg.online import engine as engine_module
+from fgreg.online import guard as guard_module
 from fgreg.online import watch as watch_module
 from fgreg.online.detect import events_in_order, find_moves, split_epochs
 from fgreg.online.evidence import MoveCase
@@ -47,6 +49,16 @@ def _session(
     return model, replace(first, pairs=first.pairs + later), (truth, moved)
 
 
+@cache
+def _ran(seed: int) -> tuple[SessionModel, Measurements, tuple[Truth, Truth], OnlineRegistration]:
+    """A session with an untold move, and the engine that went through it: to look at only."""
+    model, measurements, truths = _session(seed, SHIFT, 8)
+    engine = OnlineRegistration(model, judge=None)
+    for _, event in events_in_order(measurements):
+        engine.add(event)
+    return model, measurements, truths, engine
+
+
 def _query(measurements: Measurements) -> Track:
     pair = measurements.pairs[-1]
     return Track(pair.t, 0, pair.marker, looks=(pair.look,))
@@ -64,14 +76,11 @@ def _until_alarm(engine: OnlineRegistration, measurements: Measurements) -> tupl
 
 
 def test_the_engine_finds_an_untold_move_and_gives_the_pairs_since_to_a_new_epoch() -> None:
-    model, measurements, truth = _session(3, SHIFT, 10)
-    engine = OnlineRegistration(model, judge=None)
-    for _, event in events_in_order(measurements):
-        engine.add(event)
+    model, measurements, truth, engine = _ran(3)
     (move,) = engine.moves
     taken = engine.measurements()
     assert abs(move.since - BEFORE) <= 1
-    assert [pair.epoch for pair in taken.pairs] == [0] * move.since + [1] * (BEFORE + 10 - move.since)
+    assert [pair.epoch for pair in taken.pairs] == [0] * move.since + [1] * (BEFORE + 8 - move.since)
     assert taken.epochs[1].t == move.since_t == measurements.pairs[move.since].t
     assert move.last_t < move.since_t < move.alarm_t
     estimate = engine.estimate
@@ -81,12 +90,9 @@ def test_the_engine_finds_an_untold_move_and_gives_the_pairs_since_to_a_new_epoc
     assert estimate.verdict is not Verdict.OK
 
 
-@pytest.mark.parametrize("seed", [3, 4, 7])
+@pytest.mark.parametrize("seed", [3, 7])
 def test_online_and_batch_find_the_same_moves_and_epochs(seed: int) -> None:
-    model, measurements, _ = _session(seed, SHIFT, 10)
-    engine = OnlineRegistration(model, judge=None)
-    for _, event in events_in_order(measurements):
-        engine.add(event)
+    model, measurements, _, engine = _ran(seed)
     moves = find_moves(measurements, model, SolveConfig())
     assert len(moves) == 1
     for batch, here in zip(moves, engine.moves, strict=True):  # but for rounding, which arrays' places in memory decide
@@ -98,7 +104,7 @@ def test_online_and_batch_find_the_same_moves_and_epochs(seed: int) -> None:
 
 
 def test_switched_off_nothing_is_found() -> None:
-    model, measurements, _ = _session(3, SHIFT, 8)
+    model, measurements, _ = _session(3, SHIFT, 4)
     engine = OnlineRegistration(model, judge=None, watch=None)
     for _, event in events_in_order(measurements):
         assert engine.add(event).epoch == 0
@@ -155,17 +161,19 @@ def test_one_gross_outlier_is_no_move() -> None:
 def test_until_the_new_epoch_is_good_enough_the_verdict_says_so_and_queries_are_not_answered() -> None:
     model, measurements, _ = _session(3, SHIFT, 10)
     engine = OnlineRegistration(model)
-    before = None
-    for index, event in events_in_order(measurements):
-        if index == BEFORE:
-            before = engine.track(_query(measurements))
+    events = [event for _, event in events_in_order(measurements)]
+    steady = len(measurements.aims) + BEFORE
+    with engine.catching_up():
+        for event in events[:steady]:
+            engine.add(event)
+    before = engine.track(_query(measurements))
+    for event in events[steady:]:
         estimate = engine.add(event)
         if engine.moves and estimate.pairs < 5:
             assert estimate.verdict is Verdict.REFUSED
             answer = engine.track(replace(_query(measurements), epoch=1))
             assert answer.stage_rad is None
             assert "the camera moved between" in answer.reason
-    assert before is not None
     assert before.stage_rad is not None
     assert len(engine.moves) == 1
 
@@ -173,7 +181,7 @@ def test_until_the_new_epoch_is_good_enough_the_verdict_says_so_and_queries_are_
 def test_where_the_pairs_cannot_be_reassigned_the_old_registration_is_not_trusted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    model, measurements, _ = _session(3, SHIFT, 10)
+    model, measurements, _ = _session(3, SHIFT, 4)
     engine = OnlineRegistration(model, judge=None)
 
     def fails(*_: object) -> None:
@@ -199,6 +207,20 @@ def test_a_test_that_fails_is_told_and_the_estimate_goes_on(monkeypatch: pytest.
         engine.add(event)
     assert engine.estimate.trus_T_camera is not None
     assert any("camera moves are not looked for: ZeroDivisionError" in reason for reason in engine.estimate.reasons)
+
+
+def test_a_look_that_fails_does_not_undo_the_pair(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, measurements, _ = _session(3, SHIFT, 1)
+
+    def fails(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr(guard_module, "move_case", fails)
+    engine = OnlineRegistration(model, judge=None)
+    for _, event in events_in_order(measurements):
+        estimate = engine.add(event)
+    assert len(engine.measurements().pairs) == BEFORE + 1
+    assert any("camera moves are not looked for: LinAlgError: singular" in reason for reason in estimate.reasons)
 
 
 def test_a_watch_in_a_process_finds_the_same_move() -> None:
@@ -332,14 +354,12 @@ def test_tags_without_a_covariance_are_refused() -> None:
 
 
 def test_moves_found_before_are_taken_from_the_record_when_catching_up() -> None:
-    model, measurements, _ = _session(3, SHIFT, 8)
-    first, record = OnlineRegistration(model, judge=None), []
+    model, measurements, _, first = _ran(3)
+    (move,), record = first.moves, []
     for _, event in events_in_order(measurements):
-        epoch = first.estimate.epoch
         record.append(event)
-        if first.add(event).epoch > epoch:
-            start: EpochStart = first.measurements().epochs[-1]
-            record.append(CameraMoved(event.t, detected=True, since_t=start.t))
+        if event.t == move.alarm_t:
+            record.append(CameraMoved(event.t, detected=True, since_t=move.since_t))
     again = OnlineRegistration(model, judge=None)
     with again.catching_up():
         for event in record:

@@ -124,9 +124,9 @@ class OnlineRegistration:
         check(event, self._t)
         if not isinstance(event, CameraMoved):  # what is told comes before what is still being looked at
             self._adopt_found(event.t)
-        guard, said = self._guard.see(event) if isinstance(event, StaticTags) else (None, None)
         before = self._state
         try:
+            guard, said = self._guard.see(event) if isinstance(event, StaticTags) else (None, None)
             state = self._next(event, said)
             estimate = self._report(state, event.t, self._judgement)
         except EventRefused:
@@ -144,7 +144,9 @@ class OnlineRegistration:
         self._estimate = estimate
         if moved:
             self._guard.epoch_began(by_tags=guard is not None)
-            self._suspicion = ""
+            if self._suspicion:
+                self._suspicion = ""
+                self._estimate = self._report(state, event.t, self._judgement)
         if guard is not None:
             self._guard.keep(guard)
         if isinstance(said, TagsMoved):

@@ -51,22 +51,27 @@ class MoveGuard:
         self._tags = TagGuard()
         self._paused = False
         self._score: float | None = None
+        self._failure = ""
 
     @property
     def failure(self) -> str:
         """Why nothing is watched though it should be; empty where it is."""
-        return "" if self._watch is None else self._watch.failure
+        return "" if self._watch is None else self._failure or self._watch.failure
 
     def look(self, state: State, serial: int, store: MeasurementStore) -> None:
         """A pair more: ask for the proper tests where the cheap look says so, and while the epoch is young."""
         if self._watch is None or self._paused:
             return
-        move = None
-        if self._may_look_moved(state):
-            move, self._score = move_case(state, serial, self._setting, self._settings.moves)
-        back = return_case(state, self._setting, store, self._settings.returns)
-        if move is not None or back is not None:
-            self._watch.ask(Case(move, back))
+        try:
+            move = None
+            if self._may_look_moved(state):
+                move, self._score = move_case(state, serial, self._setting, self._settings.moves)
+            back = return_case(state, self._setting, store, self._settings.returns)
+            if move is not None or back is not None:
+                self._watch.ask(Case(move, back))
+            self._failure = ""
+        except Exception as error:  # the pair is in the estimate, whatever becomes of the look at it
+            self._failure, self._score = f"{type(error).__name__}: {error}", None
 
     def _may_look_moved(self, state: State) -> bool:
         """Whether a look could show more than the gate: a pair adds at most half its NIS to the log of any move's odds.
