@@ -30,7 +30,7 @@ from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.recognition import EventRecogniser
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.event_document import event_document, type_of, writable
@@ -55,6 +55,10 @@ class Engine(Protocol):
     def catching_up(self) -> AbstractContextManager[None]: ...
     @property
     def estimate(self) -> OnlineEstimate | None: ...
+    @property
+    def moves(self) -> tuple[DetectedMove, ...]: ...
+    @property
+    def returns(self) -> tuple[DetectedReturn, ...]: ...
 
 
 MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engine]

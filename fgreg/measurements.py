@@ -92,11 +92,19 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochStart:
-    """Start of a camera epoch; the motion (and its 6x6 covariance, right tangent) where kinematics gave it."""
+    """Start of a camera epoch; the motion (and its 6x6 covariance, right tangent) where kinematics gave it.
+
+    ``after``: the epoch that the motion is counted from, an earlier one than the last where the camera came back to it.
+    """
 
     t: float
     camera_new_T_camera_old: FloatArray | None = None
     covariance: FloatArray | None = None
+    after: int | None = None
+
+    def old(self, index: int) -> int:
+        """The epoch that the motion is counted from, of an epoch with this index."""
+        return index - 1 if self.after is None else self.after
 
     @property
     def motion_known(self) -> bool:

@@ -244,7 +244,7 @@ def test_reassigned_pairs_belong_to_a_new_epoch_and_the_old_one_is_rid_of_them()
     untold = replace(
         measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs[:18]), epochs=measurements.epochs[:1]
     )
-    engine = OnlineRegistration(model, judge=None)
+    engine = OnlineRegistration(model, judge=None, watch=None)
     run(engine, untold)
     estimate = engine.reassign(6, measurements.epochs[1])
     assert estimate.epoch == 1

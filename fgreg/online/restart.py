@@ -157,12 +157,23 @@ def _taken(state: State, tools: Tools, pair: Pair | None, aim: Aim | None) -> _T
     first, pairs = state.now.first, state.pairs
     whole = state.layout is None or pairs <= ALL_PAIRS
     begin = 0 if whole else max(0, first - EARLIER_PAIRS)
-    taken = [store.pair(place, epoch_of(state, place)) for place in range(begin, pairs)]
+    old = [*_tied_to(state, begin), *range(begin, pairs)]
+    places = [*old, *range(pairs, pairs + len(new))]
+    taken = [store.pair(place, epoch_of(state, place)) for place in old]
     taken += [replace(p, epoch=state.epoch) for p in new]
     aims = (*store.aims, *([] if aim is None else [aim]))
     measurements = Measurements(aims, tuple(taken), tuple(data.start for data in state.epochs))
     after = replace(state, pairs=pairs + len(new), aims=len(aims))
-    return _Taken(measurements, tuple(range(begin, pairs + len(new))), whole, after)
+    return _Taken(measurements, tuple(places), whole, after)
+
+
+def _tied_to(state: State, before: int) -> range:
+    """Last pairs of the epoch that the one that lasts is tied to, where they are among those before a place."""
+    start = state.now.start
+    if start.after is None or not start.motion_known:
+        return range(0)
+    end = state.epochs[start.after + 1].first
+    return range(max(state.epochs[start.after].first, end - EARLIER_PAIRS), end) if end <= before else range(0)
 
 
 def _from_registration(

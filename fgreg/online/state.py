@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtri
@@ -207,23 +206,33 @@ def passed_from(
 
     Also each epoch's registration given what follows.
     """
-    passed: Quadratic | None = None
+    last = len(epochs) - 1
+    passed: dict[int, Quadratic] = {}
     eliminated: list[Elimination | None] = []
-    for data, following in pairwise(epochs):
-        if data.state is None:
+    # Each passes on what it knows to the last one that its registration is tied to, or to the next.
+    tied = {data.start.old(k): k for k, data in enumerate(epochs) if k and data.start.motion_known}
+    for k, data in enumerate(epochs[:-1]):
+        told = passed.get(k)
+        if data.state is None:  # what was passed on to it speaks of the common variables alone
+            if told is not None:
+                _pass(passed, k + 1, told, columns)
             eliminated.append(None)
             continue
-        here = with_common(data.state, common)
+        to = tied.get(k, k + 1)
+        start = epochs[to].start if k in tied else EpochStart(epochs[to].start.t)
+        here, state = with_common(data.state, common), epochs[to].state
         known = data.shelf.about(here, columns)
-        if passed is not None:
-            known = known.plus(passed.at(here, columns))
-        if following is epochs[-1]:
-            there = common
-        else:
-            there = with_common(following.state, common) if following.state else carried_over(here, following.start)
-        passed, elimination = passed_on(known, following.start, there, columns)
+        if told is not None:
+            known = known.plus(told.at(here, columns))
+        there = common if to == last else with_common(state, common) if state else carried_over(here, start)
+        more, elimination = passed_on(known, start, there, columns)
+        _pass(passed, to, more, columns)
         eliminated.append(elimination)
-    return passed, tuple(eliminated)
+    return passed.get(last), tuple(eliminated)
+
+
+def _pass(passed: dict[int, Quadratic], to: int, more: Quadratic, columns: Columns) -> None:
+    passed[to] = more if to not in passed else passed[to].at(more.state, columns).plus(more)
 
 
 def with_common(state: SharedState, common: SharedState) -> SharedState:
