@@ -30,6 +30,7 @@ from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
 from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
+from fgreg.online.rest import Rest, rested, with_effort
 from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
 from fgreg.online.state import EpochData, Recent, State, make_setting
@@ -111,7 +112,7 @@ class OnlineRegistration:
         check(event, self._t)
         before = self._state
         try:
-            state = self._next(event)
+            state = rested(with_effort(self._next(event)), self._tools.setting)
             estimate = self._report(state, event.t, self._judgement)
         except EventRefused:
             raise
@@ -153,7 +154,7 @@ class OnlineRegistration:
         if not 0 <= last <= self._state.epoch_pairs:
             raise EventRefused(f"{last} pairs are to be reassigned, of {self._state.epoch_pairs} in the epoch")
         try:
-            state = with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last)
+            state = with_effort(with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last))
             estimate = self._report(state, max(self._t, start.t), self._judgement)
         except Exception as error:
             raise EventRefused(f"the update failed: {type(error).__name__}: {error}") from error
@@ -199,10 +200,34 @@ class OnlineRegistration:
             yield
         finally:
             self._judge = usual
-        if deferred.case is not None and deferred.case.epoch == self._state.epoch:
+        if deferred.case is not None:
             found, _ = judge(deferred.case, self._model, self._config, self._prior)
-            self._judgement = found
-            self._estimate = self._report(self._state, self._estimate.t, found)
+            self._surface = found.surface or self._surface
+            if found.epoch == self._state.epoch:
+                self._judgement = found
+                self._estimate = self._report(self._state, self._estimate.t, found)
+
+    def rest(self) -> tuple[Rest, MeasurementStore] | None:
+        """What a session can be taken up from, where the last event ended with a rest; and the measurements."""
+        window = self._state.window
+        if window is None or window.seed is None:
+            return None
+        found = Rest(self._state, self._t, self._serial, self._estimate.t, self._judgement, self._surface)
+        return found, self._tools.store
+
+    def resume(self, rest: Rest, store: MeasurementStore) -> OnlineEstimate:
+        """Go on from a rest of an engine with the same model and configuration.
+
+        Raises:
+            ValueError: this engine has taken in something already.
+        """
+        if self._serial:
+            raise ValueError("events were taken in already")
+        self._tools = replace(self._tools, store=store)
+        self._state, self._t, self._serial = rest.state, rest.t, rest.serial
+        self._judgement, self._surface = rest.judgement, rest.surface
+        self._estimate = self._report(self._state, rest.estimate_t, rest.judgement)
+        return self._estimate
 
     # --- what is known ----------------------------------------------------------------------------------------------
 

@@ -138,6 +138,7 @@ class State:
         recent: oldest first.
         steps: events since the start, which the spreading of work goes by.
         nis, used: of the last event, where it was a pair.
+        effort: since the last rest (fgreg.online.rest).
     """
 
     epochs: tuple[EpochData, ...]
@@ -153,6 +154,7 @@ class State:
     steps: int = 0
     nis: float | None = None
     used: bool = False
+    effort: int = 0
 
     @property
     def epoch(self) -> int:
