@@ -122,7 +122,7 @@ class OnlineRegistration:
         if isinstance(event, Pair):
             self._tools.store.append(event)
         elif isinstance(event, Aim):
-            self._tools.store.aims.append(event)
+            self._tools.store.append_aim(event)
         self._state, self._t = state, event.t
         self._serial += 1
         moved = state.epoch != before.epoch

@@ -32,8 +32,8 @@ from fgreg.online.window import (
 from fgreg.tracking import SurfaceMap
 
 LEAST_EFFORT: Final = 100
-"""Effort, in events of the usual kind, after which there is a rest, or an eighth of the session's pairs if that is more:
-as much at most is to be taken in again when a session is opened, and what is written grows with the session."""
+"""Effort, in events of the usual kind, after which there is a rest, or an eighth of the session's pairs where that is
+more: so much at most is to be taken in again when a session is opened, and what is written grows with the session."""
 SHARE: Final = 8
 EFFORTS: Final = ((8, 40), (40, 8), (160, 2))
 """Up to so many pairs of an epoch an event takes so many times as long as later ones."""
@@ -86,9 +86,7 @@ def seed_of(window: Window) -> WindowSeed:
     for group in window.groups:
         prepared = group.prepared
         own = _private_numbers(group.bundle.pairs, prepared.first, values) if group.kept else None
-        groups.append(
-            GroupSeed(group.bundle, prepared.rows, prepared.residual, prepared.state, prepared.far, own)
-        )
+        groups.append(GroupSeed(group.bundle, prepared.rows, prepared.residual, prepared.state, prepared.far, own))
     return WindowSeed(window.state, tuple(groups))
 
 

@@ -127,10 +127,11 @@ class Layout:
         """The estimate of the shared variables; what is no variable is as in ``like``."""
         keys = self.keys(epoch)
         pose = isam.calculateEstimatePose3(keys[0]).matrix()
+        # Copies, laid out as all other arrays: the last digits of sums hang on that.
         state = replace(
             like,
-            rotation=pose[None, None, :3, :3],
-            translation_mm=pose[None, None, :3, 3],
+            rotation=pose[None, None, :3, :3].copy(),
+            translation_mm=pose[None, None, :3, 3].copy(),
             beam=isam.calculateEstimateVector(keys[1])[None],
             edge_rad=np.array([isam.calculateEstimateDouble(keys[2])]),
         )

@@ -12,9 +12,14 @@ import numpy as np
 
 from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, Look, MarkerObservation, Pair
+from fgreg.online.numbers import Sink, Source, check_covariances, check_poses
 
 ROWS = 512
 _T, _POSE, _COVARIANCE, _SCAN, _LOOK_COVARIANCE, _SWEEP, _AMPLITUDE, WIDTH = 0, 1, 17, 53, 57, 61, 62, 63
+
+
+def _plain(values: FloatArray) -> FloatArray:
+    return np.array(values, dtype=np.float64, order="C")
 
 
 class MeasurementStore:
@@ -46,6 +51,18 @@ class MeasurementStore:
         row[_AMPLITUDE] = np.nan if look.amplitude is None else look.amplitude
         self._pm.append(pair.pm)
         self._marker.append(pair.marker.id)
+
+    def append_aim(self, aim: Aim) -> None:
+        """Keep one more calibration shot. Its arrays are laid out as those that are read back: sums depend on that."""
+        marker = aim.marker
+        self.aims.append(
+            Aim(
+                aim.t,
+                MarkerObservation(_plain(marker.camera_T_marker), _plain(marker.covariance), marker.id),
+                _plain(aim.camera_p_spot_mm),
+                _plain(aim.covariance),
+            )
+        )
 
     def looks_at(self, pm: int, first: int = 0) -> tuple[int, ...]:
         """Places of the pairs at a PM so far, from a place on."""
@@ -80,3 +97,37 @@ class MeasurementStore:
     def time(self, index: int) -> float:
         """When a pair was taken."""
         return float(self._blocks[index // ROWS][index % ROWS, _T])
+
+    # --- as plain numbers -------------------------------------------------------------------------------------------
+
+    def write(self, sink: Sink, count: int) -> None:
+        """Put the first pairs into a sink, bit for bit."""
+        rows = np.concatenate([np.zeros((0, WIDTH)), *self._blocks])[:count]
+        silent = np.isnan(rows[:, _AMPLITUDE])
+        rows[silent, _AMPLITUDE] = 0.0
+        for numbers in (self._pm, self._marker):
+            sink.integer_array(np.array(numbers[:count], dtype=np.int64))
+        sink.integer_array(silent.astype(np.int64))
+        sink.array(rows)
+
+    def read(self, source: Source, count: int) -> None:
+        """Append pairs that :meth:`write` put there.
+
+        Raises:
+            ValueError: they are not what a session may hold.
+        """
+        pm, marker, silent = source.integer_array(count), source.integer_array(count), source.flags(count)
+        rows = source.array(count, WIDTH)
+        check_poses(rows[:, _POSE:_COVARIANCE].reshape(-1, 4, 4))
+        check_covariances(rows[:, _COVARIANCE:_SCAN].reshape(-1, 6, 6))
+        check_covariances(rows[:, _LOOK_COVARIANCE:_SWEEP].reshape(-1, 2, 2))
+        if (rows[:, _SCAN + 3] <= 0.0).any() or not np.isin(rows[:, _SWEEP], (-1.0, 0.0, 1.0)).all():
+            raise ValueError("a range or sweep that cannot be")
+        rows[silent, _AMPLITUDE] = np.nan
+        for start in range(0, count, ROWS):
+            block = np.empty((ROWS, WIDTH))
+            part = rows[start : start + ROWS]
+            block[: len(part)] = part
+            self._blocks.append(block)
+        self._pm.extend(pm.tolist())
+        self._marker.extend(marker.tolist())

@@ -282,4 +282,5 @@ def carried_over(state: SharedState, start: EpochStart) -> SharedState:
     if motion is None:
         return state
     moved_pose = state.trus_T_camera()[0] @ inverse(motion)
-    return replace(state, rotation=moved_pose[None, None, :3, :3], translation_mm=moved_pose[None, None, :3, 3])
+    rotation, translation_mm = moved_pose[None, None, :3, :3].copy(), moved_pose[None, None, :3, 3].copy()
+    return replace(state, rotation=rotation, translation_mm=translation_mm)

@@ -237,9 +237,7 @@ def _beginning(
             pose[:3, 3] -= state.bias_mm[0]
             values.insert(markers[shot], gtsam.Pose3(pose))
             values.insert(lambdas[shot], float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin)))
-        own = math.atan2(
-            float(trus_p[1]) - radius_mm * math.sin(scan), float(trus_p[2]) - radius_mm * math.cos(scan)
-        )
+        own = math.atan2(float(trus_p[1]) - radius_mm * math.sin(scan), float(trus_p[2]) - radius_mm * math.cos(scan))
         values.insert(thetas[i], own)
     return values
 
