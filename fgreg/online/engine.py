@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Literal
 
@@ -30,7 +31,9 @@ from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
 from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
+from fgreg.online.numbers import Sink, Source
 from fgreg.online.rest import Rest, rested, with_effort
+from fgreg.online.rest_codec import read_rest, write_rest
 from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
 from fgreg.online.state import EpochData, Recent, State, make_setting
@@ -76,6 +79,7 @@ class OnlineRegistration:
         self._t = -math.inf
         self._serial = 0
         self._judgement: Judgement | None = None
+        self._caught: Judgement | None = None
         self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
         self._surface: SurfaceMap | None = None
         kinds: dict[str, Callable[[], Judge]] = {
@@ -196,33 +200,50 @@ class OnlineRegistration:
         """
         usual, deferred = self._judge, DeferredJudge()
         self._judge = None if usual is None else deferred
+        self._caught = None
         try:
             yield
         finally:
             self._judge = usual
         if deferred.case is not None:
             found, _ = judge(deferred.case, self._model, self._config, self._prior)
-            self._surface = found.surface or self._surface
+            self._caught, self._surface = found, found.surface or self._surface
             if found.epoch == self._state.epoch:
                 self._judgement = found
                 self._estimate = self._report(self._state, self._estimate.t, found)
 
-    def rest(self) -> tuple[Rest, MeasurementStore] | None:
-        """What a session can be taken up from, where the last event ended with a rest; and the measurements."""
-        window = self._state.window
-        if window is None or window.seed is None:
+    def rest(self) -> Callable[[Sink], None] | None:
+        """What writes down the engine as it is now (at any later time), where the last event ended with a rest."""
+        state = self._state
+        if state.window is None or state.window.seed is None:
             return None
-        found = Rest(self._state, self._t, self._serial, self._estimate.t, self._judgement, self._surface)
-        return found, self._tools.store
+        found = Rest(state, self._t, self._serial, self._estimate.t, self._judgement, self._surface)
+        write = self._write_caught if isinstance(self._judge, DeferredJudge) else self._write
+        return partial(write, found)
 
-    def resume(self, rest: Rest, store: MeasurementStore) -> OnlineEstimate:
-        """Go on from a rest of an engine with the same model and configuration.
+    def _write(self, rest: Rest, sink: Sink) -> None:
+        write_rest(sink, rest, self._tools.store.aims, self._tools.store)
+
+    def _write_caught(self, rest: Rest, sink: Sink) -> None:
+        """Write a rest from :meth:`catching_up`, with what was judged only at its end."""
+        found = self._caught
+        if found is not None and found.serial > rest.serial:
+            raise ValueError("nothing was judged up to there")
+        if found is not None:
+            rest = replace(rest, judgement=found, surface=found.surface or rest.surface)
+        self._write(rest, sink)
+
+    def resume(self, source: Source) -> OnlineEstimate:
+        """Go on from a rest of an engine with the same model and configuration; the source has to end with it.
 
         Raises:
-            ValueError: this engine has taken in something already.
+            ValueError: it holds something else, or this engine has taken in something already.
+            RuntimeError, ArithmeticError: the window cannot be opened.
         """
         if self._serial:
             raise ValueError("events were taken in already")
+        rest, store = read_rest(source, self._tools.setting)
+        source.finish()
         self._tools = replace(self._tools, store=store)
         self._state, self._t, self._serial = rest.state, rest.t, rest.serial
         self._judgement, self._surface = rest.judgement, rest.surface

@@ -17,8 +17,10 @@ import numpy as np
 from fgreg.frames import FloatArray
 from fgreg.measurements import Pair
 from fgreg.online.judge import Judgement
+from fgreg.online.restart import AIMS_IN_CHUNK
 from fgreg.online.shared import Layout
-from fgreg.online.state import SETTLED_MANY, Setting, State, sigma_distance, summary
+from fgreg.online.state import RECENT, SETTLED_MANY, STEP, WINDOW, Setting, State, sigma_distance, summary
+from fgreg.online.summary import CHUNK
 from fgreg.online.window import (
     Group,
     GroupSeed,
@@ -37,6 +39,9 @@ more: so much at most is to be taken in again when a session is opened, and what
 SHARE: Final = 8
 EFFORTS: Final = ((8, 40), (40, 8), (160, 2))
 """Up to so many pairs of an epoch an event takes so many times as long as later ones."""
+
+CONSTANTS: Final = (CHUNK, WINDOW, STEP, RECENT, AIMS_IN_CHUNK, LEAST_EFFORT, SHARE, EFFORTS)
+"""What a rest that is taken up by another program has to have in common with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
