@@ -89,7 +89,8 @@ class Checkpoints:
     """A session's checkpoints.
 
     Attributes:
-        note: why the last one was not written or not taken up; empty where it was.
+        note: why none was taken up when the session was opened; empty where one was.
+        trouble: why the last one was not written; empty where it was.
     """
 
     def __init__(self, folder: Path, config: SolveConfig) -> None:
@@ -97,7 +98,7 @@ class Checkpoints:
         # Whatever the numbers depend on: others make them useless, and nobody would see it.
         made_by = (__version__, np.__version__, version("gtsam"), CONSTANTS, config)
         self._made_by = hashlib.sha256(repr(made_by).encode()).hexdigest()
-        self.note = ""
+        self.note = self.trouble = ""
         self._next: Moment | None = None
         self._thread: Thread | None = None
         self._lock = Lock()
@@ -127,9 +128,9 @@ class Checkpoints:
                     return
             try:
                 self._write(moment)
-                self.note = ""
+                self.trouble = ""
             except Exception as error:  # the session does without
-                self.note = f"no checkpoint was written: {error}"
+                self.trouble = f"no checkpoint was written: {error}"
 
     def _write(self, moment: Moment) -> None:
         sink = Sink()

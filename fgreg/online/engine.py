@@ -218,18 +218,19 @@ class OnlineRegistration:
         if state.window is None or state.window.seed is None:
             return None
         found = Rest(state, self._t, self._serial, self._estimate.t, self._judgement, self._surface)
-        write = self._write_caught if isinstance(self._judge, DeferredJudge) else self._write
-        return partial(write, found)
+        if isinstance(self._judge, DeferredJudge):
+            return partial(self._write_caught, found, self._judge.case)
+        return partial(self._write, found)
 
     def _write(self, rest: Rest, sink: Sink) -> None:
         write_rest(sink, rest, self._tools.store.aims, self._tools.store)
 
-    def _write_caught(self, rest: Rest, sink: Sink) -> None:
-        """Write a rest from :meth:`catching_up`, with what was judged only at its end."""
-        found = self._caught
-        if found is not None and found.serial > rest.serial:
-            raise ValueError("nothing was judged up to there")
-        if found is not None:
+    def _write_caught(self, rest: Rest, case: Case | None, sink: Sink) -> None:
+        """Write a rest from :meth:`catching_up`, judged as it was due up to there."""
+        if case is not None:
+            found = self._caught
+            if found is None or found.serial != case.serial:
+                found, _ = judge(case, self._model, self._config, self._prior)
             rest = replace(rest, judgement=found, surface=found.surface or rest.surface)
         self._write(rest, sink)
 
