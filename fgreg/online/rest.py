@@ -30,6 +30,7 @@ from fgreg.online.window import (
     factors_of,
     open_window,
     private_keys,
+    windows_of,
 )
 from fgreg.tracking import SurfaceMap
 
@@ -116,7 +117,7 @@ def window_of(seed: WindowSeed, state: State, setting: Setting) -> Window:
 
 def _group(seed: GroupSeed, layout: Layout, epoch: int, setting: Setting, first: int) -> Group:
     pairs = seed.bundle.pairs
-    graph = factors_of(pairs, layout, epoch, setting.model, first)
+    graph = factors_of(pairs, windows_of(pairs, setting.model), layout, epoch, setting.model, first)
     values = gtsam.Values() if seed.values is None else _private_values(pairs, first, seed.values)
     return Group(seed.bundle, Prepared(graph, values, seed.rows, seed.residual, seed.state, seed.far, first))
 

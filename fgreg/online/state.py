@@ -32,6 +32,7 @@ from fgreg.online.summary import (
     make_chunk,
     passed_on,
     summed,
+    with_more,
     without_pms,
     without_priors,
 )
@@ -40,8 +41,11 @@ from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import junk_p_of
 
 NOTHING = Shelf()
-WINDOW, STEP = 24, 8
-"""Most groups in the window, and how many of the oldest go into the summary at once when one more comes."""
+WINDOW, STEP = 17, 5
+"""Most groups in the window, and how many of the oldest go into the summary at once when one more comes. No multiple of
+the events between other work (fgreg.online.updates), which would always have to stand back at the same places."""
+NEAR_PAIRS = 160
+"""Up to so many pairs of an epoch, its chunks and the aims are linearised anew whenever the estimate moves much."""
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
@@ -244,8 +248,11 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 # --- groups into chunks ---------------------------------------------------------------------------------------------
 
 
-def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Setting) -> Shelf:
-    """The shelf with more PMs, the open chunk filled first and linearised anew."""
+def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Setting, *, whole: bool = True) -> Shelf:
+    """The shelf with more PMs, the open chunk filled first.
+
+    ``whole``: it is linearised anew; else only what comes to it is linearised here.
+    """
     left = list(groups)
     while left:
         before = shelf.open
@@ -255,6 +262,10 @@ def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Se
         places = np.array([place for group in now for place in group.places], dtype=np.int64)
         problem, kept = setting.pack((), pairs), np.array([group.kept for group in now])
         private: PrivateState | None = None
+        if before is not None and not whole:
+            more = make_chunk(places, problem, kept, at)
+            shelf = shelf.with_open(with_more(before, more, setting.columns), setting.columns)
+            continue
         if before is not None:
             private = joined_private(before.private, initial_private(problem, at))
             problem, places = joined(before.problem, problem), np.concatenate([before.places, places])
@@ -325,7 +336,8 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     if len(window.groups) < WINDOW:
         return state, ()
     oldest = window.groups[:STEP]
-    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting)
+    whole = state.epoch_pairs <= NEAR_PAIRS
+    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting, whole=whole)
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 

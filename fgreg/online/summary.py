@@ -23,7 +23,7 @@ from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.measurements import POSE_FLOOR, EpochStart, usable_covariance
 from fgreg.online.shared import Quadratic
 
-CHUNK = 128
+CHUNK = 64
 """PMs in a chunk that is full."""
 FAR_RAD = 5e-3
 """Turn beyond which a sum of quadratics is formed anew about a state near by, rather than carried on."""
@@ -128,6 +128,19 @@ def _honest(parts: Parts, before: PrivateState) -> Parts:
         return parts
     cost = np.where(wanders, np.maximum(parts.pm.cost, WANDERING_CHI2), parts.pm.cost)
     return replace(parts, pm=replace(parts.pm, cost=cost))
+
+
+def with_more(chunk: Chunk, more: Chunk, columns: Columns) -> Chunk:
+    """A chunk with more PMs of its epoch that are linearised already; its own stay linearised where they are."""
+    state = more.quadratic.state
+    return Chunk(
+        np.concatenate([chunk.places, more.places]),
+        joined(chunk.problem, more.problem),
+        np.concatenate([chunk.kept, more.kept]),
+        joined_private(chunk.private, more.private),
+        chunk.quadratic.at(state, columns).plus(more.quadratic),
+        chunk.count + more.count,
+    )
 
 
 def shots_of(chunk_problem: PackedProblem, parts: Parts) -> Contributions:

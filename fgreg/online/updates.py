@@ -13,6 +13,7 @@ from fgreg.measurements import Aim, EpochStart, Pair
 from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered
 from fgreg.online.shared import Layout, small_step
 from fgreg.online.state import (
+    NEAR_PAIRS,
     RECENT,
     SETTLED_FEW,
     SETTLED_MANY,
@@ -44,8 +45,6 @@ FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
-NEAR_PAIRS = 160
-"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
 VISIT, VISIT_EARLIER = 8, 64
 """A chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 

@@ -152,8 +152,9 @@ def prepare(
         FactorError: a factor that cannot be computed here.
         ArithmeticError: numbers that are not finite.
     """
-    graph = factors_of(pairs, layout, epoch, model, first)
-    private = _beginning(pairs, layout, state, model, first)
+    windows = windows_of(pairs, model)
+    graph = factors_of(pairs, windows, layout, epoch, model, first)
+    private = _beginning(pairs, windows, layout, state, model, first)
     held = gtsam.Values()
     layout.insert(held, state, epoch)
     values, rows, residual, far = _settle(graph, private, held, private_sizes(pairs, first), layout, epoch)
@@ -166,22 +167,25 @@ def private_sizes(pairs: Sequence[Pair], first: int) -> dict[int, int]:
     return {**dict.fromkeys(markers, 6), **dict.fromkeys(lambdas, 1), point: 3, **dict.fromkeys(thetas, 1)}
 
 
-def _windows(pairs: Sequence[Pair], model: SessionModel) -> tuple[list[float], list[float], list[float]]:
+Windows = tuple[list[float], list[float], list[float]]
+
+
+def windows_of(pairs: Sequence[Pair], model: SessionModel) -> Windows:
     """Centre, gain of the edge, and sigma of each look's rotation."""
     priors = sensitivity_priors([pair.look for pair in pairs], model.probe, model.stage.step_rad)
     return priors.centre_rad.tolist(), priors.edge_gain.tolist(), priors.sigma_rad.tolist()
 
 
 def factors_of(
-    pairs: Sequence[Pair], layout: Layout, epoch: int, model: SessionModel, first: int
+    pairs: Sequence[Pair], windows: Windows, layout: Layout, epoch: int, model: SessionModel, first: int
 ) -> gtsam.NonlinearFactorGraph:
-    """The looks at one PM as factors (arguments as of :func:`prepare`)."""
+    """The looks at one PM as factors (arguments as of :func:`prepare`; ``windows`` as of :func:`windows_of`)."""
     markers, lambdas, point, thetas = private_keys(pairs, first)
     shared, columns = layout.keys(epoch), layout.columns
     bias = Variable.marker_bias.key() if columns.bias is not None else None
     ratio = Variable.sound_speed_ratio.key() if columns.sound_speed is not None else None
     radius_mm = model.probe.radius_mm
-    centres, gains, sigmas = _windows(pairs, model)
+    centres, gains, sigmas = windows
     graph = gtsam.NonlinearFactorGraph()
     shot_of: dict[int, int] = {}
     for i, pair in enumerate(pairs):
@@ -207,12 +211,12 @@ def factors_of(
 
 
 def _beginning(
-    pairs: Sequence[Pair], layout: Layout, state: SharedState, model: SessionModel, first: int
+    pairs: Sequence[Pair], windows: Windows, layout: Layout, state: SharedState, model: SessionModel, first: int
 ) -> gtsam.Values:
     """Where the private variables begin: the PM on the first look's arc, in the middle of where it may be."""
     markers, lambdas, point, thetas = private_keys(pairs, first)
     radius_mm = model.probe.radius_mm
-    centres, gains, _ = _windows(pairs, model)
+    centres, gains, _ = windows
     look = pairs[0].look
     reach = float(state.sound_speed_ratio[0]) * look.range_mm
     expected = centres[0] + gains[0] * float(state.edge_rad[0])
