@@ -15,6 +15,7 @@ from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray
+from fgreg.graph.explicit import Variable
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
@@ -248,10 +249,16 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 # --- groups into chunks ---------------------------------------------------------------------------------------------
 
 
-def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Setting, *, whole: bool = True) -> Shelf:
+def shelved(
+    shelf: Shelf,
+    groups: Sequence[Bundle],
+    at: SharedState,
+    setting: Setting,
+    points: Sequence[FloatArray] | None = None,
+) -> Shelf:
     """The shelf with more PMs, the open chunk filled first.
 
-    ``whole``: it is linearised anew; else only what comes to it is linearised here.
+    ``points``: of the PMs (3,) at that state; only what comes to the open chunk is then linearised there, else all.
     """
     left = list(groups)
     while left:
@@ -262,9 +269,12 @@ def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Se
         places = np.array([place for group in now for place in group.places], dtype=np.int64)
         problem, kept = setting.pack((), pairs), np.array([group.kept for group in now])
         private: PrivateState | None = None
-        if before is not None and not whole:
-            more = make_chunk(places, problem, kept, at)
-            shelf = shelf.with_open(with_more(before, more, setting.columns), setting.columns)
+        if points is not None:
+            start = replace(initial_private(problem, at), trus_p_pm=np.array(points[: len(now)])[None])
+            points = points[len(now) :]
+            more = make_chunk(places, problem, kept, at, start, rounds=1)
+            whole = more if before is None else with_more(before, more, setting.columns)
+            shelf = shelf.with_open(whole, setting.columns)
             continue
         if before is not None:
             private = joined_private(before.private, initial_private(problem, at))
@@ -336,8 +346,11 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     if len(window.groups) < WINDOW:
         return state, ()
     oldest = window.groups[:STEP]
-    whole = state.epoch_pairs <= NEAR_PAIRS
-    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting, whole=whole)
+    points = None
+    if state.epoch_pairs > NEAR_PAIRS and all(group.kept for group in oldest):
+        keys = [Variable.trus_p_pm.key(group.prepared.first) for group in oldest]
+        points = [window.isam.calculateEstimatePoint3(key) for key in keys]
+    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting, points)
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 
