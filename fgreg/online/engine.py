@@ -372,14 +372,7 @@ class OnlineRegistration:
 def _looks_kept(state: State) -> int:
     """Looks of the epoch that lasts that count."""
     kept = sum(len(group.bundle.pairs) for group in (state.window.groups if state.window else ()) if group.kept)
-    shelf = state.now.shelf
-    for chunk in shelf.chunks:
-        # One look a PM is the rule, and then no array needs to be looked at.
-        if len(chunk.problem.look_pm) == len(chunk.kept):
-            kept += chunk.count
-        else:
-            kept += int(chunk.kept[chunk.problem.look_pm].sum())
-    return kept
+    return kept + state.now.shelf.counts[2]
 
 
 # --- checks ---------------------------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from fgreg.online.rest import Rest, private_count, window_of
 from fgreg.online.shared import Layout, Quadratic
 from fgreg.online.state import EpochData, Recent, Setting, State
 from fgreg.online.store import MeasurementStore
-from fgreg.online.summary import Chunk, Shelf
+from fgreg.online.summary import Chunk, Shelf, plus_tally, tally_of
 from fgreg.online.window import Bundle, GroupSeed, WindowSeed
 from fgreg.tracking import SurfaceMap
 from fgreg.tracking.surface_map import NODES
@@ -257,7 +257,10 @@ class _Reader:
         state = self.shared() if has_state else None
         full, has_open = source.integer(0, pairs), source.flag()
         chunks = [self._pair_chunk(first) for _ in range(full + has_open)]
-        shelf = Shelf(tuple(chunks[:full]), self.optional_quadratic(), chunks[full] if has_open else None)
+        tally = (0, 0, 0)
+        for chunk in chunks[:full]:
+            tally = plus_tally(tally, tally_of(chunk))
+        shelf = Shelf(tuple(chunks[:full]), self.optional_quadratic(), chunks[full] if has_open else None, tally)
         if full and shelf.total is None:
             raise ValueError("full chunks without their sum")
         return EpochData(EpochStart(t, motion, covariance), first, shelf, state)

@@ -309,8 +309,8 @@ def without_label(shelf: Shelf, label: int, at: SharedState, columns: Columns) -
 
 def counts(state: State) -> tuple[int, int]:
     """PMs that are kept, and all, over the epochs that have a registration."""
-    chunks = [chunk for data in state.epochs for chunk in data.shelf.chunks]
-    kept, every = sum(chunk.count for chunk in chunks), sum(len(chunk.kept) for chunk in chunks)
+    tallies = [data.shelf.counts for data in state.epochs]
+    kept, every = sum(tally[0] for tally in tallies), sum(tally[1] for tally in tallies)
     groups = state.window.groups if state.window is not None else ()
     return kept + sum(group.kept for group in groups), every + len(groups)
 

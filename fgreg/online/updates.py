@@ -132,7 +132,7 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
 def pms_in_epoch(state: State) -> int:
     """PMs of the epoch that lasts."""
     groups = state.window.groups if state.window is not None else ()
-    return len(groups) + sum(len(chunk.kept) for chunk in state.now.shelf.chunks)
+    return len(groups) + state.now.shelf.counts[1]
 
 
 def open_window_again(state: State, window: Window, setting: Setting) -> Window:
