@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Literal
 
@@ -33,6 +34,9 @@ from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
 from fgreg.online.guard import MoveGuard, WatchKind
 from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
+from fgreg.online.numbers import Sink, Source
+from fgreg.online.rest import Noticed, Rest, rested, with_effort
+from fgreg.online.rest_codec import read_rest, write_rest
 from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
 from fgreg.online.state import EpochData, Recent, State, kept_by_place, make_setting
@@ -82,6 +86,7 @@ class OnlineRegistration:
         self._t = -math.inf
         self._serial = 0
         self._judgement: Judgement | None = None
+        self._caught: Judgement | None = None
         self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
         self._surface: SurfaceMap | None = None
         kinds: dict[str, Callable[[], Judge]] = {
@@ -127,7 +132,7 @@ class OnlineRegistration:
         before = self._state
         try:
             guard, said = self._guard.see(event) if isinstance(event, StaticTags) else (None, None)
-            state = self._next(event, said)
+            state = rested(with_effort(self._next(event, said)), self._tools.setting)
             estimate = self._report(state, event.t, self._judgement)
         except EventRefused:
             raise
@@ -137,7 +142,7 @@ class OnlineRegistration:
         if isinstance(event, Pair):
             self._tools.store.append(event)
         elif isinstance(event, Aim):
-            self._tools.store.aims.append(event)
+            self._tools.store.append_aim(event)
         self._state, self._t = state, event.t
         self._serial += 1
         moved = state.epoch != before.epoch
@@ -200,7 +205,7 @@ class OnlineRegistration:
 
     def _reassign(self, last: int, start: EpochStart) -> None:
         nis, place = self._state.nis, self._state.pairs - 1
-        state = with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last)
+        state = with_effort(with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last))
         state = replace(state, nis=nis, used=nis is not None and is_kept(state, place))
         estimate = self._report(state, max(self._t, start.t), self._judgement)
         self._state, self._estimate = state, estimate
@@ -281,16 +286,61 @@ class OnlineRegistration:
         usual, deferred = self._judge, DeferredJudge()
         self._judge = None if usual is None else deferred
         self._guard.pause()
+        self._caught = None
         try:
             yield
         finally:
             self._judge = usual
         if self._guard.resume(self._state, self._serial, self._tools.store):
             self._adopt_found(self._t)
-        if deferred.case is not None and deferred.case.epoch == self._state.epoch:
+        if deferred.case is not None:
             found, _ = judge(deferred.case, self._model, self._config, self._prior)
-            self._judgement = found
-            self._estimate = self._report(self._state, self._estimate.t, found)
+            self._caught, self._surface = found, found.surface or self._surface
+            if found.epoch == self._state.epoch:
+                self._judgement = found
+                self._estimate = self._report(self._state, self._estimate.t, found)
+
+    def rest(self) -> Callable[[Sink], None] | None:
+        """What writes down the engine as it is now (at any later time), where the last event ended with a rest."""
+        state = self._state
+        if state.window is None or state.window.seed is None:
+            return None
+        noticed = Noticed(tuple(self._moves), tuple(self._returns), self._suspicion)
+        found = Rest(state, self._t, self._serial, self._estimate.t, self._judgement, self._surface, noticed)
+        if isinstance(self._judge, DeferredJudge):
+            return partial(self._write_caught, found, self._judge.case)
+        return partial(self._write, found)
+
+    def _write(self, rest: Rest, sink: Sink) -> None:
+        write_rest(sink, rest, self._tools.store.aims, self._tools.store)
+
+    def _write_caught(self, rest: Rest, case: Case | None, sink: Sink) -> None:
+        """Write a rest from :meth:`catching_up`, judged as it was due up to there."""
+        if case is not None:
+            found = self._caught
+            if found is None or found.serial != case.serial:
+                found, _ = judge(case, self._model, self._config, self._prior)
+            rest = replace(rest, judgement=found, surface=found.surface or rest.surface)
+        self._write(rest, sink)
+
+    def resume(self, source: Source) -> OnlineEstimate:
+        """Go on from a rest of an engine with the same model and configuration; the source has to end with it.
+
+        Raises:
+            ValueError: it holds something else, or this engine has taken in something already.
+            RuntimeError, ArithmeticError: the window cannot be opened.
+        """
+        if self._serial:
+            raise ValueError("events were taken in already")
+        rest, store = read_rest(source, self._tools.setting)
+        source.finish()
+        self._tools = replace(self._tools, store=store)
+        self._state, self._t, self._serial = rest.state, rest.t, rest.serial
+        self._judgement, self._surface = rest.judgement, rest.surface
+        self._moves, self._returns = list(rest.noticed.moves), list(rest.noticed.returns)
+        self._noticed, self._suspicion = rest.noticed.texts(), rest.noticed.suspicion
+        self._estimate = self._report(self._state, rest.estimate_t, rest.judgement)
+        return self._estimate
 
     # --- what is known ----------------------------------------------------------------------------------------------
 
@@ -428,11 +478,4 @@ class OnlineRegistration:
 def _looks_kept(state: State) -> int:
     """Looks of the epoch that lasts that count."""
     kept = sum(len(group.bundle.pairs) for group in (state.window.groups if state.window else ()) if group.kept)
-    shelf = state.now.shelf
-    for chunk in shelf.chunks:
-        # One look a PM is the rule, and then no array needs to be looked at.
-        if len(chunk.problem.look_pm) == len(chunk.kept):
-            kept += chunk.count
-        else:
-            kept += int(chunk.kept[chunk.problem.look_pm].sum())
-    return kept
+    return kept + state.now.shelf.counts[2]

@@ -14,6 +14,7 @@ from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
 from fgreg.frames import BoolArray, FloatArray
+from fgreg.graph.explicit import Variable
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
@@ -31,6 +32,7 @@ from fgreg.online.summary import (
     make_chunk,
     passed_on,
     summed,
+    with_more,
     without_pms,
     without_priors,
 )
@@ -39,8 +41,12 @@ from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import junk_p_of
 
 NOTHING = Shelf()
-WINDOW, STEP = 24, 8
-"""Most groups in the window, and how many of the oldest go into the summary at once when one more comes."""
+WINDOW, STEP = 17, 5
+"""Most groups in the window, and how many of the oldest go into the summary at once when one more comes. No multiple of
+the events between other work (fgreg.online.updates), which would always have to stand back at the same places."""
+NEAR_PAIRS = 160
+"""Up to so many pairs of an epoch, its chunks and the aims are linearised anew whenever the estimate moves much, and
+where there is junk all PMs are judged after every pair."""
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
@@ -137,6 +143,7 @@ class State:
         recent: oldest first.
         steps: events since the start, which the spreading of work goes by.
         nis, used: of the last event, where it was a pair.
+        effort: since the last rest (fgreg.online.rest).
     """
 
     epochs: tuple[EpochData, ...]
@@ -152,6 +159,7 @@ class State:
     steps: int = 0
     nis: float | None = None
     used: bool = False
+    effort: int = 0
 
     @property
     def epoch(self) -> int:
@@ -251,8 +259,17 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 # --- groups into chunks ---------------------------------------------------------------------------------------------
 
 
-def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Setting) -> Shelf:
-    """The shelf with more PMs, the open chunk filled first and linearised anew."""
+def shelved(
+    shelf: Shelf,
+    groups: Sequence[Bundle],
+    at: SharedState,
+    setting: Setting,
+    points: Sequence[FloatArray] | None = None,
+) -> Shelf:
+    """The shelf with more PMs, the open chunk filled first.
+
+    ``points``: of the PMs (3,) at that state; only what comes to the open chunk is then linearised there, else all.
+    """
     left = list(groups)
     while left:
         before = shelf.open
@@ -262,6 +279,13 @@ def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Se
         places = np.array([place for group in now for place in group.places], dtype=np.int64)
         problem, kept = setting.pack((), pairs), np.array([group.kept for group in now])
         private: PrivateState | None = None
+        if points is not None:
+            start = replace(initial_private(problem, at), trus_p_pm=np.array(points[: len(now)])[None])
+            points = points[len(now) :]
+            more = make_chunk(places, problem, kept, at, start, rounds=1)
+            whole = more if before is None else with_more(before, more, setting.columns)
+            shelf = shelf.with_open(whole, setting.columns)
+            continue
         if before is not None:
             private = joined_private(before.private, initial_private(problem, at))
             problem, places = joined(before.problem, problem), np.concatenate([before.places, places])
@@ -295,8 +319,8 @@ def without_label(shelf: Shelf, label: int, at: SharedState, columns: Columns) -
 
 def counts(state: State) -> tuple[int, int]:
     """PMs that are kept, and all, over the epochs that have a registration."""
-    chunks = [chunk for data in state.epochs for chunk in data.shelf.chunks]
-    kept, every = sum(chunk.count for chunk in chunks), sum(len(chunk.kept) for chunk in chunks)
+    tallies = [data.shelf.counts for data in state.epochs]
+    kept, every = sum(tally[0] for tally in tallies), sum(tally[1] for tally in tallies)
     groups = state.window.groups if state.window is not None else ()
     return kept + sum(group.kept for group in groups), every + len(groups)
 
@@ -343,7 +367,11 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     if len(window.groups) < WINDOW:
         return state, ()
     oldest = window.groups[:STEP]
-    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting)
+    points = None
+    if state.epoch_pairs > NEAR_PAIRS and all(group.kept for group in oldest):
+        keys = [Variable.trus_p_pm.key(group.prepared.first) for group in oldest]
+        points = [window.isam.calculateEstimatePoint3(key) for key in keys]
+    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting, points)
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 

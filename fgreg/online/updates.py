@@ -21,6 +21,7 @@ from fgreg.online.sorting import (
     toggled,
 )
 from fgreg.online.state import (
+    NEAR_PAIRS,
     RECENT,
     SETTLED_FEW,
     SETTLED_MANY,
@@ -54,9 +55,6 @@ FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
 JUDGED_PAIRS = 80
 """Up to so many, where there is junk, who counts is settled anew near the estimate when a PM is in or out wrongly."""
-NEAR_PAIRS = 160
-"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much, and where
-there is junk all PMs are judged after every pair."""
 VISIT, VISIT_EARLIER = 8, 64
 """A chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
@@ -165,7 +163,7 @@ def _judged_anew(state: State, pair: Pair, tools: Tools) -> State:
 def pms_in_epoch(state: State) -> int:
     """PMs of the epoch that lasts."""
     groups = state.window.groups if state.window is not None else ()
-    return len(groups) + sum(len(chunk.kept) for chunk in state.now.shelf.chunks)
+    return len(groups) + state.now.shelf.counts[1]
 
 
 def open_window_again(state: State, window: Window, setting: Setting) -> Window:
