@@ -111,8 +111,10 @@ def test_queries_are_answered_from_what_was_known_at_their_time(
     # What comes after a query cannot matter to it.
     path.write_text("".join(json.dumps(event) + "\n" for event in events[: events.index(late) + 1]))
     cut = replay_session(ReplayRequest(short), FAST, make_engine=make_engine).solved.estimate.tracks
-    assert [track.stage_rad for track in cut] == [track.stage_rad for track in whole]
-    assert [track.sigma_rad for track in cut] == [track.sigma_rad for track in whole]
+    for here, there in zip(cut, whole, strict=True):  # but for rounding, which arrays' places in memory decide
+        assert (here.stage_rad is None) == (there.stage_rad is None)
+        assert here.stage_rad == pytest.approx(there.stage_rad, abs=1e-9)
+        assert here.sigma_rad == pytest.approx(there.sigma_rad, abs=1e-9)
 
 
 def test_a_told_move_of_the_camera_begins_an_epoch(tmp_path: Path, make_engine: MakeEngine) -> None:
