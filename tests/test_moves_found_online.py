@@ -21,6 +21,7 @@ from fgreg.online import guard as guard_module
 from fgreg.online import watch as watch_module
 from fgreg.online.detect import events_in_order, find_moves, split_epochs
 from fgreg.online.evidence import MoveCase
+from fgreg.online.numbers import Sink, Source
 from fgreg.targets import tre_mm
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
@@ -369,3 +370,22 @@ def test_moves_found_before_are_taken_from_the_record_when_catching_up() -> None
     assert first.estimate.trus_T_camera is not None
     np.testing.assert_allclose(again.estimate.trus_T_camera, first.estimate.trus_T_camera, atol=1e-6)
     assert [e.t for e in again.measurements().epochs] == [e.t for e in first.measurements().epochs]
+
+
+def test_what_was_found_out_is_taken_up_again_with_the_engine() -> None:
+    model, measurements, _ = _session(3, SHIFT, 14)
+    unbroken, engine = OnlineRegistration(model, judge=None), OnlineRegistration(model, judge=None)
+    resumed = 0
+    for _, event in events_in_order(measurements):
+        expected, found = unbroken.add(event), engine.add(event)
+        assert (found.epoch, found.verdict, found.reasons) == (expected.epoch, expected.verdict, expected.reasons)
+        if (write := engine.rest()) is not None:
+            resumed, moves = resumed + bool(engine.moves), engine.moves
+            sink = Sink()
+            write(sink)
+            engine = OnlineRegistration(model, judge=None)
+            estimate = engine.resume(Source(sink.numbers()))
+            assert estimate.reasons == expected.reasons
+            assert engine.moves == moves
+    assert resumed
+    assert len(engine.moves) == 1
