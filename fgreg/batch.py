@@ -294,7 +294,7 @@ def _epoch_conditions(
     place, state = registration.epochs.index(epoch), registration.optimum.state
     mine = [pair for pair in registration.measurements.pairs if pair.epoch == place]
     search = registration.searches[epoch]
-    linked = any(link.index in (place - 1, place) for link in registration.problem.links)
+    linked = any(place in (link.old, link.new) for link in registration.problem.links)
     found = ambiguity(
         search,
         len({pair.pm for pair in mine}),

@@ -159,7 +159,8 @@ def right_from_parent_covariance(rotation: FloatArray, covariance: FloatArray) -
     turn = np.zeros((*np.asarray(rotation).shape[:-2], 6, 6))
     turn[..., :3, :3] = np.swapaxes(rotation, -1, -2)
     turn[..., 3:, 3:] = turn[..., :3, :3]
-    return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2))
+    turned = turn @ covariance @ np.swapaxes(turn, -1, -2)
+    return np.asarray(0.5 * (turned + np.swapaxes(turned, -1, -2)))  # symmetric to the last digit
 
 
 def parent_from_right_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:

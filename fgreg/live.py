@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
+from fgreg.checkpoint import Checkpoints, Moment, Resumable
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.estimate import TrackEstimate
@@ -30,7 +32,7 @@ from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.recognition import EventRecogniser
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.event_document import event_document, type_of, writable
@@ -56,6 +58,10 @@ class Engine(Protocol):
     def catching_up(self) -> AbstractContextManager[None]: ...
     @property
     def estimate(self) -> OnlineEstimate | None: ...
+    @property
+    def moves(self) -> tuple[DetectedMove, ...]: ...
+    @property
+    def returns(self) -> tuple[DetectedReturn, ...]: ...
 
 
 MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engine]
@@ -110,6 +116,7 @@ class LiveSession:
         estimate: after the last event that was taken in; None before the first.
         config: of the estimate.
         late: events may be handed over later than others that happened after them: they get the last one's time.
+        checkpoints: what spares it to take in all events again when it is opened.
     """
 
     def __init__(self, journal: Journal, engine: Engine, config: SolveConfig) -> None:
@@ -118,6 +125,10 @@ class LiveSession:
         self.late = False
         self._engine, self._feed = engine, EpochFeed(engine)
         self._recogniser = EventRecogniser(journal.model)
+        self.checkpoints = Checkpoints(journal.folder, config)
+        self._moment: Moment | None = None  # the last one that a checkpoint can be made of, while events of before come
+        self._begin, self._opening = 0, False
+        self._taken = array("q")  # lines of the events that are measurements in the engine
         self._untaken: list[Event] = []  # on disk, not in the estimate yet: an interrupt came between
         self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
 
@@ -140,8 +151,13 @@ class LiveSession:
         journal = Journal.open(folder)
         try:
             found = cls(journal, (make_engine or online_engine)(journal.model, config, None), config)
+            events = journal.take_recorded()
+            if isinstance(found._engine, Resumable) and not found._resume(events, found._engine):
+                note = found.checkpoints.note
+                found = cls(journal, (make_engine or online_engine)(journal.model, config, None), config)
+                found.checkpoints.note = note
             found.late = late
-            found._take_recorded()
+            found._take_recorded(events)
         except BaseException:
             journal.close()
             raise
@@ -157,18 +173,32 @@ class LiveSession:
 
     def close(self) -> None:
         """Unlock the session."""
+        self.checkpoints.close()
         self.journal.close()
 
-    def _take_recorded(self) -> None:
-        events = self.journal.take_recorded()
+    def _resume(self, events: Sequence[Event], engine: Resumable) -> bool:
+        """Go on from the checkpoint; whether there is one to go on from. If not, this session is spent."""
+        found = self.checkpoints.resume(events, self.journal.model, engine)
+        if found is None:
+            return False
+        self._begin, self._taken, self._recogniser = found.line, found.taken, found.recogniser
+        self._feed.epoch, self._feed.noticed = found.epoch, found.noticed
+        self.estimate = self._engine.estimate
+        return True
+
+    def _take_recorded(self, events: Sequence[Event]) -> None:
         refused = refused_lines(events)
+        self._opening = True
         with self._engine.catching_up():
             for event in events:
-                if event.line not in refused:
+                if event.line > self._begin and event.line not in refused:
                     with contextlib.suppress(EventRefused):  # noted now: the time before did not get so far
                         self._take(event)
         if self.estimate is not None:
             self.estimate = self._engine.estimate
+        self._opening = False
+        if self._moment is not None:
+            self.checkpoints.offer(self._moment)
         self._tell_moves()
         self._write_waiting()
 
@@ -290,6 +320,23 @@ class LiveSession:
             raise EventRefused(reason) from error
         if estimate is not None:
             self.estimate = estimate
+            if not isinstance(event, CameraMovedEvent):
+                self._taken.append(event.line)
+            self._rest(event.line)
+
+    def _rest(self, line: int) -> None:
+        """Let a checkpoint be written, where the engine has come to a rest with the event on a line."""
+        write = self._engine.rest() if isinstance(self._engine, Resumable) else None
+        if write is None:
+            return
+        feed = self._feed
+        moment = Moment(
+            write, line, feed.epoch, feed.noticed, self._recogniser.recollection(), self._taken, len(self._taken)
+        )
+        if self._opening:
+            self._moment = moment
+        else:
+            self.checkpoints.offer(moment)
 
     def _tell_moves(self) -> None:
         """Moves that the engine found out by itself become events: the epochs are then the same for every reader."""

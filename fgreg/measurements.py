@@ -92,11 +92,19 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochStart:
-    """Start of a camera epoch; the motion (and its 6x6 covariance, right tangent) where kinematics gave it."""
+    """Start of a camera epoch; the motion (and its 6x6 covariance, right tangent) where kinematics gave it.
+
+    ``after``: the epoch that the motion is counted from, an earlier one than the last where the camera came back to it.
+    """
 
     t: float
     camera_new_T_camera_old: FloatArray | None = None
     covariance: FloatArray | None = None
+    after: int | None = None
+
+    def old(self, index: int) -> int:
+        """The epoch that the motion is counted from, of an epoch with this index."""
+        return index - 1 if self.after is None else self.after
 
     @property
     def motion_known(self) -> bool:
@@ -122,6 +130,10 @@ def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) ->
 def usable_covariance(covariance: FloatArray, floor: Sequence[float]) -> FloatArray:
     """The covariance, with the floor's squares added where a direction of it is below the floor."""
     sigma = np.asarray(floor)
-    if np.linalg.eigvalsh(covariance / np.outer(sigma, sigma))[0] >= 1.0:
+    try:  # less the floor it has a Cholesky factor: a third of the time that its eigenvalues take
+        np.linalg.cholesky(covariance - np.diag(sigma**2))
+    except np.linalg.LinAlgError:
+        pass
+    else:
         return covariance
     return np.asarray(covariance + np.diag(sigma**2))

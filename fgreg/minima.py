@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.config import SolveConfig
+from fgreg.consensus import consensus_beams, consensus_starts
 from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray, inverse, transform_points
 from fgreg.graph.packing import PackedProblem, pack
@@ -24,8 +25,6 @@ from fgreg.measurements import Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.robust import (
     RobustOptimum,
-    consensus_beams,
-    consensus_starts,
     deviant,
     graduated,
     innovations_at,
@@ -147,7 +146,7 @@ def _is_clean(problem: PackedProblem, found: Optimum) -> bool:
         return False
     state, private = found.state.take([best]), found.evaluation.private.take([best])
     pm, aim = np.ones(len(problem.pms), dtype=bool), np.ones(len(problem.aims.rotation), dtype=bool)
-    beyond = deviant(problem, innovations_at(problem, state, pm, aim, private))
+    beyond = deviant(problem, innovations_at(problem, state, pm, aim, private), pm)
     return not (beyond.pm.any() or beyond.aim.any())
 
 

@@ -24,7 +24,7 @@ from fgreg.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEsti
 from fgreg.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.frames import FloatArray, transform_points
 from fgreg.models import SessionModel
-from fgreg.online.detect import DetectedMove, find_moves, renumbered, split_epochs
+from fgreg.online.detect import DetectedMove, EpochsFound, find_epochs, renumbered, split_epochs
 from fgreg.recognition import Recognised, load_trus_frame, looks_of, marker_pictures, recognise
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.ground_truth import GroundTruth
@@ -115,20 +115,22 @@ def solve_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        moves = find_moves(recognised.measurements, session.model, config) if request.detect_moves else ()
-        recognised = with_moves(recognised, moves)
-        conditions = [Condition(Verdict.WARNING, move.text) for move in moves]
+        prior = sound_speed_prior(recognised, config)
+        found = EpochsFound()
+        if request.detect_moves:
+            found = find_epochs(recognised.measurements, session.model, config, prior)
+        recognised = with_moves(recognised, found)
+        conditions = move_conditions(found)
         solution = solve(
             recognised.measurements,
             recognised.tracks,
             session.model,
             config,
             [*conditions, *detection_conditions(recognised, config)],
-            sound_speed_prior(recognised, config),
+            prior,
         )
         estimate = session_estimate(session, recognised, solution)
-        same_epochs = truth is not None and (not moves or len(truth.trus_T_camera) == len(estimate.epochs))
-        errors = truth_errors(estimate, truth, session.model.targets_mm) if truth is not None and same_epochs else None
+        errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         show(viewer, session, recognised, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -146,18 +148,23 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
     remove_result(result_path)
 
 
-def with_moves(recognised: Recognised, moves: Sequence[DetectedMove]) -> Recognised:
+def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
     """The session's events with camera moves in place that were found out: epochs of pairs and tracks follow."""
-    if not moves:
+    if not found.texts:
         return recognised
-    epoch_of = renumbered(recognised.epoch_of, recognised.pair_events, moves)
+    epoch_of = renumbered(recognised.epoch_of, recognised.pair_events, found.moves)
     tracks = zip(recognised.track_events, recognised.tracks, strict=True)
     return replace(
         recognised,
-        measurements=split_epochs(recognised.measurements, moves),
+        measurements=split_epochs(recognised.measurements, found.moves, found.returns),
         tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
         epoch_of=epoch_of,
     )
+
+
+def move_conditions(found: EpochsFound) -> list[Condition]:
+    """What moves that were found out mean for the verdict."""
+    return [Condition(Verdict.WARNING, text) for text in found.texts]
 
 
 def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:
@@ -212,6 +219,15 @@ def session_estimate(session: Session, recognised: Recognised, solution: Solutio
         tracks=tuple(tracks[i] for i in sorted(tracks)),
         aims=tuple(aims[i] for i in sorted(aims)),
     )
+
+
+def errors_where_known(
+    estimate: SessionEstimate, truth: GroundTruth | None, moves: Sequence[DetectedMove], targets_mm: FloatArray
+) -> TruthErrors | None:
+    """:func:`truth_errors`; None without a truth, or where moves that were found make other epochs than it has."""
+    if truth is None or (moves and len(truth.trus_T_camera) != len(estimate.epochs)):
+        return None
+    return truth_errors(estimate, truth, targets_mm)
 
 
 def truth_errors(estimate: SessionEstimate, truth: GroundTruth, targets_mm: FloatArray) -> TruthErrors:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from fgreg.detection.board import BoardFit, board_corner, detect_board
 from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
 from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
-from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.detection.noise import CornerNoise, Misfit, Weighed, pool_corner_noise
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.drivers.frame_files import read_array, read_picture
 from fgreg.errors import InputError
@@ -124,6 +124,13 @@ def load_trus_frame(path: Path, line: int, key: str, model: SessionModel) -> npt
 def needs_marker_frames(record: MarkerRecord, *, redetect: bool) -> bool:
     """Whether the marker is to be found in the frames rather than taken from the recorded pose."""
     return record.left is not None and (record.camera_T_marker is None or redetect)
+
+
+def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
+    """Equal for the same frames, or the same matrix."""
+    if needs_marker_frames(record, redetect=redetect) or record.camera_T_marker is None:
+        return record.left, record.right
+    return record.camera_T_marker.tobytes()
 
 
 def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Image, Image | None]:
@@ -293,7 +300,8 @@ class _Builder:
         self.pair_events: list[int] = []
         self.track_events: list[int] = []
         self.unused: dict[int, str] = {}
-        self._ids: dict[object, int] = {}
+        self.ids: dict[object, int] = {}
+        self.next_id = 0
 
     def add(self, index: int, event: Event, epoch: int) -> None:
         """Turn one event into a measurement, or note why not."""
@@ -332,13 +340,11 @@ class _Builder:
 
     def _marker(self, index: int, event: AimEvent | PairEvent | TrackEvent) -> MarkerObservation | str:
         record = event.marker
-        key: object
         if needs_marker_frames(record, redetect=self.redetect):
             fit = self.found.markers[index]
             if isinstance(fit, NotFound):
                 return fit.reason
             transform, covariance = fit.camera_T_marker, marker_covariance(fit, self.marker_noise)
-            key = (record.left, record.right)
         else:
             if record.camera_T_marker is None:
                 raise AssertionError("a marker is a pose or frames")
@@ -348,8 +354,11 @@ class _Builder:
                 if record.covariance is None
                 else record.covariance
             )
-            key = transform.tobytes()
-        number = self._ids.setdefault(key, len(self._ids))
+        key = _marker_key(record, redetect=self.redetect)
+        if key not in self.ids:
+            self.ids[key] = self.next_id
+            self.next_id += 1
+        number = self.ids[key]
         return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number)
 
     def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray] | str:
@@ -390,6 +399,20 @@ class _Builder:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Recollection:
+    """What an :class:`EventRecogniser` remembers of the events before, but for which marker got which number.
+
+    Attributes:
+        markers, boards: what detections left, in order.
+        next_id: the next new marker's number.
+    """
+
+    markers: tuple[Misfit, ...] = ()
+    boards: tuple[Misfit, ...] = ()
+    next_id: int = 0
+
+
 class EventRecogniser:
     """Recognises events one after another, as they come: corner noise is pooled over the frames so far.
 
@@ -400,8 +423,8 @@ class EventRecogniser:
     def __init__(self, model: SessionModel) -> None:
         nothing = pool_corner_noise(())
         self._builder = _Builder(model, _Found(), nothing, nothing, redetect=False)
-        self._marker_fits: list[MarkerFit] = []
-        self._board_fits: list[BoardFit] = []
+        self._markers: list[Misfit] = []
+        self._boards: list[Misfit] = []
         self._before = (0, 0)
 
     def add(self, event: AimEvent | PairEvent | TrackEvent, epoch: int) -> Aim | Pair | Track | str:
@@ -412,10 +435,11 @@ class EventRecogniser:
         """
         builder = self._builder
         found = builder.found = _detect([event], builder.model, redetect=False, progress=None)
-        self._before = len(self._marker_fits), len(self._board_fits)
-        self._marker_fits += [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
-        self._board_fits += [fit for fit in found.boards.values() if isinstance(fit, BoardFit)]
-        self._pool()
+        self._before = len(self._markers), len(self._boards)
+        self._markers += [_misfit(fit.pose) for fit in found.markers.values() if isinstance(fit, MarkerFit)]
+        self._boards += [_misfit(fit.pose) for fit in found.boards.values() if isinstance(fit, BoardFit)]
+        if found.markers or found.boards:
+            self._pool()
         builder.add(0, event, epoch)
         made: list[Aim | Pair | Track] = [*builder.aims, *builder.pairs, *builder.tracks]
         reason = builder.unused.get(0, "")
@@ -430,9 +454,32 @@ class EventRecogniser:
 
     def take_back(self) -> None:
         """Forget the last event: it was not taken in, and will not be there when the session is opened again."""
-        del self._marker_fits[self._before[0] :], self._board_fits[self._before[1] :]
+        if self._before != (len(self._markers), len(self._boards)):
+            del self._markers[self._before[0] :], self._boards[self._before[1] :]
+            self._pool()
+
+    def recollection(self) -> Recollection:
+        """What this recogniser goes by for the events to come."""
+        return Recollection(tuple(self._markers), tuple(self._boards), self._builder.next_id)
+
+    def recollect(self, markers: Iterable[tuple[MarkerRecord, int]], recollection: Recollection) -> None:
+        """Go on as the recogniser that gave these markers these numbers.
+
+        Raises:
+            ValueError: a number that had not been given out.
+        """
+        for record, number in markers:
+            if not 0 <= number < recollection.next_id:
+                raise ValueError(f"marker {number} of {recollection.next_id}")
+            self._builder.ids[_marker_key(record, redetect=False)] = number
+        self._builder.next_id = recollection.next_id
+        self._markers, self._boards = list(recollection.markers), list(recollection.boards)
         self._pool()
 
     def _pool(self) -> None:
-        self._builder.marker_noise = pool_corner_noise(fit.pose for fit in self._marker_fits)
-        self._builder.board_noise = pool_corner_noise(fit.pose for fit in self._board_fits)
+        self._builder.marker_noise = pool_corner_noise(self._markers)
+        self._builder.board_noise = pool_corner_noise(self._boards)
+
+
+def _misfit(fit: Weighed) -> Misfit:
+    return Misfit(float(fit.cost), int(fit.dof))

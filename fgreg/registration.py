@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +25,7 @@ from fgreg.measurements import EpochStart, Measurements
 from fgreg.minima import (
     MIN_KEPT_AIMS,
     MIN_KEPT_PMS,
+    SAME_MINIMUM_MM,
     EpochSearch,
     Minimum,
     calibrate_beam,
@@ -40,7 +41,6 @@ from fgreg.robust import (
     deviant,
     graduated_or_near,
     innovations_at,
-    junk_p,
     plausible_cost,
     predicted_pms,
     sort_shots,
@@ -54,6 +54,7 @@ __all__ = [
     "calibrate_beam",
     "choose_minimum",
     "register",
+    "register_near",
     "restrict_epochs",
     "search_epoch",
     "targets_moved",
@@ -121,9 +122,9 @@ Pack = Callable[[Measurements], PackedProblem]
 def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
     """Epochs with minima of their own or tied to such a one by measured camera motions."""
     known = {k for k, search in enumerate(searches) if search.minima}
-    tied = {k for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
+    tied = {k: epoch.old(k) for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
     for _ in range(len(searches)):
-        known |= {k for k in tied if k - 1 in known} | {k - 1 for k in tied if k in known}
+        known |= {k for k, old in tied.items() if old in known} | {old for k, old in tied.items() if k in known}
     return sorted(known)
 
 
@@ -138,10 +139,11 @@ def joint_start(
             motion = epoch.camera_new_T_camera_old
             if not k or motion is None or not epoch.motion_known:
                 continue
-            if k not in transforms and k - 1 in transforms:
-                transforms[k] = transforms[k - 1] @ inverse(motion)
-            elif k in transforms and k - 1 in solvable and k - 1 not in transforms:
-                transforms[k - 1] = transforms[k] @ motion
+            old = epoch.old(k)
+            if k not in transforms and old in transforms:
+                transforms[k] = transforms[old] @ inverse(motion)
+            elif k in transforms and old in solvable and old not in transforms:
+                transforms[old] = transforms[k] @ motion
     most = max(chosen, key=lambda k: sum(pair.epoch == k for pair in measurements.pairs))
     beam = chosen[most].state
     # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
@@ -186,12 +188,54 @@ def _best_start(
     return min(found, key=lambda optimum: float(optimum.evaluation.cost[0])).state
 
 
+def _told_apart(
+    measurements: Measurements,
+    searches: tuple[EpochSearch, ...],
+    is_open: set[int],
+    solvable: list[int],
+    start: SharedState,
+    model: SessionModel,
+    config: SolveConfig,
+) -> tuple[SharedState, set[int]]:
+    """Minima that an epoch's own pairs cannot tell apart, judged with all epochs: the start, and what stays open.
+
+    The other epochs know the beam and the window's edge better than the aims alone, and a measured motion rules out
+    all that is far from where it leads.
+    """
+    if len(solvable) < 2 or not is_open:
+        return start, is_open
+    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
+    left = set(is_open)
+    for epoch in sorted(is_open):
+        search, place = searches[epoch], solvable.index(epoch)
+        if not search.clean:
+            continue
+        rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
+        poses = [start.trus_T_camera(place)[0], *(rival.state.trus_T_camera()[0] for rival in rivals)]
+        many = start.take(np.zeros(len(poses), dtype=np.int64))
+        rotation, translation = many.rotation.copy(), many.translation_mm.copy()
+        rotation[:, place] = [pose[:3, :3] for pose in poses]
+        translation[:, place] = [pose[:3, 3] for pose in poses]
+        found = optimize(problem, replace(many, rotation=rotation, translation_mm=translation), max_iterations=30)
+        cost = np.where(np.isfinite(found.evaluation.cost), found.evaluation.cost, np.inf)
+        best = int(np.argmin(cost))
+        if not np.isfinite(cost[best]):
+            continue
+        start, ends = found.state.take([best]), found.state.trus_T_camera(place)
+        near = np.flatnonzero(cost - cost[best] < config.second_minimum_chi2)
+        if all(targets_moved(ends[best], ends[i], model.targets_mm) <= SAME_MINIMUM_MM for i in near):
+            left.discard(epoch)
+    return start, left
+
+
 def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
-    """Solvable epochs, grouped by measured motions between neighbours."""
+    """Solvable epochs, grouped by the measured motions between them."""
     out: list[list[int]] = []
     for k in solvable:
-        if out and out[-1][-1] == k - 1 and measurements.epochs[k].motion_known:
-            out[-1].append(k)
+        start = measurements.epochs[k]
+        chain = next((chain for chain in out if start.motion_known and start.old(k) in chain), None)
+        if chain is not None:
+            chain.append(k)
         else:
             out.append([k])
     return out
@@ -200,7 +244,12 @@ def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
 def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
     """The measurements of some epochs only, renumbered in order; a motion is kept where both its sides are."""
     place = {k: i for i, k in enumerate(epochs)}
-    starts = tuple(measurements.epochs[k] if k - 1 in place else EpochStart(measurements.epochs[k].t) for k in epochs)
+    starts = tuple(
+        replace(start, after=place[start.old(k)] if start.after is not None else None)
+        if start.old(k) in place
+        else EpochStart(start.t)
+        for k, start in ((k, measurements.epochs[k]) for k in epochs)
+    )
     pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
     return Measurements(measurements.aims, pairs, starts)
 
@@ -309,7 +358,7 @@ def _solve_jointly(
     if clean and aim_kept.all():
         optimum = optimize(whole, start, tolerance=1e-9)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
-        beyond = deviant(whole, found)
+        beyond = deviant(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
         if plausible and not (beyond.pm.any() or beyond.aim.any()):
             shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
@@ -334,7 +383,7 @@ def _solve_jointly(
     problem = packed(chosen)
     optimum = optimize(problem, judged.state, tolerance=1e-9)
     found = innovations_at(whole, optimum.state, *kept)
-    deviants = deviant(whole, found, junk_p(kept[0]))
+    deviants = deviant(whole, found, kept[0])
     private = initial_private(whole, optimum.state)
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)
@@ -366,6 +415,8 @@ def register(
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
     start = _best_start(measurements, chosen, solvable, model, config)
+    is_open = {k for k, (_, undecided) in choices.items() if undecided}
+    start, is_open = _told_apart(fitting, searches, is_open, solvable, start, model, config)
     clean = all(search.clean for search in searches)
 
     def packed(of: Measurements) -> PackedProblem:
@@ -377,6 +428,55 @@ def register(
         # A nominal beam given the wrong way round, and no aim to tell: +z is where the spots are.
         start = _turned(optimum.state, model)
         kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+    return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), (kept, problem, optimum, shots))
+
+
+def register_near(
+    measurements: Measurements,
+    model: SessionModel,
+    config: SolveConfig,
+    start: SharedState,
+    epochs: Sequence[int],
+    sound_speed: SoundSpeedPrior | None = None,
+) -> Registration:
+    """:func:`register` where it is known about where the optimum is: who is kept is settled anew, without a search.
+
+    What the wide losses and the narrow one lead to from ``start`` is what they lead :func:`register` to from the best
+    of all minima, where ``start`` is nearest to that one: which shots counted before has no say in it.
+
+    Args:
+        measurements: of the session.
+        model, config, sound_speed: as of :func:`register`.
+        start: one hypothesis, with the registrations of ``epochs``.
+        epochs: those to be solved.
+
+    Raises:
+        EstimationError: the shots leave the registration undetermined.
+    """
+
+    def packed(of: Measurements) -> PackedProblem:
+        return pack_session(of, model, config, sound_speed)
+
+    mine = restrict_epochs(measurements, list(epochs))
+    aims = np.ones(len(mine.aims), dtype=bool)
+    found = _solve_jointly(mine, packed, start, aims, clean=False)
+    searches = tuple(EpochSearch((), None, clean=False) for _ in measurements.epochs)
+    return _registration(model, tuple(epochs), searches, (), found)
+
+
+def _registration(
+    model: SessionModel,
+    epochs: tuple[int, ...],
+    searches: tuple[EpochSearch, ...],
+    ambiguous: tuple[int, ...],
+    found: tuple[Measurements, PackedProblem, Optimum, Shots],
+) -> Registration:
+    """What was found, with its covariance.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    kept, problem, optimum, shots = found
     hessian = optimum.evaluation.hessian[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     try:
@@ -387,11 +487,11 @@ def register(
     return Registration(
         model=model,
         measurements=kept,
-        epochs=tuple(solvable),
+        epochs=epochs,
         problem=problem,
         optimum=optimum,
         searches=searches,
-        ambiguous=tuple(k for k, (_, is_open) in choices.items() if is_open),
+        ambiguous=ambiguous,
         covariance=np.asarray(covariance, dtype=np.float64),
         shots=shots,
     )

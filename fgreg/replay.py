@@ -21,17 +21,19 @@ from fgreg.estimate import Quantiles, Timing, TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, PairEvent, TrackEvent, refused_lines
 from fgreg.live import Engine, EpochFeed, MakeEngine, online_engine
 from fgreg.measurements import Aim, Pair, Track
+from fgreg.online.detect import EpochsFound
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.pipeline import (
     RESULT_FILE,
     Progress,
     SolveReport,
     detection_conditions,
+    errors_where_known,
+    move_conditions,
     remove_older_result,
     session_estimate,
     show_frames,
     sound_speed_prior,
-    truth_errors,
 )
 from fgreg.recognition import Recognised, recognise
 from fgreg.session.reading import Session, read_ground_truth, read_session
@@ -137,19 +139,19 @@ def replay_session(
         engine = (make_engine or online_engine)(session.model, config, prior)
         player = _Player(session, recognised, engine, viewer, request.speed)
         player.play(on_step)
-        taken = player.taken()
+        taken, found = player.taken(), player.found()
         solution = solve(
             taken.measurements,
             (),
             session.model,
             config,
-            detection_conditions(recognised, config),
+            [*move_conditions(found), *detection_conditions(recognised, config)],
             prior,
         )
         settled = engine.settle() if player.estimate is not None else None
         estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())
         estimate = replace(estimate, tracks=player.answers(estimate.tracks))
-        errors = None if truth is None else truth_errors(estimate, truth, session.model.targets_mm)
+        errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         viewer.result(session.model, taken.measurements, estimate, truth, recognised.tracks)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -248,15 +250,26 @@ class _Player:
 
     def taken(self) -> Recognised:
         """What the engine took in: its measurements, the events behind them, and why others are not among them."""
-        recognised = self._recognised
+        recognised, measurements = self._recognised, self._engine.measurements()
+        epoch_of = recognised.epoch_of
+        if self._engine.moves:
+            began = [start.t for start in measurements.epochs[1:]]
+            epoch_of = tuple(sum(t <= event.t for t in began) for event in self._session.events)
         return replace(
             recognised,
-            measurements=self._engine.measurements(),
+            measurements=measurements,
+            epoch_of=epoch_of,
             aim_events=tuple(i for i in recognised.aim_events if i not in self._unused),
             pair_events=tuple(i for i in recognised.pair_events if i not in self._unused),
             tracks=(),
             unused=self._unused,
         )
+
+    def found(self) -> EpochsFound:
+        """What the engine found out and the session does not tell."""
+        told = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
+        moves = tuple(move for move in self._engine.moves if move.since_t not in told)
+        return EpochsFound(moves, self._engine.returns)
 
     def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
         """One per track event, in order; ``unanswered`` has the reasons of those that were not put to the engine."""

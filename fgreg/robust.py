@@ -1,9 +1,8 @@
-"""Junk among the shots: consensus from minimal sets, graduated truncated loss, and who is in or out by innovation.
+"""Junk among the shots: graduated truncated loss, and who is in or out by innovation.
 
 A false PM or a flipped marker is not noise: one such shot moves a least squares estimate by centimetres. Three steps:
 
-1. Consensus: the minimal solver (three points on three lines) over random triples, each solution scored by all lines
-   with a truncated cost (MSAC; Torr and Zisserman, 2000). For the beam: the lines through two aimed-at spots.
+1. Consensus of minimal sets: where to start (fgreg.consensus).
 2. Graduated loss: the chi square of each PM (and aim) on the reduced graph under a Cauchy loss that narrows, then a
    truncated one, by iteratively reweighted least squares from all starts side by side.
 3. Innovation: each shot against the estimate *without* it, in closed form. Chi square of known degrees of freedom
@@ -17,19 +16,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from typing import Any
 
 import numpy as np
-import poselib
 from scipy.special import chdtri
 
-from fgreg.frames import BoolArray, FloatArray, IntArray, inverse, log_so3, make_transform, transform_points
+from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced import Contributions, Parts, contributions, refine
-from fgreg.graph.reduced_blocks import PrivateState, arc_points, initial_private, perpendicular_basis
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Aim
 
 JUNK_P = 1e-3
 """A shot is junk where a good one would deviate as much this rarely."""
@@ -39,12 +35,6 @@ FEW = 0.05
 """So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
 TYPICAL_P = 3e-3
 IMPLAUSIBLE_P = 1e-4
-TRIPLES = 160
-"""Random triples of the consensus: at 60 % junk still ten of good pairs only."""
-STARTS = 24
-"""Distinct ones of their solutions to descend from: fewer miss the deepest minimum where only the window is known."""
-SEED = 40961
-SCORE_LIMIT = 13.8
 CAUCHY_SCALES = (100.0, 20.0, 4.0)
 """Squared scales of the narrowing Cauchy loss, in chi square."""
 STEPS_PER_SCALE = 3
@@ -67,6 +57,15 @@ def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
 def pm_limits(problem: PackedProblem, p: float = JUNK_P) -> FloatArray:
     """(J,) chi square beyond which a PM is junk."""
     return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), p))
+
+
+def limits_among(problem: PackedProblem, pm_kept: BoolArray, kept: int, count: int) -> FloatArray:
+    """(J,) chi square beyond which PMs, of which ``pm_kept`` count, are junk, where ``kept`` of ``count`` PMs count.
+
+    One that does not count is judged as if it did: one at the border is in, whether it was in before or not.
+    """
+    inside, outside = pm_limits(problem, junk_p_of(kept, count)), pm_limits(problem, junk_p_of(kept + 1, count))
+    return np.where(pm_kept, inside, outside)
 
 
 AIM_LIMIT = float(chdtri(2, JUNK_P))
@@ -108,116 +107,6 @@ def plausible_cost(problem: PackedProblem) -> float:
     seen = unknowns if len(problem.pms) else 4  # aims alone see the beam only
     equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
     return float(chdtri(max(equations - seen, 1), IMPLAUSIBLE_P))
-
-
-# --- 1. consensus ---------------------------------------------------------------------------------------------------
-
-
-def consensus_starts(
-    problem: PackedProblem, marker_T_beam: FloatArray, lambda_mm: float, keep: int = STARTS
-) -> FloatArray:
-    """Registrations that most PMs of a one-epoch problem agree on, best first.
-
-    Args:
-        problem: packed; the first look of each PM is used.
-        marker_T_beam: (4, 4), z along the beam.
-        lambda_mm: typical distance of a spot from the frame's origin, at which the beam's uncertainty is taken.
-        keep: at most so many distinct ones.
-
-    Returns:
-        (m, 4, 4) ``trus_T_camera``; empty for fewer than three PMs.
-    """
-    pms = len(problem.pms)
-    if pms < 3:
-        return np.zeros((0, 4, 4))
-    look = np.zeros(pms, dtype=np.int64)
-    look[problem.look_pm[::-1]] = np.arange(len(problem.look_pm))[::-1]
-    beam = problem.look_beam[look]
-    origin = problem.beams.rotation[beam] @ marker_T_beam[:3, 3] + problem.beams.translation_mm[beam]
-    direction = problem.beams.rotation[beam] @ marker_T_beam[:3, 2]
-    points = arc_points(problem, np.zeros(1))[0, look]
-
-    found = _minimal_poses(origin, direction, points)
-    if not len(found):
-        return np.zeros((0, 4, 4))
-    camera_R_trus, camera_t = found[:, :3, :3], found[:, :3, 3]
-    # Across the beam a PM is off by the beam's error and its own; along its arc by what the window leaves open.
-    covariance = problem.beams.covariance[beam]
-    reach = np.sqrt(lambda_mm**2 + float(marker_T_beam[:3, 3] @ marker_T_beam[:3, 3]))
-    variance = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
-    variance = variance + reach**2 * np.trace(covariance[:, :3, :3], axis1=1, axis2=2) / 3 + 1.0
-    radial = points - problem.radius_mm * np.stack(
-        [points[:, 0] * 0, np.sin(problem.looks.scan_rad[look]), np.cos(problem.looks.scan_rad[look])], axis=-1
-    )
-    tangent = np.stack([np.zeros(pms), radial[:, 2], -radial[:, 1]], axis=-1)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    slack = (problem.radius_mm + problem.looks.range_mm[look]) ** 2 / problem.looks.weight[look, 2, 2]
-    across = perpendicular_basis(direction)
-    camera_R_trus_t = camera_R_trus.swapaxes(1, 2)
-    gap = np.einsum("nia,sni->sna", across, points @ camera_R_trus_t + camera_t[:, None] - origin)
-    along_arc = np.einsum("nia,sni->sna", across, tangent @ camera_R_trus_t)
-    # (variance I + slack v v')^-1 by Sherman and Morrison.
-    projected = np.sum(gap * along_arc, axis=-1)
-    square = np.sum(gap**2, axis=-1) - slack * projected**2 / (variance + slack * np.sum(along_arc**2, axis=-1))
-    score = np.sum(np.minimum(square / variance, SCORE_LIMIT), axis=1)
-    chosen: list[int] = []
-    for index in np.argsort(score)[: 40 * keep]:
-        turn = log_so3(camera_R_trus[chosen].swapaxes(-1, -2) @ camera_R_trus[index]) if chosen else np.ones((1, 3))
-        if np.linalg.norm(turn, axis=-1).min() > 0.1:
-            chosen.append(int(index))
-        if len(chosen) == keep:
-            break
-    return inverse(found[chosen])
-
-
-def _minimal_poses(origin: FloatArray, direction: FloatArray, points: FloatArray) -> FloatArray:
-    """``camera_T_trus`` (m, 4, 4) of the minimal solver over triples of lines."""
-    count = len(points)
-    if count * (count - 1) * (count - 2) // 6 <= TRIPLES:
-        triples = np.array(list(combinations(range(count), 3)))
-    else:
-        triples = np.argsort(np.random.default_rng(SEED).random((TRIPLES, count)), axis=1)[:, :3]
-    rotations, translations = [], []
-    for rows in triples:
-        for pose in poselib.gp3p(origin[rows], direction[rows], points[rows]):
-            rotations.append(pose.R)
-            translations.append(pose.t)
-    if not rotations:
-        return np.zeros((0, 4, 4))
-    poses = make_transform(np.array(rotations), np.array(translations))
-    return poses[np.isfinite(poses).all(axis=(1, 2))]
-
-
-def consensus_beams(aims: tuple[Aim, ...], keep: int = 4) -> list[tuple[FloatArray, FloatArray]]:
-    """Beams (origin mm, unit direction, marker frame) through two aimed-at spots that most spots agree on."""
-    if len(aims) < 3:
-        return []
-    marker_p = np.array([transform_points(inverse(a.marker.camera_T_marker), a.camera_p_spot_mm) for a in aims])
-    first, second = np.array(list(combinations(range(len(aims)), 2))[:2000]).T
-    apart = marker_p[second] - marker_p[first]
-    length = np.linalg.norm(apart, axis=1)
-    long = length > 1.0
-    start, along = marker_p[first[long]], apart[long] / length[long, None]
-    variance = np.array(
-        [
-            (np.trace(a.covariance) + np.trace(a.marker.covariance[3:, 3:])) / 3
-            + p @ p * np.trace(a.marker.covariance[:3, :3]) / 3
-            for a, p in zip(aims, marker_p, strict=True)
-        ]
-    )
-    offset = marker_p - start[:, None]
-    square = np.sum(offset**2, axis=-1) - np.sum(offset * along[:, None], axis=-1) ** 2
-    score = np.sum(np.minimum(square / variance, SCORE_LIMIT), axis=1)
-    out: list[tuple[FloatArray, FloatArray]] = []
-    for index in np.argsort(score):
-        towards = along[index] if along[index] @ marker_p.mean(axis=0) >= 0 else -along[index]
-        if all(towards @ other < np.cos(0.05) for _, other in out):
-            inside = offset[index][square[index] < SCORE_LIMIT * variance]
-            centre = start[index] + inside.mean(axis=0)
-            out.append((centre - (centre @ towards) * towards, towards))
-        if len(out) == keep:
-            break
-    return out
 
 
 # --- 2. graduated loss ----------------------------------------------------------------------------------------------
@@ -453,9 +342,13 @@ class Deviants:
     aim: BoolArray
 
 
-def deviant(problem: PackedProblem, found: Innovations, p: float = JUNK_P) -> Deviants:
-    """Shots that deviate more than a good one may. Infinite innovations say nothing: the rest predicted nothing."""
-    pm, aim = found.pm > pm_limits(problem, p), found.aim > AIM_LIMIT
+def deviant(problem: PackedProblem, found: Innovations, pm_kept: BoolArray) -> Deviants:
+    """Shots that deviate more than a good one may, where these PMs (J,) count.
+
+    Infinite innovations say nothing: the rest predicted nothing.
+    """
+    limits = limits_among(problem, pm_kept, int(pm_kept.sum()), len(pm_kept))
+    pm, aim = found.pm > limits, found.aim > AIM_LIMIT
     return Deviants(pm & np.isfinite(found.pm), aim & np.isfinite(found.aim))
 
 
@@ -496,7 +389,7 @@ def sort_shots(
         descent.settle()
         state = descent.state
         found = innovations(descent.parts, pm_kept, aim_kept)
-        beyond = deviant(problem, found, junk_p(pm_kept))
+        beyond = deviant(problem, found, pm_kept)
         pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
         aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
         settled = bool((pm_next == pm_kept).all() and (aim_next == aim_kept).all())
@@ -516,4 +409,5 @@ def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted)
     _, hessian = _weighted(kept, _repeated(judged.pm_kept, kept.pm), _repeated(judged.aim_kept, kept.aim))
     none = np.zeros(len(others.pms), dtype=bool)
     innovation = _innovation(_Descent(others, judged.state).parts.pm, hessian[0], none)
-    return np.asarray(innovation < pm_limits(others, junk_p(judged.pm_kept)))
+    limits = limits_among(others, none, int(judged.pm_kept.sum()), len(judged.pm_kept))
+    return np.asarray(innovation <= limits)

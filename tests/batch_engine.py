@@ -13,7 +13,7 @@ from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.registration import SoundSpeedPrior, register
 
 
@@ -29,6 +29,14 @@ class BatchEngine:
         self.estimate: OnlineEstimate | None = None
         self.refuse_t: set[float] = set()
         self.notice: dict[float, float] = {}
+
+    @property
+    def moves(self) -> tuple[DetectedMove, ...]:
+        return ()  # what it notices it tells by epochs only
+
+    @property
+    def returns(self) -> tuple[DetectedReturn, ...]:
+        return ()
 
     def add(self, event: OnlineEvent) -> OnlineEstimate:
         if event.t in self.refuse_t:

@@ -10,6 +10,7 @@ import pytest
 from fgreg.answer import answer
 from fgreg.batch import distance_to_explicit, solve
 from fgreg.config import SolveConfig
+from fgreg.consensus import consensus_starts
 from fgreg.estimate import Verdict
 from fgreg.frames import as_float_array, exp_so3
 from fgreg.graph.packing import pack
@@ -18,7 +19,7 @@ from fgreg.graph.reduced_solver import optimize
 from fgreg.measurements import Aim, MarkerObservation, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.registration import Registration, register, targets_moved
-from fgreg.robust import consensus_starts, innovations_at, plausible_cost, pm_degrees_of_freedom
+from fgreg.robust import innovations_at, plausible_cost, pm_degrees_of_freedom
 from tests.forward import Truth, make_measurements
 
 

@@ -67,7 +67,7 @@ def test_long_streams_stay_at_the_batch_optimum_while_pairs_go_into_the_summary(
         estimate = engine.add(event)
         if isinstance(event, Pair) and engine.state.pairs in (43, 75, 180):
             assert sigmas_apart(batch(first(measurements, engine.state.pairs), model), estimate) < 0.05
-    assert len(engine.state.now.shelf.full) == 1
+    assert len(engine.state.now.shelf.full) == 2
 
 
 def test_sound_speed_as_a_variable_is_followed() -> None:
@@ -244,7 +244,7 @@ def test_reassigned_pairs_belong_to_a_new_epoch_and_the_old_one_is_rid_of_them()
     untold = replace(
         measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs[:18]), epochs=measurements.epochs[:1]
     )
-    engine = OnlineRegistration(model, judge=None)
+    engine = OnlineRegistration(model, judge=None, watch=None)
     run(engine, untold)
     estimate = engine.reassign(6, measurements.epochs[1])
     assert estimate.epoch == 1

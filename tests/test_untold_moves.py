@@ -12,11 +12,18 @@ import pytest
 
 from fgreg.cli import main
 from fgreg.config import SolveConfig
+from fgreg.events import AimEvent, CameraMovedEvent, PairEvent
 from fgreg.frames import FloatArray, inverse, make_transform
+from fgreg.live import LiveSession
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.online.detect import DetectedMove, find_moves, renumbered, split_epochs
-from fgreg.registration import register
+from fgreg.online.engine import OnlineRegistration
+from fgreg.pipeline import SolveRequest, solve_session
+from fgreg.recognition import recognise
+from fgreg.registration import SoundSpeedPrior, register
+from fgreg.replay import ReplayRequest, replay_session
+from fgreg.session.reading import read_session
 from fgreg.session.results import read_result
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
@@ -57,6 +64,7 @@ def test_an_untold_move_is_found_where_it_happened() -> None:
     assert abs(move.since - 15) <= 1
     assert move.since_t == measurements.pairs[move.since].t
     assert move.last_t < move.since_t <= move.alarm_t
+    assert move.log_bayes is not None
     assert move.log_bayes > 0
     assert f"between pair {move.since} and {move.since + 1}" in move.text
 
@@ -163,3 +171,44 @@ def test_without_the_option_nothing_is_detected(
     document = json.loads(capsys.readouterr().out)
     assert len(document["epochs"]) == 1
     assert not any("the camera moved between" in reason for reason in document["reasons"])
+
+
+def test_replay_of_the_session_finds_the_same_epochs_as_the_solve(untold: Path, tmp_path: Path) -> None:
+    fast = SolveConfig(posterior_effective=60.0, posterior_samples=600)
+    solved = solve_session(SolveRequest(untold, tmp_path / "solved.yaml", detect_moves=True), fast).estimate
+    replayed = replay_session(ReplayRequest(untold, tmp_path / "replayed.yaml"), fast).solved.estimate
+    assert len(solved.epochs) == 2
+    assert replayed.reasons == solved.reasons
+    assert [epoch.start_s for epoch in replayed.epochs] == [epoch.start_s for epoch in solved.epochs]
+    assert [pair.epoch for pair in replayed.pairs] == [pair.epoch for pair in solved.pairs]
+    for here, there in zip(replayed.epochs, solved.epochs, strict=True):
+        assert here.trus_T_camera is not None
+        assert there.trus_T_camera is not None
+        np.testing.assert_allclose(here.trus_T_camera, there.trus_T_camera, atol=1e-6)
+
+
+def test_a_session_recorded_while_the_engine_watches_tells_the_move(untold: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "recorded"
+    folder.mkdir()
+    (folder / "session.yaml").write_text((untold / "session.yaml").read_text())
+    fast = SolveConfig(posterior_effective=60.0, posterior_samples=600)
+    events = [e for e in read_session(untold).events if isinstance(e, AimEvent | PairEvent)]
+
+    def engine(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> OnlineRegistration:
+        return OnlineRegistration(model, config, judge=None, sound_speed_prior=prior)
+
+    with LiveSession.open(folder, fast, engine) as live:
+        for event in events:
+            live.add(event)
+        before = live.estimate
+    told = [event for event in read_session(folder).events if isinstance(event, CameraMovedEvent)]
+    (move,) = find_moves(recognise(events, read_session(untold).model).measurements, live.journal.model, fast)
+    assert [event.since_t for event in told] == [move.since_t]
+    with LiveSession.open(folder, fast, engine) as again:
+        after = again.estimate
+    assert before is not None
+    assert after is not None
+    assert before.trus_T_camera is not None
+    assert after.trus_T_camera is not None
+    assert after.epoch == before.epoch == 1
+    np.testing.assert_allclose(after.trus_T_camera, before.trus_T_camera, atol=1e-6)

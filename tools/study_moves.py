@@ -1,6 +1,6 @@
-"""Finding out that the camera moved: power and false alarms, beside the ideal detector.
+"""Finding out that the camera moved: power and false alarms of the online engine, beside the ideal detector.
 
-Poses with the documented noise, 12 aims. What is measured:
+Poses with the documented noise, 12 aims, pair by pair through the engine (``watch="inline"``). What is measured:
 
   clean     streams of steady pairs: false alarms (target: at most 1 in 2,000 pairs)
   junk      the same with a fifth of the pairs replaced by junk
@@ -10,79 +10,51 @@ Poses with the documented noise, 12 aims. What is measured:
 
 The ideal detector is told the old registration, the beam, the window's edge and the very shift, and sums up
 likelihood ratios (Shiryaev and Roberts); its threshold is set to the same rate of false alarms on clean pairs.
+What there is so far is printed every tenth of a row.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
-import sys
 import time
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
+from move_streams import CONFIG, shift_of, two_epochs
+from study_junk import KINDS, spoil
 
-from fgreg.config import SolveConfig
-from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
+from fgreg.frames import FloatArray, inverse
 from fgreg.graph.reduced import log_posterior, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import make_state
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
-from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
-from fgreg.online.moves import ALARM, MoveSettings, MoveTest
-from fgreg.registration import pack_session, register
-
-sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
-from study_junk import KINDS, spoil
-
-from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
+from fgreg.online import OnlineRegistration
+from fgreg.online.detect import events_in_order
+from fgreg.online.events import DetectedMove
+from fgreg.online.selection import select_pms
+from fgreg.registration import pack_session
+from tests.forward import Truth, make_measurements
 
 STEADY = 15
 AFTER = 15
 START = 8
 RATE = 2000.0
-CONFIG = SolveConfig()
 
 
-def random_direction(rng: np.random.Generator) -> FloatArray:
-    v = rng.normal(size=3)
-    return np.asarray(v / np.linalg.norm(v))
-
-
-def shift_of(rng: np.random.Generator, mm: float, degrees: float) -> FloatArray:
-    """camera_new_T_camera_old: by so many mm or turned by so many degrees, each half the time."""
-    if rng.uniform() < 0.5:
-        return make_transform(np.eye(3), mm * random_direction(rng))
-    return make_transform(exp_so3(math.radians(degrees) * random_direction(rng)), np.zeros(3))
-
-
-def two_epochs(
-    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool
-) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """Pairs before and after a motion, all told to be of epoch 0; same beam, same window edge."""
-    rng = np.random.default_rng(seed)
-    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
-    model, first, truth = make_measurements(
-        np.random.default_rng([seed, 1]), aims=12, pairs=before, first_hit=first_hit, marker_T_laser=beam,
-        trus_T_camera=trus_T_camera,
-    )  # fmt: skip
-    # The same seed draws the same window edge; without aims all that follows is drawn anew.
-    _, second, moved = make_measurements(
-        np.random.default_rng([seed, 1]), aims=0, pairs=after, first_hit=first_hit, marker_T_laser=beam,
-        trus_T_camera=trus_T_camera @ inverse(motion),
-    )  # fmt: skip
-    shift_t = first.pairs[-1].t if first.pairs else 0.0
-    later = tuple(
-        replace(pair, t=pair.t + shift_t, pm=pair.pm + before, marker=replace(pair.marker, id=pair.marker.id + 100000))
-        for pair in second.pairs
-    )
-    return model, Measurements(first.aims, first.pairs + later, first.epochs), (truth, moved)
+def moves_found(model: SessionModel, measurements: Measurements, from_pair: int | None) -> tuple[DetectedMove, ...]:
+    """What the engine finds; it stops at the first move found after so many pairs, where that is asked for."""
+    engine, pairs = OnlineRegistration(model, CONFIG, judge=None), 0
+    for index, event in events_in_order(measurements):
+        engine.add(event)
+        pairs += index is not None
+        if from_pair is not None and pairs > from_pair and engine.moves and engine.moves[-1].alarm_t == event.t:
+            break
+    return engine.moves
 
 
 def ideal_ratios(
@@ -112,29 +84,14 @@ def shiryaev_roberts(ratios: FloatArray) -> FloatArray:
     return out
 
 
-def follow(
-    model: SessionModel, measurements: Measurements, settings: MoveSettings, from_pair: int = START
-) -> list[MoveTest | None]:
-    """Tests after each pair from number ``from_pair`` + 1 on."""
-    registration = register(replace(measurements, pairs=measurements.pairs[:START]), model, CONFIG)
-    problem = pack_session(measurements, model, CONFIG)
-    problem = summarise_aims(problem, registration.optimum.state)
-    follower = EpochFollower(problem, registration.optimum.state, START)
-    tests = []
-    for n in range(START + 1, len(problem.pms) + 1):
-        follower.advance(n)
-        tests.append(follower.test(settings) if n > from_pair else None)
-    return tests[from_pair - START :]
-
-
 def excursions(scores: FloatArray, threshold: float) -> int:
     """How often a score comes to pass the threshold."""
     above = np.concatenate([[False], scores > threshold])
     return int(np.sum(above[1:] & ~above[:-1]))
 
 
-def clean_scores(seed: int, *, pairs: int, first_hit: bool, junk: float) -> list[float] | None:
-    """Scores of one steady stream; a share of its pairs replaced by junk. None where it could not be registered."""
+def false_alarms(seed: int, *, pairs: int, first_hit: bool, junk: float) -> int:
+    """Moves found in one steady stream; a share of its pairs replaced by junk."""
     rng = np.random.default_rng([seed, 3])
     model, measurements, _ = make_measurements(rng, aims=12, pairs=pairs, first_hit=first_hit)
     if junk > 0.0:
@@ -148,11 +105,7 @@ def clean_scores(seed: int, *, pairs: int, first_hit: bool, junk: float) -> list
                 for pair, bad, kind in zip(measurements.pairs, spoilt, kinds, strict=True)
             ),
         )
-    try:
-        found = follow(model, measurements, MoveSettings())
-    except EstimationError:
-        return None
-    return [test.score if test is not None else -math.inf for test in found]
+    return len(moves_found(model, measurements, None))
 
 
 def ideal_clean_scores(seed: int, *, pairs: int, first_hit: bool, mm: float, degrees: float) -> list[float]:
@@ -166,24 +119,25 @@ def ideal_clean_scores(seed: int, *, pairs: int, first_hit: bool, mm: float, deg
 
 @dataclass(frozen=True, slots=True)
 class Shifted:
-    """Scores after each pair from the shift on, ours and the ideal detector's; where the likeliest move is then."""
+    """Pairs from the shift to the alarm (infinite: none), how far off the place told is, and the ideal's scores."""
 
-    scores: list[float]
+    found_after: float
+    misplaced: int
     ideal: list[float]
-    since: list[int]
 
 
-def shift_scores(seed: int, *, first_hit: bool, mm: float, degrees: float) -> Shifted:
+def shifted(seed: int, *, first_hit: bool, mm: float, degrees: float) -> Shifted:
     """One shift after the steady pairs."""
     motion = shift_of(np.random.default_rng([seed, 5]), mm, degrees)
     model, measurements, (truth, moved) = two_epochs(seed, motion, STEADY, AFTER, first_hit=first_hit)
-    found = follow(model, measurements, MoveSettings(), STEADY)
     ratios = ideal_ratios(model, measurements, truth, truth.trus_T_camera[0], moved.trus_T_camera[0])
-    return Shifted(
-        scores=[test.score if test is not None else -math.inf for test in found],
-        ideal=shiryaev_roberts(ratios)[STEADY:].tolist(),
-        since=[-1 if test is None else k + 1 - (len(test.log_bayes) - test.since) for k, test in enumerate(found)],
-    )
+    ideal = shiryaev_roberts(ratios)[STEADY:].tolist()
+    times = [pair.t for pair in measurements.pairs]
+    for move in moves_found(model, measurements, STEADY):
+        alarm = times.index(move.alarm_t)
+        if alarm >= STEADY:
+            return Shifted(alarm - STEADY + 1.0, move.since - STEADY, ideal)
+    return Shifted(float("inf"), 0, ideal)
 
 
 def threshold_at(scores: list[list[float]], per_pairs: float) -> float:
@@ -202,67 +156,81 @@ def first_above(rows: FloatArray, threshold: float) -> FloatArray:
 
 
 def report_shifts(name: str, found: list[Shifted], ideal_threshold: float, targets: dict[int, float]) -> None:
-    ours = first_above(np.array([row.scores for row in found]), ALARM)
+    ours = np.array([row.found_after for row in found])
     ideal = first_above(np.array([row.ideal for row in found]), ideal_threshold)
-    print(f"{name} ({len(found)} shifts; threshold {ALARM:.2f}, ideal {ideal_threshold:.2f})")
+    print(f"{name} ({len(found)} shifts; ideal detector's threshold {ideal_threshold:.2f})")
     for count in (1, 2, 4, 6, 10, 15):
         target = f"   target {100 * targets[count]:.0f} %" if count in targets else ""
         share, best = float(np.mean(ours <= count)), float(np.mean(ideal <= count))
         print(f"  within {count:2d} pairs: {100 * share:5.1f} %   ideal {100 * best:5.1f} %{target}")
-    error = [row.since[int(at) - 1] for row, at in zip(found, ours, strict=True) if np.isfinite(at)]
-    late = np.mean([abs(e) <= 1 for e in error]) if error else float("nan")
-    print(f"  first pair after the move, told at the alarm: right or next to it in {100 * late:.0f} %")
+    error = [abs(row.misplaced) <= 1 for row in found if np.isfinite(row.found_after)]
+    late = np.mean(error) if error else float("nan")
+    print(f"  first pair after the move, told at the alarm: right or next to it in {100 * late:.0f} %", flush=True)
 
 
-ROWS = (
-    ("5 mm or 3 deg, first-hit", 5.0, 3.0, True, {2: 0.80, 6: 0.93}),
-    ("5 mm or 3 deg, window only", 5.0, 3.0, False, {2: 0.55, 6: 0.85}),
-    ("2 mm or 1 deg, first-hit", 2.0, 1.0, True, {6: 0.50, 15: 0.80}),
-)
+def report_alarms(counts: Iterable[int], streams: int, per_stream: int, name: str, *, target: bool) -> None:
+    started, alarms = time.perf_counter(), 0
+    for n, count in enumerate(counts, 1):
+        alarms += count
+        if n % max(streams // 10, 1) == 0:
+            tests = n * per_stream
+            print(
+                f"{name}: {alarms} false alarms in {tests} pairs (1 in {tests / max(alarms, 1):.0f}"
+                f"{'; target 1 in 2000' if target else ''}), {time.perf_counter() - started:.0f} s",
+                flush=True,
+            )
+
+
+def tenths(rows: Iterable[Shifted], total: int) -> Iterator[list[Shifted]]:
+    """All rows so far, ten times."""
+    out: list[Shifted] = []
+    for row in rows:
+        out.append(row)
+        if len(out) % max(total // 10, 1) == 0:
+            yield out
+
+
+ROWS = {
+    "5-first-hit": ("5 mm or 3 deg, first-hit", 5.0, 3.0, True, {2: 0.80, 6: 0.93}),
+    "5-window": ("5 mm or 3 deg, window only", 5.0, 3.0, False, {2: 0.55, 6: 0.85}),
+    "2-first-hit": ("2 mm or 1 deg, first-hit", 2.0, 1.0, True, {6: 0.50, 15: 0.80}),
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--what", default="clean,junk,shifts", help="which parts, with commas between")
+    parser.add_argument("--rows", default=",".join(ROWS), help=f"which shifts, of {', '.join(ROWS)}")
+    parser.add_argument("--sweep", choices=["first-hit", "window", "both"], default="both", help="of clean and junk")
     parser.add_argument("--shifts", type=int, default=500, help="shifts of each row")
     parser.add_argument("--clean-pairs", type=int, default=40000, help="steady pairs of each kind")
     parser.add_argument("--stream", type=int, default=108, help="pairs of each steady stream; the first 8 register it")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    what = set(args.what.split(","))
+    what, rows = set(args.what.split(",")), args.rows.split(",")
     if not what <= {"clean", "junk", "shifts"}:
         parser.error(f"--what is {args.what}, expected some of clean, junk, shifts")
+    if not set(rows) <= set(ROWS):
+        parser.error(f"--rows is {args.rows}, expected some of {', '.join(ROWS)}")
     per_stream = args.stream - START
     seeds = [1000000 * args.seed + s for s in range(-(-args.clean_pairs // per_stream))]
+    sweeps = {"first-hit": (True,), "window": (False,), "both": (True, False)}[args.sweep]
     with ProcessPoolExecutor(args.jobs) as pool:
-        for part, junk in (("clean", 0.0), ("junk", 0.2)):
-            if part not in what:
-                continue
-            for first_hit in (True, False):
-                started = time.perf_counter()
-                one = partial(clean_scores, pairs=args.stream, first_hit=first_hit, junk=junk)
-                streams = [row for row in pool.map(one, seeds, chunksize=4) if row is not None]
-                tests = sum(len(row) for row in streams)
-                alarms = sum(excursions(np.array(row), ALARM) for row in streams)
-                name = f"{100 * junk:.0f} % junk, {'first-hit' if first_hit else 'window only'}"
-                print(
-                    f"{name}: {alarms} false alarms in {tests} pairs (1 in {tests / max(alarms, 1):.0f}"
-                    f"{'; target 1 in 2000' if not junk else ''}), {len(seeds) - len(streams)} streams not registered, "
-                    f"{time.perf_counter() - started:.0f} s",
-                    flush=True,
-                )
-                for threshold in (5.0, 5.2, 5.4, 5.6, 6.0, 6.5, 7.6):
-                    count = sum(excursions(np.array(row), threshold) for row in streams)
-                    print(f"  threshold {threshold:.1f}: {count}", flush=True)
         if "shifts" in what:
-            for name, mm, degrees, first_hit, targets in ROWS:
+            for name, mm, degrees, first_hit, targets in (ROWS[row] for row in rows):
                 one_ideal = partial(ideal_clean_scores, pairs=per_stream, first_hit=first_hit, mm=mm, degrees=degrees)
                 ideal = list(pool.map(one_ideal, seeds[: max(len(seeds) // 4, 1)], chunksize=4))
-                one_shift = partial(shift_scores, first_hit=first_hit, mm=mm, degrees=degrees)
-                found = list(pool.map(one_shift, [7000000 * args.seed + s for s in range(args.shifts)], chunksize=4))
-                report_shifts(name, found, threshold_at(ideal, RATE), targets)
-                sys.stdout.flush()
+                threshold = threshold_at(ideal, RATE)
+                one_shift = partial(shifted, first_hit=first_hit, mm=mm, degrees=degrees)
+                shifts = pool.map(one_shift, [7000000 * args.seed + s for s in range(args.shifts)], chunksize=4)
+                for found in tenths(shifts, args.shifts):
+                    report_shifts(name, found, threshold, targets)
+        for part, junk in (("clean", 0.0), ("junk", 0.2)):
+            for first_hit in sweeps if part in what else ():
+                one = partial(false_alarms, pairs=args.stream, first_hit=first_hit, junk=junk)
+                name = f"{100 * junk:.0f} % junk, {'first-hit' if first_hit else 'window only'}"
+                report_alarms(pool.map(one, seeds, chunksize=4), len(seeds), per_stream, name, target=not junk)
 
 
 if __name__ == "__main__":

@@ -5,11 +5,14 @@
   tags-shifts shifts about the camera, 60 steady frames before: share found within 10 frames, that is before the next
               pair (target: 99 %). Tags 0.1, 0.1, 0.8 mm and 0.01 rad; a fifth of that variance wanders with a time
               constant of 200 frames (and is drawn anew by a shift), the rest is new in every frame
-  returns     15 pairs, camera gone and back (or to a place 2 mm or 1 deg off, 5 mm or 3 deg off, or anywhere): after
-              how many pairs the old registration is used again, and how often wrongly
-  told        15 pairs, a shift of up to 15 mm and 9 deg an axis, told with a motion (2 mm, 1 deg) or with none:
-              RMS target error after n pairs, beside that of the steady epoch (target with motion: at most 1.2 of it
-              after 3 pairs) and of a fresh registration with a known beam, 150 aims (target: no worse at every count)
+  returns     15 pairs, then the scope taken away and put back (told, without a motion), or to a place 2 mm or 1 deg
+              off, 5 mm or 3 deg off, or anywhere: after how many pairs the engine uses the old registration again, and
+              how often wrongly (target: at most 1 in 2,000 pairs)
+  told        15 (or so many) pairs, a shift of up to 15 mm and 9 deg an axis, told with a motion known to 2 mm and 1
+              deg (each axis; or in all) or with none: RMS target error after n pairs, beside that of the steady epoch
+              (target with motion: at most 1.2 of it after 3 pairs), of a fresh registration with the same aims, and of
+              one with a known beam, 150 aims (target: no worse at every count, paired on the same pairs). In brackets
+              what an ideal estimator has: the information of all measurements at the truth, windows as Gaussians
 
 Each mode prints what it has after every tenth of the work.
 """
@@ -18,49 +21,29 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from move_streams import CONFIG, ideal_covariance, ideal_tre, many_aims, shift_of, two_epochs
 
-from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
-from fgreg.measurements import Aim, EpochStart, Measurements
+from fgreg.frames import FloatArray, exp_so3, make_transform
+from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
-from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
-from fgreg.online.moves import relinearisation
-from fgreg.online.returns import default_return_settings, fits_again
+from fgreg.online import OnlineRegistration
+from fgreg.online.detect import events_in_order
 from fgreg.online.tags import TagFrame, TagSettings, TagWatch, watch_tags
-from fgreg.online.white import linearise, pose_columns
-from fgreg.registration import pack_session, register
+from fgreg.registration import register
 from fgreg.targets import tre_mm
+from tests.forward import Truth
 
-sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
-from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
-
-CONFIG = SolveConfig()
-STEADY, AFTER = 15, 15
+AFTER = 20
 FRAMES_PER_PAIR = 10
 TAG_SIGMA = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.8])
 STEADY_SHARE, TIME_CONSTANT = 0.2, 200.0
 KINEMATICS = np.array([math.radians(1.0)] * 3 + [2.0] * 3)
 Row = tuple[str, float, float]
 SHIFTS: tuple[Row, ...] = (("5 mm or 3 deg", 5.0, 3.0), ("2 mm or 1 deg", 2.0, 1.0))
-
-
-def random_direction(rng: np.random.Generator) -> FloatArray:
-    v = rng.normal(size=3)
-    return np.asarray(v / np.linalg.norm(v))
-
-
-def shift_of(rng: np.random.Generator, mm: float, degrees: float) -> FloatArray:
-    """camera_new_T_camera_old: by so many mm or turned by so many degrees, each half the time."""
-    if rng.uniform() < 0.5:
-        return make_transform(np.eye(3), mm * random_direction(rng))
-    return make_transform(exp_so3(math.radians(degrees) * random_direction(rng)), np.zeros(3))
 
 
 # --- static tags ----------------------------------------------------------------------------------------------------
@@ -148,151 +131,135 @@ def tags_shifts(count: int, seed: int) -> None:
 # --- pairs ----------------------------------------------------------------------------------------------------------
 
 
-def gone(
-    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool
-) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """Pairs before and after a motion, as epochs 0 and 1; same beam, same window edge."""
-    rng = np.random.default_rng(seed)
-    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
-    model, first, truth = make_measurements(
-        np.random.default_rng([seed, 1]), aims=12, pairs=before, first_hit=first_hit, marker_T_laser=beam,
-        trus_T_camera=trus_T_camera,
-    )  # fmt: skip
-    # The same seed draws the same window edge; without aims all that follows is drawn anew.
-    _, second, moved = make_measurements(
-        np.random.default_rng([seed, 1]), aims=0, pairs=after, first_hit=first_hit, marker_T_laser=beam,
-        trus_T_camera=trus_T_camera @ inverse(motion),
-    )  # fmt: skip
-    t = first.pairs[-1].t + 1.0
-    later = tuple(
-        replace(p, t=p.t + t, pm=p.pm + before, epoch=1, marker=replace(p.marker, id=p.marker.id + 100000))
-        for p in second.pairs
-    )
-    return model, Measurements(first.aims, first.pairs + later, (EpochStart(0.0), EpochStart(t))), (truth, moved)
-
-
-def returns(count: int, seed: int, *, first_hit: bool) -> None:
+def returns(count: int, seed: int, steady: int, *, first_hit: bool) -> None:
     kind = "first-hit" if first_hit else "window only"
-    rows = (("back", 0.0, 0.0), *SHIFTS[::-1], ("anywhere", 40.0, 20.0))
-    for name, mm, degrees in rows:
-        found: list[FloatArray] = []
+    for name, mm, degrees in (("back", 0.0, 0.0), *SHIFTS[::-1], ("anywhere", 40.0, 20.0)):
+        after: list[float] = []
         for s in range(count):
             motion = shift_of(np.random.default_rng([seed, s, 7]), mm, degrees)
-            try:
-                found.append(_log_bayes(seed * 100000 + s, motion, first_hit=first_hit))
-            except EstimationError:
-                continue
-            if (s + 1) % max(count // 4, 1) == 0:
-                _print_returns(f"returns ({kind}), {name}", np.array(found))
+            after.append(_used_again_after(seed * 100000 + s, motion, steady, first_hit=first_hit))
+            if (s + 1) % max(count // 10, 1) == 0:
+                found = np.array(after)
+                by = ", ".join(f"{100 * np.mean(found <= k):.1f} % by {k}" for k in (8, 10, 12, 15, 20))
+                wrong = "" if name == "back" else (
+                    f"; {2000 * np.mean(found <= AFTER) / AFTER:.2f} in 2,000 pairs (target <= 1)"
+                )  # fmt: skip
+                print(f"returns ({kind}), {name}: old epoch used again {by}{wrong} ({len(after)} sessions)", flush=True)
 
 
-def _print_returns(name: str, log_bayes: FloatArray) -> None:
-    """First decisions of each session (rows), pair by pair, by the settings' limit and by others about it."""
-    settings = default_return_settings()
-    for accept in (settings.accept - 1.0, settings.accept, settings.accept + 1.0):
-        same = log_bayes >= accept
-        same[:, : settings.least_pairs - 1] = False
-        new = log_bayes <= -settings.reject
-        at_same = np.where(same.any(axis=1), same.argmax(axis=1) + 1, AFTER + 1)
-        at_new = np.where(new.any(axis=1), new.argmax(axis=1) + 1, AFTER + 1)
-        by = ", ".join(f"{100 * np.mean((at_same <= k) & (at_same < at_new)):.1f} % by {k}" for k in (3, 6, 10, 15))
-        elsewhere = 100 * np.mean((at_new <= AFTER) & (at_new < at_same))
-        print(f"{name}, limit {accept:.1f}: old epoch used again {by}; elsewhere by 15: {elsewhere:.1f} % "
-              f"({len(log_bayes)} sessions)", flush=True)  # fmt: skip
-
-
-def _log_bayes(seed: int, motion: FloatArray, *, first_hit: bool) -> FloatArray:
-    """(15,) log Bayes factors of the old registration after 1, 2, ... pairs."""
-    model, measurements, _ = gone(seed, motion, STEADY, AFTER, first_hit=first_hit)
-    together = replace(
-        measurements, pairs=tuple(replace(p, epoch=0) for p in measurements.pairs), epochs=measurements.epochs[:1]
-    )
-    state = register(replace(together, pairs=together.pairs[:STEADY]), model, CONFIG).optimum.state
-    problem = summarise_aims(pack_session(together, model, CONFIG), state)
-    follower = EpochFollower(problem, state, STEADY)
-    earlier = follower.everything()
-    out = []
-    for n in range(1, AFTER + 1):
-        tail = select_pms(problem, np.arange(STEADY, STEADY + n))
-        test = fits_again(
-            earlier,
-            linearise(tail, follower.state),
-            default_return_settings(),
-            pose=pose_columns(0),
-            relinearise=relinearisation(tail, follower.state),
-        )
-        out.append(test.log_bayes)
-    return np.array(out)
+def _used_again_after(seed: int, motion: FloatArray, steady: int, *, first_hit: bool) -> float:
+    """Pairs of the new epoch after which the engine ties it to the old one; infinite: it does not."""
+    model, measurements, _ = two_epochs(seed, motion, steady, AFTER, first_hit=first_hit, told=True)
+    engine, pairs = OnlineRegistration(model, CONFIG, judge=None), 0
+    for index, event in events_in_order(measurements):
+        estimate = engine.add(event)
+        pairs += index is not None
+        if engine.returns or estimate.epoch > 1:
+            return pairs - steady if engine.returns else math.inf
+    return math.inf
 
 
 def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def told(count: int, seed: int, counts: tuple[int, ...], *, first_hit: bool) -> None:
-    steady: list[float] = []
+def told(count: int, seed: int, steady_pairs: int, counts: tuple[int, ...], *, first_hit: bool) -> None:
+    steady: list[tuple[float, float]] = []
     error: dict[tuple[str, int], list[float]] = {}
+    ideal: dict[tuple[str, int], list[float]] = {}
     for s in range(count):
         rng = np.random.default_rng([seed, s, 3])
         motion = make_transform(exp_so3(rng.uniform(-0.15, 0.15, 3)), rng.uniform(-15.0, 15.0, 3))
-        model, whole, (truth, moved) = gone(seed * 100000 + s, motion, STEADY, AFTER, first_hit=first_hit)
+        number = seed * 100000 + s
+        model, whole, truths = two_epochs(number, motion, steady_pairs, AFTER, first_hit=first_hit, told=True)
         unit = rng.normal(size=6)
         starts = {}
         for name, sigma in (("an axis", KINEMATICS), ("in all", KINEMATICS / math.sqrt(3.0))):
             noise = unit * sigma
             measured = motion @ make_transform(exp_so3(noise[:3]), noise[3:])
             starts[f"told, 2 mm and 1 deg {name}"] = EpochStart(whole.epochs[1].t, measured, np.diag(sigma**2))
-
-        def tre(of: Measurements, epoch: int, true: Truth, session: SessionModel = model) -> float | None:
-            try:
-                found = register(of, session, CONFIG)
-            except EstimationError:
-                return None
-            if epoch not in found.epochs:
-                return None
-            transform = found.optimum.state.trus_T_camera(found.epochs.index(epoch))[0]
-            return float(tre_mm(transform, true.trus_T_camera[0], session.targets_mm).mean())
-
-        first = tre(replace(whole, pairs=whole.pairs[:STEADY], epochs=whole.epochs[:1]), 0, truth)
-        if first is None:
-            continue
-        steady.append(first)
-        many = many_aims(seed * 100000 + s, truth)
+        old = replace(whole, pairs=whole.pairs[:steady_pairs], epochs=whole.epochs[:1])
+        first = _error(old, 0, truths[0], model)
+        steady.append((first, _least(old, 0, truths[:1], model)))
+        many = many_aims(number, truths[0])
         for n in counts:
-            cut = replace(whole, pairs=whole.pairs[: STEADY + n])
-            alone = replace(cut, pairs=tuple(replace(p, epoch=0) for p in cut.pairs[STEADY:]), epochs=whole.epochs[:1])
-            results = {
-                **{name: tre(replace(cut, epochs=(whole.epochs[0], e)), 1, moved) for name, e in starts.items()},
-                "told, motion not known": tre(cut, 1, moved),
-                "fresh, same aims": tre(alone, 0, moved),
-                "fresh, known beam": tre(replace(alone, aims=many), 0, moved),
+            cut = replace(whole, pairs=whole.pairs[: steady_pairs + n])
+            own = tuple(replace(p, epoch=0) for p in cut.pairs[steady_pairs:])
+            alone = replace(cut, pairs=own, epochs=whole.epochs[:1])
+            cases = {
+                **{name: (replace(cut, epochs=(whole.epochs[0], e)), 1, truths) for name, e in starts.items()},
+                "told, motion not known": (cut, 1, truths),
+                "fresh, same aims": (alone, 0, truths[1:]),
+                "fresh, known beam": (replace(alone, aims=many), 0, truths[1:]),
             }
-            for name, value in results.items():
-                if value is not None:
-                    error.setdefault((name, n), []).append(value)
+            for name, (of, epoch, true) in cases.items():
+                error.setdefault((name, n), []).append(_error(of, epoch, truths[1], model))
+                ideal.setdefault((name, n), []).append(_least(of, epoch, true, model))
         if (s + 1) % max(count // 10, 1) == 0:
-            _print_told(steady, error, counts, first_hit)
+            _print_told(steady, error, ideal, counts, first_hit)
 
 
-def many_aims(seed: int, truth: Truth) -> tuple[Aim, ...]:
-    """So many calibration shots that the beam counts as known."""
-    rng = np.random.default_rng([seed, 9])
-    return make_measurements(rng, aims=150, pairs=0, marker_T_laser=truth.marker_T_laser)[1].aims
+def _error(of: Measurements, epoch: int, truth: Truth, model: SessionModel) -> float:
+    """RMS target error (mm) of one epoch's optimum; nan where there is none."""
+    try:
+        found = register(of, model, CONFIG)
+    except EstimationError:
+        return math.nan
+    if epoch not in found.epochs:
+        return math.nan
+    transform = found.optimum.state.trus_T_camera(found.epochs.index(epoch))[0]
+    return _rms(tre_mm(transform, truth.trus_T_camera[0], model.targets_mm).tolist())
+
+
+def _least(of: Measurements, epoch: int, truths: tuple[Truth, ...], model: SessionModel) -> float:
+    try:
+        covariance, state = ideal_covariance(model, of, truths)
+    except np.linalg.LinAlgError:
+        return math.nan
+    return ideal_tre(covariance, state, epoch, model.targets_mm)
 
 
 def _print_told(
-    steady: list[float], error: dict[tuple[str, int], list[float]], counts: tuple[int, ...], first_hit: bool
+    steady: list[tuple[float, float]],
+    error: dict[tuple[str, int], list[float]],
+    ideal: dict[tuple[str, int], list[float]],
+    counts: tuple[int, ...],
+    first_hit: bool,
 ) -> None:
     kind = "first-hit" if first_hit else "window only"
-    print(f"told moves ({kind}), {len(steady)} sessions: RMS target error of the steady epoch {_rms(steady):.2f} mm")
+    base, least = _rms([e for e, _ in steady]), _rms([e for _, e in steady])
+    print(
+        f"told moves ({kind}), {len(steady)} sessions: RMS target error of the steady epoch {base:.2f} ({least:.2f}) mm"
+    )
     for name in sorted({name for name, _ in error}):
-        row = ", ".join(
-            f"{n}: {_rms(error[name, n]):.2f} (x{_rms(error[name, n]) / _rms(steady):.2f}, "
-            f"median {np.median(error[name, n]):.2f})"
-            for n in counts
-            if (name, n) in error
-        )
-        print(f"  {name}, after pairs {row}", flush=True)
+        row = []
+        for n in counts:
+            ours, best = np.array(error[name, n]), np.array(ideal[name, n])
+            there = np.isfinite(ours)
+            value, limit = _rms(ours[there].tolist()), _rms(best[np.isfinite(best)].tolist())
+            row.append(
+                f"{n}: {value:.2f} (x{value / base:.2f}, median {np.median(ours[there]):.2f}; "
+                f"ideal {limit:.2f}, x{limit / least:.2f})"
+            )
+        print(f"  {name}, after pairs {', '.join(row)}", flush=True)
+    for other in ("fresh, same aims", "fresh, known beam"):
+        row = [f"{n}: {_paired(error['told, motion not known', n], error[other, n])}" for n in counts]
+        print(f"  told, motion not known, over {other}, the same pairs: {', '.join(row)}", flush=True)
+
+
+def _paired(ours: list[float], others: list[float]) -> str:
+    """Median ratio of errors on the same pairs, and ratio of RMS, each with 95 % by resampling of sessions."""
+    both = np.array([ours, others])
+    both = both[:, np.isfinite(both).all(axis=0)]
+    index = np.random.default_rng(0).integers(both.shape[1], size=(1000, both.shape[1]))
+    median = np.exp(np.median(np.log(both[0] / both[1])[index], axis=1))
+    rms = np.sqrt(np.mean(both[0][index] ** 2, axis=1) / np.mean(both[1][index] ** 2, axis=1))
+    low, high = np.quantile(median, (0.025, 0.975))
+    least, most = np.quantile(rms, (0.025, 0.975))
+    return (
+        f"median {math.exp(float(np.median(np.log(both[0] / both[1])))):.2f} ({low:.2f} to {high:.2f}), "
+        f"RMS {_rms(both[0].tolist()) / _rms(both[1].tolist()):.2f} ({least:.2f} to {most:.2f})"
+    )
 
 
 def main() -> None:
@@ -300,6 +267,7 @@ def main() -> None:
     parser.add_argument("mode", choices=["tags-clean", "tags-shifts", "returns", "told"])
     parser.add_argument("--count", type=int, help="frames (tags-clean), or shifts or sessions a row")
     parser.add_argument("--window-only", action="store_true", help="looks know only the window")
+    parser.add_argument("--steady", type=int, default=15, help="returns, told: pairs of the first epoch")
     parser.add_argument(
         "--after", type=int, nargs="+", default=[3, 4, 6, 10, 15], help="told: numbers of pairs after it"
     )
@@ -311,9 +279,9 @@ def main() -> None:
     elif args.mode == "tags-shifts":
         tags_shifts(args.count or 500, args.seed)
     elif args.mode == "returns":
-        returns(args.count or 200, args.seed, first_hit=first_hit)
+        returns(args.count or 200, args.seed, args.steady, first_hit=first_hit)
     else:
-        told(args.count or 100, args.seed, tuple(args.after), first_hit=first_hit)
+        told(args.count or 100, args.seed, args.steady, tuple(args.after), first_hit=first_hit)
 
 
 if __name__ == "__main__":

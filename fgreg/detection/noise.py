@@ -22,14 +22,26 @@ SHARED_DOF = 30.0
 """How many degrees of freedom the pooled value is worth against a detection's own: detections differ."""
 
 
-class Residuals(Protocol):
-    """What a fit leaves: whitened sum of squares, its degrees of freedom, information, common errors."""
+class Weighed(Protocol):
+    """What a fit leaves: whitened sum of squares, its degrees of freedom."""
 
     @property
     def cost(self) -> float: ...
 
     @property
     def dof(self) -> int: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """:class:`Weighed`, and nothing else."""
+
+    cost: float
+    dof: int
+
+
+class Residuals(Weighed, Protocol):
+    """What a fit leaves, with its information and common errors."""
 
     @property
     def information(self) -> FloatArray: ...
@@ -54,7 +66,7 @@ class CornerNoise:
 
 
 def pool_corner_noise(
-    fits: Iterable[Residuals], *, prior_scale: float = 1.0, prior_dof: float = PRIOR_DOF
+    fits: Iterable[Weighed], *, prior_scale: float = 1.0, prior_dof: float = PRIOR_DOF
 ) -> CornerNoise:
     """Corner noise of a session from its detections (all of one kind: markers, or boards).
 

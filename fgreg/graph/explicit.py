@@ -311,7 +311,7 @@ def _add_shared_priors(
 def _add_epoch_changes(
     graph: gtsam.NonlinearFactorGraph, keys: GraphKeys, measurements: Measurements, options: GraphOptions
 ) -> None:
-    for k, epoch in enumerate(measurements.epochs[1:]):
+    for k, epoch in enumerate(measurements.epochs[1:], 1):
         motion, covariance = epoch.camera_new_T_camera_old, epoch.covariance
         if motion is None or covariance is None:
             if options.unknown_motion_sigma is None:
@@ -319,4 +319,4 @@ def _add_epoch_changes(
             rad, mm = options.unknown_motion_sigma
             motion, covariance = np.eye(4), np.diag([rad**2] * 3 + [mm**2] * 3)
         covariance = usable_covariance(covariance, POSE_FLOOR)
-        graph.add(epoch_change_factor(keys.trus_T_camera[k], keys.trus_T_camera[k + 1], motion, covariance))
+        graph.add(epoch_change_factor(keys.trus_T_camera[epoch.old(k)], keys.trus_T_camera[k], motion, covariance))

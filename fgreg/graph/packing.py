@@ -110,9 +110,10 @@ class RotationShapes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochLink:
-    """Prior between epochs: ``trus_T_camera[k+1] = trus_T_camera[k] * old_T_new``, information over the tangent."""
+    """Prior between epochs: ``trus_T_camera[new] = trus_T_camera[old] * old_T_new``, information over the tangent."""
 
-    index: int
+    old: int
+    new: int
     old_T_new: FloatArray
     information: FloatArray
 
@@ -163,14 +164,14 @@ def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
 
 def _links(epochs: Sequence[EpochStart]) -> tuple[EpochLink, ...]:
     links = []
-    for k, epoch in enumerate(epochs[1:]):
+    for k, epoch in enumerate(epochs[1:], 1):
         motion, covariance = epoch.camera_new_T_camera_old, epoch.covariance
         if motion is not None and covariance is not None:
             # new_T_old Exp(xi) inverted is old_T_new Exp(-Ad xi): the covariance moves to the other frame.
             turn = adjoint(motion)
             spread = turn @ usable_covariance(covariance, POSE_FLOOR) @ turn.T
             information = np.asarray(np.linalg.inv(spread), dtype=np.float64)
-            links.append(EpochLink(k, inverse(motion), information))
+            links.append(EpochLink(epoch.old(k), k, inverse(motion), information))
     return tuple(links)
 
 

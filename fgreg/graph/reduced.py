@@ -346,8 +346,8 @@ def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray
     for link in problem.links:
         residual, jacobian = _link_residual(link, state)
         weighted = link.information @ jacobian
-        columns = slice(6 * link.index, 6 * link.index + 12)
-        hessian[:, columns, columns] += transposed(jacobian) @ weighted
+        columns = np.r_[6 * link.old : 6 * link.old + 6, 6 * link.new : 6 * link.new + 6]
+        hessian[:, columns[:, None], columns] += transposed(jacobian) @ weighted
         gradient[:, columns] += times(transposed(weighted), residual)
     if problem.anchor is not None:
         hessian += problem.anchor.information
@@ -356,9 +356,10 @@ def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray
 
 def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:
     """Error (S, 6) on the right of ``old_T_new`` in ``new = old * old_T_new``, and its derivative (S, 6, 12)."""
-    k, new_R_old = link.index, link.old_T_new[:3, :3].T
-    relative_R = transposed(state.rotation[:, k]) @ state.rotation[:, k + 1]
-    relative_t = times(transposed(state.rotation[:, k]), state.translation_mm[:, k + 1] - state.translation_mm[:, k])
+    old, new, new_R_old = link.old, link.new, link.old_T_new[:3, :3].T
+    back = transposed(state.rotation[:, old])
+    relative_R = back @ state.rotation[:, new]
+    relative_t = times(back, state.translation_mm[:, new] - state.translation_mm[:, old])
     turn = log_so3(new_R_old @ relative_R)
     residual = np.concatenate([turn, times(new_R_old, relative_t - link.old_T_new[:3, 3])], axis=1)
     by_turn = np.eye(3) + 0.5 * hat(turn)  # inverse right Jacobian of SO(3), to first order in the error

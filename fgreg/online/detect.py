@@ -1,142 +1,87 @@
-"""Untold camera moves in a recorded session: where its pairs say that an epoch ends."""
+"""Untold camera moves in a recorded session: what the online engine finds out, going through it event by event."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from fgreg.config import SolveConfig
-from fgreg.errors import EstimationError
+from fgreg.errors import EventRefused
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
-from fgreg.online.follow import WINDOW, EpochFollower, summarise_aims
-from fgreg.online.moves import MoveSettings, MoveTest, default_scales
-from fgreg.registration import pack_session, register
-
-START = 8
-"""PMs that an epoch's first registration is made of."""
-CONFIRM = 10
-"""PMs after an alarm that may still shift where the move is put."""
+from fgreg.online.back import back_to
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
+from fgreg.registration import SoundSpeedPrior
 
 
 @dataclass(frozen=True, slots=True)
-class DetectedMove:
-    """A move found by the pairs.
+class EpochsFound:
+    """What nobody told of the camera's epochs: moves, and that it is back (its epochs with the moves counted in)."""
 
-    Attributes:
-        epoch: camera epoch (as told) that it divides.
-        since: index among all pairs of the first pair after it.
-        since_t: time of that pair. last_t: of the pair before.
-        alarm_t: of the pair at which the evidence sufficed.
-        log_bayes: of the move there against none, when it was found.
-    """
-
-    epoch: int
-    since: int
-    since_t: float
-    last_t: float
-    alarm_t: float
-    log_bayes: float
+    moves: tuple[DetectedMove, ...] = ()
+    returns: tuple[DetectedReturn, ...] = ()
 
     @property
-    def text(self) -> str:
-        """What to tell the user; pairs are counted from 1."""
-        return (
-            f"the camera moved between pair {self.since} and {self.since + 1} "
-            f"({self.last_t:.1f} to {self.since_t:.1f} s), untold: solved as a camera epoch of its own from there"
-        )
+    def texts(self) -> tuple[str, ...]:
+        """What to tell the user."""
+        return (*(move.text for move in self.moves), *(back.text for back in self.returns))
 
 
-def default_settings() -> MoveSettings:
-    """Settings that the figures in tools/study_moves.py are for."""
-    return MoveSettings(default_scales())
+def find_moves(measurements: Measurements, model: SessionModel, config: SolveConfig) -> tuple[DetectedMove, ...]:
+    """The moves of :func:`find_epochs`."""
+    return find_epochs(measurements, model, config).moves
 
 
-def find_moves(
-    measurements: Measurements, model: SessionModel, config: SolveConfig, settings: MoveSettings | None = None
-) -> tuple[DetectedMove, ...]:
-    """Moves that nobody told, in the order of time, found going through each told epoch's pairs.
+def find_epochs(
+    measurements: Measurements,
+    model: SessionModel,
+    config: SolveConfig,
+    sound_speed_prior: SoundSpeedPrior | None = None,
+) -> EpochsFound:
+    """What nobody told, in the order of time: what the online engine finds in the same events.
 
-    An epoch's first registration takes :data:`START` PMs; a move among those is not looked for.
+    None are found in sessions that there is no online form of (``config.estimate_radius``).
     """
-    settings = settings or default_settings()
-    found: list[DetectedMove] = []
-    for epoch in range(len(measurements.epochs)):
-        mine = [i for i, pair in enumerate(measurements.pairs) if pair.epoch == epoch]
-        names = list(dict.fromkeys(measurements.pairs[i].pm for i in mine))
-        begin = 0
-        while len(names) - begin > START:
-            alone = _alone(measurements, mine, names[begin:])
-            result = _first_move(alone, model, config, settings)
-            if result is None:
-                break
-            place, alarm, log_bayes = result
-            since = min(i for i in mine if measurements.pairs[i].pm == names[begin + place])
-            before = max((i for i in mine if i < since), default=since)
-            alarm_pm = names[begin + alarm]
-            alarm_t = max(measurements.pairs[i].t for i in mine if measurements.pairs[i].pm == alarm_pm)
-            pairs = measurements.pairs
-            found.append(DetectedMove(epoch, since, pairs[since].t, pairs[before].t, alarm_t, log_bayes))
-            begin += place
-    return tuple(found)
-
-
-def _alone(measurements: Measurements, mine: Sequence[int], names: Sequence[int]) -> Measurements:
-    """Some PMs of one epoch as an epoch 0."""
-    wanted = set(names)
-    pairs = tuple(replace(measurements.pairs[i], epoch=0) for i in mine if measurements.pairs[i].pm in wanted)
-    return Measurements(measurements.aims, pairs, (EpochStart(pairs[0].t),))
-
-
-def _first_move(
-    measurements: Measurements, model: SessionModel, config: SolveConfig, settings: MoveSettings
-) -> tuple[int, int, float] | None:
-    """Number of the first PM after the first move, of that at which it was found, and the log Bayes factor."""
-    names = list(dict.fromkeys(pair.pm for pair in measurements.pairs))
-    follower = None
-    for count in range(START, len(names)):
+    if config.estimate_radius:
+        config = replace(config, estimate_radius=False)
+    engine = OnlineRegistration(
+        model, config, judge=None, watch="inline", sound_speed_prior=sound_speed_prior, start=measurements.epochs[0]
+    )
+    index_of: list[int] = []
+    for index, event in events_in_order(measurements):
         try:
-            follower = _follower(measurements, names, count, model, config)
-            break
-        except EstimationError:
+            engine.add(event)
+        except EventRefused:
             continue
-    if follower is None:
-        return None
-    for count in range(follower.count + 1, len(names) + 1):
-        try:
-            follower.advance(count)
-        except EstimationError:
-            return None
-        test = follower.test(settings)
-        if test is None or not test.alarm:
-            continue
-        place = _since(test, count)
-        # A few pairs more may tell better where it happened.
-        for more in range(count + 1, min(count + CONFIRM, len(names)) + 1):
-            follower.advance(more)
-            later = follower.test(settings, WINDOW + more - count)
-            if later is not None and later.alarm:
-                place = _since(later, more)
-        return place, count - 1, float(test.log_bayes[test.since])
-    return None
+        if index is not None:
+            index_of.append(index)
+    pairs = measurements.pairs
+    found = []
+    for move in engine.moves:
+        since = index_of[move.since]
+        found.append(replace(move, since=since, epoch=pairs[since].epoch))
+    return EpochsFound(tuple(found), engine.returns)
 
 
-def _since(test: MoveTest, count: int) -> int:
-    return count - len(test.log_bayes) + test.since
+def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, OnlineEvent]]:
+    """Aims, pairs (with their index) and told moves in the order of time; a move before what happened at its time."""
+    timed: list[tuple[float, int, int, int | None, OnlineEvent]] = []
+    for place, start in enumerate(measurements.epochs[1:]):
+        moved = CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance)
+        timed.append((start.t, 0, place, None, moved))
+    timed.extend((aim.t, 1, place, None, aim) for place, aim in enumerate(measurements.aims))
+    timed.extend((pair.t, 1, len(measurements.aims) + i, i, pair) for i, pair in enumerate(measurements.pairs))
+    for _, _, _, index, event in sorted(timed, key=lambda entry: entry[:3]):
+        yield index, event
 
 
-def _follower(
-    measurements: Measurements, names: list[int], count: int, model: SessionModel, config: SolveConfig
-) -> EpochFollower:
-    first = set(names[:count])
-    start = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm in first))
-    state = register(start, model, config).optimum.state
-    problem = summarise_aims(pack_session(measurements, model, config), state)
-    return EpochFollower(problem, state, count)
-
-
-def split_epochs(measurements: Measurements, moves: Sequence[DetectedMove]) -> Measurements:
+def split_epochs(
+    measurements: Measurements, moves: Sequence[DetectedMove], returns: Sequence[DetectedReturn] = ()
+) -> Measurements:
     """The measurements with an epoch more for every move found; motions told before stay between their sides.
+
+    Epochs in which the camera is back are tied to those that it is back to.
 
     All looks at a PM are of the epoch of its first.
     """
@@ -144,6 +89,8 @@ def split_epochs(measurements: Measurements, moves: Sequence[DetectedMove]) -> M
     for epoch, start in enumerate(measurements.epochs):
         starts.append(start)
         starts.extend(EpochStart(move.since_t) for move in moves if move.epoch == epoch)
+    for back in returns:
+        starts[back.epoch] = back_to(starts[back.epoch], back.to)
     first: dict[tuple[int, int], int] = {}
     for index, pair in enumerate(measurements.pairs):
         first.setdefault((pair.epoch, pair.pm), index)
@@ -171,4 +118,4 @@ def renumbered(epoch_of: Sequence[int], shots: Sequence[int], moves: Sequence[De
     return tuple(_with_moves(epoch, index, places) for index, epoch in enumerate(epoch_of))
 
 
-__all__ = ["DetectedMove", "default_settings", "find_moves", "renumbered", "split_epochs"]
+__all__ = ["DetectedMove", "EpochsFound", "events_in_order", "find_epochs", "find_moves", "renumbered", "split_epochs"]

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Literal
 
@@ -24,23 +25,30 @@ from fgreg.batch import Solution
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.frames import FloatArray, is_rigid, make_transform, rotation_to_direction
-from fgreg.measurements import Aim, EpochStart, MarkerObservation, Measurements, Pair, Track
+from fgreg.frames import FloatArray, make_transform, rotation_to_direction
+from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
+from fgreg.online.back import ReturnFound, back_to
+from fgreg.online.checks import check
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
-from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
+from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
+from fgreg.online.guard import MoveGuard, WatchKind
 from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
+from fgreg.online.numbers import Sink, Source
+from fgreg.online.rest import Noticed, Rest, rested, with_effort
+from fgreg.online.rest_codec import read_rest, write_rest
 from fgreg.online.restart import Tools, all_measurements
 from fgreg.online.shared import POSE
-from fgreg.online.state import EpochData, Recent, State, make_setting
+from fgreg.online.state import EpochData, Recent, State, kept_by_place, make_setting
 from fgreg.online.store import MeasurementStore
+from fgreg.online.tag_guard import TagsMoved, TagsRest
+from fgreg.online.tie import with_motion
 from fgreg.online.tracking import online_snapshot
-from fgreg.online.updates import with_aim, with_move, with_pair
+from fgreg.online.updates import is_kept, with_aim, with_move, with_pair
 from fgreg.registration import SoundSpeedPrior
 from fgreg.tracking import Snapshot, SurfaceMap, fast_track
 from fgreg.verdict import accuracy
 
-INT64 = 2**63
 NOT_JUDGED = "this camera epoch has not been judged by the full solve yet: take the estimate as preliminary"
 NO_REGISTRATION = "no registration of this camera epoch"
 
@@ -53,6 +61,8 @@ class OnlineRegistration:
         config: settings of estimate and verdict.
         judge: ``inline`` judges within ``add`` at fixed counts of pairs (deterministic, some tenths of a second each),
             ``process`` in a process of its own (adopted when ready), None never.
+        watch: how camera moves that nobody tells are looked for: ``inline`` within ``add`` (deterministic), ``process``
+            in a process of its own (an alarm is adopted with the next event), None not at all.
         sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
         start: of the first epoch.
 
@@ -66,6 +76,7 @@ class OnlineRegistration:
         config: SolveConfig | None = None,
         *,
         judge: Literal["inline", "process"] | None = "inline",
+        watch: WatchKind | None = "inline",
         sound_speed_prior: SoundSpeedPrior | None = None,
         start: EpochStart | None = None,
     ) -> None:
@@ -75,6 +86,7 @@ class OnlineRegistration:
         self._t = -math.inf
         self._serial = 0
         self._judgement: Judgement | None = None
+        self._caught: Judgement | None = None
         self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
         self._surface: SurfaceMap | None = None
         kinds: dict[str, Callable[[], Judge]] = {
@@ -83,6 +95,11 @@ class OnlineRegistration:
         }
         if judge is not None and judge not in kinds:
             raise ValueError(f"judge is {judge!r}, expected 'inline', 'process' or None")
+        self._guard = MoveGuard(watch, model, self._config, sound_speed_prior, self._tools.setting)
+        self._moves: list[DetectedMove] = []
+        self._returns: list[DetectedReturn] = []
+        self._noticed: dict[int, str] = {}
+        self._suspicion = ""
         self._judge = None if judge is None else kinds[judge]()
         self._estimate = self._report(self._state, 0.0, None)
 
@@ -93,7 +110,8 @@ class OnlineRegistration:
         self.close()
 
     def close(self) -> None:
-        """End the judging process, where there is one; the estimate stays."""
+        """End the processes beside it, where there are any; the estimate stays."""
+        self._guard.close()
         if self._judge is not None:
             self._judge.close()
             self._judge = None
@@ -109,9 +127,12 @@ class OnlineRegistration:
             EventRefused: the event cannot be taken in, or the update failed; everything is as it was before.
         """
         check(event, self._t)
+        if not isinstance(event, CameraMoved):  # what is told comes before what is still being looked at
+            self._adopt_found(event.t)
         before = self._state
         try:
-            state = self._next(event)
+            guard, said = self._guard.see(event) if isinstance(event, StaticTags) else (None, None)
+            state = rested(with_effort(self._next(event, said)), self._tools.setting)
             estimate = self._report(state, event.t, self._judgement)
         except EventRefused:
             raise
@@ -121,28 +142,51 @@ class OnlineRegistration:
         if isinstance(event, Pair):
             self._tools.store.append(event)
         elif isinstance(event, Aim):
-            self._tools.store.aims.append(event)
+            self._tools.store.append_aim(event)
         self._state, self._t = state, event.t
         self._serial += 1
         moved = state.epoch != before.epoch
         self._estimate = estimate
-        self._consult(ask=moved or isinstance(event, Pair | Aim))
+        if moved:
+            self._guard.epoch_began(by_tags=guard is not None)
+            if self._suspicion:
+                self._suspicion = ""
+                self._estimate = self._report(state, event.t, self._judgement)
+        if guard is not None:
+            self._guard.keep(guard)
+        if isinstance(said, TagsMoved):
+            self._note_move(before, state.now.first, said.since_t, event.t, None)
+        elif isinstance(event, Pair):
+            self._guard.look(state, self._serial, self._tools.store)
+            moved = self._adopt_found(event.t) or moved
+        self._consult(ask=moved or isinstance(said, TagsRest) or isinstance(event, Pair | Aim))
         return self._estimate
 
-    def _next(self, event: OnlineEvent) -> State:
+    def _next(self, event: OnlineEvent, said: TagsMoved | TagsRest | None) -> State:
         state = replace(self._state, steps=self._state.steps + 1)
         if isinstance(event, Pair):
             return with_pair(state, event, self._tools)
         if isinstance(event, Aim):
             return with_aim(state, event, self._tools)
         if isinstance(event, CameraMoved):
-            last = 0
-            if event.since_t is not None:
-                store, first = self._tools.store, state.now.first
-                last = sum(store.time(place) >= event.since_t for place in range(first, state.pairs))
             start = EpochStart(event.t, event.camera_new_T_camera_old, event.covariance)
-            return with_move(state, start, self._tools, last)
-        return replace(state, nis=None, used=False)  # what tags tell is read by the test for moves
+            if event.since_t is not None:
+                return with_move(state, replace(start, t=event.since_t), self._tools, self._pairs_since(event.since_t))
+            if self._noticed.get(state.epoch) and (state.window is None or not state.epoch_pairs):
+                # Whether this is the move that was found out, or another, is not known: the motion of neither is.
+                start = EpochStart(event.t)
+            return with_move(state, start, self._tools)
+        if isinstance(said, TagsMoved):
+            return with_move(state, EpochStart(said.since_t), self._tools, self._pairs_since(said.since_t))
+        if isinstance(said, TagsRest):
+            start = EpochStart(state.now.start.t, said.camera_new_T_camera_old, said.covariance)
+            return with_motion(state, start, self._tools)
+        return replace(state, nis=None, used=False)
+
+    def _pairs_since(self, t: float) -> int:
+        """How many of the epoch's pairs were taken at a time or later."""
+        store, first = self._tools.store, self._state.now.first
+        return sum(store.time(place) >= t for place in range(first, self._state.pairs))
 
     def reassign(self, last: int, start: EpochStart) -> OnlineEstimate:
         """A new epoch to which the last so many pairs belong already: the camera moved before them, untold.
@@ -153,14 +197,59 @@ class OnlineRegistration:
         if not 0 <= last <= self._state.epoch_pairs:
             raise EventRefused(f"{last} pairs are to be reassigned, of {self._state.epoch_pairs} in the epoch")
         try:
-            state = with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last)
-            estimate = self._report(state, max(self._t, start.t), self._judgement)
+            self._reassign(last, start)
         except Exception as error:
             raise EventRefused(f"the update failed: {type(error).__name__}: {error}") from error
-        self._state, self._estimate = state, estimate
-        self._serial += 1
         self._consult(ask=True)
         return self._estimate
+
+    def _reassign(self, last: int, start: EpochStart) -> None:
+        nis, place = self._state.nis, self._state.pairs - 1
+        state = with_effort(with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last))
+        state = replace(state, nis=nis, used=nis is not None and is_kept(state, place))
+        estimate = self._report(state, max(self._t, start.t), self._judgement)
+        self._state, self._estimate = state, estimate
+        self._serial += 1
+        self._guard.epoch_began()
+        self._suspicion = ""
+
+    def _adopt_found(self, t: float) -> bool:
+        """Begin a new epoch, or tie the one that lasts to an earlier one, where the watch says so; whether it does."""
+        before = self._state
+        found = self._guard.found(before)
+        if found is None:
+            return False
+        if isinstance(found, ReturnFound):
+            return self._go_back(found, t)
+        since_t = self._tools.store.time(found.first)
+        try:
+            self._reassign(before.pairs - found.first, EpochStart(since_t))
+        except Exception as error:  # the old registration is not to be trusted, and there is no new one
+            self._suspicion = f"the camera has moved, and its pairs cannot be given to a new epoch: {error}"
+            self._estimate = self._report(before, self._estimate.t, self._judgement)
+            return False
+        self._note_move(before, found.first, since_t, t, found.log_bayes)
+        return True
+
+    def _go_back(self, found: ReturnFound, t: float) -> bool:
+        before = self._state
+        start = back_to(before.now.start, found.to)
+        try:
+            state = with_motion(replace(before, steps=before.steps + 1), start, self._tools)
+            state = replace(state, nis=before.nis, used=before.used)
+            self._estimate = self._report(state, self._estimate.t, None)
+        except Exception:  # it is the same camera epoch without it, only less well known
+            return False
+        self._returns.append(DetectedReturn(before.epoch, found.to, t, found.log_bayes))
+        self._state, self._serial, self._judgement = state, self._serial + 1, None
+        return True
+
+    def _note_move(self, before: State, first: int, since_t: float, t: float, log_bayes: float | None) -> None:
+        last_t = self._tools.store.time(first - 1) if first else before.now.start.t
+        move = DetectedMove(before.epoch - len(self._moves), first, since_t, last_t, t, log_bayes)
+        self._moves.append(move)
+        self._noticed[self._state.epoch] = move.text
+        self._estimate = self._report(self._state, self._estimate.t, self._judgement)
 
     def _consult(self, *, ask: bool) -> None:
         """Ask the judge, adopt what it answers."""
@@ -192,17 +281,66 @@ class OnlineRegistration:
         """While many events of before are taken in again: judged once, at the end, where the last judgement was due.
 
         What is reported afterwards is what ``inline`` reports after the same events, but for the time that it takes.
+        Moves that were found out are among the events; only after the last one they are looked for again.
         """
         usual, deferred = self._judge, DeferredJudge()
         self._judge = None if usual is None else deferred
+        self._guard.pause()
+        self._caught = None
         try:
             yield
         finally:
             self._judge = usual
-        if deferred.case is not None and deferred.case.epoch == self._state.epoch:
+        if self._guard.resume(self._state, self._serial, self._tools.store):
+            self._adopt_found(self._t)
+        if deferred.case is not None:
             found, _ = judge(deferred.case, self._model, self._config, self._prior)
-            self._judgement = found
-            self._estimate = self._report(self._state, self._estimate.t, found)
+            self._caught, self._surface = found, found.surface or self._surface
+            if found.epoch == self._state.epoch:
+                self._judgement = found
+                self._estimate = self._report(self._state, self._estimate.t, found)
+
+    def rest(self) -> Callable[[Sink], None] | None:
+        """What writes down the engine as it is now (at any later time), where the last event ended with a rest."""
+        state = self._state
+        if state.window is None or state.window.seed is None:
+            return None
+        noticed = Noticed(tuple(self._moves), tuple(self._returns), self._suspicion)
+        found = Rest(state, self._t, self._serial, self._estimate.t, self._judgement, self._surface, noticed)
+        if isinstance(self._judge, DeferredJudge):
+            return partial(self._write_caught, found, self._judge.case)
+        return partial(self._write, found)
+
+    def _write(self, rest: Rest, sink: Sink) -> None:
+        write_rest(sink, rest, self._tools.store.aims, self._tools.store)
+
+    def _write_caught(self, rest: Rest, case: Case | None, sink: Sink) -> None:
+        """Write a rest from :meth:`catching_up`, judged as it was due up to there."""
+        if case is not None:
+            found = self._caught
+            if found is None or found.serial != case.serial:
+                found, _ = judge(case, self._model, self._config, self._prior)
+            rest = replace(rest, judgement=found, surface=found.surface or rest.surface)
+        self._write(rest, sink)
+
+    def resume(self, source: Source) -> OnlineEstimate:
+        """Go on from a rest of an engine with the same model and configuration; the source has to end with it.
+
+        Raises:
+            ValueError: it holds something else, or this engine has taken in something already.
+            RuntimeError, ArithmeticError: the window cannot be opened.
+        """
+        if self._serial:
+            raise ValueError("events were taken in already")
+        rest, store = read_rest(source, self._tools.setting)
+        source.finish()
+        self._tools = replace(self._tools, store=store)
+        self._state, self._t, self._serial = rest.state, rest.t, rest.serial
+        self._judgement, self._surface = rest.judgement, rest.surface
+        self._moves, self._returns = list(rest.noticed.moves), list(rest.noticed.returns)
+        self._noticed, self._suspicion = rest.noticed.texts(), rest.noticed.suspicion
+        self._estimate = self._report(self._state, rest.estimate_t, rest.judgement)
+        return self._estimate
 
     # --- what is known ----------------------------------------------------------------------------------------------
 
@@ -212,9 +350,19 @@ class OnlineRegistration:
         return self._estimate
 
     def refresh(self) -> OnlineEstimate:
-        """Adopt what the judge has found since, without an event."""
-        self._consult(ask=False)
+        """Adopt what the judge, and the watch for moves, have found since, without an event."""
+        self._consult(ask=self._adopt_found(self._t))
         return self._estimate
+
+    @property
+    def moves(self) -> tuple[DetectedMove, ...]:
+        """Camera moves that were found out, in the order of time; their epochs are numbered as told."""
+        return tuple(self._moves)
+
+    @property
+    def returns(self) -> tuple[DetectedReturn, ...]:
+        """Epochs in which the camera was found to be back where it was, in the order of time."""
+        return tuple(self._returns)
 
     @property
     def recent(self) -> tuple[Recent, ...]:
@@ -229,15 +377,7 @@ class OnlineRegistration:
     @property
     def kept(self) -> tuple[bool, ...]:
         """Whether each pair counts, in the order in which they came."""
-        out = [False] * self._state.pairs
-        for data in self._state.epochs:
-            for chunk in data.shelf.chunks:
-                for place, pm in zip(chunk.places.tolist(), chunk.problem.look_pm.tolist(), strict=True):
-                    out[place] = bool(chunk.kept[pm])
-        for group in self._state.window.groups if self._state.window is not None else ():
-            for place in group.bundle.places:
-                out[place] = group.kept
-        return tuple(out)
+        return tuple(kept_by_place(self._state).tolist())
 
     def measurements(self) -> Measurements:
         """All that was taken in, as the batch solve takes it."""
@@ -264,6 +404,7 @@ class OnlineRegistration:
 
     def track(self, query: Track) -> TrackEstimate:
         """Answer a query from the estimate as it is; the graph is not touched."""
+        self._adopt_found(self._t)
         return fast_track(query, self.snapshot())
 
     def snapshot(self) -> Snapshot:
@@ -278,7 +419,19 @@ class OnlineRegistration:
     # --- reporting --------------------------------------------------------------------------------------------------
 
     def _report(self, state: State, t: float, found: Judgement | None) -> OnlineEstimate:
-        """The estimate of a state, with what the judge said of its epoch."""
+        """The estimate of a state, with what the judge said of its epoch, and what is known of moves."""
+        estimate = self._judged(state, t, found)
+        known = [(Verdict.REFUSED, self._suspicion), (Verdict.WARNING, self._noticed.get(state.epoch, ""))]
+        if self._guard.failure:
+            text = f"camera moves are not looked for: {self._guard.failure}; tell them by camera_moved"
+            known.append((Verdict.WARNING, text))
+        told = [(verdict, text) for verdict, text in known if text]
+        if not told:
+            return estimate
+        verdict = max(estimate.verdict, *(verdict for verdict, _ in told), key=lambda v: v.severity)
+        return replace(estimate, verdict=verdict, reasons=(*(text for _, text in told), *estimate.reasons))
+
+    def _judged(self, state: State, t: float, found: Judgement | None) -> OnlineEstimate:
         if found is not None and found.epoch != state.epoch:
             found = None
         exact = found is not None and found.serial == self._serial and state is self._state
@@ -325,81 +478,4 @@ class OnlineRegistration:
 def _looks_kept(state: State) -> int:
     """Looks of the epoch that lasts that count."""
     kept = sum(len(group.bundle.pairs) for group in (state.window.groups if state.window else ()) if group.kept)
-    shelf = state.now.shelf
-    for chunk in shelf.chunks:
-        # One look a PM is the rule, and then no array needs to be looked at.
-        if len(chunk.problem.look_pm) == len(chunk.kept):
-            kept += chunk.count
-        else:
-            kept += int(chunk.kept[chunk.problem.look_pm].sum())
-    return kept
-
-
-# --- checks ---------------------------------------------------------------------------------------------------------
-
-
-def check(event: OnlineEvent, after: float) -> None:
-    """Refuse what must not reach the graph: numbers that are not finite, shapes, times that go back.
-
-    Raises:
-        EventRefused: with what was found.
-    """
-    if not isinstance(event, Aim | Pair | CameraMoved | StaticTags):
-        raise EventRefused(f"a {type(event).__name__} is no event of a registration")
-    if not math.isfinite(event.t):
-        raise EventRefused(f"its time is {event.t}, expected a number")
-    if event.t < after:
-        raise EventRefused(f"its time is {event.t} s, before the last event's {after} s")
-    if isinstance(event, Aim | Pair):
-        _check_marker(event.marker)
-    if isinstance(event, Aim):
-        _array("camera_p_spot_mm", event.camera_p_spot_mm, (3,))
-        _covariance("covariance of the spot", event.covariance, 3)
-    elif isinstance(event, Pair):
-        look = event.look
-        for name in ("scan_rad", "scan_sigma_rad", "x_mm", "range_mm"):
-            if not math.isfinite(getattr(look, name)):
-                raise EventRefused(f"{name} is {getattr(look, name)}, expected a number")
-        if look.range_mm <= 0.0:
-            raise EventRefused(f"range_mm is {look.range_mm}, expected a number > 0")
-        if look.amplitude is not None and not math.isfinite(look.amplitude):
-            raise EventRefused(f"amplitude is {look.amplitude}, expected a number")
-        if look.sweep not in (-1, 0, 1):
-            raise EventRefused(f"sweep is {look.sweep}, expected -1, 0 or 1")
-        _covariance("covariance of the look", look.covariance, 2)
-        for name, number in (("pm", event.pm), ("marker id", event.marker.id)):
-            if not -INT64 <= number < INT64:
-                raise EventRefused(f"{name} is {number}, expected a number of 64 bits")
-    elif isinstance(event, CameraMoved):
-        if event.camera_new_T_camera_old is not None:
-            _transform("camera_new_T_camera_old", event.camera_new_T_camera_old)
-        if event.covariance is not None:
-            _covariance("covariance of the motion", event.covariance, 6)
-    else:
-        for tag, pose in event.camera_T_tag.items():
-            _transform(f"camera_T_tag of tag {tag}", pose)
-
-
-def _check_marker(marker: MarkerObservation) -> None:
-    _transform("camera_T_marker", marker.camera_T_marker)
-    _covariance("covariance of the marker", marker.covariance, 6)
-
-
-def _array(name: str, value: FloatArray, shape: tuple[int, ...]) -> None:
-    if np.shape(value) != shape:
-        raise EventRefused(f"{name} has shape {np.shape(value)}, expected {shape}")
-    if not np.isfinite(value).all():
-        raise EventRefused(f"{name} has an entry that is not finite")
-
-
-def _transform(name: str, value: FloatArray) -> None:
-    _array(name, value, (4, 4))
-    if not is_rigid(value):
-        raise EventRefused(f"{name} is no rigid transform")
-
-
-def _covariance(name: str, value: FloatArray, size: int) -> None:
-    _array(name, value, (size, size))
-    scale = float(np.abs(value).max())
-    if np.abs(value - value.T).max() > 1e-6 * scale or (np.diag(value) < 0).any():
-        raise EventRefused(f"{name} is not symmetric with variances >= 0")
+    return kept + state.now.shelf.counts[2]

@@ -43,4 +43,52 @@ class StaticTags:
     covariance: Mapping[int, FloatArray]
 
 
+@dataclass(frozen=True, slots=True)
+class DetectedMove:
+    """A move that nobody told.
+
+    Attributes:
+        epoch: camera epoch (as told) that it divides.
+        since: index among all pairs of the first pair after it (where tags showed it, of the next one to come).
+        since_t: time of that pair, or of the first frame of tags after it. last_t: of the pair before.
+        alarm_t: of the event at which the evidence sufficed.
+        log_bayes: of the move there against none, when pairs showed it; None where tags did.
+    """
+
+    epoch: int
+    since: int
+    since_t: float
+    last_t: float
+    alarm_t: float
+    log_bayes: float | None
+
+    @property
+    def text(self) -> str:
+        """What to tell the user; pairs are counted from 1."""
+        return (
+            f"the camera moved between pair {self.since} and {self.since + 1} "
+            f"({self.last_t:.1f} to {self.since_t:.1f} s), untold: solved as a camera epoch of its own from there"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DetectedReturn:
+    """A camera that came back to where an earlier epoch had it, as the pairs say.
+
+    Attributes:
+        epoch: number of the epoch in which it is back. to: of the earlier one.
+        t: of the pair at which the evidence sufficed. log_bayes: of being back against being elsewhere.
+    """
+
+    epoch: int
+    to: int
+    t: float
+    log_bayes: float
+
+    @property
+    def text(self) -> str:
+        """What to tell the user."""
+        return f"in epoch {self.epoch} the camera is back where it was in epoch {self.to}: what that one knows counts"
+
+
 OnlineEvent = Aim | Pair | CameraMoved | StaticTags

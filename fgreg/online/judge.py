@@ -75,10 +75,15 @@ class Judgement:
         return 0.5 * (wide + wide.T), np.linalg.cholesky(covariance) @ self.shift
 
 
+def _plain(values: FloatArray | None) -> FloatArray | None:
+    """A copy laid out row by row: the last digits of what is made of it hang on that."""
+    return None if values is None else np.array(values, dtype=np.float64, order="C")
+
+
 def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
     """What carries over of a solve of all measurements up to an event."""
     data = solution.epochs[epoch]
-    pose, covariance, registration = data.trus_T_camera, data.covariance, solution.registration
+    pose, covariance, registration = _plain(data.trus_T_camera), _plain(data.covariance), solution.registration
     context = solution.context
     shift = root = optimum_root = None
     if pose is not None and covariance is not None and registration is not None and epoch in registration.epochs:

@@ -26,7 +26,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
@@ -52,6 +51,16 @@ ALARM = 5.4
 """Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and more than one odd pair has."""
 LEAST_JUNK, MOST_JUNK = 0.01, 0.5
 """However clean the stream: a single odd pair must never pass for a move."""
+
+
+def logsumexp(values: FloatArray, axis: int | None = None) -> FloatArray:
+    """Log of the sum of exponentials; as scipy's, without what that does for arrays of other kinds."""
+    top = np.max(values, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        out = np.log(np.sum(np.exp(values - top), axis=axis, keepdims=True)) + top
+    return np.asarray(out.reshape(()) if axis is None else np.squeeze(out, axis=axis))
+
 
 Relinearise = Callable[[FloatArray], WhiteTerms]
 """From steps (S, D) off the base to the same PMs linearised there, steps counted from the base."""

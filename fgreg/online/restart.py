@@ -13,12 +13,13 @@ from fgreg.errors import EstimationError
 from fgreg.graph.explicit_values import laser_chart
 from fgreg.graph.shared_state import SharedState, nominal_frame
 from fgreg.measurements import Aim, Measurements, Pair
-from fgreg.online.shared import Layout
+from fgreg.online.shared import Layout, Quadratic
 from fgreg.online.state import (
     STEP,
     WINDOW,
     Setting,
     State,
+    kept_by_place,
     opened,
     passed_from,
     shelved,
@@ -28,13 +29,13 @@ from fgreg.online.state import (
 from fgreg.online.store import MeasurementStore
 from fgreg.online.summary import Chunk, Shelf, make_chunk
 from fgreg.online.window import Bundle, Group, open_window, prepare
-from fgreg.registration import Registration, register
+from fgreg.registration import Registration, register, register_near
 
 ALL_PAIRS = 120
 """Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
 EARLIER_PAIRS = 60
 AIMS_IN_CHUNK = 64
-STAYS_SIGMA = 1.0
+STAYS_SIGMA = 0.02
 """A window that was opened at an optimum has to come to rest no farther from it."""
 
 
@@ -68,38 +69,120 @@ def registered(state: State, tools: Tools, pair: Pair | None = None, aim: Aim | 
     All of them, or where there are many the epoch that lasts and the last pairs before it; what is known of earlier
     epochs then stays as it is.
     """
+    taken = _taken(state, tools, pair, aim)
+    after = replace(taken.after, window=None, is_open=True)
+    try:
+        found = register(taken.measurements, tools.setting.model, tools.config, tools.setting.sound_speed)
+    except EstimationError as error:
+        return replace(after, why_none=str(error))
+    if state.epoch not in found.epochs:
+        count = len({p.pm for p in taken.measurements.pairs if p.epoch == state.epoch})
+        text = f"{count} pairs are too few for a registration: take at least {tools.config.min_pairs}"
+        return replace(after, why_none=text)
+    after = replace(after, is_open=state.epoch in found.ambiguous)
+    return _from_registration(after, found, taken, tools)
+
+
+def settled_anew(state: State, tools: Tools, pair: Pair) -> State | None:
+    """:func:`registered` near the present estimate, without a search; None where it leads to nothing.
+
+    ``state`` holds the pair already; it comes back as it is where the same PMs count and the optimum is the same.
+    """
+    before = replace(state, pairs=state.pairs - 1)
+    taken = _taken(before, tools, pair, None)
+    epochs = sorted({p.epoch for p in taken.measurements.pairs})
+    start = _start(state, epochs)
+    if start is None:
+        return None
+    setting = tools.setting
+    try:
+        found = register_near(taken.measurements, setting.model, tools.config, start, epochs, setting.sound_speed)
+    except EstimationError:
+        return None
+    if _is_same(state, found, taken, epochs):
+        return state
+    return _from_registration(replace(taken.after, window=None), found, taken, tools)
+
+
+def _is_same(state: State, found: Registration, taken: _Taken, epochs: Sequence[int]) -> bool:
+    """Whether a registration is what the state is already: the same shots count, and the estimate is the same."""
+    window, shots = state.window, found.shots
+    if window is None or state.layout is None:
+        return False
+    solved = np.isin([pair.epoch for pair in taken.measurements.pairs], epochs)
+    kept = kept_by_place(state)[list(taken.places)][solved]
+    if not np.array_equal(kept, shots.pm_kept[shots.problem.look_pm]):
+        return False
+    aims = [chunk.kept for chunk in state.aim_chunks]
+    if not np.array_equal(np.concatenate(aims) if aims else np.zeros(0, dtype=bool), shots.aim_kept):
+        return False
+    there = _in_chart(_one_epoch(found.optimum.state, len(epochs) - 1), state.layout)
+    return sigma_distance(there, window.state, window.covariance, state.layout.columns) < STAYS_SIGMA
+
+
+def _start(state: State, epochs: Sequence[int]) -> SharedState | None:
+    """The present estimate with the registrations of some epochs; None where one of them has none."""
+    if state.window is None:
+        return None
+    now = state.window.state
+    each = [now if k == state.epoch else state.epochs[k].state for k in epochs]
+    known = [one for one in each if one is not None]
+    if len(known) < len(each):
+        return None
+    return replace(
+        now,
+        rotation=np.concatenate([one.rotation for one in known], axis=1),
+        translation_mm=np.concatenate([one.translation_mm for one in known], axis=1),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Taken:
+    """What a registration is made of.
+
+    Attributes:
+        measurements: with the pairs at ``places`` of the session's order.
+        whole: whether those are all there are.
+        after: the state with their counts.
+    """
+
+    measurements: Measurements
+    places: tuple[int, ...]
+    whole: bool
+    after: State
+
+
+def _taken(state: State, tools: Tools, pair: Pair | None, aim: Aim | None) -> _Taken:
     store, new = tools.store, [] if pair is None else [pair]
     first, pairs = state.now.first, state.pairs
     whole = state.layout is None or pairs <= ALL_PAIRS
     begin = 0 if whole else max(0, first - EARLIER_PAIRS)
-    places = [*range(begin, pairs), *range(pairs, pairs + len(new))]
-    taken = [store.pair(place, epoch_of(state, place)) for place in range(begin, pairs)]
+    old = [*_tied_to(state, begin), *range(begin, pairs)]
+    places = [*old, *range(pairs, pairs + len(new))]
+    taken = [store.pair(place, epoch_of(state, place)) for place in old]
     taken += [replace(p, epoch=state.epoch) for p in new]
     aims = (*store.aims, *([] if aim is None else [aim]))
     measurements = Measurements(aims, tuple(taken), tuple(data.start for data in state.epochs))
-    after = replace(state, pairs=pairs + len(new), aims=len(aims), window=None, is_open=True)
-    try:
-        found = register(measurements, tools.setting.model, tools.config, tools.setting.sound_speed)
-    except EstimationError as error:
-        return replace(after, why_none=str(error))
-    if state.epoch not in found.epochs:
-        count = len({p.pm for p in taken if p.epoch == state.epoch})
-        text = f"{count} pairs are too few for a registration: take at least {tools.config.min_pairs}"
-        return replace(after, why_none=text)
-    return _from_registration(after, found, measurements, places, aims, tools, whole=whole)
+    after = replace(state, pairs=pairs + len(new), aims=len(aims))
+    return _Taken(measurements, tuple(places), whole, after)
+
+
+def _tied_to(state: State, before: int) -> range:
+    """Last pairs of the epoch that the one that lasts is tied to, where they are among those before a place."""
+    start = state.now.start
+    if start.after is None or not start.motion_known:
+        return range(0)
+    end = state.epochs[start.after + 1].first
+    return range(max(state.epochs[start.after].first, end - EARLIER_PAIRS), end) if end <= before else range(0)
 
 
 def _from_registration(
     state: State,
     found: Registration,
-    measurements: Measurements,
-    places: Sequence[int],
-    aims: Sequence[Aim],
+    taken: _Taken,
     tools: Tools,
-    *,
-    whole: bool,
 ) -> State:
-    setting, optimum = tools.setting, found.optimum.state
+    setting, optimum, whole = tools.setting, found.optimum.state, taken.whole
     columns = setting.columns
     if whole or state.layout is None:
         state = replace(state, layout=Layout(columns, optimum.marker_T_nominal[0].copy()))
@@ -108,7 +191,7 @@ def _from_registration(
     layout = state.layout
     if layout is None:
         raise ValueError("no shared variables")
-    bundles = _bundles(found, measurements, places)
+    bundles = _bundles(found, taken.measurements, taken.places)
     at_epoch = {k: _one_epoch(optimum, found.epochs.index(k)) for k in found.epochs}
     here = at_epoch[state.epoch]
     if whole:
@@ -124,8 +207,7 @@ def _from_registration(
     shelf = shelved(Shelf(), mine[:recent], here, setting)
     state = replace(
         state.with_now(shelf=shelf, state=here),
-        aim_chunks=_aim_chunks(aims, [bool(k) for k in found.shots.aim_kept], here, setting),
-        is_open=state.epoch in found.ambiguous,
+        aim_chunks=_aim_chunks(taken.measurements.aims, [bool(k) for k in found.shots.aim_kept], here, setting),
         why_none="",
     )
     state = replace(state, passed=passed_from(state.epochs, here, columns)[0])
@@ -141,12 +223,24 @@ def _from_registration(
     if not stays:
         # Among few pairs that contradict each other, full Gauss-Newton steps lead away from the optimum that damped
         # ones found. The optimum stands: all pairs are summed up at it, and the window starts empty.
-        after = state.with_now(shelf=shelved(Shelf(), mine, here, setting))
         try:
-            window = open_window((), summary(after, here, setting), layout, state.epoch, numbers)
+            after = state.with_now(shelf=shelved(Shelf(), mine, here, setting))
+            known = _at_rest(found, state.epoch, here) if whole else summary(after, here, setting)
+            window = open_window((), known, layout, state.epoch, numbers)
         except RuntimeError:  # GTSAM's word for a system that is indeterminate, as three pairs can leave it
             return replace(state, why_none="these pairs leave the registration undetermined: take more")
     return replace(after.with_now(state=window.state), window=window)
+
+
+def _at_rest(found: Registration, epoch: int, here: SharedState) -> Quadratic:
+    """What a registration says about the shared variables of one of its epochs, at its optimum."""
+    place, count = found.epochs.index(epoch), len(found.epochs)
+    mine = np.r_[6 * place : 6 * place + 6, 6 * count : len(found.covariance)]
+    covariance = found.covariance[np.ix_(mine, mine)]
+    scale = 1.0 / np.sqrt(np.diag(covariance))
+    information = np.linalg.inv(covariance * np.outer(scale, scale)) * np.outer(scale, scale)
+    cost = float(found.optimum.evaluation.cost[0])
+    return Quadratic(here, cost, np.zeros(len(mine)), np.asarray(0.5 * (information + information.T)))
 
 
 def _one_epoch(state: SharedState, place: int) -> SharedState:

@@ -45,17 +45,20 @@ class ReturnSettings:
     Attributes:
         elsewhere: prior of the registration's difference where the camera is not back.
         least_pairs: fewer never re-use an epoch.
-        accept, reject: log Bayes factors of the same place from which it is (or below minus which it is not) re-used.
+        accept, reject: log Bayes factors of the same place from which it is (or below minus which it is not) re-used;
+            accept by the share of cameras 2 mm or 1 deg off that are taken for back (tools/study_returns.py).
         junk_probability: of each pair.
         least_difference: turn (rad) and shift (mm) that matter.
+        tolerance: turn (rad) and shift (mm), sigmas, that a camera that is back may be off.
     """
 
     elsewhere: MoveScales
-    least_pairs: int = 3
-    accept: float = math.log(100.0)
+    least_pairs: int = 8
+    accept: float = 4.4
     reject: float = math.log(100.0)
     junk_probability: float = 0.04
     least_difference: tuple[float, float] = (math.radians(1.0), 2.0)
+    tolerance: tuple[float, float] = (math.radians(0.15), 0.3)
 
     def __post_init__(self) -> None:
         if not (self.accept > 0 and self.reject > 0 and self.least_pairs >= 1):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from fgreg.factors.adapter import Residual, custom_factor
 from fgreg.frames import FloatArray, exp_so3, hat, log_so3
@@ -19,6 +20,8 @@ from fgreg.graph.packing import Columns
 from fgreg.graph.shared_state import SharedState, step_between
 
 POSE = slice(0, 6)
+LEAST_PIVOT = 1e-4
+"""Of a correlation matrix's Cholesky factor, down to which it is used."""
 LEAST_CORRELATION = 1e-12
 """Eigenvalue of a correlation matrix below which a direction counts as not seen."""
 
@@ -76,7 +79,15 @@ def chart_turn(step: FloatArray) -> FloatArray:
 def square_root(hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Rows (m, D) and residual (m,) with ``rows' rows = hessian``, ``rows' residual = gradient``; m its rank."""
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    value, vector = np.linalg.eigh(hessian / np.outer(scale, scale))
+    correlation = hessian / np.outer(scale, scale)
+    try:  # where all is seen well: a tenth of the time that eigenvalues take
+        lower = np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        pass
+    else:
+        if lower.diagonal().min() > LEAST_PIVOT:
+            return lower.T * scale, solve_triangular(lower, gradient / scale, lower=True, check_finite=False)
+    value, vector = np.linalg.eigh(correlation)
     seen = value > LEAST_CORRELATION * value[-1]
     root = np.sqrt(value[seen])
     rows = (vector[:, seen] * root).T * scale
@@ -127,10 +138,11 @@ class Layout:
         """The estimate of the shared variables; what is no variable is as in ``like``."""
         keys = self.keys(epoch)
         pose = isam.calculateEstimatePose3(keys[0]).matrix()
+        # Copies, laid out as all other arrays: the last digits of sums hang on that.
         state = replace(
             like,
-            rotation=pose[None, None, :3, :3],
-            translation_mm=pose[None, None, :3, 3],
+            rotation=pose[None, None, :3, :3].copy(),
+            translation_mm=pose[None, None, :3, 3].copy(),
             beam=isam.calculateEstimateVector(keys[1])[None],
             edge_rad=np.array([isam.calculateEstimateDouble(keys[2])]),
         )

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray
+from fgreg.frames import BoolArray, FloatArray
+from fgreg.graph.explicit import Variable
 from fgreg.graph.packing import Columns, PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
@@ -32,6 +32,7 @@ from fgreg.online.summary import (
     make_chunk,
     passed_on,
     summed,
+    with_more,
     without_pms,
     without_priors,
 )
@@ -40,8 +41,12 @@ from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import junk_p_of
 
 NOTHING = Shelf()
-WINDOW, STEP = 24, 8
-"""Most groups in the window, and how many of the oldest go into the summary at once when one more comes."""
+WINDOW, STEP = 17, 5
+"""Most groups in the window, and how many of the oldest go into the summary at once when one more comes. No multiple of
+the events between other work (fgreg.online.updates), which would always have to stand back at the same places."""
+NEAR_PAIRS = 160
+"""Up to so many pairs of an epoch, its chunks and the aims are linearised anew whenever the estimate moves much, and
+where there is junk all PMs are judged after every pair."""
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
@@ -138,6 +143,7 @@ class State:
         recent: oldest first.
         steps: events since the start, which the spreading of work goes by.
         nis, used: of the last event, where it was a pair.
+        effort: since the last rest (fgreg.online.rest).
     """
 
     epochs: tuple[EpochData, ...]
@@ -153,6 +159,7 @@ class State:
     steps: int = 0
     nis: float | None = None
     used: bool = False
+    effort: int = 0
 
     @property
     def epoch(self) -> int:
@@ -207,23 +214,33 @@ def passed_from(
 
     Also each epoch's registration given what follows.
     """
-    passed: Quadratic | None = None
+    last = len(epochs) - 1
+    passed: dict[int, Quadratic] = {}
     eliminated: list[Elimination | None] = []
-    for data, following in pairwise(epochs):
-        if data.state is None:
+    # Each passes on what it knows to the last one that its registration is tied to, or to the next.
+    tied = {data.start.old(k): k for k, data in enumerate(epochs) if k and data.start.motion_known}
+    for k, data in enumerate(epochs[:-1]):
+        told = passed.get(k)
+        if data.state is None:  # what was passed on to it speaks of the common variables alone
+            if told is not None:
+                _pass(passed, k + 1, told, columns)
             eliminated.append(None)
             continue
-        here = with_common(data.state, common)
+        to = tied.get(k, k + 1)
+        start = epochs[to].start if k in tied else EpochStart(epochs[to].start.t)
+        here, state = with_common(data.state, common), epochs[to].state
         known = data.shelf.about(here, columns)
-        if passed is not None:
-            known = known.plus(passed.at(here, columns))
-        if following is epochs[-1]:
-            there = common
-        else:
-            there = with_common(following.state, common) if following.state else carried_over(here, following.start)
-        passed, elimination = passed_on(known, following.start, there, columns)
+        if told is not None:
+            known = known.plus(told.at(here, columns))
+        there = common if to == last else with_common(state, common) if state else carried_over(here, start)
+        more, elimination = passed_on(known, start, there, columns)
+        _pass(passed, to, more, columns)
         eliminated.append(elimination)
-    return passed, tuple(eliminated)
+    return passed.get(last), tuple(eliminated)
+
+
+def _pass(passed: dict[int, Quadratic], to: int, more: Quadratic, columns: Columns) -> None:
+    passed[to] = more if to not in passed else passed[to].at(more.state, columns).plus(more)
 
 
 def with_common(state: SharedState, common: SharedState) -> SharedState:
@@ -242,8 +259,17 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 # --- groups into chunks ---------------------------------------------------------------------------------------------
 
 
-def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Setting) -> Shelf:
-    """The shelf with more PMs, the open chunk filled first and linearised anew."""
+def shelved(
+    shelf: Shelf,
+    groups: Sequence[Bundle],
+    at: SharedState,
+    setting: Setting,
+    points: Sequence[FloatArray] | None = None,
+) -> Shelf:
+    """The shelf with more PMs, the open chunk filled first.
+
+    ``points``: of the PMs (3,) at that state; only what comes to the open chunk is then linearised there, else all.
+    """
     left = list(groups)
     while left:
         before = shelf.open
@@ -253,6 +279,13 @@ def shelved(shelf: Shelf, groups: Sequence[Bundle], at: SharedState, setting: Se
         places = np.array([place for group in now for place in group.places], dtype=np.int64)
         problem, kept = setting.pack((), pairs), np.array([group.kept for group in now])
         private: PrivateState | None = None
+        if points is not None:
+            start = replace(initial_private(problem, at), trus_p_pm=np.array(points[: len(now)])[None])
+            points = points[len(now) :]
+            more = make_chunk(places, problem, kept, at, start, rounds=1)
+            whole = more if before is None else with_more(before, more, setting.columns)
+            shelf = shelf.with_open(whole, setting.columns)
+            continue
         if before is not None:
             private = joined_private(before.private, initial_private(problem, at))
             problem, places = joined(before.problem, problem), np.concatenate([before.places, places])
@@ -286,14 +319,25 @@ def without_label(shelf: Shelf, label: int, at: SharedState, columns: Columns) -
 
 def counts(state: State) -> tuple[int, int]:
     """PMs that are kept, and all, over the epochs that have a registration."""
-    chunks = [chunk for data in state.epochs for chunk in data.shelf.chunks]
-    kept, every = sum(chunk.count for chunk in chunks), sum(len(chunk.kept) for chunk in chunks)
+    tallies = [data.shelf.counts for data in state.epochs]
+    kept, every = sum(tally[0] for tally in tallies), sum(tally[1] for tally in tallies)
     groups = state.window.groups if state.window is not None else ()
     return kept + sum(group.kept for group in groups), every + len(groups)
 
 
+def kept_by_place(state: State) -> BoolArray:
+    """(P,) whether each pair counts, in the session's order."""
+    out = np.zeros(state.pairs, dtype=bool)
+    for data in state.epochs:
+        for chunk in data.shelf.chunks:
+            out[chunk.places] = chunk.kept[chunk.problem.look_pm]
+    for group in state.window.groups if state.window is not None else ():
+        out[list(group.bundle.places)] = group.kept
+    return out
+
+
 def limit_of(degrees_of_freedom: int, kept: int, count: int) -> float:
-    """Chi square beyond which a PM is junk, as in fgreg.robust."""
+    """Chi square beyond which a PM is junk, as in fgreg.robust: where ``kept`` of ``count`` count, it among them."""
     return float(chdtri(max(degrees_of_freedom, 1), junk_p_of(kept, count)))
 
 
@@ -323,7 +367,11 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     if len(window.groups) < WINDOW:
         return state, ()
     oldest = window.groups[:STEP]
-    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting)
+    points = None
+    if state.epoch_pairs > NEAR_PAIRS and all(group.kept for group in oldest):
+        keys = [Variable.trus_p_pm.key(group.prepared.first) for group in oldest]
+        points = [window.isam.calculateEstimatePoint3(key) for key in keys]
+    shelf = shelved(state.now.shelf, [group.bundle for group in oldest], window.state, setting, points)
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 

@@ -23,7 +23,7 @@ from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.measurements import POSE_FLOOR, EpochStart, usable_covariance
 from fgreg.online.shared import Quadratic
 
-CHUNK = 128
+CHUNK = 64
 """PMs in a chunk that is full."""
 FAR_RAD = 5e-3
 """Turn beyond which a sum of quadratics is formed anew about a state near by, rather than carried on."""
@@ -130,6 +130,19 @@ def _honest(parts: Parts, before: PrivateState) -> Parts:
     return replace(parts, pm=replace(parts.pm, cost=cost))
 
 
+def with_more(chunk: Chunk, more: Chunk, columns: Columns) -> Chunk:
+    """A chunk with more PMs of its epoch that are linearised already; its own stay linearised where they are."""
+    state = more.quadratic.state
+    return Chunk(
+        np.concatenate([chunk.places, more.places]),
+        joined(chunk.problem, more.problem),
+        np.concatenate([chunk.kept, more.kept]),
+        joined_private(chunk.private, more.private),
+        chunk.quadratic.at(state, columns).plus(more.quadratic),
+        chunk.count + more.count,
+    )
+
+
 def shots_of(chunk_problem: PackedProblem, parts: Parts) -> Contributions:
     """What the chunk's shots add, PMs or aims."""
     return parts.pm if len(chunk_problem.pms) else parts.aim
@@ -163,16 +176,38 @@ def chunk_of(places: IntArray, problem: PackedProblem, kept: BoolArray, state: S
     return Chunk(places, problem, kept, parts.private, Quadratic(state, cost, gradient, hessian), int(kept.sum()))
 
 
+Tally = tuple[int, int, int]
+"""PMs that count, PMs, looks that count."""
+
+
+def tally_of(chunk: Chunk) -> Tally:
+    """Of one chunk of pairs."""
+    # One look a PM is the rule, and then no array needs to be looked at.
+    single = len(chunk.problem.look_pm) == len(chunk.kept)
+    return chunk.count, len(chunk.kept), chunk.count if single else int(chunk.kept[chunk.problem.look_pm].sum())
+
+
+def plus_tally(one: Tally, other: Tally, times: int = 1) -> Tally:
+    """Sum, or difference."""
+    return one[0] + times * other[0], one[1] + times * other[1], one[2] + times * other[2]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Shelf:
     """The chunks of one epoch: those that are full, with the sum of their quadratics, and the open one.
 
-    ``total`` is about a state of its own; replacing a chunk replaces its share of it.
+    ``total`` is about a state of its own; replacing a chunk replaces its share of it. ``tally``: of the full ones.
     """
 
     full: tuple[Chunk, ...] = ()
     total: Quadratic | None = None
     open: Chunk | None = None
+    tally: Tally = (0, 0, 0)
+
+    @property
+    def counts(self) -> Tally:
+        """Of all of them; takes no longer the more there are."""
+        return self.tally if self.open is None else plus_tally(self.tally, tally_of(self.open))
 
     @property
     def chunks(self) -> tuple[Chunk, ...]:
@@ -185,16 +220,17 @@ class Shelf:
             return replace(self, open=chunk)
         own = chunk.quadratic
         added = own if self.total is None else self.total.plus(own.at(self.total.state, columns))
-        return Shelf((*self.full, chunk), added, None)
+        return Shelf((*self.full, chunk), added, None, plus_tally(self.tally, tally_of(chunk)))
 
     def with_full(self, place: int, chunk: Chunk, columns: Columns) -> Shelf:
         """With another chunk in place of a full one."""
         if self.total is None:
             raise ValueError("no chunk is full")
         full = (*self.full[:place], chunk, *self.full[place + 1 :])
+        tally = plus_tally(plus_tally(self.tally, tally_of(chunk)), tally_of(self.full[place]), -1)
         at = chunk.quadratic.state
         if np.abs(step_between(self.total.state, at, columns)[0, :3]).max() > FAR_RAD:
-            return Shelf(full, summed([c.quadratic for c in full], at, columns), self.open)
+            return Shelf(full, summed([c.quadratic for c in full], at, columns), self.open, tally)
         here = self.total.state
         old, new = self.full[place].quadratic.at(here, columns), chunk.quadratic.at(here, columns)
         total = Quadratic(
@@ -203,7 +239,7 @@ class Shelf:
             self.total.gradient - old.gradient + new.gradient,
             self.total.hessian - old.hessian + new.hessian,
         )
-        return Shelf(full, total, self.open)
+        return Shelf(full, total, self.open, tally)
 
     def about(self, state: SharedState, columns: Columns) -> Quadratic:
         """Sum of all about a state."""
@@ -282,4 +318,5 @@ def carried_over(state: SharedState, start: EpochStart) -> SharedState:
     if motion is None:
         return state
     moved_pose = state.trus_T_camera()[0] @ inverse(motion)
-    return replace(state, rotation=moved_pose[None, None, :3, :3], translation_mm=moved_pose[None, None, :3, 3])
+    rotation, translation_mm = moved_pose[None, None, :3, :3].copy(), moved_pose[None, None, :3, 3].copy()
+    return replace(state, rotation=rotation, translation_mm=translation_mm)

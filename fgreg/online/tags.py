@@ -246,7 +246,17 @@ def watch_tags(watch: TagWatch, frame: TagFrame, settings: TagSettings) -> tuple
         if motion is None or (best.motion is not None and motion.chi2 <= best.motion.chi2):
             continue
         best = TagCheck(motion.chi2 > settings.threshold, motion, size)
-    return watch, best
+    return watch, best if best.alarm else _on_its_way(means, recent, settings) or best
+
+
+def _on_its_way(means: Mapping[int, TagPose], recent: Sequence[TagFrame], settings: TagSettings) -> TagCheck | None:
+    """An alarm where the last few frames do not agree with each other, and each of them alone is off its place."""
+    few = recent[-min(settings.windows) :]
+    if len(few) < 2 or average_tags(few, settings.steady_share):
+        return None
+    motions = [tag_motion(means, average_tags([frame], settings.steady_share)) for frame in few]
+    off = [motion for motion in motions if motion is not None and motion.chi2 > settings.threshold]
+    return TagCheck(True, off[-1], len(few)) if len(off) == len(few) else None
 
 
 def restart_watch(watch: TagWatch, frames: int, settings: TagSettings) -> TagWatch:

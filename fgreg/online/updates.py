@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray, IntArray
+from fgreg.frames import IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.measurements import Aim, EpochStart, Pair
-from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered
-from fgreg.online.shared import Layout, small_step
+from fgreg.online.restart import AIMS_IN_CHUNK, ALL_PAIRS, Tools, registered, settled_anew
+from fgreg.online.shared import Layout
+from fgreg.online.sorting import (
+    flipped_while_odd,
+    has_junk,
+    information,
+    is_apart,
+    odd_ones,
+    one_look_apart,
+    toggled,
+)
 from fgreg.online.state import (
+    NEAR_PAIRS,
     RECENT,
     SETTLED_FEW,
     SETTLED_MANY,
@@ -35,17 +44,17 @@ from fgreg.online.state import (
     with_common,
     without_label,
 )
-from fgreg.online.summary import carried_over, chunk_of, joined, make_chunk
+from fgreg.online.summary import carried_over, chunk_of, make_chunk
 from fgreg.online.summary import settled as settled_parts
 from fgreg.online.window import Bundle, Change, Group, Window, open_window, prepare
-from fgreg.robust import AIM_LIMIT, innovations_of, junk_p_of, pm_limits
+from fgreg.robust import AIM_LIMIT, innovations_of, limits_among
 
 FIRST_PAIRS = 8
 """Up to so many pairs of an epoch every event starts from a registration of its own, with a search for all minima."""
 FEW_PAIRS = 40
 """Up to so many, who counts is settled by a registration whenever a pair deviates, or a PM is in that should be out."""
-NEAR_PAIRS = 160
-"""Up to so many, all of the epoch's chunks and the aims are linearised anew whenever the estimate moves much."""
+JUDGED_PAIRS = 80
+"""Up to so many, where there is junk, who counts is settled anew near the estimate when a PM is in or out wrongly."""
 VISIT, VISIT_EARLIER = 8, 64
 """A chunk is linearised anew and its PMs judged every so many events; one of the earlier epochs."""
 
@@ -73,7 +82,7 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     """:func:`with_pair` where there is a registration to begin with."""
     setting, place = tools.setting, state.pairs
     before = window
-    earlier = tools.store.looks_at(pair.pm, state.now.first)
+    earlier = [p for p in tools.store.looks_at(pair.pm, state.now.first) if not is_apart(state, p, pair.pm)]
     bundle = Bundle(
         pair.pm,
         (*earlier, place),
@@ -90,16 +99,25 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     known = same.prepared.quadratic.at(window.state, layout.columns) if same is not None and same.kept else None
     nis = innovation(prepared, window.covariance, known)
     kept, every = counts(state)
-    limit = limit_of(len(prepared.rows), kept, every)
+    limit = limit_of(len(prepared.rows), kept + (same is None or not same.kept), every + (same is None))
     fits = nis <= limit
+    group = Group(replace(bundle, kept=fits), prepared)
+    change = Change(take_in=(group,) if fits else (), set_aside=() if fits else (group,))
+    apart = None if fits or not earlier else one_look_apart(state, bundle, layout, window, tools, known)
+    if apart is not None:
+        group, junk = apart
+        numbers += 1
+        change = Change(take_in=(group,), set_aside=(junk,))
+        fits, prepared = place in group.bundle.places, group.prepared
     state = replace(state, pairs=place + 1)
     recent = Recent(place, prepared.quadratic, before.state, before.covariance, nis, fits)
-    forget = () if same is None else (same.label,)
-    group = Group(replace(bundle, kept=fits), prepared)
-    change = Change(take_in=(group,) if fits else (), set_aside=() if fits else (group,), forget=forget)
+    if same is not None:
+        change = replace(change, forget=(same.label,))
     few, near = state.epoch_pairs <= FEW_PAIRS, state.epoch_pairs <= NEAR_PAIRS
     settled = SETTLED_FEW if few else SETTLED_NEAR if near else SETTLED_MANY
-    state, gone = popped(state, window, setting)
+    # Looks that the new one is summed up with do not go onto the shelf beside.
+    others = replace(window, groups=tuple(group for group in window.groups if group is not same))
+    state, gone = popped(state, others, setting)
     if gone:
         if near:
             state = refreshed(state, window.state, setting)
@@ -121,19 +139,31 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     )
     if few:
         first = pms_in_epoch(state) <= FIRST_PAIRS or state.is_open
-        if first or not fits or odd_ones(state, setting):
+        if first or nis > limit or odd_ones(state, setting):
             found = registered(replace(state, pairs=place), tools, pair)
             return replace(found, nis=nis, used=is_kept(found, place), recent=state.recent)
-        return state
+        return _judged_anew(state, pair, tools) if has_junk(state) else state
+    if near and has_junk(state):
+        if state.epoch_pairs > JUDGED_PAIRS:
+            return flipped_while_odd(state, setting)
+        return _judged_anew(state, pair, tools) if odd_ones(state, setting) else state
     if state.steps % VISIT == 3:
-        state = _toggled(state, setting)
+        state = toggled(state, setting)
     return state
+
+
+def _judged_anew(state: State, pair: Pair, tools: Tools) -> State:
+    """The state with its last pair, after who counts was settled anew by what the batch solve settles it by."""
+    found = settled_anew(state, tools, pair)
+    if found is None or found.window is None:
+        return state
+    return replace(found, nis=state.nis, used=is_kept(found, state.pairs - 1), recent=state.recent)
 
 
 def pms_in_epoch(state: State) -> int:
     """PMs of the epoch that lasts."""
     groups = state.window.groups if state.window is not None else ()
-    return len(groups) + sum(len(chunk.kept) for chunk in state.now.shelf.chunks)
+    return len(groups) + state.now.shelf.counts[1]
 
 
 def open_window_again(state: State, window: Window, setting: Setting) -> Window:
@@ -154,36 +184,6 @@ def is_kept(state: State, place: int) -> bool:
     return bool(len(found) and chunks[-1].kept[chunks[-1].problem.look_pm[found[0]]])
 
 
-def _information(window: Window) -> FloatArray:
-    return np.asarray(np.linalg.inv(window.covariance), dtype=np.float64)
-
-
-def odd_ones(state: State, setting: Setting) -> frozenset[int]:
-    """Labels of the epoch's PMs that count though they deviate, or do not though they fit."""
-    window = state.window
-    if window is None:
-        return frozenset()
-    problem: PackedProblem | None = None
-    kept: list[bool] = []
-    for chunk in state.now.shelf.chunks:
-        problem = chunk.problem if problem is None else joined(problem, chunk.problem)
-        kept.extend(chunk.kept.tolist())
-    pairs = [replace(pair, pm=g.label, epoch=0) for g in window.groups for pair in g.bundle.pairs]
-    if pairs:
-        mine = setting.pack((), pairs)
-        problem = mine if problem is None else joined(problem, mine)
-        kept.extend(group.kept for group in window.groups)
-    if problem is None:
-        return frozenset()
-    counted = np.array(kept)
-    parts = settled_parts(problem, window.state)
-    found = innovations_of(parts.pm, _information(window), counted)
-    limits = pm_limits(problem, junk_p_of(*counts(state)))
-    known = np.isfinite(found)
-    odd = known & (counted == (found > limits))
-    return frozenset(label for label, is_odd in zip(problem.pms, odd, strict=True) if is_odd)
-
-
 # --- many pairs: who counts, and old linearisation points, a bounded piece at a time --------------------------------
 
 
@@ -195,8 +195,8 @@ def visited_chunks(state: State, window: Window, setting: Setting) -> tuple[Stat
         place = turn % len(shelf.chunks)
         chunk = shelf.chunks[place]
         parts = settled_parts(chunk.problem, window.state, chunk.private, rounds=1)
-        found = innovations_of(parts.pm, _information(window), chunk.kept)
-        limits = pm_limits(chunk.problem, junk_p_of(*counts(state)))
+        found = innovations_of(parts.pm, information(window), chunk.kept)
+        limits = limits_among(chunk.problem, chunk.kept, *counts(state))
         kept = np.where(np.isfinite(found), found <= limits, chunk.kept)
         new = chunk_of(chunk.places, chunk.problem, kept, window.state, parts)
         if place == len(shelf.full):
@@ -240,51 +240,6 @@ def _visit_earlier(state: State, window: Window, setting: Setting) -> State:
     return replace(state, epochs=tuple(epochs), passed=passed_from(epochs, window.state, columns)[0])
 
 
-def _toggled(state: State, setting: Setting) -> State:
-    """The window's pairs judged anew: at most one that deviates goes out, at most one that fits comes in."""
-    window, layout = state.window, state.layout
-    if window is None or layout is None or not window.groups:
-        return state
-    found = _window_innovations(window.groups, window, setting)
-    kept, every = counts(state)
-    out, back = None, None
-    for group, value in zip(window.groups, found, strict=True):
-        fits = value <= limit_of(len(group.prepared.rows), kept, every)
-        if group.kept and not fits and out is None:
-            out = group
-        if not group.kept and fits and back is None:
-            back = group
-    if out is None and back is None:
-        return state
-    taken: tuple[Group, ...] = ()
-    numbers = window.numbers
-    if back is not None:
-        fresh = prepare(back.bundle.pairs, layout, window.state, state.epoch, setting.model, numbers)
-        numbers += len(back.bundle.pairs)
-        taken = (Group(replace(back.bundle, kept=True), fresh),)
-    change = Change(take_in=taken, leave_out=() if out is None else (out.label,))
-    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, SETTLED_MANY)
-    return replace(state.with_now(state=window.state), window=window)
-
-
-def _window_innovations(groups: Sequence[Group], window: Window, setting: Setting) -> list[float]:
-    """Innovations of the window's PMs by their rows; a PM that counts is predicted without itself, in closed form."""
-    out = []
-    root = np.linalg.cholesky(window.covariance)
-    for group in groups:
-        prepared = group.prepared
-        if prepared.far:
-            out.append(prepared.quadratic.cost)
-            continue
-        step = small_step(prepared.state, window.state, setting.columns)
-        residual = prepared.residual + prepared.rows @ step
-        seen = prepared.rows @ root
-        # |r|^2 + g' (H -+ A)^-1 g with A = rows' rows, g = rows' r, written in the few rows (Woodbury).
-        spread = np.eye(len(seen)) + (-1.0 if group.kept else 1.0) * (seen @ seen.T)
-        out.append(float(residual @ np.linalg.solve(spread, residual)))
-    return out
-
-
 # --- aims, moves ----------------------------------------------------------------------------------------------------
 
 
@@ -299,7 +254,7 @@ def with_aim(state: State, aim: Aim, tools: Tools) -> State:
     problem = setting.pack([aim], ())
     parts = settled_parts(problem, window.state)
     alone = np.zeros(1, dtype=bool)
-    found = innovations_of(parts.aim, _information(window), alone)
+    found = innovations_of(parts.aim, information(window), alone)
     kept = np.array([bool(found[0] <= AIM_LIMIT)])
     chunks = list(state.aim_chunks)
     new = chunk_of(np.array([state.aims]), problem, kept, window.state, parts)

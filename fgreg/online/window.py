@@ -62,6 +62,7 @@ class Prepared:
             ``|residual + rows d|^2`` of steps d from ``state``. m their degrees of freedom.
         state: shared variables where that holds.
         far: no place was found where they fit.
+        first: number of the first of the private variables.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -70,6 +71,7 @@ class Prepared:
     residual: FloatArray
     state: SharedState
     far: bool
+    first: int
 
     @property
     def quadratic(self) -> Quadratic:
@@ -150,74 +152,98 @@ def prepare(
         FactorError: a factor that cannot be computed here.
         ArithmeticError: numbers that are not finite.
     """
+    windows = windows_of(pairs, model)
+    graph = factors_of(pairs, windows, layout, epoch, model, first)
+    private = _beginning(pairs, windows, layout, state, model, first)
+    held = gtsam.Values()
+    layout.insert(held, state, epoch)
+    values, rows, residual, far = _settle(graph, private, held, private_sizes(pairs, first), layout, epoch)
+    return Prepared(graph, values, rows, residual, state, far, first)
+
+
+def private_sizes(pairs: Sequence[Pair], first: int) -> dict[int, int]:
+    """Keys of the private variables with their tangent dimensions, in the order in which they are eliminated."""
+    markers, lambdas, point, thetas = private_keys(pairs, first)
+    return {**dict.fromkeys(markers, 6), **dict.fromkeys(lambdas, 1), point: 3, **dict.fromkeys(thetas, 1)}
+
+
+Windows = tuple[list[float], list[float], list[float]]
+
+
+def windows_of(pairs: Sequence[Pair], model: SessionModel) -> Windows:
+    """Centre, gain of the edge, and sigma of each look's rotation."""
+    priors = sensitivity_priors([pair.look for pair in pairs], model.probe, model.stage.step_rad)
+    return priors.centre_rad.tolist(), priors.edge_gain.tolist(), priors.sigma_rad.tolist()
+
+
+def factors_of(
+    pairs: Sequence[Pair], windows: Windows, layout: Layout, epoch: int, model: SessionModel, first: int
+) -> gtsam.NonlinearFactorGraph:
+    """The looks at one PM as factors (arguments as of :func:`prepare`; ``windows`` as of :func:`windows_of`)."""
     markers, lambdas, point, thetas = private_keys(pairs, first)
     shared, columns = layout.keys(epoch), layout.columns
     bias = Variable.marker_bias.key() if columns.bias is not None else None
     ratio = Variable.sound_speed_ratio.key() if columns.sound_speed is not None else None
-    probe = model.probe
-    priors = sensitivity_priors([pair.look for pair in pairs], probe, model.stage.step_rad)
-    centres, gains, sigmas = priors.centre_rad.tolist(), priors.edge_gain.tolist(), priors.sigma_rad.tolist()
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    radius_mm = model.probe.radius_mm
+    centres, gains, sigmas = windows
+    graph = gtsam.NonlinearFactorGraph()
+    shot_of: dict[int, int] = {}
+    for i, pair in enumerate(pairs):
+        look, marker = pair.look, pair.marker
+        if marker.id not in shot_of:
+            shot = shot_of[marker.id] = len(shot_of)
+            covariance = usable_covariance(marker.covariance, POSE_FLOOR)
+            graph.add(marker_pose_factor(markers[shot], marker.camera_T_marker, covariance, bias))
+            graph.add(
+                point_on_line_factor(shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal)
+            )
+        covariance = usable_covariance(look.covariance, (FLOOR_MM,) * 2)
+        graph.add(
+            point_on_arc_factor(point, thetas[i], look.scan_rad, look.x_mm, look.range_mm, covariance, radius_mm, ratio)
+        )
+        edge = shared[2] if gains[i] else None
+        graph.add(
+            sensitivity_prior_factor(
+                thetas[i], look.scan_rad, look.range_mm, radius_mm, centres[i], gains[i], sigmas[i], edge, ratio
+            )
+        )
+    return graph
 
-    # The PM first: on the first look's arc, in the middle of where it may be.
+
+def _beginning(
+    pairs: Sequence[Pair], windows: Windows, layout: Layout, state: SharedState, model: SessionModel, first: int
+) -> gtsam.Values:
+    """Where the private variables begin: the PM on the first look's arc, in the middle of where it may be."""
+    markers, lambdas, point, thetas = private_keys(pairs, first)
+    radius_mm = model.probe.radius_mm
+    centres, gains, _ = windows
     look = pairs[0].look
     reach = float(state.sound_speed_ratio[0]) * look.range_mm
     expected = centres[0] + gains[0] * float(state.edge_rad[0])
-    theta = look.scan_rad + float(arc_of_rotation(expected, look.range_mm, probe.radius_mm))
+    theta = look.scan_rad + float(arc_of_rotation(expected, look.range_mm, radius_mm))
     trus_p = np.array(
         [
             look.x_mm,
-            probe.radius_mm * math.sin(look.scan_rad) + reach * math.sin(theta),
-            probe.radius_mm * math.cos(look.scan_rad) + reach * math.cos(theta),
+            radius_mm * math.sin(look.scan_rad) + reach * math.sin(theta),
+            radius_mm * math.cos(look.scan_rad) + reach * math.cos(theta),
         ]
     )
+    values = gtsam.Values()
     values.insert(point, trus_p)
     camera_p = state.rotation[0, 0].T @ (trus_p - state.translation_mm[0, 0])
     origin, direction = beam_of_chart(state.beam[0], layout.marker_T_nominal)
     shot_of: dict[int, int] = {}
     for i, pair in enumerate(pairs):
-        look = pair.look
+        scan = pair.look.scan_rad
         if pair.marker.id not in shot_of:
             shot = shot_of[pair.marker.id] = len(shot_of)
             pose = pair.marker.camera_T_marker.copy()
             pose[:3, 3] -= state.bias_mm[0]
-            covariance = usable_covariance(pair.marker.covariance, POSE_FLOOR)
-            graph.add(marker_pose_factor(markers[shot], pair.marker.camera_T_marker, covariance, bias))
-            graph.add(
-                point_on_line_factor(shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal)
-            )
             values.insert(markers[shot], gtsam.Pose3(pose))
             values.insert(lambdas[shot], float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin)))
-        sine, cosine = math.sin(look.scan_rad), math.cos(look.scan_rad)
-        own = math.atan2(float(trus_p[1]) - probe.radius_mm * sine, float(trus_p[2]) - probe.radius_mm * cosine)
+        own = math.atan2(float(trus_p[1]) - radius_mm * math.sin(scan), float(trus_p[2]) - radius_mm * math.cos(scan))
         values.insert(thetas[i], own)
-        covariance = usable_covariance(look.covariance, (FLOOR_MM,) * 2)
-        graph.add(
-            point_on_arc_factor(
-                point, thetas[i], look.scan_rad, look.x_mm, look.range_mm, covariance, probe.radius_mm, ratio
-            )
-        )
-        edge = shared[2] if gains[i] else None
-        graph.add(
-            sensitivity_prior_factor(
-                thetas[i],
-                look.scan_rad,
-                look.range_mm,
-                probe.radius_mm,
-                centres[i],
-                gains[i],
-                sigmas[i],
-                edge,
-                ratio,
-            )
-        )
-    markers = markers[: len(shot_of)]
-    lambdas = lambdas[: len(shot_of)]
-    held = gtsam.Values()
-    layout.insert(held, state, epoch)
-    sizes = {**dict.fromkeys(markers, 6), **dict.fromkeys(lambdas, 1), point: 3, **dict.fromkeys(thetas, 1)}
-    values, rows, residual, far = _settle(graph, values, held, sizes, layout, epoch)
-    return Prepared(graph, values, rows, residual, state, far)
+    return values
 
 
 def _settle(
@@ -266,6 +292,30 @@ def _settle(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class GroupSeed:
+    """A group as numbers: what :class:`Group` is but for GTSAM's objects, which follow from it.
+
+    ``values``: its private variables in the window: (shots, 13) poses (rows of 3x4) and lambda, flat, then the PM (3)
+    and the thetas; None where it is left out.
+    """
+
+    bundle: Bundle
+    rows: FloatArray
+    residual: FloatArray
+    state: SharedState
+    far: bool
+    values: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowSeed:
+    """All that a window is opened from, but for its summary: shared variables, and groups, oldest first."""
+
+    at: SharedState
+    groups: tuple[GroupSeed, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """ISAM2 with the recent pairs in it, and the shared variables' Gaussian.
 
@@ -278,6 +328,7 @@ class Window:
         state: the estimate (one hypothesis, one epoch).
         covariance: (D, D) of the shared variables.
         numbers: of private variables used so far.
+        seed: from which it was opened, where it was and nothing has changed since.
     """
 
     isam: gtsam.ISAM2
@@ -288,6 +339,7 @@ class Window:
     state: SharedState
     covariance: FloatArray
     numbers: int
+    seed: WindowSeed | None = None
 
 
 def empty_isam() -> gtsam.ISAM2:

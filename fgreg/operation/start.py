@@ -119,7 +119,7 @@ def running(
         say("starting the registration")
         engines: list[EngineProcess] = []
 
-        def make_engine(model: SessionModel, settings: SolveConfig, prior: Any) -> EngineProcess:
+        def make_engine(model: SessionModel, settings: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
             engines.append(stack.enter_context(EngineProcess(model, settings, prior)))
             return engines[-1]
 

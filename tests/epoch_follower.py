@@ -1,4 +1,4 @@
-"""The estimate of one camera epoch, pair by pair, warm started: what a test for moves is made against.
+"""The estimate of one camera epoch, pair by pair, warm started: a reference for tests on moves, apart from the engine.
 
 Reduced Gauss-Newton on the kept PMs of the epoch so far; who is kept follows from the innovations, by the limits of
 fgreg.robust. Calibration shots (and what earlier epochs said of beam and window edge) enter as one Gaussian.
@@ -6,21 +6,22 @@ fgreg.robust. Calibration shots (and what earlier epochs said of beam and window
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from fgreg.errors import EstimationError
-from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.graph.packing import Anchor, BeamArrays, LookArrays, PackedProblem, RotationShapes, only_aims, without_aims
+from fgreg.frames import BoolArray, FloatArray
+from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
 from fgreg.graph.reduced import contributions, evaluate, refine
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
-from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, quick_score, relinearisation
+from fgreg.online.evidence import LAST, MIN_BEFORE
+from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, relinearisation
+from fgreg.online.selection import private_of, select_pms
 from fgreg.online.white import (
     Gaussian,
     WhiteTerms,
-    add_terms,
     gaussian_of,
     pivot_scale,
     pose_columns,
@@ -28,48 +29,10 @@ from fgreg.online.white import (
     whiten,
 )
 from fgreg.robust import junk_p, pm_degrees_of_freedom, pm_limits
-from fgreg.sensitivity import WindowShapes
 
-MIN_BEFORE = 6
-"""PMs that a registration takes; before so many there is nothing that could have moved."""
-WINDOW = 15
-"""Last PMs among which a move is looked for."""
-GATE = 0.5
-"""Log score by the quick test below which the proper one is left out."""
 MAX_STEPS = 8
 TOLERANCE = 3e-3
 """Newton decrement (chi square) at which an estimate has settled: what is left is in the gradients that tests get."""
-
-
-def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:
-    """The problem with some of its PMs only (increasing indices)."""
-    place = np.full(len(problem.pms), -1, dtype=np.int64)
-    place[index] = np.arange(len(index))
-    beams, looks = place[problem.beam_pm] >= 0, place[problem.look_pm] >= 0
-    beam_place = np.cumsum(beams) - 1
-    return replace(
-        problem,
-        pms=tuple(problem.pms[i] for i in index),
-        beam_pm=place[problem.beam_pm[beams]],
-        beam_epoch=problem.beam_epoch[beams],
-        beams=BeamArrays(*(getattr(problem.beams, name)[beams] for name in BeamArrays.__slots__)),
-        look_pm=place[problem.look_pm[looks]],
-        look_beam=beam_place[problem.look_beam[looks]],
-        looks=LookArrays(*(getattr(problem.looks, name)[looks] for name in LookArrays.__slots__)),
-        shapes=None if problem.shapes is None else _select_shapes(problem.shapes, index, looks),
-        log_junk=None if problem.log_junk is None else problem.log_junk[index],
-    )
-
-
-def _select_shapes(shapes: RotationShapes, index: IntArray, looks: BoolArray) -> RotationShapes:
-    look_place = np.cumsum(looks) - 1
-    stands = shapes.amplitude_look[index]
-    return RotationShapes(
-        WindowShapes(*(getattr(shapes.windows, name)[looks] for name in WindowShapes.__slots__)),
-        shapes.plane_rad[index],
-        shapes.amplitude_log[index],
-        np.where(stands >= 0, look_place[stands], -1),
-    )
 
 
 def summarise_aims(problem: PackedProblem, state: SharedState) -> PackedProblem:
@@ -191,45 +154,26 @@ class EpochFollower:
         good = nis < pm_limits(self.seen, junk_p(kept))
         self.kept = good if good.sum() >= MIN_BEFORE else before
 
-    def test(self, settings: MoveSettings, window: int = WINDOW, gate: float = GATE) -> MoveTest | None:
-        """Whether the camera moved among the last PMs; None where nothing looks like it, or too few came before them.
-
-        All PMs fitting, a test without junk, windows as Gaussians and no large moves is enough to tell that the proper
-        one is not worth its time.
-        """
-        size = min(window, self.count - MIN_BEFORE)
+    def test(self, settings: MoveSettings) -> MoveTest | None:
+        """Whether the camera moved among the last PMs; None where too few came before them."""
+        size = min(LAST, self.count - MIN_BEFORE)
         if size < 1:
             return None
-        last = np.arange(self.count - size, self.count)
-        if self.kept[last].all():
-            score = quick_score(self.everything(), self.here.terms.take(last), settings.scales, pose_columns(0))
-            if score < gate:
-                return None
-        old = np.arange(self.count) < self.count - size
+        last, old = np.arange(self.count - size, self.count), np.arange(self.count) < self.count - size
         before = self.posterior(old)
         if before is None:
             return None
         tail = select_pms(self.seen, last)
-        closer = relinearisation(tail, self.state)
         return check_for_move(
             before,
-            white_terms(tail, self.state, self._private_of(last)),
+            white_terms(tail, self.state, private_of(self.seen, self.private, last)),
             settings.learned(self.kept[old]),
             pose=pose_columns(0),
-            relinearise=closer,
+            relinearise=relinearisation(tail, self.state),
         )
-
-    def _private_of(self, pms: IntArray) -> PrivateState:
-        """The private variables of some PMs at the present state."""
-        mine = np.isin(self.seen.beam_pm, pms)
-        private = self.private
-        return replace(private, trus_p_pm=private.trus_p_pm[:, pms], beam_error=private.beam_error[:, mine])
 
     def everything(self) -> Gaussian:
         """The step given all kept PMs."""
         posterior = self.posterior(np.ones(self.count, dtype=bool))
         assert posterior is not None  # _settle raised otherwise
         return posterior
-
-
-__all__ = ["MIN_BEFORE", "WINDOW", "EpochFollower", "add_terms", "select_pms", "summarise_aims"]

@@ -1,4 +1,4 @@
-"""One epoch followed pair by pair: the batch optimum at each, whitened pairs, windows, and what is worth a test."""
+"""Whitened pairs and windows as the test for moves has them, and the cheap look beside the proper test."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from fgreg.config import SolveConfig
-from fgreg.errors import EstimationError
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced import contributions, refine
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.follow import EpochFollower, select_pms, summarise_aims
 from fgreg.online.moves import MoveSettings, check_for_move, default_scales, quick_score
 from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, add_terms, linearise, pivot_scale, pose_columns, whiten
 from fgreg.registration import pack_session
 from fgreg.robust import pm_degrees_of_freedom
+from tests.epoch_follower import EpochFollower, summarise_aims
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
 PLAIN = SolveConfig(window_shape=False)
@@ -91,51 +89,6 @@ def test_steps_are_counted_from_the_base_wherever_pairs_are_linearised() -> None
     from_base = terms.residual[0] + terms.jacobian[0] @ step[1]
     # The rows may be turned against each other: what counts is their square.
     np.testing.assert_allclose(np.sum(there**2, -1), np.sum(from_base**2, -1), rtol=0.1, atol=0.05)
-
-
-def test_the_follower_is_at_the_batch_optimum_after_every_pair() -> None:
-    problem, state, _ = _session(5, 20)
-    follower = EpochFollower(problem, state, 6)
-    for count in (7, 12, 20):
-        while follower.count < count:
-            follower.advance(follower.count + 1)
-        kept = select_pms(problem, np.flatnonzero(follower.kept))
-        batch = optimize(kept, state).state
-        here = follower.everything()
-        mean = follower.state.retract(here.mean[None], problem.columns)
-        apart = batch.trus_T_camera()[0] @ inverse(mean.trus_T_camera()[0])
-        moved = apart[:3, :3] @ np.array([0.0, 0.0, 40.0]) + apart[:3, 3] - [0.0, 0.0, 40.0]
-        sigma = math.sqrt(np.trace(here.covariance[3:6, 3:6]))
-        assert np.linalg.norm(moved) < 0.05 * sigma
-
-
-def test_too_few_pairs_to_register_are_an_error_not_an_answer() -> None:
-    problem, state, _ = _session(6, 6)
-    with pytest.raises(EstimationError, match="undetermined"):
-        EpochFollower(problem, state, 2)
-
-
-def test_a_gross_outlier_is_left_out_of_what_is_followed() -> None:
-    model, measurements, truth = make_measurements(np.random.default_rng(7), pairs=16)
-    pairs = list(measurements.pairs)
-    look = pairs[12].look
-    pairs[12] = replace(pairs[12], look=replace(look, x_mm=look.x_mm + 15.0))
-    problem, state, _ = _packed(model, replace(measurements, pairs=tuple(pairs)), truth, PLAIN)
-    follower = EpochFollower(problem, state, 8)
-    for count in range(9, 17):
-        follower.advance(count)
-    assert not follower.kept[12]
-    assert follower.kept.sum() == 15
-
-
-def test_looks_at_one_pm_that_share_it_are_followed_as_one_pm() -> None:
-    problem, state, _ = _session(8, 10, looks=2)
-    follower = EpochFollower(problem, state, 6)
-    for count in range(7, 11):
-        follower.advance(count)
-    assert follower.count == 10
-    assert len(follower.seen.look_pm) == 20
-    follower.test(MoveSettings())
 
 
 def _alone(mean: float, sigma: float, half_width: float, soft: float) -> WhiteTerms:
@@ -257,14 +210,3 @@ def test_large_moves_are_found_with_the_pairs_they_begin_at(
         camera_p = inverse(true) @ np.array([0.0, 0.0, 42.0, 1.0])
         found += bool(np.linalg.norm((moved @ camera_p)[:3] - [0.0, 0.0, 42.0]) < 4.0)
     assert found >= 2
-
-
-def test_a_steady_stream_raises_no_alarm_and_mostly_needs_no_proper_test() -> None:
-    problem, state, _ = _session(31, 50)
-    follower = EpochFollower(problem, state, 8)
-    tests = []
-    for count in range(9, 51):
-        follower.advance(count)
-        tests.append(follower.test(MoveSettings()))
-    assert not any(test is not None and test.alarm for test in tests)
-    assert sum(test is None for test in tests) > 0.3 * len(tests)

@@ -1,0 +1,49 @@
+"""Some of a packed problem's PMs, with what belongs to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fgreg.frames import BoolArray, IntArray
+from fgreg.graph.packing import BeamArrays, LookArrays, PackedProblem, RotationShapes
+from fgreg.graph.reduced_blocks import PrivateState
+from fgreg.sensitivity import WindowShapes
+
+
+def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:
+    """The problem with some of its PMs only (increasing indices)."""
+    place = np.full(len(problem.pms), -1, dtype=np.int64)
+    place[index] = np.arange(len(index))
+    beams, looks = place[problem.beam_pm] >= 0, place[problem.look_pm] >= 0
+    beam_place = np.cumsum(beams) - 1
+    return replace(
+        problem,
+        pms=tuple(problem.pms[i] for i in index),
+        beam_pm=place[problem.beam_pm[beams]],
+        beam_epoch=problem.beam_epoch[beams],
+        beams=BeamArrays(*(getattr(problem.beams, name)[beams] for name in BeamArrays.__slots__)),
+        look_pm=place[problem.look_pm[looks]],
+        look_beam=beam_place[problem.look_beam[looks]],
+        looks=LookArrays(*(getattr(problem.looks, name)[looks] for name in LookArrays.__slots__)),
+        shapes=None if problem.shapes is None else _select_shapes(problem.shapes, index, looks),
+        log_junk=None if problem.log_junk is None else problem.log_junk[index],
+    )
+
+
+def _select_shapes(shapes: RotationShapes, index: IntArray, looks: BoolArray) -> RotationShapes:
+    look_place = np.cumsum(looks) - 1
+    stands = shapes.amplitude_look[index]
+    return RotationShapes(
+        WindowShapes(*(getattr(shapes.windows, name)[looks] for name in WindowShapes.__slots__)),
+        shapes.plane_rad[index],
+        shapes.amplitude_log[index],
+        np.where(stands >= 0, look_place[stands], -1),
+    )
+
+
+def private_of(problem: PackedProblem, private: PrivateState, pms: IntArray) -> PrivateState:
+    """The private variables of some PMs (increasing indices)."""
+    mine = np.isin(problem.beam_pm, pms)
+    return replace(private, trus_p_pm=private.trus_p_pm[:, pms], beam_error=private.beam_error[:, mine])

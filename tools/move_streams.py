@@ -1,0 +1,104 @@
+"""Simulated streams with a camera move in them, and what an ideal estimator could know of them.
+
+For tools/study_moves.py and tools/study_returns.py. Poses with the documented noise (tests.forward).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
+from fgreg.graph.reduced import evaluate, refine
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.measurements import Aim, EpochStart, Measurements
+from fgreg.models import SessionModel
+from fgreg.registration import pack_session
+from fgreg.targets import target_jacobians
+
+sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
+
+from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
+
+CONFIG = SolveConfig()
+MANY_AIMS = 150
+
+
+def random_direction(rng: np.random.Generator) -> FloatArray:
+    v = rng.normal(size=3)
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def shift_of(rng: np.random.Generator, mm: float, degrees: float) -> FloatArray:
+    """camera_new_T_camera_old: by so many mm or turned by so many degrees, each half the time."""
+    if rng.uniform() < 0.5:
+        return make_transform(np.eye(3), mm * random_direction(rng))
+    return make_transform(exp_so3(math.radians(degrees) * random_direction(rng)), np.zeros(3))
+
+
+def two_epochs(
+    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool, told: bool = False
+) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
+    """Pairs before and after a motion; same beam and window edge. ``told``: as epochs 0 and 1, else all as epoch 0."""
+    rng = np.random.default_rng(seed)
+    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
+    model, first, truth = make_measurements(
+        np.random.default_rng([seed, 1]), aims=12, pairs=before, first_hit=first_hit, marker_T_laser=beam,
+        trus_T_camera=trus_T_camera,
+    )  # fmt: skip
+    # The same seed draws the same window edge; without aims all that follows is drawn anew.
+    _, second, moved = make_measurements(
+        np.random.default_rng([seed, 1]), aims=0, pairs=after, first_hit=first_hit, marker_T_laser=beam,
+        trus_T_camera=trus_T_camera @ inverse(motion),
+    )  # fmt: skip
+    t = first.pairs[-1].t + 0.5 if first.pairs else 0.0
+    later = tuple(
+        replace(
+            pair, t=pair.t + t, pm=pair.pm + before, epoch=int(told),
+            marker=replace(pair.marker, id=pair.marker.id + 100000),
+        )
+        for pair in second.pairs
+    )  # fmt: skip
+    epochs = (*first.epochs, EpochStart(t)) if told else first.epochs
+    return model, Measurements(first.aims, first.pairs + later, epochs), (truth, moved)
+
+
+def many_aims(seed: int, truth: Truth) -> tuple[Aim, ...]:
+    """So many calibration shots that the beam counts as known."""
+    rng = np.random.default_rng([seed, 9])
+    return make_measurements(rng, aims=MANY_AIMS, pairs=0, marker_T_laser=truth.marker_T_laser)[1].aims
+
+
+def ideal_covariance(
+    model: SessionModel, measurements: Measurements, truths: tuple[Truth, ...]
+) -> tuple[FloatArray, SharedState]:
+    """Covariance of all shared variables by the information at the truth: the least that any estimator can have.
+
+    Gaussian: windows count as such, and the geometry as linear. One truth per epoch of the measurements.
+    """
+    problem = pack_session(measurements, model, replace(CONFIG, window_shape=False))
+    poses = np.stack([truth.trus_T_camera[0] for truth in truths])
+    state = make_state(poses[None], truths[0].marker_T_laser, model.probe.radius_mm)
+    state = replace(state, edge_rad=np.array([truths[0].window_edge_rad]))
+    private = initial_private(problem, state)
+    for _ in range(4):
+        _, private = refine(problem, state, private)
+    hessian = evaluate(problem, state, private).hessian[0]
+    scale = 1.0 / np.sqrt(np.diag(hessian))
+    return np.asarray(np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)), state
+
+
+def ideal_tre(covariance: FloatArray, state: SharedState, epoch: int, targets_mm: FloatArray) -> float:
+    """Root mean square target error (mm) of one epoch's registration with that covariance."""
+    pose = state.trus_T_camera(epoch)[0]
+    block = slice(6 * epoch, 6 * epoch + 6)
+    jacobian = target_jacobians(pose, targets_mm)
+    spread = jacobian @ covariance[block, block] @ np.swapaxes(jacobian, 1, 2)
+    return float(np.sqrt(np.einsum("nii->n", spread).mean()))
