@@ -366,6 +366,8 @@ def test_moves_found_before_are_taken_from_the_record_when_catching_up() -> None
         for event in record:
             again.add(event)
     assert again.estimate.epoch == first.estimate.epoch == 1
+    assert again.estimate.reasons == first.estimate.reasons
+    assert again.estimate.verdict is first.estimate.verdict
     assert again.estimate.trus_T_camera is not None
     assert first.estimate.trus_T_camera is not None
     np.testing.assert_allclose(again.estimate.trus_T_camera, first.estimate.trus_T_camera, atol=1e-6)

@@ -26,6 +26,7 @@ from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_tran
 from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track, default_marker_covariance
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
+from fgreg.online.guard import WatchKind
 from fgreg.online.state import WINDOW
 
 FIRST = 8
@@ -199,13 +200,13 @@ def _row(name: str, values: FloatArray, targets: str) -> None:
     print(f"{name:<34} wall {shown[0]}   processor {shown[1]}   target {targets}")
 
 
-def bench(pairs: int, epochs: int, seed: int, judge: str | None) -> None:
+def bench(pairs: int, epochs: int, seed: int, judge: str | None, watch: WatchKind | None) -> None:
     """One stream."""
     from tests.forward import make_session
 
     model = make_session()
     stream = Stream(model, seed)
-    engine = OnlineRegistration(model, judge=None if judge is None else "process")
+    engine = OnlineRegistration(model, judge=None if judge is None else "process", watch=watch)
     for aim in stream.aims(12):
         engine.add(aim)
     times: list[tuple[float, float]] = []
@@ -260,8 +261,15 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--judge", choices=["process"], default=None, help="judge in a process of its own meanwhile")
+    parser.add_argument(
+        "--watch",
+        choices=["process", "inline", "none"],
+        default="process",
+        help="untold camera moves are looked for in a process of their own, as in the operating room; within add; or not",
+    )
     arguments = parser.parse_args()
-    bench(arguments.pairs, arguments.epochs, arguments.seed, arguments.judge)
+    watch = None if arguments.watch == "none" else arguments.watch
+    bench(arguments.pairs, arguments.epochs, arguments.seed, arguments.judge, watch)
 
 
 if __name__ == "__main__":

@@ -156,6 +156,8 @@ class OnlineRegistration:
             self._guard.keep(guard)
         if isinstance(said, TagsMoved):
             self._note_move(before, state.now.first, said.since_t, event.t, None)
+        elif isinstance(event, CameraMoved) and event.detected and event.since_t is not None:
+            self._note_move(before, state.now.first, event.since_t, event.t, None, recorded=True)
         elif isinstance(event, Pair):
             self._guard.look(state, self._serial, self._tools.store)
             moved = self._adopt_found(event.t) or moved
@@ -244,10 +246,14 @@ class OnlineRegistration:
         self._state, self._serial, self._judgement = state, self._serial + 1, None
         return True
 
-    def _note_move(self, before: State, first: int, since_t: float, t: float, log_bayes: float | None) -> None:
+    def _note_move(
+        self, before: State, first: int, since_t: float, t: float, log_bayes: float | None, *, recorded: bool = False
+    ) -> None:
+        """Tell of a move that was found out, now or (``recorded``) when the session was recorded."""
         last_t = self._tools.store.time(first - 1) if first else before.now.start.t
         move = DetectedMove(before.epoch - len(self._moves), first, since_t, last_t, t, log_bayes)
-        self._moves.append(move)
+        if not recorded:
+            self._moves.append(move)
         self._noticed[self._state.epoch] = move.text
         self._estimate = self._report(self._state, self._estimate.t, self._judgement)
 

@@ -41,7 +41,7 @@ from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import junk_p_of
 
 NOTHING = Shelf()
-WINDOW, STEP = 17, 5
+WINDOW, STEP = 17, 9
 """Most groups in the window, and how many of the oldest go into the summary at once when one more comes. No multiple of
 the events between other work (fgreg.online.updates), which would always have to stand back at the same places."""
 NEAR_PAIRS = 160
