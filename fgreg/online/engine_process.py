@@ -25,7 +25,7 @@ from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import OnlineEvent
+from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.registration import SoundSpeedPrior
@@ -58,6 +58,8 @@ class EngineProcess:
         )
         self._turn = threading.Lock()
         self._estimate: OnlineEstimate | None = None
+        self._moves: tuple[DetectedMove, ...] = ()
+        self._returns: tuple[DetectedReturn, ...] = ()
         self._process.start()
         theirs.close()
         try:
@@ -89,7 +91,7 @@ class EngineProcess:
         with self._turn:
             try:
                 self._connection.send((name, arguments))
-                how, value, self._estimate = self._connection.recv()
+                how, value, self._estimate, self._moves, self._returns = self._connection.recv()
             except (EOFError, OSError):
                 raise EngineGone("the registration's process has ended: open the session again") from None
         if how == "refused":
@@ -151,6 +153,16 @@ class EngineProcess:
         """After the last call."""
         return self._estimate
 
+    @property
+    def moves(self) -> tuple[DetectedMove, ...]:
+        """Camera moves that were found out, as of the last call."""
+        return self._moves
+
+    @property
+    def returns(self) -> tuple[DetectedReturn, ...]:
+        """Epochs in which the camera is back where it was, as of the last call."""
+        return self._returns
+
     def close(self) -> None:
         """End the process."""
         with suppress(OSError):
@@ -167,7 +179,7 @@ def _serve(
     """The process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main program ends it, in its own time
     with (
-        OnlineRegistration(model, config, judge="process", sound_speed_prior=prior) as engine,
+        OnlineRegistration(model, config, judge="process", watch="process", sound_speed_prior=prior) as engine,
         SharedSnapshot(Layout.of(model)) as shared,
         suppress(EOFError, OSError),
     ):
@@ -199,7 +211,7 @@ class _Server:
             except Exception as error:  # a defect: the estimate stands, and the caller is told
                 answer = ("failed", f"{type(error).__name__}: {error}")
             self._publish()
-            self._connection.send((*answer, self._engine.estimate))
+            self._connection.send((*answer, self._engine.estimate, self._engine.moves, self._engine.returns))
 
     def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
         engine = self._engine

@@ -22,6 +22,7 @@ from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
+from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
 
 WATCHDOG_LOG = "stage-orders.log"
