@@ -6,6 +6,7 @@ A connection that is lost is looked for again by itself, as with a real device.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import socket
@@ -22,6 +23,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from fgreg.drivers.base import Command, DeviceLost, PaFrame, Said, StereoFrame, host_now
+from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
 from fgreg.models import StageModel
@@ -33,6 +35,9 @@ AGAIN_S = 0.2
 SILENT_S = 0.5
 """A device that sends by itself and has not for so long is gone."""
 START_S = 60.0
+
+BEGINS_RAD = math.radians(-17.0)
+"""Where the stage stands at power-on; it does not know."""
 
 Item = TypeVar("Item")
 
@@ -224,67 +229,47 @@ class SimulatedOperator(_Feed[Command]):
                 send(connection, {"next": done, "say": wants})
 
 
-class RoomStage:
-    """The room's stage (RotationStage): every call asks the room and has its answer within the time allowed.
+class RoomStage(SimulatedStage):
+    """The room's stage: turns here, in the watchdog's process, and tells the room where it is at every look.
 
     Args:
+        model: direction and zero.
         path: of the room's socket.
 
     Raises:
         StageLost: the room is not there.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._connection.settimeout(MAX_CALL_S)
+    def __init__(self, model: StageModel, path: Path) -> None:
+        super().__init__(model, device_rad=BEGINS_RAD)
+        self._room = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            self._connection.connect(os.fspath(path))
-            send(self._connection, {"role": "stage"})
+            self._room.connect(os.fspath(path))
+            send(self._room, {"role": "stage"})
         except (OSError, WireClosed) as error:
-            self._connection.close()
+            self._room.close()
             raise StageLost(f"simulated stage: the room is not there ({error})") from None
-
-    def _ask(self, what: str, **more: float) -> StageStatus:
-        try:
-            send(self._connection, {"do": what, **more})
-            told, _ = receive(self._connection)
-            now = host_now()
-            return StageStatus(
-                Stamp(told["device_s"], now),
-                told["scan"],
-                told["velocity"],
-                told["moving"],
-                told["homing"],
-                told["homed"],
-            )
-        except (WireClosed, KeyError) as error:
-            self._connection.close()
-            raise StageLost(f"simulated stage: gone ({error})") from None
-
-    def home(self, speed_rad_s: float) -> None:
-        """Begin to look for the zero position."""
-        self._ask("home", speed=speed_rad_s)
-
-    def move_to(self, scan_rad: float, speed_rad_s: float) -> None:
-        """Begin to turn to a plane angle."""
-        self._ask("move", scan=scan_rad, speed=speed_rad_s)
-
-    def stop(self) -> None:
-        """Brake."""
-        self._ask("stop")
+        self._room.settimeout(MAX_CALL_S)
 
     def status(self) -> StageStatus:
-        """What it reports now."""
-        return self._ask("status")
+        """What it reports now; the room hears where it truly is."""
+        status = super().status()
+        try:
+            send(self._room, {"scan": self.model.scan_from_device(self.device_rad)})
+        except WireClosed as error:
+            self._room.close()
+            raise StageLost(f"simulated stage: the room is gone ({error})") from None
+        return status
 
     def close(self) -> None:
-        """Let go of it."""
-        self._connection.close()
+        """Brake and let go."""
+        super().close()
+        self._room.close()
 
 
-def open_stage(_model: StageModel, path: str) -> RoomStage:
-    """The stage of the room whose socket is at ``path``, for the watchdog; it knows direction and zero itself."""
-    return RoomStage(Path(path))
+def open_stage(model: StageModel, path: str) -> RoomStage:
+    """The stage of the room whose socket is at ``path``, for the watchdog."""
+    return RoomStage(model, Path(path))
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:

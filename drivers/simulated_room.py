@@ -2,9 +2,9 @@
 
     python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
 
-Devices, each by a connection that begins with ``{"role": ...}``: ``camera`` and ``probe`` only send; ``stage`` is asked
-and answers; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp with
-clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
+Devices, each by a connection that begins with ``{"role": ...}``: ``camera`` and ``probe`` only send; ``stage`` tells
+where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp
+with clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.simulation.room import Room, RoomConfig, room_config
 
@@ -31,8 +30,6 @@ CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
 """What the devices' clocks read when the room begins."""
 FRAMES_WAITING, PULSES_WAITING = 2, 64
 """What a slow receiver may leave unread before the oldest is dropped."""
-STAGE_BEGINS_RAD = math.radians(-17.0)
-"""Where the stage stands when the room begins; it does not know."""
 SETTLE_S = 0.4
 """The surgeon says that he aims once the fibre has been still for so long."""
 SAY_AGAIN_S = 3.0
@@ -101,8 +98,7 @@ class RoomServer:
         self._clients: list[_Client] = []
         self._asked: queue.Queue[dict[str, Any]] = queue.Queue()
         self._end = threading.Event()
-        self._stage = SimulatedStage(room.config.scene.stage, device_rad=STAGE_BEGINS_RAD)
-        self._stage_lock = threading.Lock()
+        self._scan_rad = 0.0  # where the plane truly stands
         self._start_s = time.monotonic()
         self._said_s = -math.inf
 
@@ -146,14 +142,12 @@ class RoomServer:
             self._clients.remove(client)
 
     def _turn(self, connection: socket.socket) -> None:
-        """The stage: one answer to each command, until the other end leaves."""
+        """The stage tells where it is."""
         try:
             while True:
                 header, _ = receive(connection)
-                with self._stage_lock:
-                    answer = _do(self._stage, header)
-                send(connection, answer)
-        except WireClosed:
+                self._scan_rad = float(header["scan"])
+        except (WireClosed, KeyError, TypeError, ValueError):
             connection.close()
 
     def _to(self, role: str) -> list[_Client]:
@@ -205,16 +199,10 @@ class RoomServer:
         clients = self._to("probe")
         if not clients:
             return
-        data = self.room.channel_data(t_s, self.scan_rad(), index)
+        data = self.room.channel_data(t_s, self._scan_rad, index)
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
         for client in clients:
             client.put(header, data.tobytes())
-
-    def scan_rad(self) -> float:
-        """Where the plane truly stands."""
-        with self._stage_lock:
-            self._stage.status()
-            return self._stage.model.scan_from_device(self._stage.device_rad)
 
     # --- the surgeon ------------------------------------------------------------------------------------------------
 
@@ -241,26 +229,6 @@ class RoomServer:
     def _say(self, words: dict[str, Any]) -> None:
         for client in self._to("operator"):
             client.put(words)
-
-
-def _do(stage: SimulatedStage, header: dict[str, Any]) -> dict[str, Any]:
-    """Carry out a command of the stage's driver; what the stage reports then. Angles rad, TRUS convention."""
-    match header.get("do"):
-        case "home":
-            stage.home(float(header["speed"]))
-        case "move":
-            stage.move_to(float(header["scan"]), float(header["speed"]))
-        case "stop":
-            stage.stop()
-    status = stage.status()
-    return {
-        "device_s": status.stamp.device_s,
-        "scan": status.scan_rad,
-        "velocity": status.velocity_rad_s,
-        "moving": status.moving,
-        "homing": status.homing,
-        "homed": status.homed,
-    }
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -20,6 +20,7 @@ import typer
 from fgreg import __version__
 from fgreg.cli_convert import add_convert
 from fgreg.cli_evaluate import add_commands
+from fgreg.cli_live import add_live
 from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
 from fgreg.errors import FgregError, InputError
@@ -262,6 +263,7 @@ def simulate(
 
 
 add_commands(app, _progress)
+add_live(app, _summary_extras)
 add_replay(app, _summary_extras)
 add_convert(app)
 

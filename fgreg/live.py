@@ -274,6 +274,10 @@ class LiveSession:
         """All that was taken in."""
         return self._engine.measurements()
 
+    def marker_T_laser(self) -> FloatArray | None:
+        """The beam, (4, 4), as the estimate has it; None where there is none yet."""
+        return self._engine.marker_T_laser()
+
     def _catch_up(self) -> None:
         """What an interrupt or a full disk left undone comes before the next event.
 

@@ -10,12 +10,14 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from fgreg.detection.board import BoardFit, board_corner, detect_board
+from fgreg.detection.joint import NotFound
 from fgreg.detection.noise import pool_corner_noise
 from fgreg.drivers.base import (
     Command,
@@ -169,6 +171,8 @@ class LiveLoop:
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
         self._answer: TrackEstimate | None = None
+        self._worker = ThreadPoolExecutor(1, "board")
+        self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
 
     def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
         """While ``going``."""
@@ -192,6 +196,7 @@ class LiveLoop:
         self._beat()
         for action in self._conductor.step(self._view(now)):
             self._do(action)
+        self._take_aim()
         if frames:
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
@@ -218,6 +223,7 @@ class LiveLoop:
     def close(self) -> None:
         """End what the loop has started itself."""
         self.ears.close()
+        self._worker.shutdown(wait=False, cancel_futures=True)
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
@@ -383,7 +389,16 @@ class LiveLoop:
         if rig is None or board is None:
             self._tell(Tell("no aim: session.yaml has no board"))
             return
-        fit = detect_board(frame.left, frame.right, rig, board)
+        if self._aiming is None:  # else one is being looked at
+            found = self._worker.submit(detect_board, frame.left, frame.right, rig, board)
+            self._aiming = (corner, pose, found)
+
+    def _take_aim(self) -> None:
+        """The calibration shot whose board was being looked for, once it is found."""
+        if self._aiming is None or not self._aiming[2].done():
+            return
+        (corner, pose, found), self._aiming = self._aiming, None
+        fit = found.result()
         if not isinstance(fit, BoardFit):
             self._tell(Tell(f"no aim: {fit.reason}"))
             return
@@ -391,7 +406,7 @@ class LiveLoop:
         turn = fit.camera_T_board[:3, :3]
         covariance = covariance + turn @ np.diag(np.square(self._model.noise.aim_mm)) @ turn.T
         marker = MarkerRecord(pose.parent_T_child, pose.covariance)
-        self._recorder.hand_over(AimEvent(self._t(host_now()), 0, marker, spot, covariance))
+        self._recorder.hand_over(AimEvent(self._t(pose.t_s), 0, marker, spot, covariance))
         self._tell(Tell(f"aim at corner {corner[0]}, {corner[1]} taken", done=True))
 
     def _pair(self, pm: int, look: Heard) -> None:

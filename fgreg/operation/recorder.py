@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from fgreg.errors import EventRefused, FgregError
 from fgreg.estimate import Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent
+from fgreg.frames import FloatArray
 from fgreg.live import LiveSession
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.operation.view import Known
@@ -43,7 +44,8 @@ class RecorderState:
     trouble: str = ""
 
 
-OnTaken = Callable[[Recorded, OnlineEstimate | None], None]
+OnTaken = Callable[[Recorded, OnlineEstimate | None, FloatArray | None], None]
+"""Gets the event, the estimate after it, and the beam (``marker_T_laser``) as that has it."""
 
 
 class Recorder:
@@ -124,7 +126,7 @@ class Recorder:
                 trouble=trouble,
             )
         if self._on_taken is not None and not refused:
-            self._on_taken(event, estimate)
+            self._on_taken(event, estimate, self._session.marker_T_laser())
 
     def _refresh(self) -> None:
         try:
