@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -197,6 +199,43 @@ def igtl_operator(around: Surroundings, *, host: str, port: int, listen: bool, d
     from fgreg.drivers.operators import IgtlOperator
 
     return IgtlOperator(_endpoint(host, port, listen), device, answers, around.corners)
+
+
+def ask_thorlabs(_around: Surroundings, *, port: str | None, **_: object) -> str:
+    """What a cube says of itself; nothing moves. Raises StageError: nobody answers, or somebody else."""
+    from fgreg.drivers.cube_identity import identify
+    from fgreg.drivers.thorlabs_stage import only_port
+
+    return str(identify(port or only_port()))
+
+
+def ask_room_stage(around: Surroundings) -> str:
+    """Where the simulated room's stage stands. Raises StageLost."""
+    from fgreg.drivers.simulated import RoomStage
+
+    stage = RoomStage(_room(around))
+    try:
+        status = stage.status()
+    finally:
+        stage.close()
+    zero = "knows its zero position" if status.homed else "has to find its zero position"
+    return f"stands at {math.degrees(status.scan_rad):.1f} deg by its own account, {zero}"
+
+
+def ask_stand_in(_around: Surroundings, **_: object) -> str:
+    """Nobody is there."""
+    return "simulated: nothing turns"
+
+
+def ask_keyboard(_around: Surroundings) -> str:
+    """What standard input is; nothing is read. Raises DeviceLost where it is closed."""
+    from fgreg.drivers.base import DeviceLost
+    from fgreg.drivers.keyboard import standard_input
+
+    fd = standard_input()
+    if fd is None:
+        raise DeviceLost("standard input is closed")
+    return "standard input, a terminal" if os.isatty(fd) else "standard input, not a terminal"
 
 
 def _endpoint(host: str, port: int, listen: bool) -> Endpoint:

@@ -37,7 +37,7 @@ class KeyboardOperator:
         self, say: Callable[[str], None], fd: int | None = None, corners: tuple[int, int] | None = None
     ) -> None:
         self._say, self._corners = say, corners
-        self._fd = _standard_input() if fd is None else fd
+        self._fd = standard_input() if fd is None else fd
         self._waiting: deque[Command] = deque()
         self._lock = threading.Lock()
         self._dropped, self._open = 0, self._fd is not None
@@ -130,7 +130,7 @@ class KeyboardOperator:
                 self._dropped += 1
 
 
-def _standard_input() -> int | None:
+def standard_input() -> int | None:
     """Its descriptor; None where there is none."""
     try:
         return sys.stdin.fileno()

@@ -46,7 +46,7 @@ class Key:
         choices: of a choice.
         example: what an example shows where there is no default.
         check: raises InputError for a text that cannot be one.
-        nullable: ``null`` may be written, and means what absence of a limit means.
+        nullable: ``null`` may be written; it may, too, where it is the default.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Key:
         """Its value; what is wrong is reported to ``fields``. Paths are relative to ``folder``."""
         if not fields.has(self.name) and self.default is not REQUIRED:
             return self.default
-        if self.nullable and fields.has(self.name) and fields.raw(self.name) is None:
+        if (self.nullable or self.default is None) and fields.has(self.name) and fields.raw(self.name) is None:
             return None
         value = self._value(fields, folder)
         if self.check is not None and isinstance(value, str) and value:

@@ -18,7 +18,7 @@ from fgreg.errors import MissingExtraError
 from fgreg.session.schema import Bounds
 
 NAME_BYTES = 20
-IGTL_PORT, BK_PORT = 18944, 7915
+IGTL_PORT, SINK_PORT, BK_PORT = 18944, 18945, 7915
 
 
 class Role(StrEnum):
@@ -76,6 +76,8 @@ class DriverEntry:
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
         check: ``package.module:function``, called with the keys: raises InputError, opens no device.
+        ask: ``package.module:function``, called with Surroundings and the keys: says what is there in a line, or raises;
+            of devices that are not to be opened only to see whether they answer.
     """
 
     role: Role
@@ -86,12 +88,12 @@ class DriverEntry:
     extra: str | None = None
     room: bool = False
     check: str | None = None
+    ask: str | None = None
 
     def require(self) -> None:
         """Raises MissingExtraError where its library is not installed."""
         if self.extra is not None and not installed(self.extra):
-            module = EXTRAS[self.extra][0]
-            raise MissingExtraError(_DISTRIBUTIONS.get(module, module), self.extra)
+            raise MissingExtraError(distribution(self.extra), self.extra)
 
     def checked(self, options: Mapping[str, Any]) -> None:
         """Raises InputError, MissingExtraError, ValueError where these options, right each by itself, cannot be."""
@@ -111,6 +113,12 @@ def installed(extra: str) -> bool:
         return importlib.util.find_spec(EXTRAS[extra][0]) is not None
     except (ImportError, ValueError):
         return False
+
+
+def distribution(extra: str) -> str:
+    """What the package index calls an extra's library."""
+    module = EXTRAS[extra][0]
+    return _DISTRIBUTIONS.get(module, module)
 
 
 def load(dotted: str) -> Callable[..., Any]:
@@ -224,8 +232,8 @@ _SCANNER = (
 _HERE = "fgreg.drivers.factories"
 
 
-def _simulated(role: Role, help_text: str, factory: str) -> DriverEntry:
-    return DriverEntry(role, "simulated", help_text, (), factory, room=True)
+def _simulated(role: Role, help_text: str, factory: str, ask: str | None = None) -> DriverEntry:
+    return DriverEntry(role, "simulated", help_text, (), factory, room=True, ask=ask)
 
 
 ENTRIES: tuple[DriverEntry, ...] = (
@@ -263,14 +271,16 @@ ENTRIES: tuple[DriverEntry, ...] = (
         _THORLABS,
         "fgreg.drivers.thorlabs_stage:open_stage",
         "stage",
+        ask=f"{_HERE}:ask_thorlabs",
     ),
-    _simulated(Role.STAGE, "of the simulated room", "fgreg.drivers.simulated:open_stage"),
+    _simulated(Role.STAGE, "of the simulated room", "fgreg.drivers.simulated:open_stage", f"{_HERE}:ask_room_stage"),
     DriverEntry(
         Role.STAGE,
         "stand-in",
         "a simulated stage beside real devices, for rehearsals: nothing turns",
         _STAND_IN,
         "fgreg.drivers.simulated_stage:open_stage",
+        ask=f"{_HERE}:ask_stand_in",
     ),
     DriverEntry(
         Role.MOTION,
@@ -302,11 +312,18 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.SINKS,
         "igtl",
         "3D Slicer, PLUS: takes the registration over OpenIGTLink",
-        (*_address(IGTL_PORT, listen=True), *_NAMES),
+        (*_address(SINK_PORT, listen=True), *_NAMES),
         f"{_HERE}:igtl_sink",
         "igtl",
     ),
-    DriverEntry(Role.OPERATOR, "keyboard", "whoever sits at the terminal", (), f"{_HERE}:keyboard"),
+    DriverEntry(
+        Role.OPERATOR,
+        "keyboard",
+        "whoever sits at the terminal",
+        (),
+        f"{_HERE}:keyboard",
+        ask=f"{_HERE}:ask_keyboard",
+    ),
     DriverEntry(
         Role.OPERATOR,
         "igtl",

@@ -19,6 +19,7 @@ import typer
 
 from fgreg import __version__
 from fgreg.cli_convert import add_convert
+from fgreg.cli_devices import add_devices
 from fgreg.cli_evaluate import add_commands
 from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
@@ -264,6 +265,7 @@ def simulate(
 add_commands(app, _progress)
 add_replay(app, _summary_extras)
 add_convert(app)
+add_devices(app)
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def _lines() -> Iterator[str]:
     yield "# calibration:  # of the endoscope, where session.yaml has no camera"
     yield from (f"#   {key.line()}" for key in CALIBRATION_KEYS)
     yield ""
-    yield "# room:  # the simulated room, where camera, photoacoustic and stage have the driver simulated; no session then"
+    yield "# room:  # the simulated room: camera, photoacoustic and stage have the driver simulated; no session then"
     yield from (f"#   {key.line()}" for key in ROOM_KEYS)
     for role, text in _ROLES.items():
         yield ""
@@ -104,7 +104,7 @@ def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
         shown = key.default is REQUIRED or (role is Role.CAMERA and key.name == "right" and not commented)
         lines.append(f"{indent}{'' if shown else '# '}{key.line()}")
     if role is Role.STAGE and not commented:
-        lines.append("  limits:  # beyond those of session.yaml")
+        lines.append("  limits:  # besides those of session.yaml")
         lines.append("    # sweep_deg: [-60, 60]  # plane angles that a search may use; all that session.yaml allows")
         first, *rest = LIMIT_KEYS
         lines.append(f"    {first.line()}")
