@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from fgreg.drivers.options import Key, Kind
-from fgreg.errors import MissingExtraError
+from fgreg.errors import InputError, MissingExtraError
 from fgreg.session.schema import Bounds
 
 NAME_BYTES = 20
@@ -141,6 +141,12 @@ def host_name(text: str) -> None:
     Endpoint(text, 1)
 
 
+def four_characters(text: str) -> None:
+    """Raises InputError for what is no FOURCC."""
+    if len(text) != 4 or not text.isascii():
+        raise InputError("fourcc", repr(text), "four characters such as MJPG")
+
+
 def _address(port: int, listen: bool = False) -> tuple[Key, ...]:
     return (
         Key("host", Kind.TEXT, "the other side's; with listen: where to listen", "127.0.0.1", check=host_name),
@@ -171,7 +177,7 @@ _ENDOSCOPE = (
     Key("width", Kind.INTEGER, "asked of a device, px", None, Bounds(16, 8192), example="1280"),
     Key("height", Kind.INTEGER, "asked of a device, px", None, Bounds(16, 8192), example="720"),
     Key("fps", Kind.NUMBER, "asked of a device; a folder's pace", None, Bounds(0.0, 1000.0, above=True), example="30"),
-    Key("fourcc", Kind.TEXT, "kind of pixels asked of a device, four characters", None, example="MJPG"),
+    Key("fourcc", Kind.TEXT, "kind of pixels asked of a device", None, example="MJPG", check=four_characters),
     Key("loop", Kind.TRUTH, "files and folders begin again at their end", False),
     Key("delay_s", Kind.NUMBER, "from the exposure to the device's time stamp", 0.0, Bounds(-1.0, 1.0, unit="s")),
     Key("max_gap_s", Kind.NUMBER, "most time between left and right", 0.017, Bounds(0.0, 1.0, above=True, unit="s")),
