@@ -14,6 +14,12 @@ ANSWER_S = 1.0
 """How long a cube may take for both answers."""
 
 
+_QUESTIONS = {
+    apt.GET_INFO: apt.short(apt.REQ_INFO),
+    apt.GET_STATUS: apt.short(apt.REQ_STATUS, apt.CHANNEL),
+}
+
+
 @dataclass(frozen=True, slots=True)
 class CubeIdentity:
     """What a cube says of itself: model, serial number, device angle (deg, from where it was switched on unless
@@ -45,13 +51,15 @@ def identify(port: str) -> CubeIdentity:
         told: dict[int, bytes] = {}
         parser = apt.AptParser()
         until, asked = time.monotonic() + ANSWER_S, -math.inf
-        while not told.keys() >= {apt.GET_INFO, apt.GET_STATUS}:
+        while not told.keys() >= _QUESTIONS.keys():
             now = time.monotonic()
             if now > until:
                 raise StageLost(f"stage at {port} does not answer: is it switched on, is it a KDC101 or TDC001?")
             if now - asked > ASK_AGAIN_S:
                 asked = now
-                line.write(apt.short(apt.REQ_INFO) + apt.short(apt.REQ_STATUS, apt.CHANNEL))
+                for answer, question in _QUESTIONS.items():
+                    if answer not in told:  # the others get in the way of lost replies
+                        line.write(question)
             time.sleep(0.002)
             told |= {message.id: message.data for message in parser.feed(line.read(4096))}
     except OSError as error:

@@ -76,8 +76,8 @@ class DriverEntry:
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
         check: ``package.module:function``, called with the keys: raises InputError, opens no device.
-        ask: ``package.module:function``, called with Surroundings and the keys: says what is there in a line, or raises;
-            of devices that are not to be opened only to see whether they answer.
+        ask: ``package.module:function``, called with Surroundings and the keys: says what is there, or raises; of
+            devices that are not to be opened only to see whether they answer.
     """
 
     role: Role

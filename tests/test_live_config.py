@@ -1,4 +1,4 @@
-"""CONFIG.yaml of a live session: each mistake is one line before any device is opened, and what is read is what is run."""
+"""CONFIG.yaml of a live session: each mistake is one line before any device is opened; what is read is what runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import yaml
 
-from fgreg.drivers import registry
 from fgreg.drivers.registry import ENTRIES, Role, Surroundings, load
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.motion.limits import MotionLimits
@@ -294,7 +293,7 @@ def test_a_missing_library_is_one_line_that_names_the_extra(tmp_path: Path, monk
     for module, package, extra in (("pyigtl", "pyigtl", "igtl"), ("serial", "pyserial", "stage")):
         with monkeypatch.context() as patch:
             patch.setattr(
-                registry.importlib.util,
+                importlib.util,
                 "find_spec",
                 lambda name, hidden=module: None if name == hidden else find(name),
             )
@@ -389,7 +388,7 @@ def test_a_port_that_is_taken_is_one_line_and_leaves_nothing_open(tmp_path: Path
 
 def test_listening_to_other_machines_is_warned_of(tmp_path: Path) -> None:
     data = live_configs.config()
-    data["sinks"][0]["host"] = "0.0.0.0"  # noqa: S104
+    data["sinks"][0]["host"] = "0.0.0.0"
     (warning,) = read_config(live_configs.write(tmp_path, data)).warnings
     assert warning.startswith("live.yaml: sinks[0]")
     assert "other machines can connect" in warning
@@ -409,3 +408,23 @@ def test_devices_that_play_one_recording_share_its_time(tmp_path: Path) -> None:
         device.close()
     with pytest.raises(InputError, match="no such topic"):
         entry.checked(options | {"topic": "/other"})
+
+
+def test_the_readme_shows_a_config_that_reads(tmp_path: Path) -> None:
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (block,) = [part.split("```")[0] for part in readme.split("```yaml\n")[1:] if part.startswith("format: fgreg-live")]
+    config = read_config(live_configs.write(tmp_path, block))
+    assert {role.value for role in config.devices} == {"camera", "photoacoustic", "stage", "sinks", "operator"}
+    with ExitStack() as stack:
+        assert config.open_bmode(stack) is None
+
+
+def test_a_scanner_for_overlay_is_opened_apart_from_what_is_measured(tmp_path: Path) -> None:
+    data = live_configs.config()
+    data["bmode"] = {"driver": "bk", "host": "127.0.0.1", "port": free_port()}
+    config = read_config(live_configs.write(tmp_path, data))
+    with ExitStack() as stack:
+        scanner = config.open_bmode(stack)
+        assert scanner is not None
+        assert scanner.name == f"127.0.0.1:{data['bmode']['port']}"
+        assert scanner.poll() == []

@@ -125,12 +125,12 @@ class LiveConfig:
         options = {"path": os.fspath(around.room)} if chosen[0].entry.room and around.room else chosen[0].options
         return StageSetup(chosen[0].entry.factory, options, self.stage_limits)
 
-    def open_bmode(self, stack: ExitStack, around: Surroundings) -> BmodeSource | None:
+    def open_bmode(self, stack: ExitStack) -> BmodeSource | None:
         """The scanner's pictures for overlay, where the file names one; closed with the stack."""
         chosen = self.devices.get(Role.BMODE)
         if chosen is None:
             return None
-        device: BmodeSource = chosen[0].open(around)
+        device: BmodeSource = chosen[0].open(Surroundings(lambda _: None))
         stack.callback(device.close)
         return device
 
