@@ -140,4 +140,7 @@ def standard_input() -> int | None:
 
 def _in_foreground(fd: int) -> bool:
     """Whether reading is allowed now: not from the terminal of another job."""
-    return not os.isatty(fd) or os.tcgetpgrp(fd) == os.getpgrp()
+    try:
+        return not os.isatty(fd) or os.tcgetpgrp(fd) == os.getpgrp()
+    except OSError:  # a terminal that does not control this program, or has hung up: reading does no harm
+        return True

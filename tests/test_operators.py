@@ -159,10 +159,13 @@ def test_closing_does_not_wait_for_a_line_and_may_be_done_twice(typed: Typed) ->
     assert select.select([typed.read_end], [], [], 0)[0]
 
 
-def test_a_terminal_that_hangs_up_is_the_end_of_the_input() -> None:
+def test_a_terminal_is_read_until_it_hangs_up_and_that_is_the_end_of_the_input() -> None:
     ours, theirs = pty.openpty()
     operator = KeyboardOperator(lambda _: None, theirs)
     try:
+        os.write(ours, b"home\n")  # not this program's own terminal, but one that can be read
+        assert collect(operator.poll, 1) == [Command(Said.HOME)]
+        assert operator.connected
         os.close(ours)
         wait_for(lambda: not operator.connected)
         assert operator.poll() == []
