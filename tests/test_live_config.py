@@ -229,6 +229,11 @@ def test_calibration_files_bring_the_camera_and_halve_it_for_fields(tmp_path: Pa
     problems: list[InputError] = []
     again = read_setup(parse_yaml(config.setup, "s"), "s", "s", problems)  # what the new session's folder gets
     assert not problems
+    assert config.warnings == ()
+    info(tmp_path, "right", r=LEVEL, p3=700.0 * 0.005)
+    (warning,) = read_config(live_configs.write(tmp_path, data, session)).warnings
+    assert "are the two swapped?" in warning
+    info(tmp_path, "right", r=LEVEL, p3=-700.0 * 0.005)
     assert again.camera is not None
     assert np.array_equal(again.camera.left.distortion, [-0.25, 0.125, 0.001, -0.002, 0.5])
     data["camera"]["fields"] = "both"
@@ -275,6 +280,7 @@ def test_a_mistake_in_the_calibration_is_one_line(
 
 def test_the_simulated_room_brings_its_own_set_up(tmp_path: Path) -> None:
     config = read_config(live_configs.write(tmp_path, live_configs.room()))
+    assert config.warnings == ()
     assert config.room == {"seed": 3, "bump_every_s": 90.0, "width": 320}
     assert config.model.camera is not None
     assert config.model.camera.left.image_size[0] == 320
@@ -282,6 +288,9 @@ def test_the_simulated_room_brings_its_own_set_up(tmp_path: Path) -> None:
     data = live_configs.room()
     data["session"] = "session.yaml"
     assert "it, and the simulated room" in error_of(live_configs.write(tmp_path, data))
+    data = live_configs.room()
+    del data["operator"]
+    assert "nobody tells the room's surgeon" in read_config(live_configs.write(tmp_path, data)).warnings[0]
     data = live_configs.room()
     data["stage"] = {"driver": "stand-in"}
     assert "stand-in, and camera of the simulated room" in error_of(live_configs.write(tmp_path, data))

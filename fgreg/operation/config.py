@@ -181,7 +181,7 @@ class _Reader:
         limits = _limits(top)
         if self.problems or settings is None:
             return None
-        setup, label, rectified = _session(top, folder, devices, room, settings[0].aims)
+        setup, label, rectified = self._session(top, folder, devices, room, settings[0].aims)
         model = self._model(setup, label)
         if model is None:
             return None
@@ -210,6 +210,10 @@ class _Reader:
         for key in ("session", "calibration"):
             if top.has(key):
                 top.fail(key, "it, and the simulated room", "one of the two: the room brings a set-up of its own")
+        if Role.OPERATOR not in simulated:
+            self.warnings.append(
+                f"{self.path.name}: without a simulated operator nobody tells the room's surgeon to go on"
+            )
         if not top.has("room"):
             return {key.name: key.default for key in ROOM_KEYS}
         inner = top.child("room", [key.name for key in ROOM_KEYS])
@@ -219,6 +223,64 @@ class _Reader:
         found = read_setup(parse_yaml(setup, label), label, "session", self.problems)
         self.warnings += found.warnings
         return found.model if not self.problems else None
+
+    def _session(
+        self,
+        top: Fields,
+        folder: Path,
+        devices: Mapping[Role, tuple[Chosen, ...]],
+        room: Mapping[str, Any] | None,
+        aims: int,
+    ) -> tuple[str, str, Any]:
+        """Text of the ``session.yaml``, what messages call it, the rectification of the pictures. Raises InputError."""
+        if room is not None:
+            from fgreg.simulation.documents import session_document
+            from fgreg.simulation.room import room_config
+
+            config = room_config(room["seed"], room["width"], aims=aims, bump_every_s=room["bump_every_s"])
+            return setup_text(session_document(config.scene)), "the simulated room", None
+        path = read_path(top, "session", folder)
+        if top.problems:
+            raise top.problems[0]
+        file = path / SETUP_FILE if path.is_dir() else path
+        label = str(Path(str(top.raw("session"))) / SETUP_FILE) if path.is_dir() else str(top.raw("session"))
+        data = load_yaml(file, label)
+        text = read_bounded(file, label, 4_000_000).decode("utf-8-sig")
+        if not top.has("calibration"):
+            return text, label, None
+        if "camera" in data:
+            raise InputError(str(top.at("calibration")), "it, and a camera in the session.yaml", "one of the two")
+        rig, rectified = self._calibration(top, folder, devices)
+        return text.rstrip("\n") + "\n" + camera_yaml(rig), label, rectified
+
+    def _calibration(
+        self, top: Fields, folder: Path, devices: Mapping[Role, tuple[Chosen, ...]]
+    ) -> tuple[StereoRig, Any]:
+        """The rig of the pictures as the loop sees them. Raises InputError."""
+        from fgreg.drivers.calibration_files import read_calibration
+        from fgreg.drivers.interlaced import Fields as Interlaced
+        from fgreg.drivers.interlaced import field_rig
+        from fgreg.drivers.rectification import rectification
+
+        inner = top.child("calibration", [key.name for key in CALIBRATION_KEYS])
+        values = {} if inner is None else read_keys(CALIBRATION_KEYS, inner, folder)
+        if top.problems:
+            raise top.problems[0]
+        files = [file for file in (values["left"], values["right"]) if file is not None]
+        pictures = values["pictures"]
+        read = read_calibration(files, unit=values["unit"], rectified=pictures == "rectified")
+        rig = read.rig
+        self.warnings += read.warnings
+        camera = devices[Role.CAMERA][0]
+        if not values["of_fields"]:
+            rig = field_rig(rig, Interlaced(camera.options.get("fields", "whole")))
+        if pictures != "rectify":
+            return rig, None
+        if camera.entry.name != "endoscope":
+            place = str(top.at("calibration").key("pictures"))
+            raise InputError(place, f"rectify with the driver {camera.entry.name}", "rectify with endoscope only")
+        made = rectification(rig)
+        return made.rig, made
 
 
 def _devices(top: Fields, folder: Path) -> dict[Role, tuple[Chosen, ...]]:
@@ -319,61 +381,6 @@ def _check_limits(top: Fields, model: SessionModel, limits: Mapping[str, Any]) -
     except ValueError as error:
         inner = f"{Role.STAGE}.limits" if "sweep" in str(error) else Role.STAGE
         top.fail(inner, str(error), "limits inside those of session.yaml (stage.limits_deg)")
-
-
-def _session(
-    top: Fields,
-    folder: Path,
-    devices: Mapping[Role, tuple[Chosen, ...]],
-    room: Mapping[str, Any] | None,
-    aims: int,
-) -> tuple[str, str, Any]:
-    """Text of the ``session.yaml``, what messages call it, the rectification of the pictures. Raises InputError."""
-    if room is not None:
-        from fgreg.simulation.documents import session_document
-        from fgreg.simulation.room import room_config
-
-        config = room_config(room["seed"], room["width"], aims=aims, bump_every_s=room["bump_every_s"])
-        return setup_text(session_document(config.scene)), "the simulated room", None
-    path = read_path(top, "session", folder)
-    if top.problems:
-        raise top.problems[0]
-    file = path / SETUP_FILE if path.is_dir() else path
-    label = str(Path(str(top.raw("session"))) / SETUP_FILE) if path.is_dir() else str(top.raw("session"))
-    data = load_yaml(file, label)
-    text = read_bounded(file, label, 4_000_000).decode("utf-8-sig")
-    if not top.has("calibration"):
-        return text, label, None
-    if "camera" in data:
-        raise InputError(str(top.at("calibration")), "it, and a camera in the session.yaml", "one of the two")
-    rig, rectified = _calibration(top, folder, devices)
-    return text.rstrip("\n") + "\n" + camera_yaml(rig), label, rectified
-
-
-def _calibration(top: Fields, folder: Path, devices: Mapping[Role, tuple[Chosen, ...]]) -> tuple[StereoRig, Any]:
-    """The rig of the pictures as the loop sees them. Raises InputError."""
-    from fgreg.drivers.calibration_files import read_calibration
-    from fgreg.drivers.interlaced import Fields as Interlaced
-    from fgreg.drivers.interlaced import field_rig
-    from fgreg.drivers.rectification import rectification
-
-    inner = top.child("calibration", [key.name for key in CALIBRATION_KEYS])
-    values = {} if inner is None else read_keys(CALIBRATION_KEYS, inner, folder)
-    if top.problems:
-        raise top.problems[0]
-    files = [file for file in (values["left"], values["right"]) if file is not None]
-    pictures = values["pictures"]
-    rig = read_calibration(files, unit=values["unit"], rectified=pictures == "rectified").rig
-    camera = devices[Role.CAMERA][0]
-    if not values["of_fields"]:
-        rig = field_rig(rig, Interlaced(camera.options.get("fields", "whole")))
-    if pictures != "rectify":
-        return rig, None
-    if camera.entry.name != "endoscope":
-        place = str(top.at("calibration").key("pictures"))
-        raise InputError(place, f"rectify with the driver {camera.entry.name}", "rectify with endoscope only")
-    made = rectification(rig)
-    return made.rig, made
 
 
 def _check_model(top: Fields, model: SessionModel, devices: Mapping[Role, tuple[Chosen, ...]], aims: int) -> None:
