@@ -108,6 +108,11 @@ def read_model(data: bytes) -> str:
     return data[4:12].split(b"\0")[0].decode("ascii", "replace").strip()
 
 
+def read_serial(data: bytes) -> int:
+    """Serial number of the cube."""
+    return int(struct.unpack_from("<I", data)[0])
+
+
 class AptParser:
     """Bytes in, messages out; keeps what is not complete yet."""
 

@@ -67,7 +67,7 @@ class ThorlabsStage:
         self._velocity = 0.0
         self._told: int | None = None
         self._fault = ""
-        self._port = _open_port(port)
+        self._port = open_port(port)
         try:
             self._start()
         except BaseException:
@@ -232,14 +232,21 @@ def open_stage(model: StageModel, *, port: str | None = None, acceleration_deg_s
         StageLost: none is there, or it does not answer. StageError: several are there, or it is something else.
         MissingExtraError: pyserial is not installed.
     """
-    if port is None:
-        ports = find_ports()
-        if not ports:
-            raise StageLost("no Thorlabs cube is plugged in: plug one in, or name its serial port")
-        if len(ports) > 1:
-            raise StageError(f"several Thorlabs cubes are plugged in, name one: {', '.join(ports)}")
-        port = ports[0]
-    return ThorlabsStage(model, port, math.radians(acceleration_deg_s2))
+    return ThorlabsStage(model, only_port() if port is None else port, math.radians(acceleration_deg_s2))
+
+
+def only_port() -> str:
+    """The serial port of the only cube that is plugged in.
+
+    Raises:
+        StageLost: none is there. StageError: several are. MissingExtraError: pyserial is not installed.
+    """
+    ports = find_ports()
+    if not ports:
+        raise StageLost("no Thorlabs cube is plugged in: plug one in, or name its serial port")
+    if len(ports) > 1:
+        raise StageError(f"several Thorlabs cubes are plugged in, name one: {', '.join(ports)}")
+    return ports[0]
 
 
 def find_ports() -> list[str]:
@@ -255,7 +262,8 @@ def _velocity(speed_rad_s: float) -> int:
     return max(1, math.floor(speed_rad_s * VELOCITY_PER_RAD_S))
 
 
-def _open_port(port: str) -> serial.Serial:
+def open_port(port: str) -> serial.Serial:
+    """The line to a cube, for nobody else. Raises StageLost, MissingExtraError."""
     try:
         import serial
     except ImportError as error:

@@ -19,6 +19,7 @@ import typer
 
 from fgreg import __version__
 from fgreg.cli_convert import add_convert
+from fgreg.cli_devices import add_devices
 from fgreg.cli_evaluate import add_commands
 from fgreg.cli_live import add_live
 from fgreg.cli_options import EstimateOption, LimitOption, solve_config
@@ -266,6 +267,7 @@ add_commands(app, _progress)
 add_live(app, _summary_extras)
 add_replay(app, _summary_extras)
 add_convert(app)
+add_devices(app)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,111 @@
+"""Operators by other ways than the keyboard: texts over OpenIGTLink, and several operators as one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from fgreg.drivers.base import Command, DeviceLost, Operator, Said
+from fgreg.drivers.igtl import IgtlReceiver
+from fgreg.drivers.igtl_messages import Text, check_name, pack_text
+from fgreg.drivers.operator_words import asked, understand
+from fgreg.drivers.tcp_link import Endpoint
+
+
+class IgtlOperator(IgtlReceiver):
+    """An Operator whose words are the STRING messages of a device: a foot switch, a button in 3D Slicer.
+
+    What the operator is told goes back as STRING messages, as does the answer to a word that is not understood; where
+    the other side is slow only the newest is kept.
+
+    Args:
+        endpoint: the sender, or where it connects.
+        device: of its words.
+        answers: device of what is told.
+        corners: columns and rows of the board's inner corners; aims at others are answered.
+    """
+
+    _role = "operator"
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        device: str = "Operator",
+        answers: str = "OperatorTold",
+        corners: tuple[int, int] | None = None,
+    ) -> None:
+        self._answers, self._corners = check_name(answers), corners
+        super().__init__(endpoint, [("STRING", check_name(device))])
+
+    def poll(self) -> list[Command]:  # type: ignore[override]
+        """What was said since the last call. Raises DeviceLost."""
+        commands = []
+        for message in self._messages():
+            if not isinstance(message.content, Text):
+                continue
+            command = understand(message.content.text, self._corners)
+            if isinstance(command, str):
+                self._leave_out(message, command)
+                self._offer(command)
+            else:
+                commands.append(command)
+        return commands
+
+    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:  # noqa: ARG002
+        """Send it."""
+        self._offer(asked(text, wants))
+
+    def _offer(self, text: str) -> None:
+        self._link.offer(pack_text(self._answers, text, time.time(), {}, 2))
+
+
+class Operators:
+    """Several operators as one: whoever says something is heard, and all are told."""
+
+    def __init__(self, operators: Sequence[Operator]) -> None:
+        self._operators = tuple(operators)
+        self._losses: list[DeviceLost] = []
+        self._held: list[Command] = []
+
+    @property
+    def name(self) -> str:
+        """Their names."""
+        return " and ".join(operator.name for operator in self._operators)
+
+    @property
+    def connected(self) -> bool:
+        """Whether all are there."""
+        return all(operator.connected for operator in self._operators)
+
+    @property
+    def dropped(self) -> int:
+        """Commands that nobody fetched in time."""
+        return sum(operator.dropped for operator in self._operators)
+
+    def poll(self) -> list[Command]:
+        """What was said since the last call, by any of them; a loss is told with nothing of that lost.
+
+        Raises:
+            DeviceLost: one of them is gone; once for each loss.
+        """
+        for operator in self._operators:
+            try:
+                self._held += operator.poll()
+            except DeviceLost as error:
+                self._losses.append(error)
+        if self._held:  # a stop does not wait for a loss to be told
+            commands, self._held = self._held, []
+            return commands
+        if self._losses:
+            raise self._losses.pop(0)
+        return []
+
+    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+        """All of them."""
+        for operator in self._operators:
+            operator.tell(text, done=done, wants=wants)
+
+    def close(self) -> None:
+        """Let go of all."""
+        for operator in self._operators:
+            operator.close()

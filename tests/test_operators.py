@@ -1,0 +1,283 @@
+"""Operators: what is understood, a stop that always gets through, inputs that end, hang up or belong to another job."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fgreg.drivers.base import Command, DeviceLost, Operator, Said
+from fgreg.drivers.keyboard import MAX_LINE_BYTES, MOST_WAITING, KeyboardOperator
+from fgreg.drivers.operator_words import EXPECTED, LETTERS, understand
+from fgreg.drivers.operators import IgtlOperator, Operators
+from fgreg.drivers.tcp_link import Endpoint
+from tests.igtl_bytes import message, read_messages
+from tests.network_peers import collect, wait_for
+
+
+@pytest.mark.parametrize("said", [said for said in Said if said is not Said.AIM])
+def test_each_word_and_its_letter_are_understood_in_any_case(said: Said) -> None:
+    letter = next(letter for letter, meant in LETTERS.items() if meant is said)
+    for line in (said.value, said.value.upper(), letter, f"  {letter} \r"):
+        assert understand(line) == Command(said)
+
+
+@pytest.mark.parametrize("line", ["aim 3 2", "a 3 2", "aim 3,2", "AIM 3, 2"])
+def test_an_aim_names_its_corner(line: str) -> None:
+    assert understand(line, (9, 6)) == Command(Said.AIM, (3, 2))
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("aim", "aim COLUMN ROW"),
+        ("aim 3", "aim COLUMN ROW"),
+        ("aim 3 2 1", "aim COLUMN ROW"),
+        ("aim -1 2", "aim COLUMN ROW"),
+        ("aim 3.0 2", "aim COLUMN ROW"),
+        ("aim 9 2", "columns 0 to 8, rows 0 to 5"),
+        ("aim 3 6", "columns 0 to 8, rows 0 to 5"),
+        ("serch", EXPECTED),
+        ("search the left side", "search takes nothing after it"),
+        ("\x1b[A", "'\\x1b[a]'"[:6]),
+    ],
+)
+def test_what_is_not_understood_is_answered_with_what_is_expected(line: str, told: str) -> None:
+    answer = understand(line, (9, 6))
+    assert isinstance(answer, str)
+    assert told.lower() in answer.lower()
+    assert answer.isprintable()
+
+
+@pytest.mark.parametrize("line", ["", "   ", "\r", "stop", "STOP!", "x", "please stop", "stop the stage, now"])
+def test_a_stop_need_not_be_spelt(line: str) -> None:
+    assert understand(line) == Command(Said.STOP)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(line=st.text(max_size=60))
+def test_any_line_is_a_command_or_a_printable_answer(line: str) -> None:
+    found = understand(line, (9, 6))
+    assert isinstance(found, Command) or (found.isprintable() and len(found) < 250)
+
+
+class Typed:
+    """A keyboard operator on a pipe or another input."""
+
+    def __init__(self, corners: tuple[int, int] | None = None) -> None:
+        self.told: list[str] = []
+        self.read_end, self.write_end = os.pipe()
+        self.operator = KeyboardOperator(self.told.append, self.read_end, corners)
+
+    def type(self, data: bytes) -> None:
+        os.write(self.write_end, data)
+
+    def hang_up(self) -> None:
+        os.close(self.write_end)
+        self.write_end = -1
+
+
+@pytest.fixture
+def typed() -> Iterator[Typed]:
+    made = Typed((9, 6))
+    try:
+        yield made
+    finally:
+        made.operator.close()
+        os.close(made.read_end)
+        if made.write_end >= 0:
+            os.close(made.write_end)
+
+
+def test_lines_come_as_commands_in_order_however_they_are_cut(typed: Typed) -> None:
+    operator: Operator = typed.operator
+    assert operator.poll() == []
+    for piece in (b"ho", b"me\naim 3", b" 2\nregi", b"ster\n\n", b"s\n"):
+        typed.type(piece)
+        time.sleep(0.01)
+    said = [Command(Said.HOME), Command(Said.AIM, (3, 2)), Command(Said.REGISTER), Command(Said.STOP)]
+    assert collect(operator.poll, 5) == [*said, Command(Said.SEARCH)]
+    assert operator.poll() == []
+    assert (operator.connected, operator.dropped, typed.told) == (True, 0, [])
+
+
+def test_unknown_words_are_answered_and_the_next_line_works(typed: Typed) -> None:
+    typed.type(b"aim 9 9\ngo\n\xff\xfe\nnext\n")
+    assert collect(typed.operator.poll, 1) == [Command(Said.NEXT)]
+    assert len(typed.told) == 3
+    assert "columns 0 to 8" in typed.told[0]
+    assert "'go' is not understood" in typed.told[1]
+
+
+def test_the_end_of_the_input_is_no_loss_and_its_last_line_counts(typed: Typed) -> None:
+    typed.type(b"moved\nstop")
+    typed.hang_up()
+    assert collect(typed.operator.poll, 2) == [Command(Said.MOVED), Command(Said.STOP)]
+    wait_for(lambda: not typed.operator.connected)
+    assert typed.operator.poll() == []  # an end is no empty line
+    assert typed.told == []
+
+
+def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -> None:
+    for _ in range(20):
+        typed.type(b"a" * MAX_LINE_BYTES)
+    typed.type(b"\nfollow\n")
+    assert collect(typed.operator.poll, 1) == [Command(Said.FOLLOW)]
+    assert typed.told == [f"a line of more than {MAX_LINE_BYTES} characters is not understood"]
+
+
+def test_where_nobody_fetches_the_oldest_go_but_never_a_stop(typed: Typed) -> None:
+    typed.type(b"stop\n" + b"next\n" * (MOST_WAITING + 10) + b"home\n")
+    wait_for(lambda: typed.operator.dropped == 12)
+    commands = typed.operator.poll()
+    assert len(commands) == MOST_WAITING
+    assert (commands[0], commands[-1]) == (Command(Said.STOP), Command(Said.HOME))
+
+
+def test_what_is_told_is_one_line_with_the_word_that_is_wanted(typed: Typed) -> None:
+    typed.operator.tell("the stage has to find\nits zero", wants=Said.HOME)
+    typed.operator.tell("registered", done=True)
+    assert typed.told == ["the stage has to find\\nits zero: say home (h)", "registered"]
+
+
+def test_closing_does_not_wait_for_a_line_and_may_be_done_twice(typed: Typed) -> None:
+    began = time.monotonic()
+    typed.operator.close()
+    typed.operator.close()
+    assert time.monotonic() - began < 0.3
+    typed.type(b"home\n")  # stays for whoever has the input next
+    assert select.select([typed.read_end], [], [], 0)[0]
+
+
+def test_a_terminal_is_read_until_it_hangs_up_and_that_is_the_end_of_the_input() -> None:
+    ours, theirs = pty.openpty()
+    operator = KeyboardOperator(lambda _: None, theirs)
+    try:
+        os.write(ours, b"home\n")  # not this program's own terminal, but one that can be read
+        assert collect(operator.poll, 1) == [Command(Said.HOME)]
+        assert operator.connected
+        os.close(ours)
+        wait_for(lambda: not operator.connected)
+        assert operator.poll() == []
+    finally:
+        operator.close()
+        os.close(theirs)
+
+
+BACKGROUND = """
+import os, sys, time
+from fgreg.drivers.keyboard import KeyboardOperator
+os.setpgid(0, 0)  # another job than the one in the terminal's foreground
+operator = KeyboardOperator(lambda _: None)
+time.sleep(1.2)
+print("went on", operator.poll(), operator.connected)
+operator.close()
+"""
+
+
+def test_in_the_background_the_program_is_not_stopped_by_its_terminal(tmp_path: Path) -> None:
+    script = tmp_path / "background.py"
+    script.write_text(BACKGROUND)
+    child, terminal = pty.fork()
+    if child == 0:  # pragma: no cover
+        done = subprocess.run([sys.executable, str(script)], timeout=30, check=False, stdout=subprocess.PIPE)
+        os.write(1, done.stdout)
+        os._exit(0)
+    try:
+        os.write(terminal, b"stop\n")
+        said, end = b"", time.monotonic() + 30.0
+        while b"True" not in said and time.monotonic() < end and select.select([terminal], [], [], 30.0)[0]:
+            said += os.read(terminal, 1024)
+    finally:
+        os.close(terminal)
+        os.waitpid(child, 0)
+    assert b"went on [] True" in said
+
+
+@pytest.fixture
+def switch() -> Iterator[tuple[IgtlOperator, socket.socket]]:
+    pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
+    operator = IgtlOperator(Endpoint.listening(0), "FootSwitch", corners=(9, 6))
+    peer = socket.create_connection(("127.0.0.1", operator.endpoint.port), timeout=5.0)
+    try:
+        with peer:
+            yield operator, peer
+    finally:
+        operator.close()
+
+
+def words(text: str, device: str = "FootSwitch") -> bytes:
+    data = text.encode()
+    return message("STRING", device, (3).to_bytes(2, "big") + len(data).to_bytes(2, "big") + data)
+
+
+def told(peer: socket.socket) -> str:
+    data = b""
+    while len(data) < 58 or len(data) < 58 + int.from_bytes(data[42:50], "big"):
+        data += peer.recv(65536)
+    (only,) = read_messages(data)
+    assert (only.kind, only.device) == ("STRING", "OperatorTold")
+    return only.content[4:].decode("ascii")
+
+
+def test_texts_of_a_device_are_commands_and_others_are_not(switch: tuple[IgtlOperator, socket.socket]) -> None:
+    operator, peer = switch
+    peer.sendall(words("search") + words("stop", "Someone") + words("aim 1 5") + words("stop"))
+    found = collect(operator.poll, 3)
+    assert found == [Command(Said.SEARCH), Command(Said.AIM, (1, 5)), Command(Said.STOP)]
+
+
+def test_a_peer_is_told_and_answered(switch: tuple[IgtlOperator, socket.socket]) -> None:
+    operator, peer = switch
+    wait_for(lambda: operator.connected)
+    operator.tell("the stage is ready to follow the beam", wants=Said.FOLLOW)
+    assert told(peer) == "the stage is ready to follow the beam: say follow (f)"
+    peer.sendall(words("go"))
+    wait_for(lambda: operator.poll() or operator.rejected)
+    assert "'go' is not understood" in told(peer)
+    assert operator.rejected == 1
+
+
+def test_a_switch_that_is_unplugged_is_lost_once_and_back(switch: tuple[IgtlOperator, socket.socket]) -> None:
+    operator, peer = switch
+    wait_for(lambda: operator.connected)
+    peer.close()
+    with pytest.raises(DeviceLost, match="operator"):
+        wait_for(lambda: operator.poll() or None)
+    assert operator.poll() == []
+    with socket.create_connection(("127.0.0.1", operator.endpoint.port), timeout=5.0) as again:
+        again.sendall(words("home"))
+        assert collect(operator.poll, 1) == [Command(Said.HOME)]
+
+
+def test_several_operators_are_one_and_a_loss_keeps_nobodys_stop_back(
+    typed: Typed, switch: tuple[IgtlOperator, socket.socket]
+) -> None:
+    foot, peer = switch
+    both: Operator = Operators([typed.operator, foot])
+    wait_for(lambda: both.connected)
+    typed.type(b"home\n")
+    peer.sendall(words("search"))
+    assert {command.said for command in collect(both.poll, 2)} == {Said.HOME, Said.SEARCH}
+    both.tell("registered")
+    assert told(peer) == "registered"
+    assert typed.told == ["registered"]
+    peer.close()
+    wait_for(lambda: not foot.connected)
+    typed.type(b"\n")
+    wait_for(lambda: typed.operator._waiting)
+    assert both.poll() == [Command(Said.STOP)]
+    with pytest.raises(DeviceLost, match="operator"):
+        both.poll()
+    assert both.poll() == []
+    assert not both.connected
