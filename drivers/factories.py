@@ -212,8 +212,9 @@ def ask_thorlabs(_around: Surroundings, *, port: str | None, **_: object) -> str
 def ask_room_stage(around: Surroundings) -> str:
     """Where the simulated room's stage stands. Raises StageLost."""
     from fgreg.drivers.simulated import RoomStage
+    from fgreg.simulation.config import default_stage
 
-    stage = RoomStage(_room(around))
+    stage = RoomStage(default_stage(), _room(around))
     try:
         status = stage.status()
     finally:

@@ -62,6 +62,9 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
         ] = 90.0,
         limit_mm: LimitOption = 3.0,
+        example_config: Annotated[
+            bool, typer.Option("--example-config", help="Print a CONFIG.yaml with every driver and key, explained.")
+        ] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document at the end.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
     ) -> None:
@@ -74,6 +77,11 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         Ctrl-C ends it: the stage stops first, the session in FOLDER is complete and solved once more as a whole.
         Replay it: fgreg replay FOLDER. Exit status 1 where the verdict is refused.
         """
+        if example_config:
+            from fgreg.operation.config_keys import example_config as example
+
+            typer.echo(example(), nl=False)
+            return
         from fgreg.estimate import Verdict
         from fgreg.operation.start import default_folder
         from fgreg.pipeline import SolveRequest, solve_session
@@ -85,7 +93,10 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         folder = default_folder() if out is None else out
         silent = as_json or quiet
         with ExitStack() as stack:
-            setup = _setup(stack, config, seed, aims, bumps)
+            if config is None:
+                setup = _room(stack, seed, aims, bumps)
+            else:
+                setup, settings = _configured(stack, config, silent=silent)
             viewer = not (no_viewer or silent)
             figures = _conduct(setup, folder, settings, duration, rrd, viewer=viewer, silent=silent)
         report = solve_session(SolveRequest(folder, None, None), settings, None)
@@ -100,9 +111,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             raise typer.Exit(EXIT_REFUSED)
 
 
-def _setup(stack: ExitStack, config: Path | None, seed: int, aims: int, bump_every_s: float) -> LiveSetup:
-    if config is not None:
-        raise InputError("CONFIG", str(config), "no CONFIG: drivers by name are not read yet")
+def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float) -> LiveSetup:
     from fgreg.operation.rooms import simulated_room
 
     if not 0 <= aims <= 100:
@@ -110,6 +119,15 @@ def _setup(stack: ExitStack, config: Path | None, seed: int, aims: int, bump_eve
     if not bump_every_s > 0:
         raise InputError("--bump-every", str(bump_every_s), "seconds > 0, or inf")
     return simulated_room(stack, seed, aims, bump_every_s)
+
+
+def _configured(stack: ExitStack, path: Path, *, silent: bool) -> tuple[LiveSetup, SolveConfig]:
+    from fgreg.operation.config import read_config
+
+    found = read_config(path)
+    for warning in found.warnings:
+        sys.stderr.write(f"fgreg: warning: {warning}\n")
+    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo), found.solve
 
 
 def _conduct(

@@ -57,10 +57,8 @@ def test_ctrl_c_ends_it_with_the_session_complete(tmp_path: Path) -> None:
     assert "from frame to angle" in out
     orders = [json.loads(line) for line in (folder / "stage-orders.log").read_text().splitlines()]
     assert orders[-1]["command"] == "stop"
-    told = [event.command for event in session.events if isinstance(event, StageEvent)]
-    assert all(
-        command.split()[0] in ("request", "home", "search", "track", "stop", "emergency", "reset") for command in told
-    )
+    told = {event.command.split()[0] for event in session.events if isinstance(event, StageEvent)}
+    assert told <= {"request", "home", "search", "track", "stop", "emergency", "reset"}
 
 
 def test_a_killed_room_is_said_and_the_session_survives(tmp_path: Path) -> None:

@@ -68,6 +68,8 @@ AGAIN_RAD, AGAIN_S = math.radians(0.1), 0.5
 """An order to follow is repeated once the goal has moved by so much, or after so long."""
 SEND_S = 0.2
 """Between sendings of the registration where nothing has changed."""
+START_S = 5.0
+"""So long devices may take to send for the first time."""
 LATENCIES = 100_000
 
 
@@ -165,6 +167,8 @@ class LiveLoop:
         self.eyes, self.ears = Eyes(model), Ears(model)
         self.figures = Figures()
         self._lost: dict[str, str] = {}
+        self._seen: set[str] = set()
+        self._began_s = host_now()
         self._commands: list[Command] = []
         self._text, self._number = "", 0
         self._followed: tuple[float, float] = (math.nan, -math.inf)
@@ -262,8 +266,10 @@ class LiveLoop:
             return
         view = link.view
         if view is None or not view.connected or view.status is None:
-            self._is_lost("stage", "the stage is not there")
+            if "stage" in self._seen or host_now() - self._began_s > START_S:
+                self._is_lost("stage", "the stage is not there")
             return
+        self._seen.add("stage")
         self.ears.plane(view.status.stamp.host_s, view.status.scan_rad, view.status.moving)
 
     def _reported(self, report: Report) -> None:
@@ -398,7 +404,15 @@ class LiveLoop:
         if self._aiming is None or not self._aiming[2].done():
             return
         (corner, pose, found), self._aiming = self._aiming, None
-        fit = found.result()
+        board = self._model.board
+        try:
+            fit = found.result()
+        except Exception as error:  # of one picture: the next one may be as it should
+            self._tell(Tell(f"no aim: {error}"))
+            return
+        if board is None or not (0 <= corner[0] < board.columns and 0 <= corner[1] < board.rows):
+            self._tell(Tell(f"no aim: the board has no inner corner {corner[0]}, {corner[1]}"))
+            return
         if not isinstance(fit, BoardFit):
             self._tell(Tell(f"no aim: {fit.reason}"))
             return
@@ -456,8 +470,11 @@ class LiveLoop:
             if role in self._lost and device.connected:
                 del self._lost[role]
                 self._note(f"{role} is back")
-            elif role not in self._lost and not device.connected and role in ("camera", "probe"):
-                self._is_lost(role, f"{device.name} does not answer")
+            elif role not in self._lost and role in ("camera", "probe"):
+                if device.connected:
+                    self._seen.add(role)
+                elif role in self._seen or host_now() - self._began_s > START_S:
+                    self._is_lost(role, f"{device.name} does not answer")
         plane = self._plane()
         if "stage" in self._lost and plane is not None:
             del self._lost["stage"]
