@@ -96,7 +96,7 @@ def test_the_engine_with_a_tie_is_at_the_batch_optimum(counts: tuple[int, ...]) 
 
 
 def test_the_engine_finds_out_that_the_camera_is_back_and_the_batch_does_too() -> None:
-    model, measurements, truths = _there_and_back(3, (25, 4, 16))
+    model, measurements, truths = _there_and_back(7, (25, 4, 24))
     engine = OnlineRegistration(model, judge=None)
     for _, event in events_in_order(measurements):
         engine.add(event)

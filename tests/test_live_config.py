@@ -7,7 +7,7 @@ import math
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
+from fgreg.drivers.base import DeviceLost
 from fgreg.drivers.registry import ENTRIES, Role, Surroundings, load
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.motion.limits import MotionLimits
@@ -436,4 +437,5 @@ def test_a_scanner_for_overlay_is_opened_apart_from_what_is_measured(tmp_path: P
         scanner = config.open_bmode(stack)
         assert scanner is not None
         assert scanner.name == f"127.0.0.1:{data['bmode']['port']}"
-        assert scanner.poll() == []
+        with suppress(DeviceLost):  # nobody is there: how soon that is known depends
+            assert scanner.poll() == []

@@ -22,7 +22,7 @@ from fgreg.online.store import MeasurementStore
 from fgreg.online.white import gaussian_of, linearise, pivot_scale, pose_columns
 from fgreg.registration import SoundSpeedPrior, pack_session
 
-MOST_PAIRS = 20
+MOST_PAIRS = 30
 """Pairs of an epoch up to which it is asked whether it is an earlier one: by then it knows itself as well."""
 MIN_EARLIER = 8
 """PMs that an earlier epoch has to have."""

@@ -54,7 +54,7 @@ class ReturnSettings:
 
     elsewhere: MoveScales
     least_pairs: int = 8
-    accept: float = 4.4
+    accept: float = 4.7
     reject: float = math.log(100.0)
     junk_probability: float = 0.04
     least_difference: tuple[float, float] = (math.radians(1.0), 2.0)

@@ -71,7 +71,7 @@ def with_pair(state: State, pair: Pair, tools: Tools) -> State:
     try:
         return _one_more(state, state.window, state.layout, pair, tools)
     except ArithmeticError:
-        if state.epoch_pairs >= FEW_PAIRS:
+        if state.epoch_pairs >= JUDGED_PAIRS:
             raise
     # Among few pairs that contradict each other full steps may lead anywhere: begin anew, with damped ones.
     found = registered(state, tools, pair)
@@ -168,7 +168,11 @@ def pms_in_epoch(state: State) -> int:
 
 def open_window_again(state: State, window: Window, setting: Setting) -> Window:
     """The window with a summary from which a PM was taken."""
-    return relaxed(state, window, Change(summary=summary(state, window.state, setting)), setting, SETTLED_MANY)[1]
+    change = Change(summary=summary(state, window.state, setting))
+    try:
+        return relaxed(state, window, change, setting, SETTLED_MANY)[1]
+    except RuntimeError as error:  # GTSAM's word for a system that is indeterminate
+        raise ArithmeticError("without one of its PMs the registration is not determined") from error
 
 
 def is_kept(state: State, place: int) -> bool:
