@@ -17,6 +17,7 @@ from fgreg.models import SessionModel
 from fgreg.motion.limits import MotionKind
 from fgreg.online import OnlineRegistration
 from fgreg.operation.conductor import Conductor, ConductorSettings
+from fgreg.operation.spots import one_spot
 from fgreg.operation.view import (
     Action,
     Ask,
@@ -156,8 +157,9 @@ class Rehearsal:
             case TakeMove():
                 raise AssertionError("nobody told a move")
             case TakePairs(pm, looks):
-                for look in looks:
-                    self._pair(pm, look)
+                spot = one_spot(looks)
+                for look in spot.looks:
+                    self._pair(pm, spot.marker, look)
             case Tell():
                 self.told.append((self.now_s, action))
                 if action.wants is not None and self.obliging:
@@ -196,6 +198,12 @@ class Rehearsal:
         distance += config.noise.range_mm * rng.standard_normal()
         return Heard(t_s, where, marker, unpaired, x, distance, covariance, amplitude)
 
+    def _observation(self, pm: int, pose: TimedPose) -> MarkerObservation:
+        """One observation a PM."""
+        return MarkerObservation(
+            as_float_array(pose.parent_T_child, 4, 4), as_float_array(pose.covariance, 6, 6), 1_000_000 + pm
+        )
+
     def _marker(self, pose: TimedPose) -> MarkerObservation:
         self._number += 1
         return MarkerObservation(
@@ -214,15 +222,14 @@ class Rehearsal:
         self._aims += 1
         self.room.proceed(self.now_s)
 
-    def _pair(self, pm: int, look: Heard) -> None:
-        assert look.marker is not None
+    def _pair(self, pm: int, pose: TimedPose, look: Heard) -> None:
         assert look.scan_rad is not None
         assert look.x_mm is not None
         assert look.range_mm is not None
         assert look.covariance is not None
         noise = self.model.noise
         made = Look(look.scan_rad, noise.scan_rad, look.x_mm, look.range_mm, look.covariance, 0, look.amplitude)
-        self.engine.add(Pair(self.now_s, pm, 0, self._marker(look.marker), made))
+        self.engine.add(Pair(self.now_s, pm, 0, self._observation(pm, pose), made))
 
     def error_mm(self) -> float:
         """Largest error of the registration at the targets; infinite without one."""

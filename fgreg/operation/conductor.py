@@ -43,6 +43,8 @@ WORTH_PREDICTING_RAD = math.radians(8.0)
 CHECK_RAD = math.radians(2.0)
 """While the stage follows, a PM heard with the plane so near to the answer becomes a pair."""
 ASK_AGAIN_S = 10.0
+PATIENCE_S = 6.0
+"""A spot at which nothing happens for so long is not worth waiting at."""
 DEAF = 8
 """Pulses in a row that are not heard where they should be before the operator is told."""
 
@@ -106,6 +108,7 @@ class Conductor:
         self._deaf = 0
         self._wanted: Said | None = None
         self._wanted_s = -math.inf
+        self._waits_s = -math.inf
 
     def step(self, view: View) -> tuple[Action, ...]:
         """What to do now."""
@@ -198,7 +201,9 @@ class Conductor:
         held = held_pose(view.poses, view.now_s)
         if self._hunt is None:
             if held is None or not self._is_another(held):
+                self._wait(view, held, out)
                 return
+            self._waits_s = view.now_s
             self._hunt = self._begin(view, stage, held, cold=False)
         elif (slipped := self._slipped(view, self._hunt)) is not None:
             self._hunt = None
@@ -209,9 +214,22 @@ class Conductor:
         if isinstance(step, Turn):
             out.append(Sweep(step.scan_rad, step.reason))
         elif isinstance(step, Found):
-            self._found(self._hunt, step, out)
+            self._found(view.now_s, self._hunt, step, out)
         elif isinstance(step, NotFound):
             self._not_found(view, stage, self._hunt, step, out)
+
+    def _wait(self, view: View, held: FloatArray | None, out: list[Action]) -> None:
+        """Say what is waited for, once it lasts."""
+        if view.now_s - self._waits_s < PATIENCE_S:
+            return
+        self._waits_s = view.now_s
+        newest = view.poses.newest()
+        if newest is None or view.now_s - newest.t_s > 1.0:
+            out.append(Tell("the marker is not seen: hold the fibre elsewhere", done=True))
+        elif held is None:
+            out.append(Tell("hold the fibre still", done=False))
+        else:
+            out.append(Tell("this spot is done: hold the fibre elsewhere", done=True))
 
     def _begin(self, view: View, stage: StageView, held: FloatArray, *, cold: bool) -> Hunt:
         low, high = self._field
@@ -224,8 +242,8 @@ class Conductor:
         planner = SearchPlanner(self._hearing, low, high, stands, prediction)
         return Hunt(planner, held, prediction is None, self._settings.hearing_threshold, view.now_s, [])
 
-    def _found(self, hunt: Hunt, found: Found, out: list[Action]) -> None:
-        self._hunt, self._done_at = None, hunt.held
+    def _found(self, now_s: float, hunt: Hunt, found: Found, out: list[Action]) -> None:
+        self._hunt, self._done_at, self._waits_s = None, hunt.held, now_s
         looks = tuple(look for look in hunt.kept(found, self._model) if look.marker is not None)
         if not looks:
             why = next((look.unpaired for look in hunt.looks if look.unpaired), "the looks were off the window")
@@ -243,7 +261,7 @@ class Conductor:
             self._hunt = self._begin(view, stage, hunt.held, cold=True)
             out.append(Tell(f"{why.reason}: searching the whole field"))
             return
-        self._hunt, self._done_at = None, hunt.held
+        self._hunt, self._done_at, self._waits_s = None, hunt.held, view.now_s
         out.append(Tell(f"{why.reason}: go on to the next spot", done=True))
 
     def _slipped(self, view: View, hunt: Hunt) -> str | None:

@@ -43,6 +43,7 @@ from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.operation.conductor import Conductor
 from fgreg.operation.recorder import Recorder, RecorderState
 from fgreg.operation.senses import Ears, Eyes
+from fgreg.operation.spots import one_spot
 from fgreg.operation.view import (
     Action,
     Ask,
@@ -347,8 +348,9 @@ class LiveLoop:
             case TakeAim(corner):
                 self._aim(corner)
             case TakePairs(pm, looks):
-                for look in looks:
-                    self._pair(pm, look)
+                spot = one_spot(looks)
+                for look in spot.looks:
+                    self._pair(pm, spot.marker, look)
             case TakeMove():
                 self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
             case Tell():
@@ -423,12 +425,12 @@ class LiveLoop:
         self._recorder.hand_over(AimEvent(self._t(pose.t_s), 0, marker, spot, covariance))
         self._tell(Tell(f"aim at corner {corner[0]}, {corner[1]} taken", done=True))
 
-    def _pair(self, pm: int, look: Heard) -> None:
-        if look.marker is None or look.scan_rad is None:
+    def _pair(self, pm: int, pose: TimedPose, look: Heard) -> None:
+        if look.scan_rad is None:
             raise AssertionError("a look that cannot be paired")
         device = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
         trus = TrusRecord(device, look.x_mm, look.range_mm, look.covariance, look.amplitude, 0)
-        marker = MarkerRecord(look.marker.parent_T_child, look.marker.covariance)
+        marker = MarkerRecord(pose.parent_T_child, pose.covariance)
         self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))
 
     def _send(self, now: float) -> None:
