@@ -29,6 +29,7 @@ from fgreg.errors import FgregError
 from fgreg.models import StageModel
 from fgreg.motion.device import MAX_CALL_S, StageLost, StageStatus
 from fgreg.pairing import Stamp
+from fgreg.simulation.room import BUMP_EVERY_S
 
 AGAIN_S = 0.2
 """Between attempts to connect."""
@@ -56,7 +57,7 @@ class RoomProcess:
     """
 
     def __init__(
-        self, seed: int = 1, width_px: int = 640, aims: int = 10, bump_every_s: float = 90.0, *extra: str
+        self, seed: int = 1, width_px: int = 640, aims: int = 10, bump_every_s: float = BUMP_EVERY_S, *extra: str
     ) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="fgreg-room-"))  # of mode 0700
         self.path = self._folder / "socket"

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
-from fgreg.simulation.room import Room, RoomConfig, room_config
+from fgreg.simulation.room import BUMP_EVERY_S, Room, RoomConfig, room_config
 
 CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
 """What the devices' clocks read when the room begins."""
@@ -238,7 +238,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=640, help="of the camera's images, px")
     parser.add_argument("--aims", type=int, default=10, help="calibration shots before the surgeon turns to the tissue")
-    parser.add_argument("--bump-every-s", type=float, default=90.0, help="mean time between camera moves; inf: none")
+    parser.add_argument(
+        "--bump-every-s", type=float, default=BUMP_EVERY_S, help="mean time between camera moves; inf: none"
+    )
     given = parser.parse_args(arguments)
     config: RoomConfig = room_config(given.seed, given.width, aims=given.aims, bump_every_s=given.bump_every_s)
     server = RoomServer(Room(config), given.socket)

@@ -60,7 +60,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         bumps: Annotated[
             float,
             typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
-        ] = 90.0,
+        ] = 240.0,
         limit_mm: LimitOption = 3.0,
         example_config: Annotated[
             bool, typer.Option("--example-config", help="Print a CONFIG.yaml with every driver and key, explained.")

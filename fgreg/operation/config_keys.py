@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from fgreg.drivers.options import REQUIRED, Key, Kind
 from fgreg.drivers.registry import DriverEntry, Role, drivers_of
 from fgreg.session.schema import ANY, Bounds
+from fgreg.simulation.room import BUMP_EVERY_S
 
 LIVE_FORMAT = "fgreg-live/1"
 _DEG_S = Bounds(0.0, 30.0, above=True, unit="deg/s")
 
 ROOM_KEYS = (
     Key("seed", Kind.INTEGER, "of everything random in it", 1, Bounds(0, 2**31 - 1)),
-    Key("bump_every_s", Kind.NUMBER, "mean time between moves of the camera", 90.0, Bounds(1.0, 1e9, unit="s")),
+    Key("bump_every_s", Kind.NUMBER, "mean time between moves of the camera", BUMP_EVERY_S, Bounds(1.0, 1e9, unit="s")),
     Key("width", Kind.INTEGER, "of its camera's images, px", 640, Bounds(160, 1920)),
 )
 CALIBRATION_KEYS = (

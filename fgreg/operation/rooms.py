@@ -12,7 +12,7 @@ from fgreg.operation.conductor import ConductorSettings
 from fgreg.operation.loop import Devices
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.simulation.documents import session_document
-from fgreg.simulation.room import room_config
+from fgreg.simulation.room import BUMP_EVERY_S, room_config
 
 HEARING_THRESHOLD = 20.0
 """Amplitude in the room's units: well above what its noise makes, half of what is heard at the window's edge."""
@@ -20,7 +20,7 @@ SPEED_RAD_S = math.radians(20.0)
 
 
 def simulated_room(
-    stack: ExitStack, seed: int = 1, aims: int = 8, bump_every_s: float = 90.0, width_px: int = 640
+    stack: ExitStack, seed: int = 1, aims: int = 8, bump_every_s: float = BUMP_EVERY_S, width_px: int = 640
 ) -> LiveSetup:
     """A room that runs until the stack is left.
 

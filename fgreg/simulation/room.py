@@ -26,6 +26,8 @@ TRAVEL_MM_S, TRAVEL_RAD_S, LEAST_TRAVEL_S = 40.0, math.radians(30.0), 0.8
 TREMOR_HZ = (0.7, 2.3, 5.1, 8.7)
 TREMOR_MM, TREMOR_RAD = 0.03, 0.0006
 """Amplitude of each tremor component and axis."""
+BUMP_EVERY_S = 240.0
+"""Mean time between bumps, unless said otherwise: some registrations long."""
 BUMP_S = 0.5
 """A bump moves the camera for so long."""
 SCENES = 6
@@ -48,7 +50,7 @@ class RoomConfig:
 
     seed: int = 1
     aims: int = 10
-    bump_every_s: float = 90.0
+    bump_every_s: float = BUMP_EVERY_S
     bump_rad: float = math.radians(2.0)
     bump_mm: float = 2.5
     scene: SimulationConfig
@@ -62,7 +64,9 @@ class RoomConfig:
             raise ValueError("the room's probe has to record channel data")
 
 
-def room_config(seed: int = 1, width_px: int = 640, *, aims: int = 10, bump_every_s: float = 90.0) -> RoomConfig:
+def room_config(
+    seed: int = 1, width_px: int = 640, *, aims: int = 10, bump_every_s: float = BUMP_EVERY_S
+) -> RoomConfig:
     """A room with a stereo camera of this width and a probe that records channel data."""
     scene = SimulationConfig(
         name="room",
