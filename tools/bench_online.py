@@ -265,7 +265,7 @@ def main() -> None:
         "--watch",
         choices=["process", "inline", "none"],
         default="process",
-        help="untold camera moves are looked for in a process of their own, as in the operating room; within add; or not",
+        help="untold camera moves are looked for in a process of their own, as in operating rooms; within add; or not",
     )
     arguments = parser.parse_args()
     watch = None if arguments.watch == "none" else arguments.watch
