@@ -61,8 +61,11 @@ def custom_factor(
     dims = tuple(variable_dims)
     count = len(dims)
     buffer = np.empty(error_dim * sum(dims))
-    starts = np.cumsum([0, *(error_dim * n for n in dims)]).tolist()
-    blocks = tuple(buffer[starts[i] : starts[i + 1]].reshape(error_dim, dims[i]) for i in range(count))
+    blocks, start = [], 0
+    for n in dims:
+        blocks.append(buffer[start : start + error_dim * n].reshape(error_dim, n))
+        start += error_dim * n
+    heights, widths = [error_dim] * count, [n for n in dims for _ in range(error_dim)]
     error_out = np.empty(error_dim)
     finite = math.isfinite
 
@@ -82,14 +85,9 @@ def custom_factor(
             return error_out
         if len(jacobians) != count:
             raise FactorError(f"{name}: {len(jacobians)} Jacobians, expected {count}")
-        flat: list[float] = []
-        for index, rows in enumerate(jacobians):
-            if len(rows) != error_dim:
-                raise FactorError(f"{name}: Jacobian {index} has {len(rows)} rows, expected {error_dim}")
-            for row in rows:
-                if len(row) != dims[index]:
-                    raise FactorError(f"{name}: Jacobian {index} has a row of {len(row)}, expected {dims[index]}")
-                flat.extend(row)
+        if [len(rows) for rows in jacobians] != heights or [len(row) for rows in jacobians for row in rows] != widths:
+            raise FactorError(f"{name}: {_misshapen(jacobians, error_dim, dims)}")
+        flat = [value for rows in jacobians for row in rows for value in row]
         if not finite(sum(flat)):
             raise FactorError(f"{name}: a Jacobian has an entry that is not finite")
         buffer[:] = flat
@@ -98,3 +96,14 @@ def custom_factor(
         return error_out
 
     return gtsam.CustomFactor(noise_model, list(keys), callback)
+
+
+def _misshapen(jacobians: Sequence[Rows], error_dim: int, dims: Sequence[int]) -> str:
+    """What is wrong with the first Jacobian that has not the shape it should have."""
+    for index, rows in enumerate(jacobians):
+        if len(rows) != error_dim:
+            return f"Jacobian {index} has {len(rows)} rows, expected {error_dim}"
+        for row in rows:
+            if len(row) != dims[index]:
+                return f"Jacobian {index} has a row of {len(row)}, expected {dims[index]}"
+    raise AssertionError("every Jacobian has its shape")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf
 
 from fgreg.frames import FloatArray, right_from_parent_covariance
 from fgreg.models import NoiseModel
@@ -129,11 +131,14 @@ def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) ->
 
 def usable_covariance(covariance: FloatArray, floor: Sequence[float]) -> FloatArray:
     """The covariance, with the floor's squares added where a direction of it is below the floor."""
-    sigma = np.asarray(floor)
-    try:  # less the floor it has a Cholesky factor: a third of the time that its eigenvalues take
-        np.linalg.cholesky(covariance - np.diag(sigma**2))
-    except np.linalg.LinAlgError:
-        pass
-    else:
+    least = _squares(tuple(floor))
+    # Less the floor it has a Cholesky factor: a fraction of the time that its eigenvalues take.
+    if dpotrf(covariance - least, lower=1)[1] == 0:
         return covariance
-    return np.asarray(covariance + np.diag(sigma**2))
+    return np.asarray(covariance + least)
+
+
+@lru_cache
+def _squares(sigmas: tuple[float, ...]) -> FloatArray:
+    """Diagonal matrix of squares."""
+    return np.diag(np.square(sigmas))

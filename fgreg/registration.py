@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -392,11 +392,16 @@ def _solve_jointly(
 
 
 def register(
-    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+    measurements: Measurements,
+    model: SessionModel,
+    config: SolveConfig,
+    sound_speed: SoundSpeedPrior | None = None,
+    searched: Mapping[int, EpochSearch] | None = None,
 ) -> Registration:
     """Calibrate and register: the joint optimum over all epochs that can be solved.
 
     ``sound_speed`` is what is known of the ratio where it is estimated; the configuration's prior where None.
+    ``searched``: epochs that need no search, with what is known of their minima.
 
     Raises:
         EstimationError: no beam to start from, or no epoch with three PMs.
@@ -404,7 +409,11 @@ def register(
     beam = calibrate_beam(measurements, model)
     trusted = _keep(measurements, (), np.zeros(0, dtype=bool), beam.aim_kept).aims
     fitting = replace(measurements, aims=trusted)
-    searches = tuple(search_epoch(fitting, model, beam.frames, k) for k in range(len(measurements.epochs)))
+    known = searched or {}
+    searches = tuple(
+        known[k] if k in known else search_epoch(fitting, model, beam.frames, k)
+        for k in range(len(measurements.epochs))
+    )
     solvable = _solvable(measurements, searches)
     if not solvable:
         counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]

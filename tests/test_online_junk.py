@@ -10,6 +10,7 @@ from fgreg.config import SolveConfig
 from fgreg.graph.packing import pack
 from fgreg.measurements import Measurements, Pair
 from fgreg.online import OnlineRegistration
+from fgreg.online.state import WINDOW
 from fgreg.online.updates import pms_in_epoch
 from fgreg.registration import register, register_near
 from fgreg.robust import limits_among
@@ -78,7 +79,7 @@ def test_a_look_at_the_oldest_pm_of_a_full_window_does_not_count_twice() -> None
     run(engine, replace(measurements, pairs=()))
     looks = iter(measurements.pairs[::2])
     t = 0.0
-    while engine.state.window is None or len(engine.state.window.groups) < 24:
+    while engine.state.window is None or len(engine.state.window.groups) < WINDOW:
         pair = next(looks)
         t = pair.t
         engine.add(pair)

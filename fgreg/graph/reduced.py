@@ -207,6 +207,8 @@ def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _Sys
         by_shared[:, mine, :, 6 * epoch : 6 * epoch + 6] = pose[:, mine]
     aim_by_shared = np.zeros((count, len(problem.aims.rotation), 2, size))
     for block, columns_of in ((line, by_shared), (system.aim, aim_by_shared)):
+        if not columns_of.shape[1]:
+            continue
         columns_of[..., columns.beam : columns.beam + 4] = beam_columns(block, state)
         if columns.bias is not None:
             columns_of[..., columns.bias : columns.bias + 3] = block.to_camera

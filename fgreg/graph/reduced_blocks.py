@@ -59,7 +59,7 @@ def perpendicular_basis(direction: FloatArray) -> FloatArray:
 
 
 def transposed(matrix: FloatArray) -> FloatArray:
-    return np.swapaxes(matrix, -1, -2)
+    return matrix.swapaxes(-1, -2)
 
 
 def times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
@@ -91,7 +91,7 @@ def inverse3(matrix: FloatArray) -> FloatArray:
 
 def sum_by(values: FloatArray, index: IntArray, groups: int) -> FloatArray:
     """Sum (S, n, ...) over entries of the same group: (S, groups, ...)."""
-    if len(index) == groups and np.array_equal(index, np.arange(groups)):
+    if len(index) == groups and (index == np.arange(groups)).all():
         return values
     out = np.zeros((values.shape[0], groups, *values.shape[2:]))
     np.add.at(out.swapaxes(0, 1), index, values.swapaxes(0, 1))
@@ -107,6 +107,8 @@ def line_block(
     translation_mm: FloatArray | None,
 ) -> LineBlock:
     """Two residuals across the beam for points (S, n, 3), in TRUS (with rotation, translation) or camera axes."""
+    if not len(beams.rotation):
+        return _no_lines(state.count)
     # The marker moves by Exp of a twist (w, n) about its observed origin: t + n + w x n / 2 to second order.
     half_turn = 0.5 * hat(error[..., :3])
     marker_rotation = exp_so3(error[..., :3]) @ beams.rotation
@@ -140,6 +142,15 @@ def line_block(
         to_camera=to_camera,
         marker_rotation=marker_rotation,
     )
+
+
+def _no_lines(count: int) -> LineBlock:
+    """Of no beams."""
+
+    def none(*shape: int) -> FloatArray:
+        return np.zeros((count, 0, *shape))
+
+    return LineBlock(none(3, 2), none(2), none(2, 2), none(2, 6), none(), none(3), none(2, 3), none(3, 3))
 
 
 def beam_columns(block: LineBlock, state: SharedState) -> FloatArray:

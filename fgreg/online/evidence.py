@@ -95,7 +95,7 @@ class MoveFound:
 
 def size_of(state: State, window: Window) -> int:
     """How many of the window's last PMs can be looked at; 0 where there is no sound registration before them."""
-    older = sum(len(chunk.kept) for chunk in state.now.shelf.chunks)
+    older = state.now.shelf.counts[1]
     return max(0, min(LAST, len(window.groups), older + len(window.groups) - MIN_BEFORE))
 
 
@@ -157,15 +157,15 @@ def _terms(groups: tuple[Group, ...], state: SharedState, columns: Columns) -> W
 def small_steps(first: list[SharedState], second: SharedState, columns: Columns) -> FloatArray:
     """(n, D) of :func:`fgreg.online.shared.small_step` from several states to one."""
     out = np.zeros((len(first), columns.size))
-    back = np.stack([state.rotation[0, 0].T for state in first])
+    back = np.concatenate([state.rotation[0] for state in first]).swapaxes(1, 2)
     turn = back @ second.rotation[0, 0]
     out[:, 0] = 0.5 * (turn[:, 2, 1] - turn[:, 1, 2])
     out[:, 1] = 0.5 * (turn[:, 0, 2] - turn[:, 2, 0])
     out[:, 2] = 0.5 * (turn[:, 1, 0] - turn[:, 0, 1])
-    shift = second.translation_mm[0, 0] - np.stack([state.translation_mm[0, 0] for state in first])
+    shift = second.translation_mm[0, 0] - np.concatenate([state.translation_mm[0] for state in first])
     out[:, 3:6] = (back @ shift[:, :, None])[..., 0]
-    out[:, columns.beam : columns.beam + 4] = second.beam[0] - np.stack([state.beam[0] for state in first])
-    out[:, columns.edge] = second.edge_rad[0] - np.array([state.edge_rad[0] for state in first])
+    out[:, columns.beam : columns.beam + 4] = second.beam[0] - np.concatenate([state.beam for state in first])
+    out[:, columns.edge] = second.edge_rad[0] - np.concatenate([state.edge_rad for state in first])
     if columns.bias is not None:
         out[:, columns.bias : columns.bias + 3] = second.bias_mm[0] - np.stack([state.bias_mm[0] for state in first])
     if columns.sound_speed is not None:

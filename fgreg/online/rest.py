@@ -19,7 +19,7 @@ from fgreg.measurements import Pair
 from fgreg.online.events import DetectedMove, DetectedReturn
 from fgreg.online.judge import Judgement
 from fgreg.online.restart import AIMS_IN_CHUNK
-from fgreg.online.shared import Layout
+from fgreg.online.shared import Layout, number_at
 from fgreg.online.state import RECENT, SETTLED_MANY, STEP, WINDOW, Setting, State, sigma_distance, summary
 from fgreg.online.summary import CHUNK
 from fgreg.online.window import (
@@ -165,9 +165,9 @@ def _private_values(pairs: tuple[Pair, ...], first: int, numbers: FloatArray) ->
         pose = np.eye(4)
         pose[:3] = numbers[at : at + 12].reshape(3, 4)
         values.insert(marker, gtsam.Pose3(pose))
-        values.insert(lam, float(numbers[at + 12]))
+        values.insert(number_at(lam, float(numbers[at + 12])))
         at += 13
     values.insert(point, numbers[at : at + 3])
     for theta, value in zip(thetas, numbers[at + 3 :].tolist(), strict=True):
-        values.insert(theta, value)
+        values.insert(number_at(theta, value))
     return values

@@ -29,11 +29,13 @@ from fgreg.online.state import (
 from fgreg.online.store import MeasurementStore
 from fgreg.online.summary import Chunk, Shelf, make_chunk
 from fgreg.online.window import Bundle, Group, open_window, prepare
-from fgreg.registration import Registration, register, register_near
+from fgreg.registration import EpochSearch, Minimum, Registration, register, register_near
 
 ALL_PAIRS = 120
 """Sessions of more pairs are not registered as a whole again: the epoch that lasts, and the last pairs before it."""
 EARLIER_PAIRS = 60
+LEAST_PMS = 3
+"""What an epoch takes to be registered at all."""
 AIMS_IN_CHUNK = 64
 STAYS_SIGMA = 0.02
 """A window that was opened at an optimum has to come to rest no farther from it."""
@@ -72,7 +74,9 @@ def registered(state: State, tools: Tools, pair: Pair | None = None, aim: Aim | 
     taken = _taken(state, tools, pair, aim)
     after = replace(taken.after, window=None, is_open=True)
     try:
-        found = register(taken.measurements, tools.setting.model, tools.config, tools.setting.sound_speed)
+        found = register(
+            taken.measurements, tools.setting.model, tools.config, tools.setting.sound_speed, _known(state, taken)
+        )
     except EstimationError as error:
         return replace(after, why_none=str(error))
     if state.epoch not in found.epochs:
@@ -81,6 +85,24 @@ def registered(state: State, tools: Tools, pair: Pair | None = None, aim: Aim | 
         return replace(after, why_none=text)
     after = replace(after, is_open=state.epoch in found.ambiguous)
     return _from_registration(after, found, taken, tools)
+
+
+def _known(state: State, taken: _Taken) -> dict[int, EpochSearch]:
+    """Earlier epochs that are not registered as a whole again: only the one that lasts is searched for minima."""
+    if taken.whole:
+        return {}
+    # Theirs are all on the shelf; the window, which may hold the new pair already, is of the epoch that lasts.
+    kept = kept_by_place(replace(state, window=None, pairs=state.pairs + 1))
+    mine: dict[int, list[tuple[int, bool]]] = {}
+    for place, pair in zip(taken.places, taken.measurements.pairs, strict=True):
+        if pair.epoch != state.epoch:
+            mine.setdefault(pair.epoch, []).append((pair.pm, bool(kept[place])))
+    out = {}
+    for epoch, pairs in mine.items():
+        there = state.epochs[epoch].state
+        if there is not None and len({pm for pm, _ in pairs}) >= LEAST_PMS:
+            out[epoch] = EpochSearch((Minimum(0.0, there),), None, clean=all(counts for _, counts in pairs))
+    return out
 
 
 def settled_anew(state: State, tools: Tools, pair: Pair) -> State | None:

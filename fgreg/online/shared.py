@@ -7,7 +7,9 @@ window's edge, then the marker bias and the sound speed ratio where they are var
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -71,7 +73,9 @@ def small_step(first: SharedState, second: SharedState, columns: Columns) -> Flo
 def chart_turn(step: FloatArray) -> FloatArray:
     """(D, D) derivative of ``step_between(a, b.retract(d))`` by d, where b is ``step`` (D,) from a."""
     turn = np.eye(len(step))
-    turn[:3, :3] += 0.5 * hat(step[:3])
+    x, y, z = (0.5 * step[:3]).tolist()
+    turn[0, 1], turn[0, 2], turn[1, 2] = -z, y, -x
+    turn[1, 0], turn[2, 0], turn[2, 1] = z, -y, x
     turn[3:6, 3:6] = exp_so3(step[:3])
     return turn
 
@@ -92,6 +96,20 @@ def square_root(hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, 
     root = np.sqrt(value[seen])
     rows = (vector[:, seen] * root).T * scale
     return rows, (vector[:, seen] / root).T @ (gradient / scale)
+
+
+@lru_cache(maxsize=4096)
+def _zero_at(key: int) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(key, 0.0)
+    return values
+
+
+def number_at(key: int, value: float) -> gtsam.Values:
+    """Values of one double. By retraction: to insert one goes through all of the wrapper's overloads, 40 us."""
+    delta = gtsam.VectorValues()
+    delta.insert(key, np.array([value]))
+    return _zero_at(key).retract(delta)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,11 +146,11 @@ class Layout:
         keys = self.keys(epoch)
         values.insert(keys[0], gtsam.Pose3(state.trus_T_camera()[0]))
         values.insert(keys[1], state.beam[0])
-        values.insert(keys[2], float(state.edge_rad[0]))
+        values.insert(number_at(keys[2], float(state.edge_rad[0])))
         if self.columns.bias is not None:
             values.insert(Variable.marker_bias.key(), state.bias_mm[0])
         if self.columns.sound_speed is not None:
-            values.insert(Variable.sound_speed_ratio.key(), float(state.sound_speed_ratio[0]))
+            values.insert(number_at(Variable.sound_speed_ratio.key(), float(state.sound_speed_ratio[0])))
 
     def read(self, isam: gtsam.ISAM2, epoch: int, like: SharedState) -> SharedState:
         """The estimate of the shared variables; what is no variable is as in ``like``."""
@@ -155,8 +173,8 @@ class Layout:
 
 
 def finite(state: SharedState) -> bool:
-    """Whether every number of a state is finite."""
-    return all(bool(np.isfinite(getattr(state, name)).all()) for name in SharedState.__slots__)
+    """Whether every number of a state is finite (a sum is only if its terms are)."""
+    return math.isfinite(sum(float(getattr(state, name).sum()) for name in SharedState.__slots__))
 
 
 def summary_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> gtsam.CustomFactor:

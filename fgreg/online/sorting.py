@@ -12,8 +12,6 @@ from fgreg.graph.packing import PackedProblem
 from fgreg.online.restart import Tools
 from fgreg.online.shared import Layout, Quadratic, small_step
 from fgreg.online.state import (
-    SETTLED_MANY,
-    SETTLED_NEAR,
     Setting,
     State,
     counts,
@@ -24,7 +22,7 @@ from fgreg.online.state import (
 )
 from fgreg.online.summary import joined, make_chunk
 from fgreg.online.summary import settled as settled_parts
-from fgreg.online.window import Bundle, Change, Group, Window, prepare
+from fgreg.online.window import Bundle, Change, Group, Window, free_number, prepare
 from fgreg.robust import innovations_of, limits_among
 
 JUNK_PMS = 2
@@ -84,7 +82,7 @@ def toggled(state: State, setting: Setting) -> State:
         if not group.kept and fits and back is None:
             back = group
     labels = {group.label for group in (out, back) if group is not None}
-    return _flipped(state, window, labels, setting, SETTLED_MANY) if labels else state
+    return _flipped(state, window, labels, setting) if labels else state
 
 
 def _window_innovations(groups: Sequence[Group], window: Window, setting: Setting) -> list[float]:
@@ -117,7 +115,7 @@ def flipped_while_odd(state: State, setting: Setting) -> State:
             odd -= _counting(state)
         if window is None or not odd:
             break
-        state = _flipped(state, window, set(sorted(odd)[:MOST_FLIPS]), setting, SETTLED_NEAR)
+        state = _flipped(state, window, set(sorted(odd)[:MOST_FLIPS]), setting, near=True)
     return state
 
 
@@ -130,7 +128,7 @@ def _counting(state: State) -> frozenset[int]:
     return frozenset(found)
 
 
-def _flipped(state: State, window: Window, labels: Set[int], setting: Setting, settled: float) -> State:
+def _flipped(state: State, window: Window, labels: Set[int], setting: Setting, *, near: bool = False) -> State:
     """The state in which those of some PMs of the epoch that count no longer do, and the others do."""
     layout, columns = state.layout, setting.columns
     if layout is None:
@@ -145,7 +143,8 @@ def _flipped(state: State, window: Window, labels: Set[int], setting: Setting, s
             changed = True
     state = state.with_now(shelf=shelf)
     taken: list[Group] = []
-    numbers = window.numbers
+    coming = sum(len(group.bundle.pairs) for group in window.groups if group.label in labels and not group.kept)
+    numbers = free_number(window.groups, coming)
     for group in window.groups:
         if group.label in labels and not group.kept:
             fresh = prepare(group.bundle.pairs, layout, window.state, state.epoch, setting.model, numbers)
@@ -156,7 +155,7 @@ def _flipped(state: State, window: Window, labels: Set[int], setting: Setting, s
         leave_out=tuple(group.label for group in window.groups if group.label in labels and group.kept),
         summary=summary(state, window.state, setting) if changed else None,
     )
-    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, settled)
+    state, window = relaxed(state, replace(window, numbers=numbers), change, setting, near=near)
     return replace(state.with_now(state=window.state), window=window)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
@@ -45,12 +46,12 @@ WINDOW, STEP = 17, 9
 """Most groups in the window, and how many of the oldest go into the summary at once when one more comes. No multiple of
 the events between other work (fgreg.online.updates), which would always have to stand back at the same places."""
 NEAR_PAIRS = 160
-"""Up to so many pairs of an epoch, its chunks and the aims are linearised anew whenever the estimate moves much, and
-where there is junk all PMs are judged after every pair."""
+"""Up to so many pairs of an epoch, its chunks and the aims are linearised anew whenever the estimate moves much or more
+pairs join them, and where there is junk all PMs are judged after every pair."""
 RECENT = 24
 """How many pairs' quadratics are kept for tests on the last ones."""
 MOST_UPDATES = 8
-SETTLED_FEW, SETTLED_NEAR, SETTLED_MANY = 0.05, 0.1, 0.3
+SETTLED_FEW, SETTLED_NEAR, SETTLED_MANY = 0.05, 0.4, 0.3
 """Updates are repeated until the estimate moves by less, in its own standard deviations. What then is left is of second
 order, and falls with the number of pairs: with few, chunks are linearised anew on the way."""
 
@@ -250,9 +251,11 @@ def with_common(state: SharedState, common: SharedState) -> SharedState:
 
 def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArray, columns: Columns) -> float:
     """Mahalanobis distance of two states near each other."""
-    scale = np.sqrt(np.diag(covariance))
+    scale = np.sqrt(covariance.diagonal())
     step = small_step(first, second, columns) / scale
-    square = float(step @ np.linalg.solve(covariance / np.outer(scale, scale), step))
+    correlation = covariance / scale / scale[:, None]
+    _, along, failed = dposv(correlation, step, lower=1)
+    square = float(step @ (along if failed == 0 else np.linalg.solve(correlation, step)))
     return math.sqrt(max(square, 0.0))
 
 
@@ -375,12 +378,15 @@ def popped(state: State, window: Window, setting: Setting) -> tuple[State, tuple
     return state.with_now(shelf=shelf), tuple(group.label for group in oldest)
 
 
-def relaxed(state: State, window: Window, change: Change, setting: Setting, settled: float) -> tuple[State, Window]:
+def relaxed(
+    state: State, window: Window, change: Change, setting: Setting, settled: float = SETTLED_MANY, *, near: bool = False
+) -> tuple[State, Window]:
     """Update the window until the estimate stands still.
 
     Args:
-        settled: movement, in sigma, at which it does. Below ``SETTLED_MANY`` the epoch's chunks and the aims are
-            linearised at every new estimate, else they are left where they are.
+        state, window, change, setting: of the update.
+        settled: movement, in sigma, at which it does.
+        near: the epoch's chunks and the aims are linearised at every new estimate, else left where they are.
     """
     layout = state.layout
     if layout is None:
@@ -392,7 +398,7 @@ def relaxed(state: State, window: Window, change: Change, setting: Setting, sett
         if moved < settled:
             break
         change = Change()
-        if settled < SETTLED_MANY:
+        if near:
             state = refreshed(state, window.state, setting)
             change = Change(summary=summary(state, window.state, setting))
     return state, window
@@ -409,8 +415,8 @@ def refreshed(state: State, at: SharedState, setting: Setting) -> State:
 
 
 def again(chunk: Chunk, at: SharedState) -> Chunk:
-    """A chunk linearised at another state near by."""
-    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private, rounds=1)
+    """A chunk linearised at another state near by: its private variables make one step on the way."""
+    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private, rounds=0)
 
 
 def opened(

@@ -94,7 +94,9 @@ class MeasurementStore:
             self._blocks.append(np.empty((ROWS, len(_KEPT))))
         kept = row[_KEPT]
         self._blocks[-1][index % ROWS] = kept
-        if not np.array_equal(_whole(kept[None])[0], row, equal_nan=True):
+        whole = kept[_FROM]
+        whole[_LAST_ROW] = 0.0, 0.0, 0.0, 1.0
+        if not (whole[:_AMPLITUDE] == row[:_AMPLITUDE]).all():  # the amplitude may be none, which equals nothing
             self._odd[index] = row
 
     def _row(self, index: int) -> FloatArray:

@@ -46,7 +46,7 @@ from fgreg.online.state import (
 )
 from fgreg.online.summary import carried_over, chunk_of, make_chunk
 from fgreg.online.summary import settled as settled_parts
-from fgreg.online.window import Bundle, Change, Group, Window, open_window, prepare
+from fgreg.online.window import Bundle, Change, Group, Window, free_number, open_window, prepare
 from fgreg.robust import AIM_LIMIT, innovations_of, limits_among
 
 FIRST_PAIRS = 8
@@ -89,6 +89,8 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
         (*(tools.store.pair(p, state.epoch, pair.pm) for p in earlier), replace(pair, epoch=state.epoch)),
         kept=True,
     )
+    # One more than its looks: where one of them turns out to be junk, that one is a PM of its own.
+    window = replace(window, numbers=free_number(window.groups, len(bundle.pairs) + 1))
     prepared = prepare(bundle.pairs, layout, window.state, state.epoch, setting.model, window.numbers)
     numbers = window.numbers + len(bundle.pairs)
     same = next((group for group in window.groups if group.label == pair.pm), None)
@@ -129,7 +131,7 @@ def _one_more(state: State, window: Window, layout: Layout, pair: Pair, tools: T
     if gone:
         change = replace(change, summary=summary(state, window.state, setting))
     window = replace(window, numbers=numbers)
-    state, window = relaxed(state, window, change, setting, settled)
+    state, window = relaxed(state, window, change, setting, settled, near=near)
     state = replace(
         state.with_now(state=window.state),
         window=window,
@@ -170,7 +172,7 @@ def open_window_again(state: State, window: Window, setting: Setting) -> Window:
     """The window with a summary from which a PM was taken."""
     change = Change(summary=summary(state, window.state, setting))
     try:
-        return relaxed(state, window, change, setting, SETTLED_MANY)[1]
+        return relaxed(state, window, change, setting)[1]
     except RuntimeError as error:  # GTSAM's word for a system that is indeterminate
         raise ArithmeticError("without one of its PMs the registration is not determined") from error
 
@@ -272,7 +274,7 @@ def with_aim(state: State, aim: Aim, tools: Tools) -> State:
         chunks.append(new)
     state = replace(state, aims=state.aims + 1, aim_chunks=tuple(chunks))
     change = Change(summary=summary(state, window.state, setting))
-    state, window = relaxed(state, window, change, setting, SETTLED_MANY)
+    state, window = relaxed(state, window, change, setting)
     return replace(state.with_now(state=window.state), window=window)
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dgeqrf, dtrtrs
 
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
@@ -30,7 +30,7 @@ from fgreg.graph.explicit_values import beam_of_chart
 from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
 from fgreg.models import SessionModel
-from fgreg.online.shared import Layout, Quadratic, finite, summary_factor
+from fgreg.online.shared import Layout, Quadratic, finite, number_at, summary_factor
 from fgreg.sensitivity import arc_of_rotation, sensitivity_priors
 
 THRESHOLDS: dict[Variable, tuple[float, ...]] = {
@@ -46,8 +46,9 @@ THRESHOLDS: dict[Variable, tuple[float, ...]] = {
 }
 """Steps (rad, mm) beyond which a variable is linearised anew."""
 PRIVATE_STEPS = 10
-SETTLED_MM = 0.1
-"""A new pair's own variables have settled after a step that moves the PM by less: what is left is of second order."""
+SETTLED_MM = 0.5
+"""A new pair's own variables have settled after a step that moves the PM by less: what is left is of second order, some
+hundredths of a millimetre."""
 FAR_CHI2 = 1e4
 """What a PM counts as that has no place where beam and arc meet."""
 
@@ -133,6 +134,19 @@ def private_keys(pairs: Sequence[Pair], first: int) -> tuple[list[int], list[int
     markers = [Variable.camera_T_marker.key(first + i) for i in range(shots)]
     lambdas = [Variable.lam.key(first + i) for i in range(shots)]
     return markers, lambdas, Variable.trus_p_pm.key(first), [Variable.theta.key(first + i) for i in range(len(pairs))]
+
+
+def free_number(groups: Sequence[Group], count: int) -> int:
+    """The first of so many numbers in a row that no private variables of a window's groups have.
+
+    Numbers are used again and again, so that GTSAM's keys are few: of each a double is made once, which is slow.
+    """
+    free = 0
+    for first, taken in sorted((group.prepared.first, len(group.bundle.pairs)) for group in groups):
+        if free + count <= first:
+            break
+        free = max(free, first + taken)
+    return free
 
 
 def prepare(
@@ -240,9 +254,10 @@ def _beginning(
             pose = pair.marker.camera_T_marker.copy()
             pose[:3, 3] -= state.bias_mm[0]
             values.insert(markers[shot], gtsam.Pose3(pose))
-            values.insert(lambdas[shot], float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin)))
+            lam = float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin))
+            values.insert(number_at(lambdas[shot], lam))
         own = math.atan2(float(trus_p[1]) - radius_mm * math.sin(scan), float(trus_p[2]) - radius_mm * math.cos(scan))
-        values.insert(thetas[i], own)
+        values.insert(number_at(thetas[i], own))
     return values
 
 
@@ -263,12 +278,14 @@ def _settle(
     for _ in range(PRIVATE_STEPS):
         values = gtsam.Values(held)
         values.insert(private)
-        jacobian, right = graph.linearize(values).jacobian(ordering)
-        if not (math.isfinite(right.sum()) and math.isfinite(jacobian.sum())):
+        system = graph.linearize(values).augmentedJacobian(ordering)
+        if not math.isfinite(system.sum()):
             raise ArithmeticError("a pair's linear system is not finite")
-        q, r = np.linalg.qr(jacobian[:, :own], mode="complete")
-        turned = q.T @ right
-        step = solve_triangular(r[:own], turned[:own], check_finite=False)
+        # Triangular, the private variables first: theirs are the first rows, those below are what is left over.
+        turned = dgeqrf(system)[0]
+        step, singular = dtrtrs(turned[:own, :own], turned[:own, -1])
+        if singular:
+            raise np.linalg.LinAlgError("a pair's linear system is singular")
         # By retraction: setting a double anew goes through all of the wrapper's overloads, ten times as slow.
         delta, at = gtsam.VectorValues(), 0
         for key, size in sizes.items():
@@ -280,7 +297,7 @@ def _settle(
         if not far:
             break
     # What is left over after the private variables, on the shared ones; absent ones (the edge) get zeros.
-    left = q.T[own:] @ jacobian[:, own:]
+    left = np.triu(turned[own:, own:])
     rows = np.zeros((len(left), layout.columns.size))
     at, column = 0, 0
     for key, size in shared:
@@ -288,7 +305,7 @@ def _settle(
             rows[:, column : column + size] = left[:, at : at + size]
             at += size
         column += size
-    return private, rows, -turned[own:], far
+    return private, rows, -left[:, -1], far
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -327,7 +344,7 @@ class Window:
         summary_slot: where the summary factor is.
         state: the estimate (one hypothesis, one epoch).
         covariance: (D, D) of the shared variables.
-        numbers: of private variables used so far.
+        numbers: from which on the next private variables are counted.
         seed: from which it was opened, where it was and nothing has changed since.
     """
 
