@@ -34,6 +34,22 @@ def test_exponential_and_logarithm_are_gtsams_and_inverse(size: float) -> None:
     np.testing.assert_allclose(log_so3(r), w, atol=1e-8)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 0.3, 2.0, math.pi - 1e-6])
+def test_a_single_rotation_is_what_it_is_among_many(size: float) -> None:
+    w = np.random.default_rng(1).normal(size=(30, 3))
+    w *= size / np.linalg.norm(w, axis=1, keepdims=True)
+    r = exp_so3(w)
+    np.testing.assert_allclose([exp_so3(v) for v in w], r, atol=1e-14)
+    np.testing.assert_allclose([log_so3(m) for m in r], log_so3(r), atol=1e-14)
+    assert exp_so3(w[None, :1]).shape == (1, 1, 3, 3)
+    assert log_so3(r[None, :1]).shape == (1, 1, 3)
+
+
+def test_a_single_rotation_by_what_is_no_number_is_none() -> None:
+    assert np.isnan(exp_so3(np.array([math.inf, 0.0, 0.0]))).any()
+    assert np.isnan(log_so3(np.full((3, 3), math.nan))).any()
+
+
 def test_half_a_turn_has_a_logarithm_of_length_pi() -> None:
     for axis in (np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), np.array([0, 0.6, 0.8])):
         w = log_so3(exp_so3(math.pi * axis))
@@ -90,4 +106,10 @@ def test_reflections_and_stretches_are_not_rigid() -> None:
     assert is_rigid(np.eye(4))
     assert not is_rigid(np.diag([1.0, 1.0, -1.0, 1.0]))
     assert not is_rigid(np.diag([1.01, 1.0, 1.0, 1.0]))
+    assert not is_rigid(np.diag([1.0, 1.0, 1.0, 2.0]))
+    for bad in (math.nan, math.inf):
+        for at in ((0, 1), (1, 3), (3, 0)):
+            matrix = np.eye(4)
+            matrix[at] = bad
+            assert not is_rigid(matrix)
     np.testing.assert_allclose(nearest_rotation(np.diag([1.2, 0.9, 1.1])), np.eye(3), atol=1e-12)

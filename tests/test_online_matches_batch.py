@@ -19,7 +19,9 @@ from fgreg.models import NoiseModel
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.online.estimate import gaussian_quantile_mm, gaussian_tre
 from fgreg.online.judge import is_due, judgement_of
+from fgreg.online.state import WINDOW
 from fgreg.online.store import MeasurementStore
+from fgreg.online.window import free_number
 from fgreg.registration import register
 from tests.forward import make_measurements, make_session
 from tests.online_streams import batch, events, first, run, sigmas_apart
@@ -253,3 +255,18 @@ def test_reassigned_pairs_belong_to_a_new_epoch_and_the_old_one_is_rid_of_them()
         estimate = engine.add(pair)
     found = batch(measurements, model)
     assert sigmas_apart(found, estimate) < 0.05
+
+
+def test_numbers_of_private_variables_are_used_again_and_never_twice_at_once() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=40, looks_per_pm=2)
+    engine = OnlineRegistration(model, judge=None)
+    for event in events(measurements):
+        engine.add(event)
+        window = engine.state.window
+        if window is None:
+            continue
+        taken = [group.prepared.first + i for group in window.groups for i in range(len(group.bundle.pairs))]
+        assert len(set(taken)) == len(taken)
+        assert max(taken, default=0) < 4 * WINDOW
+        free = free_number(window.groups, 3)
+        assert not {free, free + 1, free + 2} & set(taken)

@@ -404,19 +404,20 @@ def relaxed(
     return state, window
 
 
-def refreshed(state: State, at: SharedState, setting: Setting) -> State:
-    """The state with its epoch's chunks, and the aims, linearised anew."""
+def refreshed(state: State, at: SharedState, setting: Setting, *, rounds: int = 0) -> State:
+    """The state with its epoch's chunks, and the aims, linearised anew (``rounds`` as of :func:`again`)."""
     shelf = state.now.shelf
     for i, chunk in enumerate(shelf.full):
-        shelf = shelf.with_full(i, again(chunk, at), setting.columns)
+        shelf = shelf.with_full(i, again(chunk, at, rounds), setting.columns)
     if shelf.open is not None:
-        shelf = replace(shelf, open=again(shelf.open, at))
-    return replace(state.with_now(shelf=shelf), aim_chunks=tuple(again(chunk, at) for chunk in state.aim_chunks))
+        shelf = replace(shelf, open=again(shelf.open, at, rounds))
+    aims = tuple(again(chunk, at, rounds) for chunk in state.aim_chunks)
+    return replace(state.with_now(shelf=shelf), aim_chunks=aims)
 
 
-def again(chunk: Chunk, at: SharedState) -> Chunk:
-    """A chunk linearised at another state near by: its private variables make one step on the way."""
-    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private, rounds=0)
+def again(chunk: Chunk, at: SharedState, rounds: int = 0) -> Chunk:
+    """A chunk linearised at another state near by; its private variables make one step more than ``rounds``."""
+    return make_chunk(chunk.places, chunk.problem, chunk.kept, at, chunk.private, rounds=rounds)
 
 
 def opened(
@@ -428,7 +429,7 @@ def opened(
         raise ValueError("no shared variables yet")
     window = open_window(groups, summary(state, at, setting), layout, state.epoch, numbers)
     for _ in range(MOST_UPDATES):
-        state = refreshed(state, window.state, setting)
+        state = refreshed(state, window.state, setting, rounds=1)  # three pairs hardly hold a registration
         before = window.state
         change = Change(summary=summary(state, window.state, setting))
         window = updated(window, change, layout, numbers)
