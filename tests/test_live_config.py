@@ -23,6 +23,7 @@ from fgreg.operation.config import LiveConfig, read_config
 from fgreg.operation.config_keys import example_config
 from fgreg.session.safe_yaml import parse_yaml
 from fgreg.session.setup import read_setup
+from fgreg.simulation.room import BUMP_EVERY_S
 from tests import live_configs, session_files
 from tests.network_peers import free_port
 from tests.session_files import ABSENT, change
@@ -282,7 +283,7 @@ def test_a_mistake_in_the_calibration_is_one_line(
 def test_the_simulated_room_brings_its_own_set_up(tmp_path: Path) -> None:
     config = read_config(live_configs.write(tmp_path, live_configs.room()))
     assert config.warnings == ()
-    assert config.room == {"seed": 3, "bump_every_s": 90.0, "width": 320}
+    assert config.room == {"seed": 3, "bump_every_s": BUMP_EVERY_S, "width": 320}
     assert config.model.camera is not None
     assert config.model.camera.left.image_size[0] == 320
     assert config.settings.aims == 3
