@@ -99,7 +99,7 @@ def test_the_same_events_give_the_same_estimates() -> None:
             assert a.trus_T_camera is b.trus_T_camera
             continue
         assert a.used == b.used
-        # Seen once: 4e-8 mm, among few pairs, where the last digits decide after which step the optimum counts as found.
+        # Seen once: 4e-8 mm among few pairs, where the last digits decide after which step it is settled.
         np.testing.assert_allclose(a.trus_T_camera, b.trus_T_camera, rtol=0, atol=1e-6)
         np.testing.assert_allclose(np.asarray(a.covariance), np.asarray(b.covariance), rtol=1e-5, atol=1e-12)
 
