@@ -189,7 +189,7 @@ class Updates:
     def run(self, shared: SharedSnapshot, going: Callable[[], bool]) -> None:
         """Add and publish while ``going``."""
         while going():
-            with OnlineRegistration(self._model, SolveConfig(), judge=self._judge) as engine:
+            with OnlineRegistration(self._model, SolveConfig(), judge=self._judge, watch=None) as engine:
                 for aim in self._used.aims:
                     engine.add(aim)
                 for k, pair in enumerate(self._used.pairs):
