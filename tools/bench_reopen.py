@@ -48,7 +48,7 @@ def bench(folder: Path, pairs: int, seed: int) -> bool:
             finally:
                 disk_ms.append(1e3 * (time.perf_counter() - start))
 
-        live.journal.append = timed  # type: ignore[method-assign, assignment]
+        live.journal.append = timed  # type: ignore[method-assign]
         for event in events:
             if isinstance(event, AimEvent | PairEvent | CameraMovedEvent):
                 start = time.perf_counter()
