@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.epochs import restrict_epochs
 from fgreg.errors import EstimationError
 from fgreg.frames import (
     BoolArray,
@@ -35,7 +36,7 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import EpochStart, Look, MarkerObservation, Measurements, Pair
 from fgreg.models import CameraModel, SessionModel
-from fgreg.registration import Minimum, Registration, restrict_epochs
+from fgreg.registration import Minimum, Registration
 from fgreg.surface import REACH_MM, TissueSurface, fit_surface
 from fgreg.targets import expected_tre_mm, target_jacobians
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.config import SolveConfig
+from fgreg.epochs import epoch_chains, restrict_epochs, solvable_epochs
 from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray, inverse
 from fgreg.graph.packing import PackedProblem, pack
@@ -21,7 +22,7 @@ from fgreg.graph.reduced import Evaluation, evaluate, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
-from fgreg.measurements import EpochStart, Measurements
+from fgreg.measurements import Measurements
 from fgreg.minima import (
     MIN_KEPT_AIMS,
     MIN_KEPT_PMS,
@@ -55,7 +56,6 @@ __all__ = [
     "choose_minimum",
     "register",
     "register_near",
-    "restrict_epochs",
     "search_epoch",
     "targets_moved",
 ]
@@ -119,15 +119,6 @@ class Registration:
 Pack = Callable[[Measurements], PackedProblem]
 
 
-def _solvable(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
-    """Epochs with minima of their own or tied to such a one by measured camera motions."""
-    known = {k for k, search in enumerate(searches) if search.minima}
-    tied = {k: epoch.old(k) for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
-    for _ in range(len(searches)):
-        known |= {k for k, old in tied.items() if old in known} | {old for k, old in tied.items() if k in known}
-    return sorted(known)
-
-
 def joint_start(
     measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
 ) -> SharedState:
@@ -176,7 +167,7 @@ def _best_start(
     own = joint_start(measurements, chosen, solvable, model)
     count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
     leaders: dict[int, Minimum] = {}
-    for chain in _chains(measurements, solvable):
+    for chain in epoch_chains(measurements, solvable):
         among = [k for k in chain if k in chosen]
         best = max(among, key=lambda k: count[k])
         leaders[best] = chosen[best]
@@ -226,32 +217,6 @@ def _told_apart(
         if all(targets_moved(ends[best], ends[i], model.targets_mm) <= SAME_MINIMUM_MM for i in near):
             left.discard(epoch)
     return start, left
-
-
-def _chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
-    """Solvable epochs, grouped by the measured motions between them."""
-    out: list[list[int]] = []
-    for k in solvable:
-        start = measurements.epochs[k]
-        chain = next((chain for chain in out if start.motion_known and start.old(k) in chain), None)
-        if chain is not None:
-            chain.append(k)
-        else:
-            out.append([k])
-    return out
-
-
-def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
-    """The measurements of some epochs only, renumbered in order; a motion is kept where both its sides are."""
-    place = {k: i for i, k in enumerate(epochs)}
-    starts = tuple(
-        replace(start, after=place[start.old(k)] if start.after is not None else None)
-        if start.old(k) in place
-        else EpochStart(start.t)
-        for k, start in ((k, measurements.epochs[k]) for k in epochs)
-    )
-    pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
-    return Measurements(measurements.aims, pairs, starts)
 
 
 def pack_session(
@@ -414,7 +379,7 @@ def register(
         known[k] if k in known else search_epoch(fitting, model, beam.frames, k)
         for k in range(len(measurements.epochs))
     )
-    solvable = _solvable(measurements, searches)
+    solvable = solvable_epochs(measurements, searches)
     if not solvable:
         counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
         raise EstimationError(
