@@ -100,7 +100,7 @@ class OnlineRegistration:
         self._returns: list[DetectedReturn] = []
         self._noticed: dict[int, str] = {}
         self._suspicion = ""
-        self._judge = None if judge is None else kinds[judge]()
+        self._judge: Judge | None = None if judge is None else kinds[judge]()
         self._estimate = self._report(self._state, 0.0, None)
 
     def __enter__(self) -> OnlineRegistration:
@@ -261,23 +261,15 @@ class OnlineRegistration:
         """Ask the judge, adopt what it answers."""
         if self._judge is None:
             return
-        try:
-            if ask:
-                self._judge.ask(self._case, self._state.epoch_pairs)
-            found = self._judge.answer()
-        except Exception as error:  # the estimate stands without the judge
-            text = f"the full solve failed: {type(error).__name__}: {error}"
-            self._estimate = replace(
-                self._estimate,
-                reasons=(*self._estimate.reasons, text),
-                verdict=max(self._estimate.verdict, Verdict.WARNING, key=lambda v: v.severity),
-            )
-            return
+        if ask:
+            self._judge.ask(self._case, self._state.epoch_pairs)
+        found = self._judge.answer()
         if found is not None:
             self._surface = found.surface or self._surface
-        if found is not None and found.epoch == self._state.epoch:
-            self._judgement = found
-            self._estimate = self._report(self._state, self._estimate.t, found)
+            if found.epoch == self._state.epoch:
+                self._judgement = found
+        if self._judge.failure or found is not None:
+            self._estimate = self._report(self._state, self._estimate.t, self._judgement)
 
     def _case(self) -> Case:
         return Case(self._serial, self._state.epoch, self.measurements())
@@ -404,6 +396,8 @@ class OnlineRegistration:
     def solution(self) -> Solution:
         """The full solve of everything so far, adopted as :meth:`settle` does."""
         found, solution = judge(self._case(), self._model, self._config, self._prior)
+        if self._judge is not None:
+            self._judge.forgive()
         self._judgement, self._surface = found, found.surface or self._surface
         self._estimate = self._report(self._state, self._estimate.t, found)
         return solution
@@ -430,6 +424,9 @@ class OnlineRegistration:
         known = [(Verdict.REFUSED, self._suspicion), (Verdict.WARNING, self._noticed.get(state.epoch, ""))]
         if self._guard.failure:
             text = f"camera moves are not looked for: {self._guard.failure}; tell them by camera_moved"
+            known.append((Verdict.WARNING, text))
+        if self._judge is not None and self._judge.failure:
+            text = f"the full solve failed: {self._judge.failure}: what it said before may hold no longer"
             known.append((Verdict.WARNING, text))
         told = [(verdict, text) for verdict, text in known if text]
         if not told:

@@ -7,11 +7,9 @@ the full solve's (fgreg.batch.solve), some tenths of a second; its answer is ado
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +20,7 @@ from fgreg.estimate import PredictedTre, Verdict
 from fgreg.frames import FloatArray
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
+from fgreg.online.beside import Beside
 from fgreg.posterior import pose_tangent
 from fgreg.registration import SoundSpeedPrior
 from fgreg.tracking import SurfaceMap, make_surface_map
@@ -127,7 +126,16 @@ def judge(
 
 
 class Judge(Protocol):
-    """Where judgements come from."""
+    """Where judgements come from.
+
+    ``failure``: why the last case could not be judged; empty where it could. What was judged before then stands alone.
+    """
+
+    @property
+    def failure(self) -> str: ...
+
+    def forgive(self) -> None:
+        """All was judged elsewhere: what failed before does not matter any more."""
 
     def ask(self, case: Callable[[], Case], pairs: int) -> None:
         """There is something new; ``case`` makes what is to be judged where that is wanted."""
@@ -145,16 +153,25 @@ class InlineJudge:
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
         self._of = (model, config, sound_speed)
         self._found: Judgement | None = None
+        self.failure = ""
 
     def ask(self, case: Callable[[], Case], pairs: int) -> None:
         """Judge now where the count of pairs is one of the schedule's."""
-        if is_due(pairs):
-            self._found, _ = judge(case(), *self._of)
+        if not is_due(pairs):
+            return
+        try:
+            self._found, self.failure = judge(case(), *self._of)[0], ""
+        except Exception as error:  # the estimate stands without the judge
+            self.failure = f"{type(error).__name__}: {error}"
 
     def answer(self) -> Judgement | None:
         """What :meth:`ask` found."""
         found, self._found = self._found, None
         return found
+
+    def forgive(self) -> None:
+        """The failure is of the past."""
+        self.failure = ""
 
     def close(self) -> None:
         """Nothing to stop."""
@@ -165,6 +182,7 @@ class DeferredJudge:
 
     def __init__(self) -> None:
         self.case: Case | None = None
+        self.failure = ""
 
     def ask(self, case: Callable[[], Case], pairs: int) -> None:
         """Keep it where it is due."""
@@ -175,87 +193,49 @@ class DeferredJudge:
         """Nothing yet."""
         return None
 
+    def forgive(self) -> None:
+        """The failure is of the past."""
+        self.failure = ""
+
     def close(self) -> None:
         """Nothing to stop."""
 
 
-def _serve(
-    connection: Connection, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None
-) -> None:
-    """Judge what comes until the other end closes."""
-    while True:
-        try:
-            case = connection.recv()
-        except EOFError:
-            return
-        if case is None:
-            return
-        try:
-            found: Judgement | str = judge(case, model, config, sound_speed)[0]
-        except Exception as error:  # the judge's defects must not end the session's estimate
-            found = f"{type(error).__name__}: {error}"
-        try:
-            connection.send(found)
-        except (BrokenPipeError, OSError):
-            return
+def _judged(case: Case, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> Judgement:
+    return judge(case, model, config, sound_speed)[0]
 
 
 class ProcessJudge:
-    """Judges in a process of its own: whenever it is idle and the epoch has grown by a quarter since, or by few pairs.
-
-    Attributes:
-        failure: what went wrong with the last case, empty where nothing did.
-    """
+    """Judges in a process of its own, whenever it is idle and the epoch has grown by a quarter since, or by few pairs."""
 
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_serve, args=(theirs, model, config, sound_speed), name="fgreg-judge", daemon=True
-        )
-        self._process.start()
-        theirs.close()
-        self._busy = False
+        work = partial(_judged, model=model, config=config, sound_speed=sound_speed)
+        self._beside: Beside[Case, Judgement] = Beside(work, "fgreg-judge", "the judging process")
         self._asked: tuple[int, int] = (-1, 0)
-        self.failure = ""
+
+    @property
+    def failure(self) -> str:
+        """What went wrong with the last case."""
+        return self._beside.failure
 
     def ask(self, case: Callable[[], Case], pairs: int) -> None:
         """Send the case where the process is idle and enough is new."""
-        if self._busy or self._process is None or not self._process.is_alive():
-            return
         _, before = self._asked
-        if before <= pairs < before + max(1, before // 4):
+        if self._beside.busy or before <= pairs < before + max(1, before // 4):
             return
         made = case()
-        try:
-            self._connection.send(made)
-        except (BrokenPipeError, OSError) as error:
-            self.failure = str(error)
-            return
-        self._busy, self._asked = True, (made.epoch, pairs)
+        if self._beside.send(made):
+            self._asked = (made.epoch, pairs)
 
     def answer(self) -> Judgement | None:
         """What has come back since."""
-        try:
-            if not (self._busy and self._connection.poll()):
-                return None
-            found = self._connection.recv()
-        except (EOFError, OSError) as error:
-            self._busy, self.failure = False, f"the judging process ended: {error}"
-            return None
-        self._busy = False
-        if isinstance(found, str):
-            self.failure = found
-            return None
-        self.failure = ""
-        return found  # type: ignore[no-any-return]
+        found = self._beside.fetch()
+        return None if found is None else found[0]
+
+    def forgive(self) -> None:
+        """The failure is of the past."""
+        self._beside.failure = ""
 
     def close(self) -> None:
         """End the process."""
-        with suppress(OSError):
-            self._connection.send(None)
-        self._connection.close()
-        self._process.join(timeout=0.5)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join()
+        self._beside.close()

@@ -7,15 +7,14 @@ pairs from the move on are given to the new epoch anyhow.
 
 from __future__ import annotations
 
-import multiprocessing
-from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from functools import partial
 from typing import Protocol
 
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
+from fgreg.online.beside import Beside
 from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test
 from fgreg.online.moves import MoveSettings
 from fgreg.online.returns import ReturnSettings, default_return_settings
@@ -56,11 +55,11 @@ def tested(
 class Watch(Protocol):
     """Where alarms come from.
 
-    Attributes:
-        failure: why the last case could not be tested; empty where it could.
+    ``failure``: why the last case could not be tested; empty where it could.
     """
 
-    failure: str
+    @property
+    def failure(self) -> str: ...
 
     def ask(self, case: Case) -> None:
         """Here is something to be tested."""
@@ -105,93 +104,45 @@ class InlineWatch:
         """Nothing to stop."""
 
 
-def _serve(
-    connection: Connection,
-    model: SessionModel,
-    config: SolveConfig,
-    sound_speed: SoundSpeedPrior | None,
-    settings: WatchSettings,
-) -> None:
-    """Test what comes until the other end closes."""
-    while True:
-        try:
-            case = connection.recv()
-        except EOFError:
-            return
-        if case is None:
-            return
-        try:
-            found: Found | str | None = tested(case, model, config, sound_speed, settings)
-        except Exception as error:  # the test's defects must not end the watch
-            found = f"{type(error).__name__}: {error}"
-        try:
-            connection.send(found)
-        except (BrokenPipeError, OSError):
-            return
-
-
 class ProcessWatch:
     """Tests in a process of its own; what comes while it is busy waits, and only the latest of that is tested."""
 
     def __init__(
         self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: WatchSettings
     ) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_serve, args=(theirs, model, config, sound_speed, settings), name="fgreg-watch", daemon=True
-        )
-        self._process.start()
-        theirs.close()
-        self._busy = False
+        work = partial(tested, model=model, config=config, prior=sound_speed, settings=settings)
+        self._beside: Beside[Case, Found | None] = Beside(work, "fgreg-watch", "the watching process")
         self._waiting: Case | None = None
         self._stale = False
-        self.failure = ""
+
+    @property
+    def failure(self) -> str:
+        """Why the last case could not be tested."""
+        return self._beside.failure
 
     def ask(self, case: Case) -> None:
         """Send the case, as soon as the process is idle."""
         self._waiting = case
-        if not self._busy:
+        if not self._beside.busy:
             self._send()
 
     def _send(self) -> None:
         case, self._waiting = self._waiting, None
-        if case is None:
-            return
-        if not self._process.is_alive():
-            self.failure = "the watching process ended"
-            return
-        try:
-            self._connection.send(case)
-        except (BrokenPipeError, OSError) as error:
-            self.failure = f"the watching process ended: {error}"
-            return
-        self._busy, self._stale = True, False
+        if case is not None and self._beside.send(case):
+            self._stale = False
 
     def answer(self) -> Found | None:
         """What has come back since."""
-        try:
-            if not (self._busy and self._connection.poll()):
-                return None
-            found = self._connection.recv()
-        except (EOFError, OSError) as error:
-            self._busy, self.failure = False, f"the watching process ended: {error}"
+        found, stale = self._beside.fetch(), self._stale
+        if found is None:
             return None
-        stale, self._busy = self._stale, False
         self._send()
-        self.failure = found if isinstance(found, str) else ""
-        return found if isinstance(found, Found) and not stale else None
+        return None if stale else found[0]
 
     def forget(self) -> None:
         """What waits goes; an answer that is under way will not count."""
-        self._waiting, self._stale = None, self._busy
+        self._waiting, self._stale = None, self._beside.busy
 
     def close(self) -> None:
         """End the process."""
-        with suppress(OSError):
-            self._connection.send(None)
-        self._connection.close()
-        self._process.join(timeout=0.5)
-        if self._process.is_alive():
-            self._process.terminate()
-            self._process.join()
+        self._beside.close()
