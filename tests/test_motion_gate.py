@@ -107,10 +107,11 @@ def _halts(actions: list[Action]) -> list[str]:
     return [action.reason for action in actions if isinstance(action, Halt)]
 
 
-def _refused(actions: list[Action], says: str) -> None:
-    assert len(actions) == 1
-    assert isinstance(actions[0], Refusal)
-    assert says in actions[0].reason
+def _refusal(actions: list[Action]) -> str:
+    """The reason of the one thing that was let out: a refusal."""
+    (only,) = actions
+    assert isinstance(only, Refusal)
+    return only.reason
 
 
 def test_homing_then_search_then_tracking_all_arrive() -> None:
@@ -142,7 +143,7 @@ def test_held_tracking_goes_on_when_the_marker_is_back_even_the_other_way() -> N
     room.go(MotionKind.TRACK, 30.0)
     room.run(1.0)
     assert any("tracking held: the marker is" in reason for reason in _halts(room.run(0.4, marker=False)))
-    _refused(room.command(MotionKind.TRACK, 30.0), "the marker is")
+    assert "the marker is" in _refusal(room.command(MotionKind.TRACK, 30.0))
     room.run(0.02)
     assert isinstance(room.command(MotionKind.TRACK, -10.0)[0], Drive)
     assert Arrived(room.number) in room.run(6.0)
@@ -157,7 +158,7 @@ def test_tracking_that_cannot_go_on_stops_and_does_not_search() -> None:
     actions = room.run(3.0)
     assert _halts(actions) == ["tracking held: the registration is refused"]
     assert not [action for action in actions if isinstance(action, Drive)]
-    _refused(room.command(MotionKind.SEARCH, 0.0), "the operator has not asked to search")
+    assert "the operator has not asked to search" in _refusal(room.command(MotionKind.SEARCH, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -179,18 +180,18 @@ def test_tracking_that_cannot_go_on_stops_and_does_not_search() -> None:
 def test_order_that_is_not_allowed_is_refused_with_the_reason(
     kind: MotionKind, deg: float | None, more: dict[str, float], says: str
 ) -> None:
-    _refused(_room().go(kind, deg, **more), says)
+    assert says in _refusal(_room().go(kind, deg, **more))
 
 
 def test_without_the_operator_nothing_moves_and_one_request_serves_one_kind() -> None:
     room = _room()
     for kind in MotionKind:
-        _refused(room.command(kind, None if kind is MotionKind.HOME else 0.0), "the operator has not asked")
+        assert "the operator has not asked" in _refusal(room.command(kind, None if kind is MotionKind.HOME else 0.0))
     room.request(MotionKind.SEARCH)
-    _refused(room.command(MotionKind.TRACK, 0.0), "the operator has not asked to track")
+    assert "the operator has not asked to track" in _refusal(room.command(MotionKind.TRACK, 0.0))
     assert isinstance(room.go(MotionKind.HOME, None)[0], Drive)
     room.run(5.0)
-    _refused(room.command(MotionKind.HOME, None), "the operator has not asked to home")
+    assert "the operator has not asked to home" in _refusal(room.command(MotionKind.HOME, None))
 
 
 def test_request_runs_out() -> None:
@@ -201,8 +202,8 @@ def test_request_runs_out() -> None:
 
 def test_not_homed_stage_neither_searches_nor_tracks() -> None:
     room = _room(homed=False)
-    _refused(room.go(MotionKind.SEARCH, 0.0), "not homed")
-    _refused(room.go(MotionKind.TRACK, 0.0), "not homed")
+    assert "not homed" in _refusal(room.go(MotionKind.SEARCH, 0.0))
+    assert "not homed" in _refusal(room.go(MotionKind.TRACK, 0.0))
 
 
 def test_stalled_main_program_stops_the_stage_and_needs_a_new_request() -> None:
@@ -218,7 +219,7 @@ def test_stalled_main_program_stops_the_stage_and_needs_a_new_request() -> None:
     assert not room.stage.status().moving
     room.beating = True
     room.run(0.1)
-    _refused(room.command(MotionKind.SEARCH, 0.0), "the operator has not asked")
+    assert "the operator has not asked" in _refusal(room.command(MotionKind.SEARCH, 0.0))
     assert isinstance(room.go(MotionKind.SEARCH, 0.0)[0], Drive)
 
 
@@ -231,11 +232,11 @@ def test_backlog_of_a_stall_is_worth_nothing() -> None:
     room.run(0.4)
     for beat in beats:
         room.do(room.gate.handle(beat, room.now))
-    _refused(room.do(room.gate.handle(late, room.now)), "the operator has not asked")
+    assert "the operator has not asked" in _refusal(room.do(room.gate.handle(late, room.now)))
     room.beating = True
     room.run(0.02)
     room.request(MotionKind.SEARCH)
-    _refused(room.do(room.gate.handle(late, room.now)), "on its way")
+    assert "on its way" in _refusal(room.do(room.gate.handle(late, room.now)))
 
 
 @pytest.mark.parametrize(
@@ -258,8 +259,8 @@ def test_trouble_latches_until_the_operator_resets(happens: Any, says: str) -> N
     assert actions[-1] == Halt(_halts(actions)[-1], latched=True)
     room.run(3.0)
     assert not room.stage.status().moving
-    _refused(room.request(MotionKind.SEARCH), "latched")
-    _refused(room.command(MotionKind.SEARCH, 0.0), "latched")
+    assert "latched" in _refusal(room.request(MotionKind.SEARCH))
+    assert "latched" in _refusal(room.command(MotionKind.SEARCH, 0.0))
     assert room.gate.handle(Reset(room.now, "nurse"), room.now) == []
     assert isinstance(room.go(MotionKind.SEARCH, 0.0)[0], Drive)
     assert Arrived(room.number) in room.run(6.0)
@@ -271,11 +272,11 @@ def test_reset_is_refused_while_the_stage_moves_or_is_silent() -> None:
     room.run(1.0)
     room.do(room.gate.fault("test", room.now))
     room.run(0.1)
-    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "still moves")
+    assert "still moves" in _refusal(room.gate.handle(Reset(room.now, "nurse"), room.now))
     room.run(2.0)
     room.hearing = False
     room.run(0.4)
-    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "the stage is silent")
+    assert "the stage is silent" in _refusal(room.gate.handle(Reset(room.now, "nurse"), room.now))
 
 
 @pytest.mark.parametrize(
@@ -301,7 +302,7 @@ def test_reset_without_a_heartbeat_is_refused() -> None:
     room.do(room.gate.fault("test", room.now))
     room.beating = False
     room.run(0.4)
-    _refused(room.gate.handle(Reset(room.now, "nurse"), room.now), "heartbeat is missing")
+    assert "heartbeat is missing" in _refusal(room.gate.handle(Reset(room.now, "nurse"), room.now))
 
 
 def test_stage_that_leaps_within_its_way_is_stopped() -> None:

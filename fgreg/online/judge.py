@@ -206,7 +206,7 @@ def _judged(case: Case, model: SessionModel, config: SolveConfig, sound_speed: S
 
 
 class ProcessJudge:
-    """Judges in a process of its own, whenever it is idle and the epoch has grown by a quarter since, or by few pairs."""
+    """Judges in a process of its own: when it is idle and the epoch has grown by a quarter since, or by few pairs."""
 
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
         work = partial(_judged, model=model, config=config, sound_speed=sound_speed)
