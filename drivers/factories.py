@@ -120,6 +120,13 @@ def simulated_probe(around: Surroundings) -> PhotoacousticSource:
     return SimulatedProbe(_room(around))
 
 
+def simulated_motion(around: Surroundings) -> MotionSource:
+    """The simulated room's endoscope holder."""
+    from fgreg.drivers.simulated import SimulatedMotion
+
+    return SimulatedMotion(_room(around))
+
+
 def simulated_operator(around: Surroundings) -> Operator:
     """The simulated room's surgeon."""
     from fgreg.drivers.simulated import SimulatedOperator

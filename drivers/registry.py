@@ -305,6 +305,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         "ros",
         check=f"{_HERE}:check_recorded_motion",
     ),
+    _simulated(Role.MOTION, "the endoscope's holder in the simulated room", f"{_HERE}:simulated_motion"),
     DriverEntry(
         Role.BMODE,
         "igtl",

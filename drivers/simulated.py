@@ -22,10 +22,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from fgreg.drivers.base import Command, DeviceLost, PaFrame, Said, StereoFrame, host_now
+from fgreg.drivers.base import Command, DeviceLost, MotionSample, PaFrame, Said, StereoFrame, host_now
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
+from fgreg.frames import as_float_array
 from fgreg.models import StageModel
 from fgreg.motion.device import MAX_CALL_S, StageLost, StageStatus
 from fgreg.pairing import Stamp
@@ -197,6 +198,10 @@ def _pa(header: dict[str, Any], payload: bytearray) -> PaFrame:
     return PaFrame(Stamp(header["device_s"], host_now()), data, header["index"])
 
 
+def _motion(header: dict[str, Any], _payload: bytearray) -> MotionSample:
+    return MotionSample(Stamp(header["device_s"], host_now()), as_float_array(header["pose"], 4, 4))
+
+
 def _command(header: dict[str, Any], _payload: bytearray) -> Command:
     corner = header.get("corner")
     return Command(Said(header["says"]), None if corner is None else (int(corner[0]), int(corner[1])))
@@ -214,6 +219,13 @@ class SimulatedProbe(_Feed[PaFrame]):
 
     def __init__(self, path: Path) -> None:
         super().__init__("probe", path, 64, _pa, sends=True)
+
+
+class SimulatedMotion(_Feed[MotionSample]):
+    """The endoscope's holder (MotionSource)."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("motion", path, 64, _motion, sends=True)
 
 
 class SimulatedOperator(_Feed[Command]):

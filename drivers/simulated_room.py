@@ -2,8 +2,8 @@
 
     python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
 
-Devices, each by a connection that begins with ``{"role": ...}``: ``camera`` and ``probe`` only send; ``stage`` tells
-where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp
+Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe`` and ``motion`` (the endoscope's
+holder) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp
 with clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
 """
 
@@ -124,7 +124,7 @@ class RoomServer:
         if role == "stage":
             self._turn(connection)
             return
-        if role not in ("camera", "probe", "operator"):
+        if role not in ("camera", "probe", "motion", "operator"):
             connection.close()
             return
         client = _Client(role, connection, queue.Queue(FRAMES_WAITING if role == "camera" else PULSES_WAITING))
@@ -187,6 +187,9 @@ class RoomServer:
         self._end.set()
 
     def _frame(self, t_s: float, index: int) -> None:
+        for holder in self._to("motion"):
+            pose = self.room.base_T_camera(t_s, index)
+            holder.put({"index": index, "device_s": CAMERA_CLOCK_S + t_s, "pose": pose.tolist()})
         clients = self._to("camera")
         if not clients:
             return

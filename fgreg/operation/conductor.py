@@ -109,12 +109,17 @@ class Conductor:
         self._wanted: Said | None = None
         self._wanted_s = -math.inf
         self._waits_s = -math.inf
+        self._not_before_s = -math.inf  # pulses of before are another epoch's
 
     def step(self, view: View) -> tuple[Action, ...]:
         """What to do now."""
         out: list[Action] = []
         for command in view.commands:
             out += self._obey(command)
+        if view.unsettled_s is not None:
+            # What is known holds no more. The stage's request stays: the gate holds the motion, as long as this lasts.
+            self._hunt, self._not_before_s = None, max(self._not_before_s, view.now_s)
+            return tuple(out)
         if view.known.epoch != self._epoch:
             self._epoch, self._pms, self._done_at, self._deaf = view.known.epoch, 0, None, 0
             self._hunt = None
@@ -173,6 +178,7 @@ class Conductor:
             case Said.NEXT:
                 self._hunt = None
             case Said.MOVED:
+                self._hunt = None
                 return [TakeMove()]
             case Said.STOP:
                 self._hunt = None
@@ -295,7 +301,7 @@ class Conductor:
             self._deaf = 0
             return
         for pulse in view.heard:
-            if pulse.scan_rad is None or abs(pulse.scan_rad - plane) > CHECK_RAD:
+            if pulse.scan_rad is None or abs(pulse.scan_rad - plane) > CHECK_RAD or pulse.pulse_s < self._not_before_s:
                 continue
             loud = pulse.amplitude is not None and pulse.amplitude >= self._settings.hearing_threshold
             self._deaf = 0 if loud else self._deaf + 1

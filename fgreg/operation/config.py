@@ -30,6 +30,7 @@ from fgreg.operation.config_keys import (
     SETTING_KEYS,
     THRESHOLD,
 )
+from fgreg.operation.holder import HolderSettings
 from fgreg.operation.loop import Devices
 from fgreg.operation.rooms import HEARING_THRESHOLD
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
@@ -65,7 +66,7 @@ class LiveConfig:
         stage_limits: as MotionLimits.of_session takes them.
         room: options of the simulated room, where its devices are used.
         rectified: fgreg.drivers.rectification.Rectification of the pictures, where they are to be rectified.
-        settings, solve: of the conductor, of the estimate.
+        settings, holder, solve: of the conductor, the endoscope's holder, the estimate.
         warnings: plain sentences on what is allowed but hardly meant.
     """
 
@@ -77,6 +78,7 @@ class LiveConfig:
     room: Mapping[str, Any] | None
     rectified: Any
     settings: ConductorSettings
+    holder: HolderSettings
     solve: SolveConfig
     warnings: tuple[str, ...]
 
@@ -115,7 +117,7 @@ class LiveConfig:
                 sinks=tuple(opened(chosen) for chosen in self.devices.get(Role.SINKS, ())),
             )
 
-        return LiveSetup(self.setup, open_devices, self.stage_setup(around), self.settings)
+        return LiveSetup(self.setup, open_devices, self.stage_setup(around), self.settings, self.holder)
 
     def stage_setup(self, around: Surroundings) -> StageSetup | None:
         """The stage for the watchdog; None where there is none."""
@@ -181,18 +183,18 @@ class _Reader:
         limits = _limits(top)
         if self.problems or settings is None:
             return None
-        setup, label, rectified = self._session(top, folder, devices, room, settings[0].aims)
+        conductor, holder, solve = settings
+        setup, label, rectified = self._session(top, folder, devices, room, conductor.aims)
         model = self._model(setup, label)
         if model is None:
             return None
-        _check_model(top, model, devices, settings[0].aims)
+        _check_model(top, model, devices, conductor.aims)
         if Role.STAGE in devices:
             _check_limits(top, model, limits)
         _check_ports(top, devices)
         self.warnings += _open_to_all(devices)
-        solve = SolveConfig(limit_mm=settings[1])
         return LiveConfig(
-            self.path, setup, model, devices, limits, room, rectified, settings[0], solve, tuple(self.warnings)
+            self.path, setup, model, devices, limits, room, rectified, conductor, holder, solve, tuple(self.warnings)
         )
 
     def _room(self, top: Fields, devices: Mapping[Role, tuple[Chosen, ...]]) -> Mapping[str, Any] | None:
@@ -329,19 +331,23 @@ def _chosen(role: Role, fields: Fields, folder: Path) -> Chosen | None:
     return Chosen(entry, options, str(fields.place)) if fields.ok else None
 
 
-def _settings(top: Fields, simulated: bool) -> tuple[ConductorSettings, float] | None:
+def _settings(top: Fields, simulated: bool) -> tuple[ConductorSettings, HolderSettings, SolveConfig] | None:
     known = [*(key.name for key in SETTING_KEYS), THRESHOLD.name]
     inner = top.child("settings", known) if top.has("settings") or not simulated else None
     if inner is None:
-        return (ConductorSettings(hearing_threshold=HEARING_THRESHOLD), 3.0) if simulated else None
+        conductor = ConductorSettings(hearing_threshold=HEARING_THRESHOLD)
+        return (conductor, HolderSettings(), SolveConfig()) if simulated else None
     values = dict(read_keys(SETTING_KEYS, inner, Path()))
     if inner.has(THRESHOLD.name) or not simulated:
         values[THRESHOLD.name] = THRESHOLD.read(inner, Path())
     else:
         values[THRESHOLD.name] = HEARING_THRESHOLD
-    limit_mm = values.pop("limit_mm")
+    solve = SolveConfig(limit_mm=values.pop("limit_mm"))
+    holder = HolderSettings(
+        values.pop("holder_sigma_mm"), math.radians(values.pop("holder_sigma_deg")), values.pop("holder_least_mm")
+    )
     made = inner.build(lambda: ConductorSettings(**values))
-    return None if made is None else (made, limit_mm)
+    return None if made is None else (made, holder, solve)
 
 
 def _limits(top: Fields) -> dict[str, Any]:

@@ -44,6 +44,9 @@ SETTING_KEYS = (
     Key("pms", Kind.INTEGER, "PMs after which the stage may follow", 8, Bounds(1, 1000)),
     Key("most_pms", Kind.INTEGER, "the same where the verdict is a warning", 15, Bounds(1, 1000)),
     Key("follow", Kind.TRUTH, "whether the stage follows the beam at all", True),
+    Key("holder_sigma_mm", Kind.NUMBER, "of a move, by motion's account", 2.0, Bounds(0.0, 100.0, True, "mm")),
+    Key("holder_sigma_deg", Kind.NUMBER, "the same, of its rotation", 1.0, Bounds(0.0, 30.0, True, "deg")),
+    Key("holder_least_mm", Kind.NUMBER, "a smaller shift of the view is none", 1.0, Bounds(0.0, 10.0, True, "mm")),
     Key("limit_mm", Kind.NUMBER, "predicted error up to which the verdict is ok", 3.0, Bounds(0.0, 100.0, True, "mm")),
 )
 THRESHOLD = Key(

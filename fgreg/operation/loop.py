@@ -41,6 +41,7 @@ from fgreg.motion.limits import MotionKind
 from fgreg.motion.link import Report, StageLink
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.operation.conductor import Conductor
+from fgreg.operation.holder import Holder, HolderSettings
 from fgreg.operation.recorder import Recorder, RecorderState
 from fgreg.operation.senses import Ears, Eyes
 from fgreg.operation.spots import one_spot
@@ -152,6 +153,7 @@ class LiveLoop:
         reader: of the estimate's snapshots.
         conductor: what happens next.
         start_s: host time of session time 0.
+        holder: how far the endoscope's holder is to be believed, where there is one (``devices.motion``).
     """
 
     def __init__(
@@ -162,10 +164,13 @@ class LiveLoop:
         reader: SnapshotReader,
         conductor: Conductor,
         start_s: float,
+        holder: HolderSettings | None = None,
     ) -> None:
         self._model, self._devices, self._recorder, self._reader = model, devices, recorder, reader
         self._conductor, self._start_s = conductor, start_s
         self.eyes, self.ears = Eyes(model), Ears(model)
+        self._holder = Holder(holder or HolderSettings())
+        self._unsettled_s: float | None = None
         self.figures = Figures()
         self._lost: dict[str, str] = {}
         self._seen: set[str] = set()
@@ -195,6 +200,7 @@ class LiveLoop:
             return False
         pose = self._look(frames)
         self._listen()
+        self._hold()
         self._stage_reports()
         self._answer = self._where_to(pose)
         self._stepped_s = now
@@ -255,6 +261,22 @@ class LiveLoop:
         self.ears.hear(pulses)
         self._commands += self._poll("operator", self._devices.operator)
 
+    def _hold(self) -> None:
+        """Whether the camera is where the registration has it, by its holder's account and by what is recorded."""
+        if self._devices.motion is not None:
+            move = self._holder.take(self._poll("motion", self._devices.motion), host_now())
+            if move is not None:
+                self._recorder.hand_over(
+                    CameraMovedEvent(self._t(host_now()), 0, move.camera_new_T_camera_old, move.covariance)
+                )
+                self.eyes.poses.clear()  # those of before are another frame's
+        since_s = self._holder.moving_since_s
+        if since_s is None and self._recorder.state.unsettled:
+            since_s = host_now() if self._unsettled_s is None else self._unsettled_s
+        if since_s is not None and self._unsettled_s is None:
+            self._tell(Tell("the camera moves: nothing holds until it rests and is registered again"))
+        self._unsettled_s = since_s
+
     def _stage_reports(self) -> None:
         link = self._devices.stage
         if link is None:
@@ -279,6 +301,8 @@ class LiveLoop:
 
     def _where_to(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Where to turn for a new pose, else for the last one as long as that is new enough to matter."""
+        if self._unsettled_s is not None:
+            return None
         if pose is None:
             newest = self.eyes.poses.newest()
             return self._answer if newest is not None and host_now() - newest.t_s < 0.2 else None
@@ -319,6 +343,7 @@ class LiveLoop:
             state.known,
             self._answer,
             state.aims,
+            self._unsettled_s,
         )
 
     # --- out --------------------------------------------------------------------------------------------------------
@@ -330,7 +355,7 @@ class LiveLoop:
     def _verdict(self) -> Verdict | None:
         """Of the registration that holds now; None where there is none."""
         known = self._recorder.state.known
-        return known.verdict if known.registered else None
+        return known.verdict if known.registered and self._unsettled_s is None else None
 
     def _beat(self) -> None:
         link = self._devices.stage
@@ -442,17 +467,18 @@ class LiveLoop:
         stamp = None if self.eyes.newest is None else self.eyes.newest.stamp
         if estimate is None or stamp is None or newest is None:
             return
-        refused = estimate.verdict is Verdict.REFUSED
+        unsettled = self._unsettled_s is not None
+        refused = unsettled or estimate.verdict is Verdict.REFUSED
         answer = None if refused else self._answer
         plane = None if answer is None or answer.stage_rad is None else answer.stage_rad
         registration = Registration(
             stamp,
-            estimate.verdict.value,
+            (Verdict.REFUSED if refused else estimate.verdict).value,
             None if refused else estimate.trus_T_camera,
             None if refused else estimate.covariance,
             None if plane is None else self._model.stage.scan_from_device(plane),
             None if answer is None else answer.sigma_rad,
-            estimate.reasons,
+            ("the camera is moving, or its move is not in the estimate yet",) if unsettled else estimate.reasons,
         )
         for number, sink in enumerate(self._devices.sinks):
             try:

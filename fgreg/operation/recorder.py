@@ -33,6 +33,7 @@ class RecorderState:
         known: of the estimate. estimate: itself.
         aims, pairs: on disk and taken in. refused: on disk, and not taken in. waiting: handed over, not on disk yet.
         trouble: the last thing that went wrong; empty where nothing is.
+        unsettled: a move of the camera was handed over and is not in the estimate: its registration holds no more.
     """
 
     known: Known
@@ -42,6 +43,7 @@ class RecorderState:
     refused: int = 0
     waiting: int = 0
     trouble: str = ""
+    unsettled: bool = False
 
 
 OnTaken = Callable[[Recorded, OnlineEstimate | None, FloatArray | None], None]
@@ -65,6 +67,7 @@ class Recorder:
             known_of(session.estimate), session.estimate, aims=len(taken.aims), pairs=len(taken.pairs)
         )
         self._ended = False
+        self._moves, self._move_lost = 0, False  # of the camera: handed over and waiting; one that was not taken in
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -82,6 +85,10 @@ class Recorder:
         """
         if self._ended:
             raise RuntimeError("the recorder is closed")
+        if isinstance(event, CameraMovedEvent):
+            with self._lock:
+                self._moves += 1
+                self._state = replace(self._state, unsettled=True)
         self._waiting.put(event)
 
     def close(self) -> None:
@@ -105,6 +112,9 @@ class Recorder:
     def _take(self, event: Recorded) -> None:
         aims = pairs = refused = 0
         trouble, estimate = "", self._session.estimate
+        moved = isinstance(event, CameraMovedEvent)
+        if isinstance(event, CameraMovedEvent) and self._move_lost:  # it begins where a move nobody knows of has ended
+            event = replace(event, camera_new_T_camera_old=None, covariance=None)
         try:
             if isinstance(event, NoteEvent):
                 self._session.record(event)
@@ -117,6 +127,8 @@ class Recorder:
             refused, trouble = 1, str(error)
         with self._lock:
             before = self._state
+            if moved:
+                self._moves, self._move_lost = self._moves - 1, bool(refused)
             self._state = RecorderState(
                 known_of(estimate),
                 estimate,
@@ -124,6 +136,7 @@ class Recorder:
                 before.pairs + pairs,
                 before.refused + refused,
                 trouble=trouble,
+                unsettled=self._moves > 0 or self._move_lost,
             )
         if self._on_taken is not None and not refused:
             self._on_taken(event, estimate, self._session.marker_T_laser())

@@ -20,6 +20,7 @@ from fgreg.motion.limits import MotionLimits
 from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
+from fgreg.operation.holder import HolderSettings
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
 from fgreg.registration import SoundSpeedPrior
@@ -50,12 +51,14 @@ class LiveSetup:
         open_devices: all but the stage.
         stage: None where there is none: then nothing turns.
         settings: of the conductor.
+        holder: how far the endoscope's holder is to be believed, where there is one.
     """
 
     setup: str
     open_devices: OpenDevices
     stage: StageSetup | None
     settings: ConductorSettings
+    holder: HolderSettings = field(default_factory=HolderSettings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +142,7 @@ def running(
         conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
         reader = engines[-1].reader()
         stack.callback(reader.close)
-        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s)
+        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s, live.holder)
         stack.callback(loop.close)
         yield Running(folder, model, loop, recorder, session)
         if devices.stage is not None:

@@ -67,6 +67,8 @@ class View:
         known: of the estimate.
         answer: where the plane should turn for the newest pose; None where nothing can be told.
         aims: calibration shots recorded.
+        unsettled_s: the camera has been on the move since this host time, or its move is not in the estimate yet: what
+            is known of the registration holds no more. None where it holds.
     """
 
     now_s: float
@@ -77,6 +79,7 @@ class View:
     known: Known
     answer: TrackEstimate | None
     aims: int
+    unsettled_s: float | None = None
 
 
 # --- what the conductor asks for -----------------------------------------------------------------------------------

@@ -26,6 +26,8 @@ TRAVEL_MM_S, TRAVEL_RAD_S, LEAST_TRAVEL_S = 40.0, math.radians(30.0), 0.8
 TREMOR_HZ = (0.7, 2.3, 5.1, 8.7)
 TREMOR_MM, TREMOR_RAD = 0.03, 0.0006
 """Amplitude of each tremor component and axis."""
+HOLDER_MM, HOLDER_RAD = 0.03, 0.0003
+"""Noise of what the camera's holder tells of its pose, each axis."""
 BUMP_EVERY_S = 240.0
 """Mean time between bumps, unless said otherwise: some registrations long."""
 BUMP_S = 0.5
@@ -129,6 +131,8 @@ class Room:
         self._scene_rng, self._aim_rng, self._shot_rng, self._bump_rng, tremor, self._miss_rng = streams
         self._aims = self._begin()
         trus_T_camera = self.scene.trus_T_camera[0]
+        holder = np.random.default_rng((self.config.seed, 3))
+        self._base_T_trus = make_transform(exp_so3(holder.normal(0.0, 1.0, 3)), holder.normal(0.0, 300.0, 3))
         self._phase = tremor.uniform(0.0, 2.0 * math.pi, (6, len(TREMOR_HZ)))
         self._cameras: list[_Travel] = [_Travel(0.0, 0.0, trus_T_camera, trus_T_camera)]
         self.moved_s: list[float] = []
@@ -232,6 +236,13 @@ class Room:
     def camera_T_marker(self, t_s: float) -> FloatArray:
         """(4, 4) as the camera sees it."""
         return np.asarray(inverse(self.trus_T_camera(t_s)) @ self.trus_T_marker(t_s))
+
+    def base_T_camera(self, t_s: float, index: int) -> FloatArray:
+        """(4, 4) as the camera's holder tells it, from its own base; ``index`` seeds the noise."""
+        rng = np.random.default_rng((self.config.seed, index, 3))
+        true = self._base_T_trus @ self.trus_T_camera(t_s)
+        noise = make_transform(exp_so3(HOLDER_RAD * rng.standard_normal(3)), HOLDER_MM * rng.standard_normal(3))
+        return np.asarray(true @ noise)
 
     def spot_mm(self, t_s: float) -> FloatArray:
         """(3,) TRUS point where the beam ends: on the tissue, or in the air where it misses it."""
