@@ -2,9 +2,10 @@
 
     python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
 
-Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe`` and ``motion`` (the endoscope's
-holder) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp
-with clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
+Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe`` and ``motion`` (the holder of
+the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon, who says what he does and can
+be asked to go on. Camera and probe stamp with clocks of their own. The process ends with the one that started it (its
+standard input closes), or on SIGTERM.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def test_a_move_is_told_with_its_motion_once_it_is_over() -> None:
 
 
 def test_while_it_moves_that_is_known() -> None:
-    moving = dict((round(t, 2), value) for t, value in moved_arm().moving)
+    moving = {round(t, 2): value for t, value in moved_arm().moving}
     assert not moving[0.9]
     assert moving[1.5]
     assert moving[2.2]

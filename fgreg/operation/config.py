@@ -342,12 +342,13 @@ def _settings(top: Fields, simulated: bool) -> tuple[ConductorSettings, HolderSe
         values[THRESHOLD.name] = THRESHOLD.read(inner, Path())
     else:
         values[THRESHOLD.name] = HEARING_THRESHOLD
-    solve = SolveConfig(limit_mm=values.pop("limit_mm"))
-    holder = HolderSettings(
-        values.pop("holder_sigma_mm"), math.radians(values.pop("holder_sigma_deg")), values.pop("holder_least_mm")
+    limit_mm, sigma_mm, sigma_deg, least_mm = (
+        values.pop(name) for name in ("limit_mm", "holder_sigma_mm", "holder_sigma_deg", "holder_least_mm")
     )
     made = inner.build(lambda: ConductorSettings(**values))
-    return None if made is None else (made, holder, solve)
+    if made is None:
+        return None
+    return made, HolderSettings(sigma_mm, math.radians(sigma_deg), least_mm), SolveConfig(limit_mm=limit_mm)
 
 
 def _limits(top: Fields) -> dict[str, Any]:

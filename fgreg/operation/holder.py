@@ -1,7 +1,7 @@
 """What the endoscope's holder says of the camera's moves: that one goes on, and how far it went once it is over.
 
-While the camera moves no registration holds. A move is measured between two rests, each the mean of its samples, so that
-the noise of single samples and the way in between do not count. Pure state: samples in, moves out.
+While the camera moves no registration holds. A move is measured between two rests, each the mean of its samples, so
+that the noise of single samples and the way in between do not count. Pure state: samples in, moves out.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class Holder:
 
 
 def _mean_rest(samples: Sequence[MotionSample]) -> _Rest:
-    """The mean of samples at rest; one covariance, since what a holder does not know is much the same in all of them."""
+    """The mean of samples at rest; one covariance: what a holder does not know is much the same in all."""
     first = samples[0].base_T_camera[:3, :3]
     turns = np.array([log_so3(first.T @ sample.base_T_camera[:3, :3]) for sample in samples])
     middle = np.mean([sample.base_T_camera[:3, 3] for sample in samples], axis=0)

@@ -1,0 +1,231 @@
+"""The live loop while the camera is moved: nothing that rests on where it was is followed, paired or sent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from fgreg.config import SolveConfig
+from fgreg.drivers.base import Command, MotionSample, Registration, Said, StereoFrame, host_now
+from fgreg.errors import JournalError
+from fgreg.estimate import Verdict
+from fgreg.events import CameraMovedEvent
+from fgreg.frames import FloatArray, make_transform
+from fgreg.live import LiveSession
+from fgreg.models import SessionModel
+from fgreg.motion.device import StageStatus
+from fgreg.motion.limits import MotionKind
+from fgreg.motion.link import Report, StageView
+from fgreg.online.engine import OnlineRegistration
+from fgreg.operation.conductor import Conductor, ConductorSettings
+from fgreg.operation.loop import Devices, LiveLoop
+from fgreg.operation.recorder import Recorder
+from fgreg.pairing import Stamp, TimedPose
+from fgreg.registration import SoundSpeedPrior
+from fgreg.session.reading import read_session
+from fgreg.simulation.documents import session_document
+from fgreg.simulation.room import room_config
+from fgreg.tracking import Snapshot
+
+MOVED = make_transform(np.eye(3), np.array([6.0, 0.0, 0.0]))
+
+
+class Device:
+    """A device that sends what it is given."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.connected, self.dropped = name, True, 0
+        self.waiting: list[Any] = []
+        self.told: list[str] = []
+        self.sent: list[Registration] = []
+
+    def poll(self) -> Sequence[Any]:
+        found, self.waiting = self.waiting, []
+        return found
+
+    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+        self.told.append(f"{text} {done} {wants}")
+
+    def send(self, registration: Registration) -> None:
+        self.sent.append(registration)
+
+    def close(self) -> None:
+        self.connected = False
+
+
+class Link:
+    """A stage that has been homed and may follow; ``beats``: registrations it was told, ``orders`` to follow."""
+
+    def __init__(self) -> None:
+        self.beats: list[str | None] = []
+        self.orders: list[float] = []
+
+    @property
+    def view(self) -> StageView:
+        now = host_now()
+        status = StageStatus(Stamp(now, now), 0.0, 0.0, moving=False, homed=True, homing=False, fault="")
+        return StageView(now, True, status, None, MotionKind.TRACK, None)
+
+    def poll(self) -> list[Report]:
+        return []
+
+    def beat(self, _marker_s: float | None, registration: str | None) -> None:
+        self.beats.append(registration)
+
+    def track_to(self, scan_rad: float, _sigma_rad: float, _reason: str) -> None:
+        self.orders.append(scan_rad)
+
+    def stop(self, _reason: str) -> None:
+        raise AssertionError("a move that is told needs no stop: the gate holds what follows")
+
+
+class Stand:
+    """A loop at a session that is registered and follows; the marker is where the session's last query had it."""
+
+    def __init__(self, session: LiveSession, engine: OnlineRegistration, model: SessionModel) -> None:
+        self.session = session
+        self.camera, self.probe, self.operator, self.arm, self.sink = (
+            Device(name) for name in ("camera", "probe", "operator", "arm", "sink")
+        )
+        self.link = Link()
+        self.recorder = Recorder(session)
+        devices: Any = Devices(self.camera, self.probe, self.operator, None, self.arm, (self.sink,))
+        devices.stage = self.link
+        conductor = Conductor(model, ConductorSettings(aims=0, pms=1, most_pms=1, hearing_threshold=0.1))
+
+        class Reader:
+            def snapshot(self) -> Snapshot:
+                return engine.snapshot()
+
+        reader: Any = Reader()
+        self.loop = LiveLoop(model, devices, self.recorder, reader, conductor, host_now() - 1000.0)
+        self.marker = session.measurements().pairs[-1].marker.camera_T_marker
+        self.base_T_camera: FloatArray = np.eye(4)
+
+    def turn(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Turns of the loop with a pose and a sample of the arm in each."""
+        end = host_now() + seconds
+        while host_now() < end and not until():
+            now = host_now()
+            self.loop.eyes.newest = StereoFrame(Stamp(now, now), np.zeros((2, 2), np.uint8), None, 0)
+            self.loop.eyes.poses.add(TimedPose(now, self.marker, 1e-6 * np.eye(6)))
+            self.arm.waiting.append(MotionSample(Stamp(now, now), self.base_T_camera))
+            self.loop.turn()
+            time.sleep(0.02)
+
+    def moves(self) -> list[CameraMovedEvent]:
+        return [e for e in read_session(self.session.journal.folder).events if isinstance(e, CameraMovedEvent)]
+
+
+@contextmanager
+def standing(folder: Path) -> Iterator[Stand]:
+    setup = yaml.safe_load((folder / "session.yaml").read_text())
+    document = session_document(room_config(1).scene)
+    setup |= {key: document[key] for key in ("camera", "marker", "board")}
+    setup["probe"]["channels"] = document["probe"]["channels"]
+    (folder / "session.yaml").write_text(yaml.safe_dump(setup))
+    engines: list[OnlineRegistration] = []
+
+    def make(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> OnlineRegistration:
+        engines.append(OnlineRegistration(model, config, sound_speed_prior=prior))
+        return engines[-1]
+
+    with LiveSession.open(folder, make_engine=make, late=True) as session:
+        stand = Stand(session, engines[-1], session.journal.model)
+        try:
+            yield stand
+        finally:
+            stand.recorder.close()
+            stand.loop.close()
+
+
+@pytest.fixture
+def stand(pose_session: Path) -> Iterator[Stand]:
+    with standing(pose_session) as found:
+        found.turn(1.0)
+        assert found.link.beats[-1] in ("ok", "warning")
+        yield found
+
+
+def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stand) -> None:
+    epoch = stand.recorder.state.known.epoch
+    stand.base_T_camera = MOVED
+    stand.turn(0.1)
+    assert stand.link.beats[-1] is None
+    assert stand.loop.status().answer is None
+    assert any("the camera moves" in told for told in stand.operator.told)
+    orders = len(stand.link.orders)
+    stand.turn(0.25)
+    assert len(stand.link.orders) == orders
+    stand.turn(5.0, lambda: stand.recorder.state.known.epoch > epoch and stand.link.beats[-1] is not None)
+    (move,) = stand.moves()
+    assert move.camera_new_T_camera_old is not None
+    assert np.allclose(move.camera_new_T_camera_old, np.linalg.inv(MOVED), atol=1e-9)
+    assert stand.recorder.state.known.registered
+    assert not stand.recorder.state.unsettled
+
+
+def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
+    assert stand.sink.sent
+    assert stand.sink.sent[-1].trus_T_camera is not None
+    stand.base_T_camera = MOVED
+    stand.turn(0.1)
+    sent = len(stand.sink.sent)
+    stand.turn(0.25)
+    assert len(stand.sink.sent) > sent
+    for registration in stand.sink.sent[sent:]:
+        assert registration.verdict == "refused"
+        assert registration.trus_T_camera is None
+        assert registration.scan_rad is None
+        assert "moving" in registration.reasons[0]
+
+
+def test_a_move_that_the_operator_tells_holds_until_it_is_in_the_estimate(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = stand.session.add
+
+    def slowly(event: Any) -> Any:
+        time.sleep(0.4)
+        return add(event)
+
+    monkeypatch.setattr(stand.session, "add", slowly)
+    stand.operator.waiting.append(Command(Said.MOVED))
+    stand.turn(0.1)
+    beats = len(stand.link.beats)
+    stand.turn(0.2)
+    assert set(stand.link.beats[beats:]) == {None}
+    stand.turn(2.0, lambda: not stand.recorder.state.unsettled)
+    assert len(stand.moves()) == 1
+
+
+def test_a_move_that_cannot_be_recorded_holds_and_the_next_one_ties_nothing(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = stand.session.add
+    full = [True]
+
+    def refusing(event: Any) -> Any:
+        if full[0]:
+            raise JournalError("events.jsonl", "no space left on the disk", "room for events")
+        return add(event)
+
+    monkeypatch.setattr(stand.session, "add", refusing)
+    stand.base_T_camera = MOVED
+    stand.turn(1.5)
+    assert stand.recorder.state.unsettled
+    assert stand.link.beats[-1] is None
+    assert "no space left" in stand.recorder.state.trouble
+    full[0] = False
+    stand.base_T_camera = MOVED @ MOVED
+    stand.turn(5.0, lambda: bool(stand.moves()) and not stand.recorder.state.unsettled)
+    (move,) = stand.moves()
+    assert move.camera_new_T_camera_old is None
+    assert stand.recorder.state.known.verdict is Verdict.REFUSED
