@@ -134,7 +134,8 @@ class Registration:
         stamp: of the data it rests on.
         verdict: ``ok``, ``warning`` or ``refused``; where refused, ``trus_T_camera`` is None.
         trus_T_camera, covariance: (4, 4), (6, 6) right tangent.
-        scan_rad, sigma_rad: where the stage should turn for the present beam, where that can be told.
+        scan_rad, sigma_rad: where the plane should be for the present beam, where that can be told.
+        stage_rad: what the stage itself reads there, by its own zero and direction.
         reasons: the verdict's, plain sentences.
     """
 
@@ -145,6 +146,7 @@ class Registration:
     scan_rad: float | None = None
     sigma_rad: float | None = None
     reasons: tuple[str, ...] = ()
+    stage_rad: float | None = None
 
 
 class Device(Protocol):

@@ -3,7 +3,7 @@
 | message | device | when | content |
 |---|---|---|---|
 | STATUS | `RegistrationStatus` | always | code 1, `OK` or `WARNING`, or code 13 (not ready), `REFUSED`; the reasons |
-| STRING | `RegistrationVerdict` | always | JSON: `verdict`, `stage_deg`, `sigma_deg` (null where not told), `reasons` |
+| STRING | `RegistrationVerdict` | always | JSON: `verdict`, `stage_deg`, `plane_deg`, `sigma_deg` (null where not told), `reasons` |
 | TRANSFORM | `CameraToTrus` | usable | maps camera points to TRUS points, mm; metadata below |
 | TRANSFORM | `PlaneToTrus` | usable, angle known | the image plane (its z axis) turned to where the beam points |
 
@@ -14,7 +14,9 @@ its time stamp, and in SlicerIGT's Watchdog module, which marks a transform that
 
 Metadata (header version 2 only): `TransformStatus`, the key that PLUS reads and Slicer hands on (`OK`; `INVALID` on the
 STATUS and STRING of a refused registration), `Verdict`, `Reasons`, and for a transform `Covariance` (36 numbers, row by
-row, rad and mm, over the right tangent: rotation, then translation) with `CovarianceFrame`; `StageDeg`, `SigmaDeg`.
+row, rad and mm, over the right tangent: rotation, then translation) with `CovarianceFrame`; `StageDeg`, `PlaneDeg`,
+`SigmaDeg`. `stage_deg` is what the stage reads where the beam is in the plane, by its own zero and direction, as in result
+files; `plane_deg` is the plane's angle there in the TRUS frame, (0, sin, cos).
 """
 
 from __future__ import annotations
@@ -89,7 +91,7 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
     if usable and matrix is not None:
         with_covariance = {**common, **_covariance(registration.covariance)}
         messages.append(pack_transform(names.registration, matrix, sent_s, with_covariance, version))
-        if registration.scan_rad is not None and "StageDeg" in angles:
+        if registration.scan_rad is not None and "PlaneDeg" in angles:
             told_angles = {**common, **{key: f"{value:.6f}" for key, value in angles.items()}}
             plane = trus_T_plane(registration.scan_rad)
             messages.append(pack_transform(names.plane, plane, sent_s, told_angles, version))
@@ -99,16 +101,20 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
 def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:
     """JSON, ASCII; as many of the reasons as fit."""
     cut = [reason[:TEXT_CHARACTERS] for reason in reasons]
-    angle, sigma = angles.get("StageDeg"), angles.get("SigmaDeg")
+    told = {f"{what.lower()}_deg": angles.get(f"{what}Deg") for what in ("Stage", "Plane", "Sigma")}
     while True:
-        text = json.dumps({"verdict": verdict, "stage_deg": angle, "sigma_deg": sigma, "reasons": cut})
+        text = json.dumps({"verdict": verdict, **told, "reasons": cut})
         if len(text) <= SUMMARY_BYTES:
             return text
         cut.pop()
 
 
 def _angles(registration: Registration) -> dict[str, float]:
-    given = {"StageDeg": registration.scan_rad, "SigmaDeg": registration.sigma_rad}
+    given = {
+        "StageDeg": registration.stage_rad,
+        "PlaneDeg": registration.scan_rad,
+        "SigmaDeg": registration.sigma_rad,
+    }
     return {key: math.degrees(value) for key, value in given.items() if value is not None and math.isfinite(value)}
 
 

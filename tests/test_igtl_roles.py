@@ -199,7 +199,8 @@ def test_texts_and_states_come_in_order(scanner: tuple[socket.socket, Endpoint])
 
 def ok(scan_rad: float | None = math.radians(12.4), verdict: str = "ok") -> Registration:
     stamp = Stamp(5.0, host_now())
-    return Registration(stamp, verdict, MATRIX, COVARIANCE, scan_rad, math.radians(0.5), ("all good",))
+    stage_rad = None if scan_rad is None else 0.09 - scan_rad  # one that counts the other way, from elsewhere
+    return Registration(stamp, verdict, MATRIX, COVARIANCE, scan_rad, math.radians(0.5), ("all good",), stage_rad)
 
 
 def refused(matrix: npt.NDArray[np.float64] | None = None) -> Registration:
@@ -245,11 +246,14 @@ def test_a_valid_registration_goes_out_with_its_covariance_and_angle(
     assert before - 0.1 < transform.sent_s < time.time() + 0.1
     assert struct.unpack(">Hq20s", status.content[:30]) == (1, 0, b"OK".ljust(20, b"\0"))
     told = json.loads(verdict.content[4:])
-    assert told == {"verdict": "ok", "stage_deg": 12.4, "sigma_deg": pytest.approx(0.5), "reasons": ["all good"]}
+    stage_deg = pytest.approx(math.degrees(0.09) - 12.4)
+    angles = {"stage_deg": stage_deg, "plane_deg": pytest.approx(12.4), "sigma_deg": pytest.approx(0.5)}
+    assert told == {"verdict": "ok", **angles, "reasons": ["all good"]}
     turned = read_matrix(plane.content) @ [0.0, 0.0, 1.0, 0.0]  # the image plane's z axis
     angle = math.radians(12.4)
     np.testing.assert_allclose(turned, [0.0, math.sin(angle), math.cos(angle), 0.0], atol=1e-6)
-    assert float(plane.metadata["StageDeg"]) == pytest.approx(12.4)
+    assert float(plane.metadata["PlaneDeg"]) == pytest.approx(12.4)
+    assert float(plane.metadata["StageDeg"]) == stage_deg
 
 
 def test_a_warning_is_usable_and_says_so(

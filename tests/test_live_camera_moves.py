@@ -174,7 +174,10 @@ def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stan
 
 def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
     assert stand.sink.sent
-    assert stand.sink.sent[-1].trus_T_camera is not None
+    last, stage = stand.sink.sent[-1], stand.session.journal.model.stage
+    assert last.trus_T_camera is not None
+    if last.scan_rad is not None:
+        assert last.stage_rad == pytest.approx(stage.device_from_scan(last.scan_rad))
     stand.base_T_camera = MOVED
     stand.turn(0.1)
     sent = len(stand.sink.sent)

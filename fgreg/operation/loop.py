@@ -470,15 +470,16 @@ class LiveLoop:
         unsettled = self._unsettled_s is not None
         refused = unsettled or estimate.verdict is Verdict.REFUSED
         answer = None if refused else self._answer
-        plane = None if answer is None or answer.stage_rad is None else answer.stage_rad
+        stage_rad = None if answer is None else answer.stage_rad
         registration = Registration(
             stamp,
             (Verdict.REFUSED if refused else estimate.verdict).value,
             None if refused else estimate.trus_T_camera,
             None if refused else estimate.covariance,
-            None if plane is None else self._model.stage.scan_from_device(plane),
+            None if stage_rad is None else self._model.stage.scan_from_device(stage_rad),
             None if answer is None else answer.sigma_rad,
             ("the camera is moving, or its move is not in the estimate yet",) if unsettled else estimate.reasons,
+            stage_rad,
         )
         for number, sink in enumerate(self._devices.sinks):
             try:
