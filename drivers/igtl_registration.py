@@ -3,7 +3,7 @@
 | message | device | when | content |
 |---|---|---|---|
 | STATUS | `RegistrationStatus` | always | code 1, `OK` or `WARNING`, or code 13 (not ready), `REFUSED`; the reasons |
-| STRING | `RegistrationVerdict` | always | JSON: `verdict`, `stage_deg`, `plane_deg`, `sigma_deg` (null where not told), `reasons` |
+| STRING | `RegistrationVerdict` | always | JSON: `verdict`, `reasons`, `stage_deg`, `plane_deg`, `sigma_deg` or null |
 | TRANSFORM | `CameraToTrus` | usable | maps camera points to TRUS points, mm; metadata below |
 | TRANSFORM | `PlaneToTrus` | usable, angle known | the image plane (its z axis) turned to where the beam points |
 
@@ -15,8 +15,8 @@ its time stamp, and in SlicerIGT's Watchdog module, which marks a transform that
 Metadata (header version 2 only): `TransformStatus`, the key that PLUS reads and Slicer hands on (`OK`; `INVALID` on the
 STATUS and STRING of a refused registration), `Verdict`, `Reasons`, and for a transform `Covariance` (36 numbers, row by
 row, rad and mm, over the right tangent: rotation, then translation) with `CovarianceFrame`; `StageDeg`, `PlaneDeg`,
-`SigmaDeg`. `stage_deg` is what the stage reads where the beam is in the plane, by its own zero and direction, as in result
-files; `plane_deg` is the plane's angle there in the TRUS frame, (0, sin, cos).
+`SigmaDeg`. `stage_deg` is what the stage reads where the beam is in the plane, by its own zero and direction, as in
+result files; `plane_deg` is the plane's angle there in the TRUS frame, (0, sin, cos).
 """
 
 from __future__ import annotations
