@@ -68,6 +68,21 @@ class DeviceClock:
         return stamp.device_s + min(self._offsets) - self.latency_s
 
 
+@dataclass(frozen=True, slots=True)
+class Latencies:
+    """What even the quickest message of a device takes from the event to the host (s), where that was measured: a
+    grabber holds a picture for some frames, a scanner's packet comes after its pulse. Together they decide where the
+    marker was at a pulse."""
+
+    camera_s: float = 0.0
+    pulse_s: float = 0.0
+    holder_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(value) and value >= 0 for value in (self.camera_s, self.pulse_s, self.holder_s)):
+            raise ValueError(f"latencies are {self.camera_s}, {self.pulse_s}, {self.holder_s} s, expected 0 or more")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TimedPose:
     """A pose at a host time: ``parent_T_child`` (4, 4) and its covariance (6, 6), right tangent (rad, mm)."""

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from fgreg.config import SolveConfig
-from fgreg.drivers.base import Command, MotionSample, Registration, Said, StereoFrame, host_now
+from fgreg.drivers.base import Command, MotionSample, PaFrame, Registration, Said, StereoFrame, host_now
 from fgreg.errors import JournalError
 from fgreg.estimate import Verdict
 from fgreg.events import CameraMovedEvent
@@ -27,11 +27,12 @@ from fgreg.online.engine import OnlineRegistration
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import Recorder
+from fgreg.operation.senses import Ears, Eyes
 from fgreg.pairing import Stamp, TimedPose
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import read_session
 from fgreg.simulation.documents import session_document
-from fgreg.simulation.room import room_config
+from fgreg.simulation.room import Room, room_config
 from fgreg.tracking import Snapshot
 
 MOVED = make_transform(np.eye(3), np.array([6.0, 0.0, 0.0]))
@@ -232,3 +233,34 @@ def test_a_move_that_cannot_be_recorded_holds_and_the_next_one_ties_nothing(
     (move,) = stand.moves()
     assert move.camera_new_T_camera_old is None
     assert stand.recorder.state.known.verdict is Verdict.REFUSED
+
+
+def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
+    model = stand.session.journal.model
+    ears, eyes = Ears(model, latency_s=0.01), Eyes(model, latency_s=0.08)
+    now = host_now()
+    try:
+        ears.listening = False
+        ears.hear([PaFrame(Stamp(now, now), np.zeros((1, 1), np.int16), 0)])
+        (pulse,) = ears.heard(now + 1.0, eyes.poses)
+        assert pulse.pulse_s == pytest.approx(now - 0.01)
+    finally:
+        ears.close()
+    rig = model.camera
+    assert rig is not None
+    width, height = rig.left.image_size
+    blank = np.zeros((height, width), np.uint8)
+    poses: list[float] = []
+
+    class History:
+        def add(self, pose: TimedPose) -> bool:
+            poses.append(pose.t_s)
+            return True
+
+    eyes.poses = History()  # type: ignore[assignment]
+    assert eyes.see(StereoFrame(Stamp(now, now), blank, blank, 0)) is None
+    assert poses == []
+    config = room_config(1)
+    left, right = Room(config).pictures(0.0, 0)
+    assert eyes.see(StereoFrame(Stamp(now, now), left, right, 1)) is not None
+    assert poses == [pytest.approx(now - 0.08)]

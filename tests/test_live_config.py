@@ -21,6 +21,8 @@ from fgreg.errors import InputError, MissingExtraError
 from fgreg.motion.limits import MotionLimits
 from fgreg.operation.config import LiveConfig, read_config
 from fgreg.operation.config_keys import example_config
+from fgreg.operation.holder import HolderSettings
+from fgreg.pairing import Latencies
 from fgreg.session.safe_yaml import parse_yaml
 from fgreg.session.setup import read_setup
 from fgreg.simulation.room import BUMP_EVERY_S
@@ -108,6 +110,8 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("settings.hearing_threshold", 0, "settings.hearing_threshold", "0", "> 0"),
     ("settings.most_pms", 4, "settings", "pms from 1 to most_pms", "values that do"),
     ("settings.aims", 2.5, "settings.aims", "2.5", "an integer from 0"),
+    ("settings.camera_latency_s", -0.1, "settings.camera_latency_s", "-0.1", "0"),
+    ("settings.holder_sigma_mm", 0, "settings.holder_sigma_mm", "0", "> 0"),
     ("settings.limit_mm", math.nan, "settings.limit_mm", "nan", "> 0"),
     ("calibration", {"left": "session.yaml"}, "calibration", "and a camera in the session.yaml", "one of the two"),
 ]
@@ -147,6 +151,18 @@ def test_the_file_that_the_mistakes_are_made_in_is_read_as_it_says(tmp_path: Pat
         stage = config.live_setup(stack, lambda _: None).stage
     assert stage is not None
     assert (stage.driver, stage.options["port"]) == ("fgreg.drivers.thorlabs_stage:open_stage", "/dev/ttyUSB9")
+
+
+def test_latencies_and_the_holder_are_read_with_their_units(tmp_path: Path) -> None:
+    data = live_configs.config()
+    data["settings"] |= {"camera_latency_s": 0.08, "pulse_latency_s": 0.01}
+    data["settings"] |= {"holder_sigma_mm": 0.5, "holder_sigma_deg": 0.3, "holder_least_mm": 0.7}
+    config = read_config(live_configs.write(tmp_path, data))
+    assert config.latencies == Latencies(0.08, 0.01, 0.0)
+    assert config.holder == HolderSettings(0.5, pytest.approx(math.radians(0.3)), 0.7)
+    with ExitStack() as stack:
+        setup = config.live_setup(stack, lambda _line: None)
+    assert (setup.latencies, setup.holder) == (config.latencies, config.holder)
 
 
 def test_without_an_operator_it_is_the_keyboard_and_without_a_stage_nothing_turns(tmp_path: Path) -> None:

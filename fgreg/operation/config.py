@@ -34,6 +34,7 @@ from fgreg.operation.holder import HolderSettings
 from fgreg.operation.loop import Devices
 from fgreg.operation.rooms import HEARING_THRESHOLD
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
+from fgreg.pairing import Latencies
 from fgreg.session.reading import SETUP_FILE
 from fgreg.session.safe_yaml import load_yaml, parse_yaml, read_bounded
 from fgreg.session.schema import Fields, Place, shown
@@ -66,7 +67,7 @@ class LiveConfig:
         stage_limits: as MotionLimits.of_session takes them.
         room: options of the simulated room, where its devices are used.
         rectified: fgreg.drivers.rectification.Rectification of the pictures, where they are to be rectified.
-        settings, holder, solve: of the conductor, the endoscope's holder, the estimate.
+        settings, holder, latencies, solve: of the conductor, the endoscope's holder, the devices, the estimate.
         warnings: plain sentences on what is allowed but hardly meant.
     """
 
@@ -79,6 +80,7 @@ class LiveConfig:
     rectified: Any
     settings: ConductorSettings
     holder: HolderSettings
+    latencies: Latencies
     solve: SolveConfig
     warnings: tuple[str, ...]
 
@@ -117,7 +119,7 @@ class LiveConfig:
                 sinks=tuple(opened(chosen) for chosen in self.devices.get(Role.SINKS, ())),
             )
 
-        return LiveSetup(self.setup, open_devices, self.stage_setup(around), self.settings, self.holder)
+        return LiveSetup(self.setup, open_devices, self.stage_setup(around), self.settings, self.holder, self.latencies)
 
     def stage_setup(self, around: Surroundings) -> StageSetup | None:
         """The stage for the watchdog; None where there is none."""
@@ -183,7 +185,7 @@ class _Reader:
         limits = _limits(top)
         if self.problems or settings is None:
             return None
-        conductor, holder, solve = settings
+        conductor = settings.conductor
         setup, label, rectified = self._session(top, folder, devices, room, conductor.aims)
         model = self._model(setup, label)
         if model is None:
@@ -194,7 +196,18 @@ class _Reader:
         _check_ports(top, devices)
         self.warnings += _open_to_all(devices)
         return LiveConfig(
-            self.path, setup, model, devices, limits, room, rectified, conductor, holder, solve, tuple(self.warnings)
+            self.path,
+            setup,
+            model,
+            devices,
+            limits,
+            room,
+            rectified,
+            conductor,
+            settings.holder,
+            settings.latencies,
+            settings.solve,
+            tuple(self.warnings),
         )
 
     def _room(self, top: Fields, devices: Mapping[Role, tuple[Chosen, ...]]) -> Mapping[str, Any] | None:
@@ -331,24 +344,40 @@ def _chosen(role: Role, fields: Fields, folder: Path) -> Chosen | None:
     return Chosen(entry, options, str(fields.place)) if fields.ok else None
 
 
-def _settings(top: Fields, simulated: bool) -> tuple[ConductorSettings, HolderSettings, SolveConfig] | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Settings:
+    """All that ``settings`` says."""
+
+    conductor: ConductorSettings
+    holder: HolderSettings = field(default_factory=HolderSettings)
+    latencies: Latencies = field(default_factory=Latencies)
+    solve: SolveConfig = field(default_factory=SolveConfig)
+
+
+def _settings(top: Fields, simulated: bool) -> _Settings | None:
     known = [*(key.name for key in SETTING_KEYS), THRESHOLD.name]
     inner = top.child("settings", known) if top.has("settings") or not simulated else None
     if inner is None:
-        conductor = ConductorSettings(hearing_threshold=HEARING_THRESHOLD)
-        return (conductor, HolderSettings(), SolveConfig()) if simulated else None
+        return _Settings(ConductorSettings(hearing_threshold=HEARING_THRESHOLD)) if simulated else None
     values = dict(read_keys(SETTING_KEYS, inner, Path()))
     if inner.has(THRESHOLD.name) or not simulated:
         values[THRESHOLD.name] = THRESHOLD.read(inner, Path())
     else:
         values[THRESHOLD.name] = HEARING_THRESHOLD
-    limit_mm, sigma_mm, sigma_deg, least_mm = (
-        values.pop(name) for name in ("limit_mm", "holder_sigma_mm", "holder_sigma_deg", "holder_least_mm")
+    return inner.build(
+        lambda: _Settings(
+            holder=HolderSettings(
+                values.pop("holder_sigma_mm"),
+                math.radians(values.pop("holder_sigma_deg")),
+                values.pop("holder_least_mm"),
+            ),
+            latencies=Latencies(
+                values.pop("camera_latency_s"), values.pop("pulse_latency_s"), values.pop("holder_latency_s")
+            ),
+            solve=SolveConfig(limit_mm=values.pop("limit_mm")),
+            conductor=ConductorSettings(**values),
+        )
     )
-    made = inner.build(lambda: ConductorSettings(**values))
-    if made is None:
-        return None
-    return made, HolderSettings(sigma_mm, math.radians(sigma_deg), least_mm), SolveConfig(limit_mm=limit_mm)
 
 
 def _limits(top: Fields) -> dict[str, Any]:

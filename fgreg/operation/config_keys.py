@@ -47,6 +47,9 @@ SETTING_KEYS = (
     Key("holder_sigma_mm", Kind.NUMBER, "of a move, by motion's account", 2.0, Bounds(0.0, 100.0, True, "mm")),
     Key("holder_sigma_deg", Kind.NUMBER, "the same, of its rotation", 1.0, Bounds(0.0, 30.0, True, "deg")),
     Key("holder_least_mm", Kind.NUMBER, "a smaller shift of the view is none", 1.0, Bounds(0.0, 10.0, True, "mm")),
+    Key("camera_latency_s", Kind.NUMBER, "from exposure to arrival, at best", 0.0, Bounds(0.0, 1.0, unit="s")),
+    Key("pulse_latency_s", Kind.NUMBER, "from laser pulse to arrival, at best", 0.0, Bounds(0.0, 1.0, unit="s")),
+    Key("holder_latency_s", Kind.NUMBER, "the same of motion's samples", 0.0, Bounds(0.0, 1.0, unit="s")),
     Key("limit_mm", Kind.NUMBER, "predicted error up to which the verdict is ok", 3.0, Bounds(0.0, 100.0, True, "mm")),
 )
 THRESHOLD = Key(

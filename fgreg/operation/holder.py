@@ -70,16 +70,21 @@ class Holder:
     """See the module.
 
     Attributes:
+        latency_s: of its messages (fgreg.pairing.Latencies).
         moving_since_s: host time at which the move under way was noticed; None at rest.
     """
 
     settings: HolderSettings
+    latency_s: float = 0.0
     moving_since_s: float | None = None
-    _clock: DeviceClock = field(default_factory=DeviceClock)
+    _clock: DeviceClock = field(init=False)
     _recent: list[tuple[float, MotionSample]] = field(default_factory=list)
     _rest: _Rest | None = None
     _newest_s: float = -math.inf
     _silent: bool = False
+
+    def __post_init__(self) -> None:
+        self._clock = DeviceClock(self.latency_s)
 
     def take(self, samples: Sequence[MotionSample], now_s: float) -> HolderMove | None:
         """Take in what came; the move that has just ended, if one has."""

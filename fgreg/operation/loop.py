@@ -59,7 +59,7 @@ from fgreg.operation.view import (
     Tell,
     View,
 )
-from fgreg.pairing import TimedPose
+from fgreg.pairing import Latencies, TimedPose
 from fgreg.tracking import Snapshot, fast_track
 
 IDLE_S = 0.002
@@ -154,6 +154,7 @@ class LiveLoop:
         conductor: what happens next.
         start_s: host time of session time 0.
         holder: how far the endoscope's holder is to be believed, where there is one (``devices.motion``).
+        latencies: of the devices.
     """
 
     def __init__(
@@ -165,11 +166,13 @@ class LiveLoop:
         conductor: Conductor,
         start_s: float,
         holder: HolderSettings | None = None,
+        latencies: Latencies | None = None,
     ) -> None:
         self._model, self._devices, self._recorder, self._reader = model, devices, recorder, reader
         self._conductor, self._start_s = conductor, start_s
-        self.eyes, self.ears = Eyes(model), Ears(model)
-        self._holder = Holder(holder or HolderSettings())
+        latencies = latencies or Latencies()
+        self.eyes, self.ears = Eyes(model, latencies.camera_s), Ears(model, latencies.pulse_s)
+        self._holder = Holder(holder or HolderSettings(), latencies.holder_s)
         self._unsettled_s: float | None = None
         self.figures = Figures()
         self._lost: dict[str, str] = {}

@@ -39,11 +39,11 @@ STOOD_RAD = 0.002
 class Eyes:
     """Marker poses from frames."""
 
-    def __init__(self, model: SessionModel) -> None:
+    def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
         if model.camera is None or model.marker is None:
             raise ValueError("the session has no camera or no marker")
         self._rig, self._marker = model.camera, model.marker
-        self._clock = DeviceClock()
+        self._clock = DeviceClock(latency_s)
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
         self._found = 0
@@ -86,9 +86,9 @@ class Ears:
         trouble: why nothing is located any more; empty where it is.
     """
 
-    def __init__(self, model: SessionModel) -> None:
+    def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
         self._probe: ProbeModel = model.probe
-        self._clock = DeviceClock()
+        self._clock = DeviceClock(latency_s)
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
         self._pool = _pool()

@@ -23,6 +23,7 @@ from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.holder import HolderSettings
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
+from fgreg.pairing import Latencies
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
 
@@ -52,6 +53,7 @@ class LiveSetup:
         stage: None where there is none: then nothing turns.
         settings: of the conductor.
         holder: how far the endoscope's holder is to be believed, where there is one.
+        latencies: of the devices.
     """
 
     setup: str
@@ -59,6 +61,7 @@ class LiveSetup:
     stage: StageSetup | None
     settings: ConductorSettings
     holder: HolderSettings = field(default_factory=HolderSettings)
+    latencies: Latencies = field(default_factory=Latencies)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +145,7 @@ def running(
         conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
         reader = engines[-1].reader()
         stack.callback(reader.close)
-        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s, live.holder)
+        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s, live.holder, live.latencies)
         stack.callback(loop.close)
         yield Running(folder, model, loop, recorder, session)
         if devices.stage is not None:
