@@ -159,7 +159,7 @@ def test_latencies_and_the_holder_are_read_with_their_units(tmp_path: Path) -> N
     data["settings"] |= {"holder_sigma_mm": 0.5, "holder_sigma_deg": 0.3, "holder_least_mm": 0.7}
     config = read_config(live_configs.write(tmp_path, data))
     assert config.latencies == Latencies(0.08, 0.01, 0.0)
-    assert config.holder == HolderSettings(0.5, pytest.approx(math.radians(0.3)), 0.7)
+    assert config.holder == HolderSettings(0.5, math.radians(0.3), 0.7)
     with ExitStack() as stack:
         setup = config.live_setup(stack, lambda _line: None)
     assert (setup.latencies, setup.holder) == (config.latencies, config.holder)
