@@ -1,0 +1,291 @@
+"""What tools/load_live.py looks at while a session runs: latencies, queues, counts, and the processes' memory."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgreg.events import PairEvent
+from fgreg.operation.loop import Status
+from fgreg.operation.start import Running
+
+PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+BUSY_S = 1.0
+"""After an event was handed over, something else happens for so long."""
+GROWS_FROM_MIN = 2
+
+
+def percentiles(values: list[float]) -> dict[str, float]:
+    """Of latencies, rounded; how many there are."""
+    out: dict[str, float] = {"count": len(values)}
+    if values:
+        names = ("p50", "p90", "p99", "p99.9", "max")
+        out |= {name: round(float(np.percentile(values, share)), 1) for name, share in zip(names, PERCENTILES, strict=True)}
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Answered:
+    """One frame: when it was answered, its latency, the device's time of its exposure, what else was going on."""
+
+    done_s: float
+    latency_ms: float
+    device_s: float
+    stage: str
+    busy: bool
+
+
+def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Callable[..., Any]:
+    def counting(*arguments: Any) -> Any:
+        found = call(*arguments)
+        note(arguments, found)
+        return found
+
+    return counting
+
+
+class Watch:
+    """Looks at a session after each turn of its loop."""
+
+    def __init__(self, session: Running) -> None:
+        self._session = session
+        self._began_s = time.monotonic()
+        self._answered: list[_Answered] = []
+        self._look_wall_ms, self._look_cpu_ms = list[float](), list[float]()
+        self._queues: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+        self._last_queues: dict[str, int] = {}
+        self._pairs = self._handed_on = self._frames = self._in_poll = 0
+        self._event_s = -1e9
+        self._last: Status | None = None
+        self._end: dict[str, int] = {}
+        loop, recorder = session.loop, session.recorder
+        loop.ears.heard = _counted(loop.ears.heard, self._heard)  # type: ignore[method-assign]
+        recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
+        see = loop.eyes.see
+
+        def timed(frame: Any) -> Any:
+            wall, used = time.perf_counter(), time.thread_time()
+            pose = see(frame)
+            self._look_wall_ms.append(1e3 * (time.perf_counter() - wall))
+            self._look_cpu_ms.append(1e3 * (time.thread_time() - used))
+            return pose
+
+        loop.eyes.see = timed  # type: ignore[method-assign]
+
+    def _heard(self, _arguments: Any, found: Any) -> None:
+        self._handed_on += len(found)
+
+    def _handed_over(self, arguments: Any, _found: Any) -> None:
+        self._event_s = time.monotonic()
+        self._pairs += isinstance(arguments[0], PairEvent)
+
+    def see(self, status: Status) -> None:
+        """After a turn."""
+        self._last = status
+        figures = self._session.loop.figures
+        if figures.frames > self._frames and status.frame is not None and figures.latency_ms:
+            self._frames = figures.frames
+            stamp, latency = status.frame.stamp, figures.latency_ms[-1]
+            busy = status.now_s - self._event_s < BUSY_S or status.recorder.waiting > 0
+            self._answered.append(
+                _Answered(stamp.host_s + 1e-3 * latency, latency, stamp.device_s, str(status.stage), busy)
+            )
+        devices = self._session.loop._devices
+        self._last_queues = {
+            "recorder": status.recorder.waiting,
+            "pulses": self._session.loop.ears.waiting,
+            "camera": len(devices.camera._waiting),  # type: ignore[attr-defined]
+            "probe": len(devices.probe._waiting),  # type: ignore[attr-defined]
+        }
+        minute = self._queues[self._minute(status.now_s)]
+        for name, length in self._last_queues.items():
+            minute[name] = max(minute[name], length)
+
+    def _minute(self, at_s: float) -> int:
+        return int((at_s - self._began_s) / 60.0) + 1
+
+    def end(self) -> None:
+        """The devices are about to go."""
+        loop = self._session.loop
+        devices, figures = loop._devices, loop.figures
+        self._end = {
+            "frames_dropped_driver": devices.camera.dropped,
+            "frames_dropped_loop": figures.skipped,
+            "frames_looked_into": figures.frames,
+            "frames_with_marker": figures.found,
+            "pulses_received": figures.pulses,
+            "pulses_dropped": devices.probe.dropped,
+            "pulses_handed_on": self._handed_on,
+            "pulses_waiting": loop.ears.waiting,
+            "pairs_handed_over": self._pairs,
+            "orders": figures.orders,
+        }
+
+    def figures(self, device_zero_s: float, made: dict[str, int]) -> dict[str, Any]:
+        """What was seen; the host's time is the device's and ``device_zero_s``."""
+        answered, counts, last = self._answered, self._end, self._last
+        assert last is not None
+        kinds: dict[str, list[float]] = {"all": [a.latency_ms for a in answered]}
+        for a in answered:
+            kinds.setdefault(a.stage, []).append(a.latency_ms)
+            kinds.setdefault("while events come in" if a.busy else "while none comes in", []).append(a.latency_ms)
+        minutes: dict[str, list[float]] = {}
+        for a in answered:
+            minutes.setdefault(f"minute {self._minute(a.done_s)}", []).append(a.latency_ms)
+        exposed = [1e3 * (a.done_s - a.device_s - device_zero_s) for a in answered]
+        frames = counts["frames_looked_into"] + counts["frames_dropped_loop"] + counts["frames_dropped_driver"]
+        pulses = counts["pulses_handed_on"] + counts["pulses_waiting"]
+        known, estimate = last.recorder.known, last.recorder.estimate
+        return {
+            "counts": {
+                "frames_sent": made["camera"],
+                "pulses_sent": made["probe"],
+                **counts,
+                "frames_unaccounted": made["camera"] - frames,
+                "pulses_unaccounted": made["probe"] - pulses - counts["pulses_dropped"],
+            },
+            "latency_ms": {name: percentiles(values) for name, values in kinds.items()},
+            "from_exposure_ms": percentiles(exposed),
+            "look_ms": {"wall": percentiles(self._look_wall_ms), "processor": percentiles(self._look_cpu_ms)},
+            "minutes": {name: percentiles(values) for name, values in minutes.items()},
+            "queues": {**{f"minute {k}, most": dict(v) for k, v in self._queues.items()}, "end": self._last_queues},
+            "estimate": {
+                "stage": str(last.stage),
+                "verdict": known.verdict.value,
+                "epoch": known.epoch,
+                "pairs_of_epoch": known.pairs,
+                "reasons": list(known.reasons),
+                "worst_mm": None if estimate is None or estimate.predicted_tre is None else estimate.predicted_tre.worst_mm,
+                "aims": last.recorder.aims,
+                "pairs": last.recorder.pairs,
+                "refused": last.recorder.refused,
+                "trouble": last.recorder.trouble,
+                "lost": list(last.lost),
+            },
+        }
+
+
+# --- processes -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Process:
+    name: str
+    started: str
+    rss_mb: list[float] = field(default_factory=list)
+    used_s: list[float] = field(default_factory=list)
+
+
+class Processes:
+    """This process and all that it has started, looked at once a minute."""
+
+    def __init__(self, session: Running) -> None:
+        self._session, self._began_s = session, time.monotonic()
+        self._found: dict[int, _Process] = {}
+        self._next_s = self._began_s + 60.0
+        self._first_used: dict[int, float] = {}
+        self._look()
+        for pid in self._found:
+            self._first_used[pid] = _used_s(pid)
+
+    def see(self, now_s: float) -> None:
+        """Where a minute has passed, look."""
+        if now_s >= self._next_s:
+            self._next_s += 60.0
+            self.sample(now_s)
+
+    def sample(self, _now_s: float) -> None:
+        """Look at all."""
+        self._look()
+        for pid, process in self._found.items():
+            if _started(pid) == process.started:
+                process.rss_mb.append(round(_rss_mb(pid), 1))
+                process.used_s.append(_used_s(pid) - self._first_used.get(pid, 0.0))
+
+    def _look(self) -> None:
+        own, parents = os.getpid(), _parents()
+        below = [own]
+        for pid in below:
+            below += [child for child, parent in sorted(parents.items()) if parent == pid]
+        engines = [pid for pid in below if parents.get(pid) == own and "spawn_main" in _words(pid)]
+        for pid in below:
+            if pid not in self._found:
+                self._found[pid] = _Process(self._name(pid, own, parents, engines), _started(pid))
+
+    def _name(self, pid: int, own: int, parents: dict[int, int], engines: list[int]) -> str:
+        words = _words(pid)
+        if pid == own:
+            return "main"
+        for part, name in (("load_player", "player"), ("fgreg.motion.watchdog", "watchdog"), ("tracker", "tracker")):
+            if part in words:
+                return name
+        link = self._session.loop._devices.stage
+        if link is not None and pid == link.pid:
+            return "watchdog"
+        if parents.get(pid) == own:
+            return "engine" if pid == min(engines) else "locator"
+        return "beside the engine"
+
+    def figures(self) -> dict[str, Any]:
+        """By process: memory at each minute and at the end, its growth after minute 2, share of a processor."""
+        lasted = time.monotonic() - self._began_s
+        out: dict[str, Any] = {}
+        for pid, process in self._found.items():
+            figures: dict[str, Any] = {"rss_mb": process.rss_mb}
+            if process.used_s:
+                figures["processor_share"] = round(process.used_s[-1] / lasted, 3)
+            if len(process.rss_mb) > GROWS_FROM_MIN:
+                figures["growth_mb"] = round(process.rss_mb[-1] - process.rss_mb[GROWS_FROM_MIN - 1], 1)
+            out[f"{process.name} ({pid})"] = figures
+        return out
+
+    def left(self) -> list[str]:
+        """Those that are still there, but for this one."""
+        own = os.getpid()
+        return [p.name for pid, p in self._found.items() if pid != own and _started(pid) == p.started]
+
+
+def _stat(pid: int) -> list[str]:
+    """Fields after the name, from the state on; none where the process is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    except OSError:
+        return []
+
+
+def _parents() -> dict[int, int]:
+    found = {int(path.name): _stat(int(path.name)) for path in Path("/proc").glob("[0-9]*")}
+    return {pid: int(fields[1]) for pid, fields in found.items() if fields}
+
+
+def _started(pid: int) -> str:
+    """When it began, in the kernel's ticks; empty where it is gone (a zombie is)."""
+    fields = _stat(pid)
+    return fields[19] if fields and fields[0] != "Z" else ""
+
+
+def _used_s(pid: int) -> float:
+    fields = _stat(pid)
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK") if fields else 0.0
+
+
+def _rss_mb(pid: int) -> float:
+    fields = _stat(pid)
+    return int(fields[21]) * resource.getpagesize() / 1e6 if fields else 0.0
+
+
+def _words(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
