@@ -86,7 +86,6 @@ class RoomServer:
 
     Attributes:
         start_s: host time of the room's begin.
-        made: frames and pulses that somebody was there to receive, by role.
     """
 
     def __init__(
@@ -103,7 +102,6 @@ class RoomServer:
         self._scan_rad = 0.0  # where the plane truly stands
         self.start_s = time.monotonic()
         self._said_s = -math.inf
-        self.made = {"camera": 0, "probe": 0}
 
     # --- clients ----------------------------------------------------------------------------------------------------
 
@@ -194,7 +192,6 @@ class RoomServer:
         if not clients:
             return
         left, right = self.room.pictures(t_s, index)
-        self.made["camera"] += 1
         header = {"index": index, "device_s": CAMERA_CLOCK_S + t_s, "shape": list(left.shape)}
         for client in clients:
             client.put(header, left.data.cast("B"), right.data.cast("B"))
@@ -204,7 +201,6 @@ class RoomServer:
         if not clients:
             return
         data = self.room.channel_data(t_s, self._scan_rad, index)
-        self.made["probe"] += 1
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
         for client in clients:
             client.put(header, data.tobytes())

@@ -7,23 +7,32 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
 from fgreg.drivers.simulated_room import RoomServer, serve
-from fgreg.simulation.played_room import FRAME_RATE, Making
+from fgreg.simulation.played_room import FRAME_RATE, Making, PlayedRoom
 from fgreg.simulation.room import room_config
 
 
 class Player(RoomServer):
-    """The room's server, which writes down how late it was itself with each frame (s)."""
+    """The room's server, which writes down what it made for somebody: (the room's time, how late it was), s."""
 
-    late_s: list[float]
+    def __init__(self, room: PlayedRoom, path: Path, stay_s: float) -> None:
+        super().__init__(room, path, frame_rate=FRAME_RATE, roam_s=stay_s)
+        self.made: dict[str, list[tuple[float, float]]] = {"camera": [], "probe": []}
+
+    def _note(self, role: str, t_s: float) -> None:
+        if self._to(role):
+            self.made[role].append((round(t_s, 6), round(self.now_s() - t_s, 6)))
 
     def _frame(self, t_s: float, index: int) -> None:
-        self.late_s.append(self.now_s() - t_s)
+        self._note("camera", t_s)
         super()._frame(t_s, index)
+
+    def _pulse(self, t_s: float, index: int) -> None:
+        self._note("probe", t_s)
+        super()._pulse(t_s, index)
 
 
 def main() -> None:
@@ -39,8 +48,7 @@ def main() -> None:
     making = Making(room_config(given.seed, given.width, aims=given.aims), given.spots, given.laps, given.pictures)
     room = making.room()
     room.show(making.file(room, "r"))
-    server = Player(room, given.socket, frame_rate=FRAME_RATE, roam_s=given.stay_s)
-    server.late_s = []
+    server = Player(room, given.socket, given.stay_s)
     began = time.monotonic(), time.process_time()
     serve(server)
     lasted, used = time.monotonic() - began[0], time.process_time() - began[1]
@@ -49,10 +57,9 @@ def main() -> None:
         "made": server.made,
         "bumps": len(room.moved_s),
         "processor_share": used / lasted,
-        "late_ms": [round(1e3 * late, 3) for late in server.late_s],
     }
     given.figures.write_text(json.dumps(figures), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import time
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from fgreg.events import PairEvent
+from fgreg.frames import FloatArray
 from fgreg.operation.loop import Status
 from fgreg.operation.start import Running
 
@@ -21,6 +23,8 @@ PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 BUSY_S = 1.0
 """After an event was handed over, something else happens for so long."""
 GROWS_FROM_MIN = 2
+TINY_S = 1e-4
+TRACKER = "resource tracker"
 
 
 def percentiles(values: list[float]) -> dict[str, float]:
@@ -28,7 +32,9 @@ def percentiles(values: list[float]) -> dict[str, float]:
     out: dict[str, float] = {"count": len(values)}
     if values:
         names = ("p50", "p90", "p99", "p99.9", "max")
-        out |= {name: round(float(np.percentile(values, share)), 1) for name, share in zip(names, PERCENTILES, strict=True)}
+        out |= {
+            name: round(float(np.percentile(values, share)), 1) for name, share in zip(names, PERCENTILES, strict=True)
+        }
     return out
 
 
@@ -41,6 +47,15 @@ class _Answered:
     device_s: float
     stage: str
     busy: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Made:
+    """What the devices sent: times by their own clocks, and the host's time at 0 of the camera's."""
+
+    frames_s: FloatArray
+    pulses_s: FloatArray
+    camera_zero_s: float
 
 
 def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Callable[..., Any]:
@@ -59,15 +74,17 @@ class Watch:
         self._session = session
         self._began_s = time.monotonic()
         self._answered: list[_Answered] = []
-        self._look_wall_ms, self._look_cpu_ms = list[float](), list[float]()
+        self._look_wall_ms, self._look_cpu_ms, self._order_ms = list[float](), list[float](), list[float]()
         self._queues: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
         self._last_queues: dict[str, int] = {}
         self._pairs = self._handed_on = self._frames = self._in_poll = 0
         self._event_s = -1e9
+        self._last_pulse_s = -math.inf
         self._last: Status | None = None
         self._end: dict[str, int] = {}
         loop, recorder = session.loop, session.recorder
         loop.ears.heard = _counted(loop.ears.heard, self._heard)  # type: ignore[method-assign]
+        loop.ears.hear = _counted(loop.ears.hear, self._hear)  # type: ignore[method-assign]
         recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
         see = loop.eyes.see
 
@@ -79,6 +96,23 @@ class Watch:
             return pose
 
         loop.eyes.see = timed  # type: ignore[method-assign]
+        link = loop._devices.stage
+        for name in ("request", "home", "search_to", "track_to"):
+            setattr(link, name, self._timed_order(getattr(link, name)))
+
+    def _timed_order(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return call(*arguments)
+            finally:
+                self._order_ms.append(1e3 * (time.perf_counter() - start))
+
+        return timed
+
+    def _hear(self, arguments: Any, _found: Any) -> None:
+        for pulse in arguments[0]:
+            self._last_pulse_s = pulse.stamp.device_s
 
     def _heard(self, _arguments: Any, found: Any) -> None:
         self._handed_on += len(found)
@@ -129,8 +163,8 @@ class Watch:
             "orders": figures.orders,
         }
 
-    def figures(self, device_zero_s: float, made: dict[str, int]) -> dict[str, Any]:
-        """What was seen; the host's time is the device's and ``device_zero_s``."""
+    def figures(self, made: Made) -> dict[str, Any]:
+        """What was seen, beside what was sent: up to the last that was received, as more was on its way at the end."""
         answered, counts, last = self._answered, self._end, self._last
         assert last is not None
         kinds: dict[str, list[float]] = {"all": [a.latency_ms for a in answered]}
@@ -140,21 +174,24 @@ class Watch:
         minutes: dict[str, list[float]] = {}
         for a in answered:
             minutes.setdefault(f"minute {self._minute(a.done_s)}", []).append(a.latency_ms)
-        exposed = [1e3 * (a.done_s - a.device_s - device_zero_s) for a in answered]
+        exposed = [1e3 * (a.done_s - a.device_s - made.camera_zero_s) for a in answered]
+        frames_sent = int((made.frames_s <= answered[-1].device_s + TINY_S).sum())
+        pulses_sent = int((made.pulses_s <= self._last_pulse_s + TINY_S).sum())
         frames = counts["frames_looked_into"] + counts["frames_dropped_loop"] + counts["frames_dropped_driver"]
-        pulses = counts["pulses_handed_on"] + counts["pulses_waiting"]
+        pulses = counts["pulses_handed_on"] + counts["pulses_waiting"] + counts["pulses_dropped"]
         known, estimate = last.recorder.known, last.recorder.estimate
         return {
             "counts": {
-                "frames_sent": made["camera"],
-                "pulses_sent": made["probe"],
+                "frames_sent": frames_sent,
+                "pulses_sent": pulses_sent,
                 **counts,
-                "frames_unaccounted": made["camera"] - frames,
-                "pulses_unaccounted": made["probe"] - pulses - counts["pulses_dropped"],
+                "frames_unaccounted": frames_sent - frames,
+                "pulses_unaccounted": pulses_sent - pulses,
             },
             "latency_ms": {name: percentiles(values) for name, values in kinds.items()},
             "from_exposure_ms": percentiles(exposed),
             "look_ms": {"wall": percentiles(self._look_wall_ms), "processor": percentiles(self._look_cpu_ms)},
+            "order_ms": percentiles(self._order_ms),
             "minutes": {name: percentiles(values) for name, values in minutes.items()},
             "queues": {**{f"minute {k}, most": dict(v) for k, v in self._queues.items()}, "end": self._last_queues},
             "estimate": {
@@ -163,7 +200,9 @@ class Watch:
                 "epoch": known.epoch,
                 "pairs_of_epoch": known.pairs,
                 "reasons": list(known.reasons),
-                "worst_mm": None if estimate is None or estimate.predicted_tre is None else estimate.predicted_tre.worst_mm,
+                "worst_mm": None
+                if estimate is None or estimate.predicted_tre is None
+                else estimate.predicted_tre.worst_mm,
                 "aims": last.recorder.aims,
                 "pairs": last.recorder.pairs,
                 "refused": last.recorder.refused,
@@ -224,7 +263,11 @@ class Processes:
         words = _words(pid)
         if pid == own:
             return "main"
-        for part, name in (("load_player", "player"), ("fgreg.motion.watchdog", "watchdog"), ("tracker", "tracker")):
+        for part, name in (
+            ("load_player", "player"),
+            ("fgreg.motion.watchdog", "watchdog"),
+            ("resource_tracker", TRACKER),
+        ):
             if part in words:
                 return name
         link = self._session.loop._devices.stage
@@ -248,9 +291,14 @@ class Processes:
         return out
 
     def left(self) -> list[str]:
-        """Those that are still there, but for this one."""
+        """Those that are still there, but for this one and the one that Python has for as long as it runs."""
         own = os.getpid()
-        return [p.name for pid, p in self._found.items() if pid != own and _started(pid) == p.started]
+        mine = {pid for pid, parent in _parents().items() if parent == own}
+        return [
+            process.name
+            for pid, process in self._found.items()
+            if pid != own and _started(pid) == process.started and not (process.name == TRACKER and pid in mine)
+        ]
 
 
 def _stat(pid: int) -> list[str]:
@@ -287,5 +335,3 @@ def _words(pid: int) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
     except OSError:
         return ""
-
-

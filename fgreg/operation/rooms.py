@@ -55,5 +55,8 @@ def room_setup(path: Path, config: RoomConfig) -> LiveSetup:
         {"search_speed": SPEED_RAD_S, "track_speed": SPEED_RAD_S, "home_speed": SPEED_RAD_S},
     )
     return LiveSetup(
-        setup_text(document), open_devices, stage, ConductorSettings(aims=config.aims, hearing_threshold=HEARING_THRESHOLD)
+        setup_text(document),
+        open_devices,
+        stage,
+        ConductorSettings(aims=config.aims, hearing_threshold=HEARING_THRESHOLD),
     )

@@ -7,6 +7,7 @@ source is located in a process of its own, and a pulse is handed on once the mar
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 from collections import deque
 from collections.abc import Sequence
@@ -32,6 +33,8 @@ POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled anew after so many markers found, over so many."""
 GIVE_UP_S = 0.5
 """A pulse waits for the poses about it no longer than this."""
+BEHIND = 10
+"""Niceness of the process that locates sources."""
 STOOD_RAD = 0.002
 """The plane stands if it has turned by no more than this about the pulse."""
 
@@ -176,9 +179,10 @@ class Ears:
 
 
 def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_ignore_interrupt)
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin)
 
 
-def _ignore_interrupt() -> None:
-    """Ctrl-C is the main program's business."""
+def _begin() -> None:
+    """Frames come first: sources are located in what they leave. Ctrl-C is the main program's business."""
+    os.nice(BEHIND)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -10,7 +10,6 @@ that room, with the same function of time that the clips were made from.
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -148,7 +147,7 @@ class PlayedRoom(Room):
             raise ValueError(f"pictures of shape {pictures.shape}, expected {(self.frames, 2, height, width)}")
         self._pictures = pictures
 
-    def pictures(self, t_s: float, index: int) -> tuple[UInt8Image, UInt8Image]:
+    def pictures(self, t_s: float, index: int) -> tuple[UInt8Image, UInt8Image]:  # noqa: ARG002
         """Left and right image (h, w) at a time, as they were made."""
         clip, at = self.shown(t_s)
         if self._pictures is None:
@@ -166,7 +165,7 @@ class PlayedRoom(Room):
             self._place, self._travels, self._cameras = now
 
 
-# --- made beforehand ---------------------------------------------------------------------------------------------------
+# --- made beforehand -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +214,7 @@ def make_pictures(making: Making, processes: int) -> bool:
     numbers = range(len(room.clips()))
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         list(pool.map(_make, [part] * len(numbers), numbers))
-    os.replace(part.path, making.path)
+    part.path.replace(making.path)
     return True
 
 
