@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.drivers.base import StereoCamera, StereoFrame
 from fgreg.events import PairEvent
 from fgreg.frames import FloatArray
 from fgreg.operation.loop import Status
@@ -67,6 +68,17 @@ def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Call
     return counting
 
 
+def _rest(camera: StereoCamera) -> tuple[list[StereoFrame], int]:
+    """What waits at the driver, and how many it has dropped before that: of the same moment."""
+    left: list[StereoFrame] = []
+    until = time.monotonic() + 1.0
+    while True:
+        dropped, came = camera.dropped, camera.poll()
+        left += came
+        if (not came and camera.dropped == dropped) or time.monotonic() > until:
+            return left, dropped
+
+
 class Watch:
     """Looks at a session after each turn of its loop."""
 
@@ -79,7 +91,7 @@ class Watch:
         self._last_queues: dict[str, int] = {}
         self._pairs = self._handed_on = self._frames = self._in_poll = 0
         self._event_s = -1e9
-        self._last_pulse_s = -math.inf
+        self._last_frame_s = self._last_pulse_s = -math.inf
         self._last: Status | None = None
         self._end: dict[str, int] = {}
         loop, recorder = session.loop, session.recorder
@@ -150,14 +162,18 @@ class Watch:
         """The devices are about to go."""
         loop = self._session.loop
         devices, figures = loop._devices, loop.figures
+        left, dropped = _rest(devices.camera)
+        self._last_frame_s = max((frame.stamp.device_s for frame in left), default=self._answered[-1].device_s)
         self._end = {
-            "frames_dropped_driver": devices.camera.dropped,
+            "frames_dropped_driver": dropped,
+            "frames_waiting": len(left),
             "frames_dropped_loop": figures.skipped,
             "frames_looked_into": figures.frames,
             "frames_with_marker": figures.found,
             "pulses_received": figures.pulses,
             "pulses_dropped": devices.probe.dropped,
             "pulses_handed_on": self._handed_on,
+            "pulses_passed_over": loop.ears.passed_over,
             "pulses_waiting": loop.ears.waiting,
             "pairs_handed_over": self._pairs,
             "orders": figures.orders,
@@ -175,9 +191,9 @@ class Watch:
         for a in answered:
             minutes.setdefault(f"minute {self._minute(a.done_s)}", []).append(a.latency_ms)
         exposed = [1e3 * (a.done_s - a.device_s - made.camera_zero_s) for a in answered]
-        frames_sent = int((made.frames_s <= answered[-1].device_s + TINY_S).sum())
+        frames_sent = int((made.frames_s <= self._last_frame_s + TINY_S).sum())
         pulses_sent = int((made.pulses_s <= self._last_pulse_s + TINY_S).sum())
-        frames = counts["frames_looked_into"] + counts["frames_dropped_loop"] + counts["frames_dropped_driver"]
+        frames = sum(counts[f"frames_{name}"] for name in ("looked_into", "dropped_loop", "dropped_driver", "waiting"))
         pulses = counts["pulses_handed_on"] + counts["pulses_waiting"] + counts["pulses_dropped"]
         known, estimate = last.recorder.known, last.recorder.estimate
         return {
