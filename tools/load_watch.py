@@ -59,6 +59,35 @@ class Made:
     camera_zero_s: float
 
 
+class Spent:
+    """What became of the wall time of calls on one thread: at work, waiting for a processor, waiting for something."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, float, float]] = []
+
+    @staticmethod
+    def now() -> tuple[float, float, float]:
+        """Wall, at work, waiting for a processor (s; Linux's own account)."""
+        fields = Path("/proc/thread-self/schedstat").read_text(encoding="ascii").split()
+        return time.perf_counter(), time.thread_time(), 1e-9 * int(fields[1])
+
+    def add(self, before: tuple[float, float, float]) -> None:
+        """A call that began at ``before`` has ended."""
+        wall, used, queued = (1e3 * (b - a) for a, b in zip(before, self.now(), strict=True))
+        self._rows.append((wall, used, queued))
+
+    def figures(self) -> dict[str, Any]:
+        """Percentiles, ms; of the slowest hundredth the means."""
+        rows = np.array(self._rows).reshape(-1, 3)
+        rows = np.column_stack([rows, rows[:, 0] - rows[:, 1] - rows[:, 2]])
+        names = ("wall", "at work", "waits for a processor", "waits for locks and disk")
+        out: dict[str, Any] = {name: percentiles(list(rows[:, k])) for k, name in enumerate(names)}
+        if len(rows):
+            slow = rows[rows[:, 0] >= np.percentile(rows[:, 0], 99)].mean(axis=0)
+            out["slowest 1 %, mean"] = {name: round(float(slow[k]), 1) for k, name in enumerate(names)}
+        return out
+
+
 def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Callable[..., Any]:
     def counting(*arguments: Any) -> Any:
         found = call(*arguments)
@@ -86,7 +115,7 @@ class Watch:
         self._session = session
         self._began_s = time.monotonic()
         self._answered: list[_Answered] = []
-        self._look_wall_ms, self._look_cpu_ms, self._order_ms = list[float](), list[float](), list[float]()
+        self._spent = {name: Spent() for name in ("turn", "look", "order")}
         self._queues: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
         self._last_queues: dict[str, int] = {}
         self._pairs = self._handed_on = self._frames = self._in_poll = 0
@@ -98,27 +127,22 @@ class Watch:
         loop.ears.heard = _counted(loop.ears.heard, self._heard)  # type: ignore[method-assign]
         loop.ears.hear = _counted(loop.ears.hear, self._hear)  # type: ignore[method-assign]
         recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
-        see = loop.eyes.see
-
-        def timed(frame: Any) -> Any:
-            wall, used = time.perf_counter(), time.thread_time()
-            pose = see(frame)
-            self._look_wall_ms.append(1e3 * (time.perf_counter() - wall))
-            self._look_cpu_ms.append(1e3 * (time.thread_time() - used))
-            return pose
-
-        loop.eyes.see = timed  # type: ignore[method-assign]
+        loop.eyes.see = self._timed(loop.eyes.see, "look")  # type: ignore[method-assign]
+        loop.turn = self._timed(loop.turn, "turn")  # type: ignore[method-assign]
         link = loop._devices.stage
         for name in ("request", "home", "search_to", "track_to"):
-            setattr(link, name, self._timed_order(getattr(link, name)))
+            setattr(link, name, self._timed(getattr(link, name), "order"))
 
-    def _timed_order(self, call: Callable[..., Any]) -> Callable[..., Any]:
+    def _timed(self, call: Callable[..., Any], name: str) -> Callable[..., Any]:
+        spent, figures = self._spent[name], self._session.loop.figures
+
         def timed(*arguments: Any) -> Any:
-            start = time.perf_counter()
+            before, frames = Spent.now(), figures.frames
             try:
                 return call(*arguments)
             finally:
-                self._order_ms.append(1e3 * (time.perf_counter() - start))
+                if name != "turn" or figures.frames > frames:
+                    spent.add(before)
 
         return timed
 
@@ -206,8 +230,7 @@ class Watch:
             },
             "latency_ms": {name: percentiles(values) for name, values in kinds.items()},
             "from_exposure_ms": percentiles(exposed),
-            "look_ms": {"wall": percentiles(self._look_wall_ms), "processor": percentiles(self._look_cpu_ms)},
-            "order_ms": percentiles(self._order_ms),
+            **{f"{name}_ms": spent.figures() for name, spent in self._spent.items()},
             "minutes": {name: percentiles(values) for name, values in minutes.items()},
             "queues": {**{f"minute {k}, most": dict(v) for k, v in self._queues.items()}, "end": self._last_queues},
             "estimate": {
