@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -34,6 +35,7 @@ from fgreg.operation.start import running
 from fgreg.session.reading import read_session
 from fgreg.simulation.played_room import Making, make_pictures
 from fgreg.simulation.room import room_config
+from fgreg.threads import NAMES
 
 P50_MS, P99_MS = 40.0, 100.0
 RECORDER_WAITS, PULSES_WAIT = 12, 30
@@ -161,6 +163,8 @@ def main() -> int:
     parser.add_argument("--spots", type=int, default=10, help="at tissue, for either place of the camera (default 10)")
     parser.add_argument("--laps", type=int, default=2, help="through the spots between bumps (default 2)")
     options = parser.parse_args()
+    if "OMP_NUM_THREADS" not in os.environ:  # as fgreg live has it; NumPy reads that when it is loaded
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, **dict.fromkeys(NAMES, "1")})
     config = room_config(options.seed, options.width, aims=options.aims)
     with tempfile.TemporaryDirectory(prefix="fgreg-load-") as temporary:
         cache, folder = options.cache or Path(temporary), options.out or Path(temporary)

@@ -88,6 +88,13 @@ class Spent:
         return out
 
 
+def _until(times_s: FloatArray, last_s: float) -> tuple[int, int]:
+    """How many there were up to one, and how many were left out between them by a player that could not keep up."""
+    sent = times_s[times_s <= last_s + TINY_S]
+    period = float(np.diff(times_s).min())
+    return len(sent), round(float(np.ptp(sent)) / period) + 1 - len(sent)
+
+
 def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Callable[..., Any]:
     def counting(*arguments: Any) -> Any:
         found = call(*arguments)
@@ -215,18 +222,20 @@ class Watch:
         for a in answered:
             minutes.setdefault(f"minute {self._minute(a.done_s)}", []).append(a.latency_ms)
         exposed = [1e3 * (a.done_s - a.device_s - made.camera_zero_s) for a in answered]
-        frames_sent = int((made.frames_s <= self._last_frame_s + TINY_S).sum())
-        pulses_sent = int((made.pulses_s <= self._last_pulse_s + TINY_S).sum())
+        frames_sent, frames_skipped = _until(made.frames_s, self._last_frame_s)
+        pulses_sent, pulses_skipped = _until(made.pulses_s, self._last_pulse_s)
         frames = sum(counts[f"frames_{name}"] for name in ("looked_into", "dropped_loop", "dropped_driver", "waiting"))
         pulses = counts["pulses_handed_on"] + counts["pulses_waiting"] + counts["pulses_dropped"]
         known, estimate = last.recorder.known, last.recorder.estimate
         return {
             "counts": {
                 "frames_sent": frames_sent,
+                "frames_skipped_by_player": frames_skipped,
                 "pulses_sent": pulses_sent,
+                "pulses_skipped_by_player": pulses_skipped,
                 **counts,
-                "frames_unaccounted": frames_sent - frames,
-                "pulses_unaccounted": pulses_sent - pulses,
+                "frames_unaccounted": frames_sent + frames_skipped - frames,
+                "pulses_unaccounted": pulses_sent + pulses_skipped - pulses,
             },
             "latency_ms": {name: percentiles(values) for name, values in kinds.items()},
             "from_exposure_ms": percentiles(exposed),

@@ -156,7 +156,7 @@ class Ears:
             self.trouble = "the process that locates sources had ended; it was started again"
 
     def _pass_over(self, pulse: _Waiting) -> None:
-        """Nobody knows what was heard: such a pulse says nothing of any angle."""
+        """Nobody knows whether anything was heard: then the pulse says nothing of any angle."""
         pulse.scan_rad = pulse.located = None
         self.passed_over += 1
 
