@@ -49,6 +49,7 @@ class RoomProcess:
 
     Args:
         seed, width_px, aims, bump_every_s: of the room (fgreg.simulation.room).
+        program: what to start in its place that speaks as it does: words after the interpreter's.
 
     Attributes:
         path: of the socket that its devices are reached by.
@@ -58,13 +59,19 @@ class RoomProcess:
     """
 
     def __init__(
-        self, seed: int = 1, width_px: int = 640, aims: int = 10, bump_every_s: float = BUMP_EVERY_S, *extra: str
+        self,
+        seed: int = 1,
+        width_px: int = 640,
+        aims: int = 10,
+        bump_every_s: float = BUMP_EVERY_S,
+        *,
+        program: Sequence[str] = ("-m", "fgreg.drivers.simulated_room"),
     ) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="fgreg-room-"))  # of mode 0700
         self.path = self._folder / "socket"
-        words = [sys.executable, "-m", "fgreg.drivers.simulated_room", "--socket", os.fspath(self.path)]
+        words = [sys.executable, *program, "--socket", os.fspath(self.path)]
         words += ["--seed", str(seed), "--width", str(width_px), "--aims", str(aims)]
-        words += ["--bump-every-s", str(bump_every_s), *extra]
+        words += ["--bump-every-s", str(bump_every_s)]
         self._child = subprocess.Popen(
             words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, text=True
         )

@@ -35,8 +35,6 @@ SETTLE_S = 0.4
 """The surgeon says that he aims once the fibre has been still for so long."""
 SAY_AGAIN_S = 3.0
 """And says so again while nothing comes of it."""
-ROAM_S = 4.0
-"""Where he roams, the surgeon goes on by himself after so long at one place."""
 
 
 @dataclass(slots=True, eq=False)
@@ -45,10 +43,10 @@ class _Client:
 
     role: str
     connection: socket.socket
-    waiting: queue.Queue[tuple[dict[str, Any], tuple[bytes, ...]] | None]
+    waiting: queue.Queue[tuple[dict[str, Any], tuple[bytes | memoryview, ...]] | None]
     gone: threading.Event = field(default_factory=threading.Event)
 
-    def put(self, header: dict[str, Any], *payload: bytes) -> None:
+    def put(self, header: dict[str, Any], *payload: bytes | memoryview) -> None:
         """Send soon; where the receiver is slow the oldest is dropped, and its header's ``index`` tells."""
         while True:
             try:
@@ -85,13 +83,16 @@ class RoomServer:
         room: the world.
         path: of the Unix socket; its folder should be this user's alone.
         frame_rate, pulse_rate: of camera and laser, per second.
-        roam: the surgeon goes on by himself at tissue, without being asked.
+        roam_s: the surgeon goes on by himself after so long at a place at tissue, without being asked.
+
+    Attributes:
+        start_s: host time of the room's begin.
     """
 
     def __init__(
-        self, room: Room, path: Path, *, frame_rate: float = 30.0, pulse_rate: float = 10.0, roam: bool = False
+        self, room: Room, path: Path, *, frame_rate: float = 30.0, pulse_rate: float = 10.0, roam_s: float = math.inf
     ) -> None:
-        self.room, self._frame_rate, self._pulse_rate, self._roam = room, frame_rate, pulse_rate, roam
+        self.room, self._frame_rate, self._pulse_rate, self._roam_s = room, frame_rate, pulse_rate, roam_s
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(os.fspath(path))
         self._listener.listen(16)
@@ -100,7 +101,7 @@ class RoomServer:
         self._asked: queue.Queue[dict[str, Any]] = queue.Queue()
         self._end = threading.Event()
         self._scan_rad = 0.0  # where the plane truly stands
-        self._start_s = time.monotonic()
+        self.start_s = time.monotonic()
         self._said_s = -math.inf
 
     # --- clients ----------------------------------------------------------------------------------------------------
@@ -159,7 +160,7 @@ class RoomServer:
 
     def now_s(self) -> float:
         """Seconds since the room began."""
-        return time.monotonic() - self._start_s
+        return time.monotonic() - self.start_s
 
     def run(self) -> None:
         """Until :meth:`stop`."""
@@ -197,7 +198,7 @@ class RoomServer:
         left, right = self.room.pictures(t_s, index)
         header = {"index": index, "device_s": CAMERA_CLOCK_S + t_s, "shape": list(left.shape)}
         for client in clients:
-            client.put(header, left.tobytes(), right.tobytes())
+            client.put(header, left.data.cast("B"), right.data.cast("B"))
 
     def _pulse(self, t_s: float, index: int) -> None:
         clients = self._to("probe")
@@ -222,7 +223,7 @@ class RoomServer:
                 if isinstance(asked.get("say"), str):
                     self._say({"says": asked["say"]})
         rested = now_s - room.arrives_s()
-        roams = self._roam and room.place.corner is None and rested > ROAM_S
+        roams = room.place.corner is None and rested > self._roam_s
         if (go_on and rested > 0) or roams:
             room.proceed(now_s)
             self._said_s = -math.inf
@@ -247,7 +248,11 @@ def main(arguments: list[str] | None = None) -> None:
     )
     given = parser.parse_args(arguments)
     config: RoomConfig = room_config(given.seed, given.width, aims=given.aims, bump_every_s=given.bump_every_s)
-    server = RoomServer(Room(config), given.socket)
+    serve(RoomServer(Room(config), given.socket))
+
+
+def serve(server: RoomServer) -> None:
+    """Say that it is ready and run it, until SIGTERM comes or the program that started this one is gone."""
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program that started it ends it
 

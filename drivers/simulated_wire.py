@@ -57,7 +57,8 @@ def _read(connection: socket.socket, count: int) -> bytearray:
     view, done = memoryview(data), 0
     while done < count:
         try:
-            got = connection.recv_into(view[done:])
+            # All of it in one call where that can be: each call has to wait for the interpreter's lock again.
+            got = connection.recv_into(view[done:], 0, socket.MSG_WAITALL)
         except OSError as error:
             raise WireClosed(str(error)) from None
         if got == 0:

@@ -16,6 +16,7 @@ import typer
 
 from fgreg.cli_options import LimitOption, solve_config
 from fgreg.errors import InputError
+from fgreg.threads import one_thread_each
 
 if TYPE_CHECKING:
     from fgreg.config import SolveConfig
@@ -82,10 +83,11 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
             typer.echo(example(), nl=False)
             return
-        from fgreg.estimate import Verdict
-        from fgreg.operation.start import default_folder
-        from fgreg.pipeline import SolveRequest, solve_session
-        from fgreg.report import print_summary, summary_dict
+        with one_thread_each():  # the devices, the camera's loop and the estimate are processes beside each other
+            from fgreg.estimate import Verdict
+            from fgreg.operation.start import default_folder
+            from fgreg.pipeline import SolveRequest, solve_session
+            from fgreg.report import print_summary, summary_dict
 
         if duration is not None and not 0 < duration < math.inf:
             raise InputError("--duration", str(duration), "seconds > 0")
@@ -93,6 +95,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         folder = default_folder() if out is None else out
         silent = as_json or quiet
         with ExitStack() as stack:
+            stack.enter_context(one_thread_each())
             if config is None:
                 setup = _room(stack, seed, aims, bumps)
             else:

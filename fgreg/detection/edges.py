@@ -76,7 +76,7 @@ class _Band:
 
     d: FloatArray
     u: FloatArray
-    grey: npt.NDArray[np.float64] | Image
+    grey: FloatArray
     used: BoolArray
 
 
@@ -126,34 +126,43 @@ def _band(
     # Across: pixels along the minor axis; a slanted edge needs up to sqrt(2) more of them.
     reach = int(np.ceil(half_width.max() * np.sqrt(2.0))) + 1
     offsets = np.arange(-reach, reach + 1)
-    px = np.rint(centre)[:, :, None, :] + np.zeros((1, 1, offsets.size, 1))
-    sideways = np.where(major[:, None, None, None] == 1, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
-    px = px + offsets[None, None, :, None] * sideways
+    nearest = np.rint(centre)
     # Ideal distance of a pixel by first order about its row's centre: the band is narrow.
     f = focal_px(camera)
     inverse_jacobian = np.linalg.inv(f[:, None] * distort_jacobian(camera, ideal / f) / f)
-    step = np.einsum("ekij,ekpj->ekpi", inverse_jacobian, px - centre[:, :, None, :])
-    d = np.einsum("ekpi,ei->ekp", step, normal)
-    u = (s[:, :, None] + np.einsum("ekpi,ei->ekp", step, direction)) / half_length[:, None, None]
     height, width = image.shape
-    inside = (px[..., 0] >= 0) & (px[..., 0] < width) & (px[..., 1] >= 0) & (px[..., 1] < height)
-    ix = np.clip(px[..., 0], 0, width - 1).astype(np.intp)
-    iy = np.clip(px[..., 1], 0, height - 1).astype(np.intp)
-    used = inside & fresh[:, :, None] & (np.abs(d) <= half_width[:, None, None])
-    return _compact(_Band(d.reshape(n, -1), u.reshape(n, -1), image[iy, ix].reshape(n, -1), used.reshape(n, -1)))
+    parts = []
+    for k in range(n):  # pixel (row, offset) of one edge after the other: its numbers stay in the cache
+        minor, other = 1 - major[k], major[k]
+        across = nearest[k, :, minor, None] + offsets
+        off = across - centre[k, :, minor, None]
+        beside = (nearest[k, :, other] - centre[k, :, other])[:, None]
+        by_normal = normal[k] @ inverse_jacobian[k]
+        d = by_normal[:, minor, None] * off + by_normal[:, other, None] * beside
+        limits = (width, height)
+        inside = (across >= 0) & (across < limits[minor])
+        inside &= ((nearest[k, :, other] >= 0) & (nearest[k, :, other] < limits[other]) & fresh[k])[:, None]
+        row, column = np.nonzero(inside & (np.abs(d) <= half_width[k]))
+        by_direction = direction[k] @ inverse_jacobian[k]
+        u = by_direction[row, minor] * off[row, column] + by_direction[row, other] * beside[row, 0]
+        at = across[row, column].astype(np.intp), nearest[k, row, other].astype(np.intp)
+        iy, ix = at if minor == 1 else at[::-1]
+        parts.append((d[row, column], (s[k, row] + u) / half_length[k], image[iy, ix]))
+    return _joined(parts)
 
 
-def _compact(band: _Band) -> _Band:
-    """The same band with as few unused pixels as the edge with the most allows."""
-    most = max(int(band.used.sum(axis=1).max()), 1)
-    order = np.argsort(~band.used, axis=1, kind="stable")[:, :most]
-    d, u = np.take_along_axis(band.d, order, axis=1), np.take_along_axis(band.u, order, axis=1)
-    grey = np.take_along_axis(band.grey, order, axis=1).astype(np.float64)
-    return _Band(d, u, grey, np.take_along_axis(band.used, order, axis=1))
+def _joined(parts: list[tuple[FloatArray, FloatArray, Image]]) -> _Band:
+    """The pixels (d, u, grey) of each edge side by side, as wide as the edge with the most asks for."""
+    shape = len(parts), max(1, *(len(d) for d, _, _ in parts)) if parts else 1
+    band = _Band(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool))
+    for k, (d, u, grey) in enumerate(parts):
+        count = len(d)
+        band.d[k, :count], band.u[k, :count], band.grey[k, :count], band.used[k, :count] = d, u, grey, True
+    return band
 
 
 def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Grey levels (n, p) of parameters (n, 8) = (o, m, log s, b0, b1, w0, w1, g), and their Jacobian (n, p, 8)."""
+    """Grey levels (n, p) of parameters (n, 8) = (o, m, log s, b0, b1, w0, w1, g), and their Jacobian (n, 8, p)."""
     u = band.u
     blur = np.exp(x[:, 2])[:, None]
     fall = x[:, 7:8]
@@ -167,17 +176,17 @@ def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     low = light - high
     dark = x[:, 3:4] + x[:, 4:5] * u
     step = x[:, 5:6] + x[:, 6:7] * u - dark
-    jacobian = np.empty((*u.shape, PARAMETERS))
+    jacobian = np.empty((len(u), PARAMETERS, u.shape[1]))
     # d high / d e = fall Phi + light phi / s - fall t phi;  d high / d log s = -phi t light + fall s phi (1 + t^2)
     by_e = fall * dark + step * (fall * big_phi + phi * (light / blur - fall * t))
-    jacobian[..., 0] = -by_e
-    jacobian[..., 1] = -by_e * u
-    jacobian[..., 2] = step * phi * (fall * blur * (1.0 + t * t) - light * t)
-    jacobian[..., 3] = low
-    jacobian[..., 4] = low * u
-    jacobian[..., 5] = high
-    jacobian[..., 6] = high * u
-    jacobian[..., 7] = e * dark + step * (e * big_phi + blur * phi)
+    jacobian[:, 0] = -by_e
+    jacobian[:, 1] = -by_e * u
+    jacobian[:, 2] = step * phi * (fall * blur * (1.0 + t * t) - light * t)
+    jacobian[:, 3] = low
+    jacobian[:, 4] = low * u
+    jacobian[:, 5] = high
+    jacobian[:, 6] = high * u
+    jacobian[:, 7] = e * dark + step * (e * big_phi + blur * phi)
     return dark * light + step * high, jacobian
 
 
@@ -208,10 +217,10 @@ def _fit_band(
                 sigma = _spread(residual, np.minimum(weight, 9.0 * sigma[:, None] ** 2 / (residual**2 + 1e-12)), weight)
                 weight = band.used / (1.0 + (residual / (4.0 * sigma[:, None])) ** 4)
             cost = np.sum(weight * residual**2, axis=1) / sigma**2 + np.sum(prior * (x - centre) ** 2, axis=1)
-        jw = jacobian * (weight / sigma[:, None] ** 2)[..., None]
-        normal = np.swapaxes(jw, 1, 2) @ jacobian
+        jw = jacobian * (weight / sigma[:, None] ** 2)[:, None]
+        normal = jw @ np.swapaxes(jacobian, 1, 2)
         normal[:, diagonal, diagonal] += prior
-        gradient = (residual[:, None, :] @ jw)[:, 0] - prior * (x - centre)
+        gradient = (jw @ residual[..., None])[..., 0] - prior * (x - centre)
         damped = normal.copy()
         damped[:, diagonal, diagonal] *= 1.0 + damping[:, None]
         damped[:, diagonal, diagonal] += 1e-9
@@ -224,15 +233,15 @@ def _fit_band(
         new_cost = np.sum(weight * new_residual**2, axis=1) / sigma**2 + np.sum(prior * (y - centre) ** 2, axis=1)
         better = new_cost <= cost
         damping = np.where(better, damping * 0.1, damping * 10.0)
-        x = np.where(better[:, None], y, x)
-        cost = np.where(better, new_cost, cost)
-        residual = np.where(better[:, None], new_residual, residual)
-        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
+        if better.all():
+            x, cost, residual, jacobian = y, new_cost, new_residual, new_jacobian
+        else:
+            x[better], cost[better] = y[better], new_cost[better]
+            residual[better], jacobian[better] = new_residual[better], new_jacobian[better]
         if iteration > REWEIGH_AT and np.abs(step[:, :2]).max() < tolerance_px:
             break
     sigma = _spread(residual, weight, weight)
-    jw = jacobian * (weight / sigma[:, None] ** 2)[..., None]
-    normal = np.swapaxes(jw, 1, 2) @ jacobian
+    normal = (jacobian * (weight / sigma[:, None] ** 2)[:, None]) @ np.swapaxes(jacobian, 1, 2)
     normal[:, diagonal, diagonal] += prior + 1e-9
     return x, np.asarray(np.linalg.inv(normal), dtype=np.float64), sigma
 

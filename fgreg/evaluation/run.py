@@ -7,10 +7,8 @@ and results come back in that order.
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from fgreg.batch import solve
@@ -28,6 +26,7 @@ from fgreg.evaluation.resolve import Resolved, resolve
 from fgreg.frames import FloatArray
 from fgreg.sensitivity import wrap_angle
 from fgreg.targets import beam_error, tre_mm
+from fgreg.threads import one_thread_each
 from fgreg.verdict import Condition
 
 Progress = Callable[[str, int, int], None]
@@ -244,23 +243,9 @@ def _results(
         return
     # Fresh processes: a fork would inherit the threads of linear algebra libraries in whatever state they are.
     context = multiprocessing.get_context("spawn")
-    with _one_thread_each(), ProcessPoolExecutor(jobs, context, _load, (cases, conditions, config)) as pool:
+    with one_thread_each(), ProcessPoolExecutor(jobs, context, _load, (cases, conditions, config)) as pool:
         try:
             yield from pool.map(_run, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs))))
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started within use one thread each for linear algebra: there is one process per core already."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update({name: "1" for name, value in before.items() if value is None})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
+
+BEHIND = 5
+"""By so much the processes beside stand back: behind the engine, which stands back as much behind the camera's loop."""
 
 Case = TypeVar("Case")
 Answer = TypeVar("Answer")
@@ -15,6 +19,7 @@ Answer = TypeVar("Answer")
 
 def _serve(connection: Connection[Any, Any], work: Callable[[Any], Any]) -> None:
     """Work on what comes until the other end closes."""
+    os.nice(BEHIND)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main program ends it, in its own time
     while True:
         try:

@@ -23,6 +23,7 @@ from fgreg.estimate import TrackEstimate
 from fgreg.frames import FloatArray
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
+from fgreg.online.beside import BEHIND
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
@@ -177,6 +178,7 @@ def _serve(
     connection: Connection[Any, Any], model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None
 ) -> None:
     """The process."""
+    os.nice(BEHIND)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main program ends it, in its own time
     with (
         OnlineRegistration(model, config, judge="process", watch="process", sound_speed_prior=prior) as engine,

@@ -111,6 +111,11 @@ class Conductor:
         self._waits_s = -math.inf
         self._not_before_s = -math.inf  # pulses of before are another epoch's
 
+    @property
+    def listens(self) -> bool:
+        """Whether it is of any use now to know what is heard."""
+        return self.stage is Stage.FOLLOWING or self._hunt is not None
+
     def step(self, view: View) -> tuple[Action, ...]:
         """What to do now."""
         out: list[Action] = []

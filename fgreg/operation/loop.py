@@ -258,7 +258,7 @@ class LiveLoop:
         return pose
 
     def _listen(self) -> None:
-        self.ears.listening = self._conductor.stage != "calibrating"
+        self.ears.listening = self._conductor.listens
         pulses = self._poll("probe", self._devices.probe)
         self.figures.pulses += len(pulses)
         self.ears.hear(pulses)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
+from pathlib import Path
 
 from fgreg.drivers.simulated import RoomProcess, SimulatedCamera, SimulatedOperator, SimulatedProbe
 from fgreg.models import SessionModel
@@ -12,7 +13,7 @@ from fgreg.operation.conductor import ConductorSettings
 from fgreg.operation.loop import Devices
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.simulation.documents import session_document
-from fgreg.simulation.room import BUMP_EVERY_S, room_config
+from fgreg.simulation.room import BUMP_EVERY_S, RoomConfig, room_config
 
 HEARING_THRESHOLD = 20.0
 """Amplitude in the room's units: well above what its noise makes, half of what is heard at the window's edge."""
@@ -35,19 +36,27 @@ def simulated_room(
         FgregError: it did not start.
     """
     room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
+    return room_setup(room.path, room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s))
+
+
+def room_setup(path: Path, config: RoomConfig) -> LiveSetup:
+    """How to conduct a session with the room whose socket is at ``path``."""
 
     def open_devices(devices: ExitStack, _model: SessionModel) -> Devices:
-        found = Devices(SimulatedCamera(room.path), SimulatedProbe(room.path), SimulatedOperator(room.path))
+        found = Devices(SimulatedCamera(path), SimulatedProbe(path), SimulatedOperator(path))
         for device in found.roles().values():
             devices.callback(device.close)
         return found
 
-    document = session_document(room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s).scene)
+    document = session_document(config.scene)
     stage = StageSetup(
         "fgreg.drivers.simulated:open_stage",
-        {"path": os.fspath(room.path)},
+        {"path": os.fspath(path)},
         {"search_speed": SPEED_RAD_S, "track_speed": SPEED_RAD_S, "home_speed": SPEED_RAD_S},
     )
     return LiveSetup(
-        setup_text(document), open_devices, stage, ConductorSettings(aims=aims, hearing_threshold=HEARING_THRESHOLD)
+        setup_text(document),
+        open_devices,
+        stage,
+        ConductorSettings(aims=config.aims, hearing_threshold=HEARING_THRESHOLD),
     )

@@ -1,12 +1,14 @@
 """What comes from camera and probe, made into poses and pulses on the host's clock.
 
 The marker is looked for in the newest frame only, older ones are dropped and counted. Pulses are never dropped: the
-source is located in a process of its own, and a pulse is handed on once the marker's poses about it are known.
+source is located in a process of its own, and a pulse is handed on once the marker's poses about it are known. Where
+that process cannot keep up, pulses are handed on as if the plane had turned, and counted: nobody takes them for silent.
 """
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 from collections import deque
 from collections.abc import Sequence
@@ -32,6 +34,10 @@ POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled anew after so many markers found, over so many."""
 GIVE_UP_S = 0.5
 """A pulse waits for the poses about it no longer than this."""
+MOST_UNDER_WAY, LOCATE_S = 3, 2.0
+"""Pulses that the locating process has to do at a time, and how long one is waited for."""
+BEHIND = 5
+"""By so much the process that locates sources stands back."""
 STOOD_RAD = 0.002
 """The plane stands if it has turned by no more than this about the pulse."""
 
@@ -84,6 +90,7 @@ class Ears:
     Attributes:
         listening: whether anybody wants to know what is heard: locating a source takes time.
         trouble: why nothing is located any more; empty where it is.
+        passed_over: pulses that would have been located, had there been time.
     """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
@@ -92,7 +99,8 @@ class Ears:
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
         self._pool = _pool()
-        self.listening, self.trouble = True, ""
+        self._under_way: list[Future[PaFind | NoSignal]] = []
+        self.listening, self.trouble, self.passed_over = True, "", 0
 
     @property
     def waiting(self) -> int:
@@ -117,6 +125,8 @@ class Ears:
         while self._waiting:
             first = self._waiting[0]
             overdue = now_s - first.pulse_s > GIVE_UP_S
+            if first.located is not None and not first.located.done() and now_s - first.pulse_s > LOCATE_S:
+                self._pass_over(first)
             looked = first.data is None and (first.located is None or first.located.done())
             if not (looked and (poses.can_tell(first.pulse_s) or overdue)):
                 break
@@ -134,11 +144,21 @@ class Ears:
         pulse.scan_rad = self._stood(pulse.pulse_s)
         if pulse.scan_rad is None:
             return
+        self._under_way = [located for located in self._under_way if not located.done()]
+        if len(self._under_way) >= MOST_UNDER_WAY:
+            self._pass_over(pulse)
+            return
         try:
             pulse.located = self._pool.submit(locate_in_frame, data, self._probe)
+            self._under_way.append(pulse.located)
         except BrokenProcessPool:
             self._pool = _pool()
             self.trouble = "the process that locates sources had ended; it was started again"
+
+    def _pass_over(self, pulse: _Waiting) -> None:
+        """Nobody knows whether anything was heard: then the pulse says nothing of any angle."""
+        pulse.scan_rad = pulse.located = None
+        self.passed_over += 1
 
     def _complete(self, pulse: _Waiting, poses: PoseHistory) -> Heard:
         heard = Heard(pulse.pulse_s, pulse.scan_rad)
@@ -171,14 +191,15 @@ class Ears:
         return float(np.interp(t_s, (t0, t1), (first, second)))
 
     def close(self) -> None:
-        """End the process."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """End the process, after what it is at."""
+        self._pool.shutdown(cancel_futures=True)
 
 
 def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_ignore_interrupt)
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin)
 
 
-def _ignore_interrupt() -> None:
-    """Ctrl-C is the main program's business."""
+def _begin() -> None:
+    """Frames come first: sources are located in what they leave. Ctrl-C is the main program's business."""
+    os.nice(BEHIND)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

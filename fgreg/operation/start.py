@@ -21,6 +21,7 @@ from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.holder import HolderSettings
+from fgreg.operation.interpreter import undisturbed
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
 from fgreg.pairing import Latencies
@@ -147,6 +148,7 @@ def running(
         stack.callback(reader.close)
         loop = LiveLoop(model, devices, recorder, reader, conductor, start_s, live.holder, live.latencies)
         stack.callback(loop.close)
+        stack.enter_context(undisturbed())
         yield Running(folder, model, loop, recorder, session)
         if devices.stage is not None:
             devices.stage.close()  # first of all; the rest follows in the stack's order

@@ -47,6 +47,7 @@ class RoomConfig:
         aims: calibration shots before the surgeon turns to the tissue.
         bump_every_s: mean time between camera moves once that has begun; infinite: none.
         bump_rad, bump_mm: size (sigma per axis) of a move, about the middle of the tissue.
+        tremor_hz: of the hand's tremor, four.
         scene: cameras, probe, stage, noise of the room; ``frames`` and amplitudes on.
     """
 
@@ -55,6 +56,7 @@ class RoomConfig:
     bump_every_s: float = BUMP_EVERY_S
     bump_rad: float = math.radians(2.0)
     bump_mm: float = 2.5
+    tremor_hz: tuple[float, float, float, float] = TREMOR_HZ
     scene: SimulationConfig
 
     def __post_init__(self) -> None:
@@ -94,7 +96,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Travel:
+class Travel:
     """From one pose to another between two times, at rest at either end."""
 
     start_s: float
@@ -112,7 +114,14 @@ class _Travel:
         )
 
 
-def _at(travels: list[_Travel], t_s: float) -> FloatArray:
+def travel_s(start: FloatArray, end: FloatArray) -> float:
+    """How long the fibre takes from one pose (4, 4) to another."""
+    way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
+    turn = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
+    return max(LEAST_TRAVEL_S, way / TRAVEL_MM_S, turn / TRAVEL_RAD_S)
+
+
+def _at(travels: list[Travel], t_s: float) -> FloatArray:
     """Where a body is that travels one way after another."""
     return next(travel for travel in reversed(travels) if travel.start_s <= max(t_s, 0.0)).at(t_s)
 
@@ -134,13 +143,13 @@ class Room:
         holder = np.random.default_rng((self.config.seed, 3))
         self._base_T_trus = make_transform(exp_so3(holder.normal(0.0, 1.0, 3)), holder.normal(0.0, 300.0, 3))
         self._phase = tremor.uniform(0.0, 2.0 * math.pi, (6, len(TREMOR_HZ)))
-        self._cameras: list[_Travel] = [_Travel(0.0, 0.0, trus_T_camera, trus_T_camera)]
+        self._cameras: list[Travel] = [Travel(0.0, 0.0, trus_T_camera, trus_T_camera)]
         self.moved_s: list[float] = []
         self._bump_due_s = math.inf
         self._places = 0
         self._place = self._next_place()
         start = self._place.trus_T_marker
-        self._travels: list[_Travel] = [_Travel(0.0, 0.0, start, start)]
+        self._travels: list[Travel] = [Travel(0.0, 0.0, start, start)]
 
     def _begin(self) -> list[Place]:
         """A scene in which aims and spots can be seen, and the aims."""
@@ -183,10 +192,7 @@ class Room:
         start = self._travels[-1].at(t_s)
         self._place = self._next_place()
         end = self._place.trus_T_marker
-        way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
-        turn = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
-        took = max(LEAST_TRAVEL_S, way / TRAVEL_MM_S, turn / TRAVEL_RAD_S)
-        self._travels.append(_Travel(t_s, t_s + took, start, end))
+        self._travels.append(Travel(t_s, t_s + travel_s(start, end), start, end))
         if self._place.corner is None and not math.isfinite(self._bump_due_s):
             self._bump_due_s = self._next_bump(t_s)
         return self._place
@@ -199,13 +205,17 @@ class Room:
 
     def bump(self, t_s: float) -> None:
         """Somebody moves the camera, beginning at ``t_s``."""
-        rng, config = self._bump_rng, self.config
         before = self.trus_T_camera(t_s)
+        self._cameras.append(Travel(t_s, t_s + BUMP_S, before, self._bumped(before)))
+        self.moved_s.append(t_s)
+
+    def _bumped(self, trus_T_camera: FloatArray) -> FloatArray:
+        """Where a bump leaves the camera."""
+        rng, config = self._bump_rng, self.config
         middle = self.scene.tissue.point(np.zeros(()), np.zeros(()))
         turn = exp_so3(rng.normal(0.0, config.bump_rad, 3))
         move = make_transform(turn, middle - turn @ middle + rng.normal(0.0, config.bump_mm, 3))
-        self._cameras.append(_Travel(t_s, t_s + BUMP_S, before, move @ before))
-        self.moved_s.append(t_s)
+        return np.asarray(move @ trus_T_camera)
 
     def _next_bump(self, t_s: float) -> float:
         mean = self.config.bump_every_s
@@ -229,7 +239,7 @@ class Room:
 
     def trus_T_marker(self, t_s: float) -> FloatArray:
         """(4, 4) the marker, with the hand's tremor."""
-        wave = np.sin(2.0 * math.pi * np.array(TREMOR_HZ) * t_s + self._phase).sum(axis=1)
+        wave = np.sin(2.0 * math.pi * np.array(self.config.tremor_hz) * t_s + self._phase).sum(axis=1)
         still = _at(self._travels, t_s)
         return make_transform(still[:3, :3] @ exp_so3(TREMOR_RAD * wave[:3]), still[:3, 3] + TREMOR_MM * wave[3:])
 
