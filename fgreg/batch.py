@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +23,14 @@ from fgreg.frames import FloatArray
 from fgreg.graph.explicit import GraphOptions, build_graph
 from fgreg.graph.explicit_solver import optimize as optimize_graph
 from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
+from fgreg.graph.reduced import pm_contributions
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, SoundSpeedPrior, register
+from fgreg.steadiness import default_scales, log_move_odds, logsumexp
 from fgreg.surface import fit_surface
 from fgreg.tracking import Snapshot, TrackContext, fast_track
 from fgreg.verdict import (
@@ -50,6 +52,7 @@ from fgreg.verdict import (
     sweeps,
     too_few_to_tell,
     understated_noise,
+    unsteady,
     verdict_of,
 )
 
@@ -118,7 +121,8 @@ def solve(
         *sampling(posterior.effective),
         *_variable_conditions(centred, sound_speed_prior, config),
     ]
-    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
+    steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
+    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common, steady)
     context = track_context(centred, posterior, model, config, readout.origin_shift_mm)
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = Snapshot.from_context(context, refused=refused) if tracks else None
@@ -249,8 +253,12 @@ def _judge_epochs(
     model: SessionModel,
     config: SolveConfig,
     common: Sequence[Condition],
+    steady: Mapping[int, Sequence[Condition]],
 ) -> tuple[tuple[EpochEstimate, ...], list[Condition]]:
-    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several)."""
+    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several).
+
+    ``steady``: conditions of each epoch that were found at the optimum.
+    """
     several = len(measurements.epochs) > 1
     out: list[EpochEstimate] = []
     reasons: list[Condition] = []
@@ -264,7 +272,7 @@ def _judge_epochs(
             out.append(EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None))
         else:
             place = registration.epochs.index(k)
-            found = _epoch_conditions(registration, pairs, k, model, config)
+            found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
             tre = predicted_tre(posterior, place, model.targets_mm)
             found.extend(accuracy(tre, config, causes_of_error(registration, place, model.targets_mm)))
             block = slice(6 * place, 6 * place + 6)
@@ -311,6 +319,22 @@ def _epoch_conditions(
             found.extend(spread(directions, points, config))
         found.extend(sweeps(mine, config))
     return found
+
+
+def _steadiness(registration: Registration, place: int) -> list[Condition]:
+    """Whether the PMs kept of one epoch fit one registration, before and after as well."""
+    problem, optimum = registration.problem, registration.optimum
+    mine = np.unique(problem.beam_pm[problem.beam_epoch == place])
+    t_s = {pair.pm: pair.t for pair in reversed(registration.measurements.pairs)}
+    mine = mine[np.argsort([t_s[problem.pms[pm]] for pm in mine], kind="stable")]
+    if len(mine) < 2:
+        return []
+    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
+    pose = slice(6 * place, 6 * place + 6)
+    scales = default_scales()
+    log = log_move_odds(parts.hessian[mine], -parts.gradient[mine], registration.covariance, scales, pose)
+    after = 1 + int(np.argmax(log[1:]))
+    return unsteady(float(logsumexp(log[1:])), problem.pms[mine[after - 1]], problem.pms[mine[after]])
 
 
 def _junk_conditions(registration: Registration, place: int) -> list[Condition]:

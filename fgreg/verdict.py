@@ -15,6 +15,7 @@ from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.measurements import Pair
 from fgreg.registration import EpochSearch, Registration
 from fgreg.robust import JUNK_P
+from fgreg.steadiness import ALARM
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
@@ -187,6 +188,23 @@ def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names:
             Verdict.REFUSED if nis[worst] > CERTAIN_NIS else Verdict.WARNING,
             f"{names[worst]} does not fit the others (nis {nis[worst]:.1f}), and {int(kept.sum())} are too few to tell "
             "which is wrong: take more, and look at what was detected there",
+        )
+    ]
+
+
+def unsteady(log_odds: float, before: int, after: int) -> list[Condition]:
+    """Odds of a camera move among the pairs (fgreg.steadiness), likeliest between two PMs: no registration is of both.
+
+    What they are registered to lies anywhere between, and the predicted error does not know.
+    """
+    if log_odds <= ALARM:
+        return []
+    return [
+        Condition(
+            Verdict.REFUSED,
+            f"the pairs up to PM {before} and those from PM {after} do not fit one registration (odds "
+            f"{math.exp(min(log_odds, 20.0)):.2g} to 1): if the camera was moved between them, tell it (camera_moved) "
+            "or solve with --detect-moves; where it was not, look at what was detected there",
         )
     ]
 

@@ -29,7 +29,6 @@ from fgreg.online.moves import (
     MoveSettings,
     MoveTest,
     check_for_move,
-    logsumexp,
     quick_score,
     relinearisation,
 )
@@ -50,6 +49,7 @@ from fgreg.online.white import (
 from fgreg.online.window import Bundle, Group, Window
 from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import pm_degrees_of_freedom
+from fgreg.steadiness import logsumexp
 
 LAST = 15
 """Last PMs among which a move is looked for."""
