@@ -23,14 +23,13 @@ from fgreg.frames import FloatArray
 from fgreg.graph.explicit import GraphOptions, build_graph
 from fgreg.graph.explicit_solver import optimize as optimize_graph
 from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
-from fgreg.graph.reduced import pm_contributions
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, SoundSpeedPrior, register
-from fgreg.steadiness import default_scales, log_move_odds, logsumexp
+from fgreg.steadiness import logsumexp, odds_in_epoch
 from fgreg.surface import fit_surface
 from fgreg.tracking import Snapshot, TrackContext, fast_track
 from fgreg.verdict import (
@@ -323,18 +322,11 @@ def _epoch_conditions(
 
 def _steadiness(registration: Registration, place: int) -> list[Condition]:
     """Whether the PMs kept of one epoch fit one registration, before and after as well."""
-    problem, optimum = registration.problem, registration.optimum
-    mine = np.unique(problem.beam_pm[problem.beam_epoch == place])
-    t_s = {pair.pm: pair.t for pair in reversed(registration.measurements.pairs)}
-    mine = mine[np.argsort([t_s[problem.pms[pm]] for pm in mine], kind="stable")]
-    if len(mine) < 2:
+    pms, log = odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
+    if not len(log):
         return []
-    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
-    pose = slice(6 * place, 6 * place + 6)
-    scales = default_scales()
-    log = log_move_odds(parts.hessian[mine], -parts.gradient[mine], registration.covariance, scales, pose)
-    after = 1 + int(np.argmax(log[1:]))
-    return unsteady(float(logsumexp(log[1:])), problem.pms[mine[after - 1]], problem.pms[mine[after]])
+    best = int(np.argmax(log))
+    return unsteady(float(logsumexp(log)), pms[best], pms[best + 1])
 
 
 def _junk_conditions(registration: Registration, place: int) -> list[Condition]:

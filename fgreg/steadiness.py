@@ -17,7 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.frames import FloatArray
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced import pm_contributions
+from fgreg.graph.reduced_solver import Optimum
 
+DOUBT = 2.5
+"""Log of that sum from which a move is to be reckoned with."""
 ALARM = 5.4
 """Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and more than one odd pair has."""
 
@@ -78,6 +83,23 @@ def log_move_odds(
     across = hessian[:, pose, :]
     information = across[:, :, pose] - across @ covariance @ np.swapaxes(across, -1, -2)
     return logsumexp(_log_factors(scales.covariance, information, pull) + np.log(scales.share), axis=1)
+
+
+def odds_in_epoch(
+    problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
+) -> tuple[tuple[int, ...], FloatArray]:
+    """A registration's own odds: the PMs of one epoch in the order of the problem, which is that of time, and
+    :func:`log_move_odds` (n - 1,) of a move before each but the first.
+
+    Args:
+        problem: of the PMs that count. optimum: one hypothesis. covariance: (D, D) there.
+        epoch: of ``problem.columns``.
+    """
+    mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
+    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
+    pose = slice(6 * epoch, 6 * epoch + 6)
+    log = log_move_odds(parts.hessian[mine], -parts.gradient[mine], covariance, default_scales(), pose)
+    return tuple(problem.pms[pm] for pm in mine), log[1:]
 
 
 def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:

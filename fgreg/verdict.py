@@ -15,7 +15,7 @@ from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.measurements import Pair
 from fgreg.registration import EpochSearch, Registration
 from fgreg.robust import JUNK_P
-from fgreg.steadiness import ALARM
+from fgreg.steadiness import ALARM, DOUBT
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
@@ -197,14 +197,15 @@ def unsteady(log_odds: float, before: int, after: int) -> list[Condition]:
 
     What they are registered to lies anywhere between, and the predicted error does not know.
     """
-    if log_odds <= ALARM:
+    if log_odds <= DOUBT:
         return []
+    verdict, word = (Verdict.REFUSED, "do") if log_odds > ALARM else (Verdict.WARNING, "may")
     return [
         Condition(
-            Verdict.REFUSED,
-            f"the pairs up to PM {before} and those from PM {after} do not fit one registration (odds "
-            f"{math.exp(min(log_odds, 20.0)):.2g} to 1): if the camera was moved between them, tell it (camera_moved) "
-            "or solve with --detect-moves; where it was not, look at what was detected there",
+            verdict,
+            f"the pairs up to PM {before} and those from PM {after} {word} not fit one registration "
+            f"(odds {math.exp(min(log_odds, 20.0)):.0f} to 1): if the camera was moved between them, tell it "
+            "(camera_moved) or solve with --detect-moves; where it was not, take more pairs",
         )
     ]
 

@@ -17,13 +17,14 @@ from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.evidence import GATE, LAST, MIN_BEFORE, Tested, size_of
+from fgreg.online.evidence import LAST, MIN_BEFORE, Tested, size_of
 from fgreg.online.moves import MoveSettings, check_for_move, quick_score, relinearisation
 from fgreg.online.state import Setting, State, kept_by_place
 from fgreg.online.store import MeasurementStore
 from fgreg.online.white import Gaussian, linearise, pose_columns
 from fgreg.registration import Registration, SoundSpeedPrior, pack_session, register
 from fgreg.robust import plausible_cost
+from fgreg.steadiness import DOUBT, logsumexp, odds_in_epoch
 
 LEAST_AFTER = 7
 """PMs after a move that have to agree on a registration of their own: one more than it takes."""
@@ -65,7 +66,7 @@ def early_case(state: State, setting: Setting, store: MeasurementStore, settings
         problem = setting.pack((), [pair for pm in pms for pair in pm])
         posterior = Gaussian(np.zeros(setting.columns.size), window.covariance)
         terms = linearise(problem, window.state)
-        if quick_score(posterior, terms, settings.scales, pose_columns(0)) < GATE:
+        if quick_score(posterior, terms, settings.scales, pose_columns(0)) < DOUBT:
             return None
     return EarlyCase(pms, tuple(mine[0] for mine in looks.values()), early, tuple(store.aims))
 
@@ -98,8 +99,9 @@ def early_test(
 
 
 def _is_sound(found: Registration) -> bool:
-    """Whether the PMs of a registration agree, and on one only."""
+    """Whether the PMs of a registration agree, on one only, and the first of them with the last."""
     shots = found.shots
     deviates = bool((shots.pm_deviant & shots.pm_kept).any()) or shots.pm_kept.sum() < LEAST_AFTER
     plausible = float(found.optimum.evaluation.cost[0]) <= plausible_cost(found.problem)
-    return plausible and not deviates and not found.ambiguous
+    steady = logsumexp(odds_in_epoch(found.problem, found.optimum, found.covariance, 0)[1]) <= DOUBT
+    return plausible and not deviates and not found.ambiguous and bool(steady)
