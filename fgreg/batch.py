@@ -326,7 +326,7 @@ def _steadiness(registration: Registration, place: int) -> list[Condition]:
     if not len(log):
         return []
     best = int(np.argmax(log))
-    return unsteady(float(logsumexp(log)), pms[best], pms[best + 1])
+    return unsteady(float(logsumexp(log)), pms[best], pms[best + 1], len(pms))
 
 
 def _junk_conditions(registration: Registration, place: int) -> list[Condition]:

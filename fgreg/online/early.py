@@ -17,7 +17,7 @@ from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.evidence import LAST, MIN_BEFORE, Tested, size_of
+from fgreg.online.evidence import Tested, size_of
 from fgreg.online.moves import MoveSettings, check_for_move, quick_score, relinearisation
 from fgreg.online.state import Setting, State, kept_by_place
 from fgreg.online.store import MeasurementStore
@@ -25,11 +25,10 @@ from fgreg.online.white import Gaussian, linearise, pose_columns
 from fgreg.registration import Registration, SoundSpeedPrior, pack_session, register
 from fgreg.robust import plausible_cost
 from fgreg.steadiness import DOUBT, logsumexp, odds_in_epoch
+from fgreg.verdict import FEW_PMS
 
 LEAST_AFTER = 7
 """PMs after a move that have to agree on a registration of their own: one more than it takes."""
-MOST_PMS = LAST + MIN_BEFORE
-"""PMs of an epoch up to which its first ones are looked at: later they are few beside the others, and left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,14 +51,14 @@ def early_case(state: State, setting: Setting, store: MeasurementStore, settings
     """The case for the test; None where it is not the time for one, or nothing to it by the cheap look."""
     window = None if state.is_open else state.window
     known = 0 if window is None else len(window.groups) + state.now.shelf.counts[1]
-    if state.epoch_pairs <= LEAST_AFTER or known > MOST_PMS:
+    if state.epoch_pairs <= LEAST_AFTER or known > FEW_PMS:
         return None
     looks: dict[int, list[int]] = {}
     for place in range(state.now.first, state.pairs):
         looks.setdefault(store.number(place), []).append(place)
     size = 0 if window is None else size_of(state, window)
     early = min(len(looks) - size - 1, len(looks) - LEAST_AFTER)
-    if early < 1 or len(looks) > MOST_PMS:
+    if early < 1 or len(looks) > FEW_PMS:
         return None
     pms = tuple(tuple(store.pair(place, 0, n) for place in mine) for n, mine in enumerate(looks.values()))
     if window is not None and kept_by_place(state)[state.now.first :].all():
