@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, SoundSpeedPrior, register
+from fgreg.steadiness import logsumexp, odds_in_epoch
 from fgreg.surface import fit_surface
 from fgreg.tracking import Snapshot, TrackContext, fast_track
 from fgreg.verdict import (
@@ -50,6 +51,7 @@ from fgreg.verdict import (
     sweeps,
     too_few_to_tell,
     understated_noise,
+    unsteady,
     verdict_of,
 )
 
@@ -118,7 +120,8 @@ def solve(
         *sampling(posterior.effective),
         *_variable_conditions(centred, sound_speed_prior, config),
     ]
-    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common)
+    steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
+    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common, steady)
     context = track_context(centred, posterior, model, config, readout.origin_shift_mm)
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = Snapshot.from_context(context, refused=refused) if tracks else None
@@ -249,8 +252,12 @@ def _judge_epochs(
     model: SessionModel,
     config: SolveConfig,
     common: Sequence[Condition],
+    steady: Mapping[int, Sequence[Condition]],
 ) -> tuple[tuple[EpochEstimate, ...], list[Condition]]:
-    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several)."""
+    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several).
+
+    ``steady``: conditions of each epoch that were found at the optimum.
+    """
     several = len(measurements.epochs) > 1
     out: list[EpochEstimate] = []
     reasons: list[Condition] = []
@@ -264,7 +271,7 @@ def _judge_epochs(
             out.append(EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None))
         else:
             place = registration.epochs.index(k)
-            found = _epoch_conditions(registration, pairs, k, model, config)
+            found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
             tre = predicted_tre(posterior, place, model.targets_mm)
             found.extend(accuracy(tre, config, causes_of_error(registration, place, model.targets_mm)))
             block = slice(6 * place, 6 * place + 6)
@@ -311,6 +318,15 @@ def _epoch_conditions(
             found.extend(spread(directions, points, config))
         found.extend(sweeps(mine, config))
     return found
+
+
+def _steadiness(registration: Registration, place: int) -> list[Condition]:
+    """Whether the PMs kept of one epoch fit one registration, before and after as well."""
+    pms, log = odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
+    if not len(log):
+        return []
+    best = int(np.argmax(log))
+    return unsteady(float(logsumexp(log)), pms[best], pms[best + 1], len(pms))
 
 
 def _junk_conditions(registration: Registration, place: int) -> list[Condition]:

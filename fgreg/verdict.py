@@ -15,6 +15,7 @@ from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.measurements import Pair
 from fgreg.registration import EpochSearch, Registration
 from fgreg.robust import JUNK_P
+from fgreg.steadiness import ALARM, DOUBT
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
@@ -35,6 +36,8 @@ MILD_JUNK = 0.1
 """Junk is mostly farther off than this; so large a share is not."""
 MOST_SOUND_SPEED = 0.1
 """No medium is farther off than this: the cause is another."""
+FEW_PMS = 21
+"""PMs up to which those before a camera move are enough to spoil a registration, and have to be looked for there."""
 SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
@@ -187,6 +190,25 @@ def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names:
             Verdict.REFUSED if nis[worst] > CERTAIN_NIS else Verdict.WARNING,
             f"{names[worst]} does not fit the others (nis {nis[worst]:.1f}), and {int(kept.sum())} are too few to tell "
             "which is wrong: take more, and look at what was detected there",
+        )
+    ]
+
+
+def unsteady(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
+    """Odds of a camera move among ``pms`` PMs (fgreg.steadiness), likeliest between two: no registration is of both.
+
+    What they are registered to then lies anywhere between, and the predicted error does not know. Among few PMs so few
+    are odd by chance that smaller odds count; among many the wrong ones are left out, or found by --detect-moves.
+    """
+    few, alarm = pms <= FEW_PMS, log_odds > ALARM
+    if not (alarm or (few and log_odds > DOUBT)):
+        return []
+    return [
+        Condition(
+            Verdict.REFUSED if few and alarm else Verdict.WARNING,
+            f"the pairs up to PM {before} and those from PM {after} {'do' if alarm else 'may'} not fit one "
+            f"registration (odds {math.exp(min(log_odds, 20.0)):.0f} to 1): if the camera was moved between them, "
+            "tell it (camera_moved) or solve with --detect-moves; where it was not, take more pairs",
         )
     ]
 

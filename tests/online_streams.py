@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from fgreg.config import SolveConfig
+from fgreg.frames import FloatArray, inverse
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineEvent, OnlineRegistration
 from fgreg.posterior import pose_tangent
 from fgreg.registration import Registration, register
+from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
 
 def events(measurements: Measurements) -> Iterator[OnlineEvent]:
@@ -52,3 +54,23 @@ def sigmas_apart(found: Registration, estimate: OnlineEstimate) -> float:
     covariance = found.covariance[6 * place : 6 * place + 6, 6 * place : 6 * place + 6]
     tangent = pose_tangent(found.optimum.state.trus_T_camera(place)[0], estimate.optimum_trus_T_camera)
     return float(np.sqrt(tangent @ np.linalg.solve(covariance, tangent)))
+
+
+def untold_move(
+    seed: int, motion: FloatArray, after: int, before: int
+) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
+    """Pairs before and after a motion, all told to be of epoch 0."""
+    rng = np.random.default_rng(seed)
+    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
+    again = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 1])  # so that both have one window edge
+    model, first, truth = make_measurements(
+        again[0], aims=12, pairs=before, marker_T_laser=beam, trus_T_camera=trus_T_camera
+    )
+    _, second, moved = make_measurements(
+        again[1], aims=0, pairs=after, marker_T_laser=beam, trus_T_camera=trus_T_camera @ inverse(motion)
+    )
+    t = first.pairs[-1].t
+    later = tuple(
+        replace(p, t=p.t + t, pm=p.pm + before, marker=replace(p.marker, id=p.marker.id + 1000)) for p in second.pairs
+    )
+    return model, replace(first, pairs=first.pairs + later), (truth, moved)

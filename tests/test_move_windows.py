@@ -18,10 +18,11 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.moves import MoveSettings, check_for_move, default_scales, quick_score
+from fgreg.online.moves import MoveSettings, check_for_move, quick_score
 from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, add_terms, linearise, pivot_scale, pose_columns, whiten
 from fgreg.registration import pack_session
 from fgreg.robust import pm_degrees_of_freedom
+from fgreg.steadiness import default_scales
 from tests.epoch_follower import EpochFollower, summarise_aims
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 

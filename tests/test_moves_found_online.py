@@ -12,7 +12,7 @@ import pytest
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
+from fgreg.frames import FloatArray, exp_so3, make_transform
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags, evidence
@@ -23,37 +23,18 @@ from fgreg.online.detect import events_in_order, find_moves, split_epochs
 from fgreg.online.evidence import MoveCase
 from fgreg.online.numbers import Sink, Source
 from fgreg.targets import tre_mm
-from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
+from tests.forward import Truth, make_measurements
+from tests.online_streams import untold_move
 
 BEFORE = 12
 SHIFT = make_transform(np.eye(3), 8.0 * np.array([0.6, -0.8, 0.0]))
 TAG_SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.3])
 
 
-def _session(
-    seed: int, motion: FloatArray, after: int, before: int = BEFORE
-) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """Pairs before and after a motion, all told to be of epoch 0."""
-    rng = np.random.default_rng(seed)
-    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
-    again = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 1])  # so that both have one window edge
-    model, first, truth = make_measurements(
-        again[0], aims=12, pairs=before, marker_T_laser=beam, trus_T_camera=trus_T_camera
-    )
-    _, second, moved = make_measurements(
-        again[1], aims=0, pairs=after, marker_T_laser=beam, trus_T_camera=trus_T_camera @ inverse(motion)
-    )
-    t = first.pairs[-1].t
-    later = tuple(
-        replace(p, t=p.t + t, pm=p.pm + before, marker=replace(p.marker, id=p.marker.id + 1000)) for p in second.pairs
-    )
-    return model, replace(first, pairs=first.pairs + later), (truth, moved)
-
-
 @cache
 def _ran(seed: int) -> tuple[SessionModel, Measurements, tuple[Truth, Truth], OnlineRegistration]:
     """A session with an untold move, and the engine that went through it: to look at only."""
-    model, measurements, truths = _session(seed, SHIFT, 8)
+    model, measurements, truths = untold_move(seed, SHIFT, 8, BEFORE)
     engine = OnlineRegistration(model, judge=None)
     for _, event in events_in_order(measurements):
         engine.add(event)
@@ -105,7 +86,7 @@ def test_online_and_batch_find_the_same_moves_and_epochs(seed: int) -> None:
 
 
 def test_switched_off_nothing_is_found() -> None:
-    model, measurements, _ = _session(3, SHIFT, 4)
+    model, measurements, _ = untold_move(3, SHIFT, 4, BEFORE)
     engine = OnlineRegistration(model, judge=None, watch=None)
     for _, event in events_in_order(measurements):
         assert engine.add(event).epoch == 0
@@ -136,7 +117,7 @@ def test_a_steady_stream_raises_no_alarm_and_mostly_needs_no_proper_test(monkeyp
 
 
 def test_pairs_set_aside_as_junk_before_the_alarm_come_back_with_it() -> None:
-    model, measurements, _ = _session(4, make_transform(np.eye(3), np.array([0.0, 14.0, 0.0])), 10)
+    model, measurements, _ = untold_move(4, make_transform(np.eye(3), np.array([0.0, 14.0, 0.0])), 10, BEFORE)
     engine = OnlineRegistration(model, judge=None)
     odd = []
     for index, event in events_in_order(measurements):
@@ -160,7 +141,7 @@ def test_one_gross_outlier_is_no_move() -> None:
 
 
 def test_until_the_new_epoch_is_good_enough_the_verdict_says_so_and_queries_are_not_answered() -> None:
-    model, measurements, _ = _session(3, SHIFT, 10)
+    model, measurements, _ = untold_move(3, SHIFT, 10, BEFORE)
     engine = OnlineRegistration(model)
     events = [event for _, event in events_in_order(measurements)]
     steady = len(measurements.aims) + BEFORE
@@ -182,7 +163,7 @@ def test_until_the_new_epoch_is_good_enough_the_verdict_says_so_and_queries_are_
 def test_where_the_pairs_cannot_be_reassigned_the_old_registration_is_not_trusted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    model, measurements, _ = _session(3, SHIFT, 4)
+    model, measurements, _ = untold_move(3, SHIFT, 4, BEFORE)
     engine = OnlineRegistration(model, judge=None)
 
     def fails(*_: object) -> None:
@@ -197,7 +178,7 @@ def test_where_the_pairs_cannot_be_reassigned_the_old_registration_is_not_truste
 
 
 def test_a_test_that_fails_is_told_and_the_estimate_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, measurements, _ = _session(3, SHIFT, 4)
+    model, measurements, _ = untold_move(3, SHIFT, 4, BEFORE)
 
     def fails(*_: object) -> None:
         raise ZeroDivisionError("a defect")
@@ -211,7 +192,7 @@ def test_a_test_that_fails_is_told_and_the_estimate_goes_on(monkeypatch: pytest.
 
 
 def test_a_look_that_fails_does_not_undo_the_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, measurements, _ = _session(3, SHIFT, 1)
+    model, measurements, _ = untold_move(3, SHIFT, 1, BEFORE)
 
     def fails(*_: object) -> None:
         raise np.linalg.LinAlgError("singular")
@@ -225,7 +206,7 @@ def test_a_look_that_fails_does_not_undo_the_pair(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_watch_in_a_process_finds_the_same_move() -> None:
-    model, measurements, _ = _session(3, SHIFT, 10)
+    model, measurements, _ = untold_move(3, SHIFT, 10, BEFORE)
     with OnlineRegistration(model, judge=None, watch="process") as engine:
         for index, event in events_in_order(measurements):
             engine.add(event)
@@ -265,7 +246,7 @@ class _Tags:
 
 def _with_tags(seed: int, pairs: int) -> tuple[OnlineRegistration, Measurements, _Tags, tuple[Truth, Truth], float]:
     """An engine after a steady epoch in which tags were seen."""
-    model, measurements, truth = _session(seed, SHIFT, pairs)
+    model, measurements, truth = untold_move(seed, SHIFT, pairs, BEFORE)
     engine, tags = OnlineRegistration(model, judge=None), _Tags(seed)
     t = 0.0
     for index, event in events_in_order(measurements):
@@ -375,7 +356,7 @@ def test_moves_found_before_are_taken_from_the_record_when_catching_up() -> None
 
 
 def test_what_was_found_out_is_taken_up_again_with_the_engine() -> None:
-    model, measurements, _ = _session(3, SHIFT, 14)
+    model, measurements, _ = untold_move(3, SHIFT, 14, BEFORE)
     unbroken, engine = OnlineRegistration(model, judge=None), OnlineRegistration(model, judge=None)
     resumed = 0
     for _, event in events_in_order(measurements):

@@ -9,7 +9,7 @@ import pytest
 from fgreg.drivers.base import Said
 from fgreg.estimate import Verdict
 from fgreg.motion.limits import MotionKind
-from fgreg.operation.conductor import ConductorSettings, Stage
+from fgreg.operation.conductor import Conductor, ConductorSettings, Stage
 from fgreg.operation.view import Ask, Follow, Halt, Sweep, TakePairs
 from fgreg.simulation.room import Room, room_config
 from tests.rehearsal import Rehearsal
@@ -135,6 +135,36 @@ def test_after_a_told_move_it_searches_again_and_halts_first(whole: Rehearsal) -
     assert any(isinstance(a, Ask) and a.kind is MotionKind.SEARCH for a in after)
     assert any(isinstance(a, TakePairs) for a in after)
     assert whole.conductor.stage is Stage.COLLECTING
+
+
+def test_an_epoch_that_stays_refused_is_told_with_what_helps() -> None:
+    session = rehearsal(aims=0)  # without a beam nothing can be registered
+    session.conductor = Conductor(
+        session.model, ConductorSettings(aims=0, pms=2, most_pms=2, hearing_threshold=session.threshold)
+    )
+    while session.now_s < 200.0 and sum(isinstance(a, TakePairs) for _, a in session.asked) < 5:
+        session.run(1.0)
+    told = [tell.text for _, tell in session.told if "say so (moved)" in tell.text]
+    assert [text.split()[0] for text in told] == ["2", "4"]
+    assert all("no registration of this camera epoch" in text for text in told)
+
+
+def test_a_bump_after_few_pms_ends_in_following_all_the_same() -> None:
+    session = rehearsal(4)
+    settings = ConductorSettings(aims=8, pms=8, most_pms=9, hearing_threshold=session.threshold)
+    session.conductor = Conductor(session.model, settings)
+    while sum(isinstance(a, TakePairs) for _, a in session.asked) < 2:
+        session.run(0.5)
+    bumped_s = session.now_s
+    session.room.bump(bumped_s)
+    while session.conductor.stage is not Stage.FOLLOWING and session.now_s < bumped_s + 400.0:
+        session.run(1.0)
+    assert session.conductor.stage is Stage.FOLLOWING
+    assert session.engine.moves
+    estimate = session.engine.estimate
+    assert estimate.epoch == len(session.engine.moves)
+    assert estimate.predicted_tre is not None
+    assert session.error_mm() < max(2.0, 1.5 * estimate.predicted_tre.worst_mm)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform
-from fgreg.online.moves import default_scales
 from fgreg.online.tags import (
     TagFrame,
     TagPose,
@@ -20,6 +19,7 @@ from fgreg.online.tags import (
     tag_motion,
     watch_tags,
 )
+from fgreg.steadiness import default_scales
 
 SIGMA = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.8])
 COVARIANCE = np.diag(SIGMA**2)

@@ -12,10 +12,11 @@ from scipy.stats import multivariate_normal
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.measurements import Measurements
-from fgreg.online.moves import MoveScales, MoveSettings, MoveTest, check_for_move, default_scales
+from fgreg.online.moves import MoveSettings, MoveTest, check_for_move
 from fgreg.online.white import Gaussian, WhiteTerms
 from fgreg.registration import pack_session, register
 from fgreg.robust import JUNK_DENSITY
+from fgreg.steadiness import MoveScales, default_scales
 from tests.epoch_follower import EpochFollower, summarise_aims
 from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
 

@@ -1,6 +1,6 @@
 """Simulated streams with a camera move in them, and what an ideal estimator could know of them.
 
-For tools/study_moves.py and tools/study_returns.py. Poses with the documented noise (tests.forward).
+For tools/study_moves.py, study_early_moves.py and study_returns.py. Poses with the documented noise (tests.forward).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import math
 import os
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +26,12 @@ from fgreg.targets import target_jacobians
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 
-from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
+from tests.forward import Truth, make_measurements, make_session, random_marker_T_laser, random_trus_T_camera
 
 CONFIG = SolveConfig()
 MANY_AIMS = 150
+MIDDLE_MM = np.array([0.0, 0.0, 42.0])
+"""Of the tissue, TRUS."""
 
 
 def random_direction(rng: np.random.Generator) -> FloatArray:
@@ -43,18 +46,36 @@ def shift_of(rng: np.random.Generator, mm: float, degrees: float) -> FloatArray:
     return make_transform(exp_so3(math.radians(degrees) * random_direction(rng)), np.zeros(3))
 
 
+def bump_of(seed: int, sigma_mm: float, sigma_rad: float) -> FloatArray:
+    """camera_new_T_camera_old for :func:`two_epochs` of that seed: a turn about the tissue's middle and a shift.
+
+    Sigmas per axis, as fgreg.simulation.room draws them.
+    """
+    trus_T_camera, rng = random_trus_T_camera(np.random.default_rng(seed)), np.random.default_rng([seed, 6])
+    turn = exp_so3(rng.normal(0.0, sigma_rad, 3))
+    move = make_transform(turn, MIDDLE_MM - turn @ MIDDLE_MM + rng.normal(0.0, sigma_mm, 3))
+    return np.asarray(inverse(move @ trus_T_camera) @ trus_T_camera)
+
+
 def two_epochs(
-    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool, told: bool = False
+    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool, told: bool = False, looks: int = 1
 ) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """Pairs before and after a motion; same beam and window edge. ``told``: as epochs 0 and 1, else all as epoch 0."""
+    """PMs before and after a motion; same beam and window edge. ``told``: as epochs 0 and 1, else all as epoch 0.
+
+    With several ``looks`` at each PM they are 2 deg apart, with amplitudes, and share a marker observation.
+    """
     rng = np.random.default_rng(seed)
     trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
-    model, first, truth = make_measurements(
+    make = make_measurements if looks == 1 else partial(
+        make_measurements, session=make_session(curve=True), looks_per_pm=looks, share_marker=True,
+        look_spacing_deg=2.0, amplitude_noise=0.05,
+    )  # fmt: skip
+    model, first, truth = make(
         np.random.default_rng([seed, 1]), aims=12, pairs=before, first_hit=first_hit, marker_T_laser=beam,
         trus_T_camera=trus_T_camera,
     )  # fmt: skip
     # The same seed draws the same window edge; without aims all that follows is drawn anew.
-    _, second, moved = make_measurements(
+    _, second, moved = make(
         np.random.default_rng([seed, 1]), aims=0, pairs=after, first_hit=first_hit, marker_T_laser=beam,
         trus_T_camera=trus_T_camera @ inverse(motion),
     )  # fmt: skip

@@ -5,12 +5,13 @@ The window holds the last pairs one by one, and beside them the summary of every
 nothing has to be followed twice. The cheap look uses the rows that every pair came with (fgreg.online.window.Prepared):
 :func:`fgreg.online.moves.quick_score`, exact where nothing is odd and the windows are Gaussian.
 
-A registration takes :data:`MIN_BEFORE` PMs: a move before that many of an epoch are in cannot be noticed by its pairs,
-and makes those few contradict each other, which the verdict tells.
+A registration takes :data:`MIN_BEFORE` PMs: a move before that many of an epoch are in, or before the window, is for
+the test from the other end (fgreg.online.early).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,6 +49,7 @@ from fgreg.online.white import (
 from fgreg.online.window import Bundle, Group, Window
 from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import pm_degrees_of_freedom
+from fgreg.steadiness import logsumexp
 
 LAST = 15
 """Last PMs among which a move is looked for."""
@@ -216,9 +218,25 @@ def proper_test(
     )
 
 
-def found_by(case: MoveCase, test: MoveTest | None) -> MoveFound | None:
-    """The alarm that a test raises, if it does."""
-    if test is None or not test.alarm:
+@dataclass(frozen=True, slots=True, eq=False)
+class Tested:
+    """A test's outcome, and the place of the first pair after each of the moves that it looked for."""
+
+    test: MoveTest
+    places: tuple[int, ...]
+
+
+def tested_last(case: MoveCase, test: MoveTest | None) -> Tested | None:
+    """The proper test's outcome with its pairs."""
+    if test is None:
         return None
-    first = min(case.bundles[len(case.bundles) - case.size + test.since].places)
-    return MoveFound(case.epoch, first, float(test.log_bayes[test.since]), test.score)
+    return Tested(test, tuple(min(bundle.places) for bundle in case.bundles[-case.size :]))
+
+
+def found_by(epoch: int, tests: Sequence[Tested], threshold: float) -> MoveFound | None:
+    """The alarm that tests for different moves of an epoch raise together, if they do."""
+    score = float(logsumexp(np.array([-np.inf, *(tested.test.score for tested in tests)])))
+    if score <= threshold:
+        return None
+    best = max(tests, key=lambda tested: tested.test.log_bayes[tested.test.since])
+    return MoveFound(epoch, best.places[best.test.since], float(best.test.log_bayes[best.test.since]), score)

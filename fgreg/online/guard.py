@@ -8,6 +8,7 @@ from typing import Literal
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnFound, return_case
+from fgreg.online.early import early_case
 from fgreg.online.events import StaticTags
 from fgreg.online.evidence import GATE, move_case
 from fgreg.online.state import Setting, State
@@ -66,9 +67,10 @@ class MoveGuard:
             move = None
             if self._may_look_moved(state):
                 move, self._score = move_case(state, serial, self._setting, self._settings.moves)
+            early = early_case(state, self._setting, store, self._settings.moves)
             back = return_case(state, self._setting, store, self._settings.returns)
-            if move is not None or back is not None:
-                self._watch.ask(Case(move, back))
+            if move is not None or early is not None or back is not None:
+                self._watch.ask(Case(state.epoch, move, early, back))
             self._failure = ""
         except Exception as error:  # the pair is in the estimate, whatever becomes of the look at it
             self._failure, self._score = f"{type(error).__name__}: {error}", None

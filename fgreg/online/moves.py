@@ -33,6 +33,7 @@ from fgreg.graph.shared_state import SharedState
 from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, linearise
 from fgreg.robust import JUNK_DENSITY
 from fgreg.sensitivity import interval_moments, log_interval
+from fgreg.steadiness import ALARM, MoveScales, default_scales, log_move_odds, logsumexp
 
 BRANCHES = 4
 """Sequences of junk labels carried along per hypothesis."""
@@ -47,54 +48,12 @@ SUSPICION = 2.0
 
 JUNK_PRIOR, JUNK_PRIOR_PAIRS, JUNK_MEMORY = 0.04, 10.0, 50
 """Share of junk expected at first, how many pairs that opinion is worth, and how many pairs back it is learned from."""
-ALARM = 5.4
-"""Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and more than one odd pair has."""
 LEAST_JUNK, MOST_JUNK = 0.01, 0.5
 """However clean the stream: a single odd pair must never pass for a move."""
 
 
-def logsumexp(values: FloatArray, axis: int | None = None) -> FloatArray:
-    """Log of the sum of exponentials; as scipy's, without what that does for arrays of other kinds."""
-    top = np.max(values, axis=axis, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        out = np.log(np.sum(np.exp(values - top), axis=axis, keepdims=True)) + top
-    return np.asarray(out.reshape(()) if axis is None else np.squeeze(out, axis=axis))
-
-
-_SIX = np.arange(6)
 Relinearise = Callable[[FloatArray], WhiteTerms]
 """From steps (S, D) off the base to the same PMs linearised there, steps counted from the base."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MoveScales:
-    """Prior of the move: a mixture of zero-mean Gaussians about the camera, sigmas (K,) rad and mm, shares (K,)."""
-
-    rotation_rad: FloatArray
-    translation_mm: FloatArray
-    share: FloatArray
-
-    def __post_init__(self) -> None:
-        sizes = {len(self.rotation_rad), len(self.translation_mm), len(self.share)}
-        if len(sizes) != 1 or not len(self.share):
-            raise ValueError("scales need as many rotations as translations and shares, at least one")
-        if not (self.share > 0).all() or abs(float(self.share.sum()) - 1.0) > 1e-9:
-            raise ValueError("shares have to be positive and add up to 1")
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(K, 6, 6) of the move's right tangent."""
-        sigma = np.concatenate(
-            [np.repeat(self.rotation_rad[:, None], 3, axis=1), np.repeat(self.translation_mm[:, None], 3, axis=1)], 1
-        )
-        return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
-
-
-def default_scales() -> MoveScales:
-    """A nudge, a shift, a large move, and the camera put back anywhere."""
-    degrees, mm = [0.5, 1.2, 4.0, 10.0, 40.0], [1.0, 2.5, 10.0, 30.0, 120.0]
-    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.25, 0.45, 0.15, 0.1, 0.05]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -409,12 +368,7 @@ def _far(move: FloatArray) -> bool:
 def quick_score(posterior: Gaussian, terms: WhiteTerms, scales: MoveScales, pose: slice) -> float:
     """Log score as of :func:`check_for_move`, but of Gaussians throughout: no junk, no windows, no large moves.
 
-    Exact for these, and next to nothing to compute: with everything known so far (``posterior``, the last pairs in it),
-    a move of prior covariance S before pair j has the Bayes factor
-
-        |1 + S F|^(-1/2) exp(h' (1 + S F)^(-1) S h / 2),
-
-    F the information that the pairs from j on have on the move, the shared variables free, and h their pull.
+    Exact for these, and next to nothing to compute (:func:`fgreg.steadiness.log_move_odds`).
 
     Args:
         posterior: of the shared variables' step, given all pairs and that nothing moved.
@@ -426,30 +380,7 @@ def quick_score(posterior: Gaussian, terms: WhiteTerms, scales: MoveScales, pose
     left = terms.residual[0] + jacobian @ posterior.mean
     hessian = np.swapaxes(jacobian, -1, -2) @ jacobian
     pull = -np.einsum("nqd,nq->nd", jacobian, left)
-    hessian, pull = np.cumsum(hessian[::-1], axis=0)[::-1], np.cumsum(pull[::-1], axis=0)[::-1, pose]
-    across = hessian[:, pose, :]
-    information = across[:, :, pose] - across @ posterior.covariance @ np.swapaxes(across, -1, -2)
-    log = _log_factors(scales.covariance, information, pull)
-    return float(logsumexp(log + np.log(scales.share)))
-
-
-def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:
-    """(n, K) log Bayes factors of moves of prior covariances (K, 6, 6, diagonal), F (n, 6, 6) and h (n, 6)."""
-    root = np.sqrt(prior.diagonal(axis1=1, axis2=2))
-    pulled = pull[:, None] * root
-    bound = np.sum(pulled * pulled, axis=-1) + 1.0
-    bordered = np.empty((len(pull), len(root), 7, 7))
-    bordered[..., :6, :6] = information[:, None] * (root[:, :, None] * root[:, None, :])
-    bordered[..., _SIX, _SIX] += 1.0
-    bordered[..., 6, :6] = bordered[..., :6, 6] = pulled
-    bordered[..., 6, 6] = bound
-    try:  # a third of the time that solving takes; the last pivot is what the form leaves of its bound
-        pivot = np.linalg.cholesky(bordered).diagonal(axis1=-2, axis2=-1)
-    except np.linalg.LinAlgError:  # rows that were linearised elsewhere can say more than is known
-        spread = np.eye(6) + prior @ information[:, None]
-        shrunk = np.linalg.solve(spread, prior @ pull[:, None, :, None])[..., 0]
-        return np.asarray(0.5 * (np.sum(pull[:, None] * shrunk, axis=-1) - np.linalg.slogdet(spread)[1]))
-    return np.asarray(0.5 * (bound - pivot[..., 6] ** 2) - np.log(pivot[..., :6]).sum(axis=-1))
+    return float(logsumexp(log_move_odds(hessian, pull, posterior.covariance, scales, pose)))
 
 
 def relinearisation(problem: PackedProblem, base: SharedState) -> Relinearise:

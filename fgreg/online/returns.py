@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.online.moves import MoveScales, MoveSettings, Relinearise, check_for_move
+from fgreg.online.moves import MoveSettings, Relinearise, check_for_move
 from fgreg.online.tags import TagMotion, log_bayes_of_motion
 from fgreg.online.white import Gaussian, WhiteTerms
+from fgreg.steadiness import MoveScales
 
 SEEN_SIGMAS = 3.0
 """Differences that matter are seen where they are so many standard deviations of the tags' motion."""

@@ -145,6 +145,10 @@ class MeasurementStore:
         """Several pairs, all in one epoch."""
         return tuple(self.pair(index, epoch) for index in indices)
 
+    def number(self, index: int) -> int:
+        """The PM at which a pair was taken."""
+        return self._pm[index]
+
     def time(self, index: int) -> float:
         """When a pair was taken."""
         return float(self._blocks[index // ROWS][index % ROWS, _T])

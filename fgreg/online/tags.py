@@ -19,7 +19,7 @@ from scipy.special import chdtri, logsumexp
 
 from fgreg.frames import BoolArray, FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
 from fgreg.measurements import POSE_FLOOR, usable_covariance
-from fgreg.online.moves import MoveScales
+from fgreg.steadiness import MoveScales
 
 TAG_P = 1e-3
 """A tag that fits a common motion worse than this goes its own way."""

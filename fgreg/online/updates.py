@@ -22,6 +22,7 @@ from fgreg.online.sorting import (
 )
 from fgreg.online.state import (
     NEAR_PAIRS,
+    NOTHING,
     RECENT,
     SETTLED_FEW,
     SETTLED_MANY,
@@ -318,6 +319,10 @@ def _without_last(state: State, first: int, tools: Tools) -> State:
     window, layout, setting = state.window, state.layout, tools.setting
     if window is None or layout is None:
         return state
+    left = {tools.store.number(place) for place in range(state.now.first, first)}
+    if len(left) < tools.config.min_pairs and not state.now.start.motion_known:
+        # What was known was of both sides of the move, and these are too few to know a registration by themselves.
+        return replace(state.with_now(shelf=NOTHING, state=None), window=None)
     columns, shelf = setting.columns, state.now.shelf
     for chunk in state.now.shelf.chunks:
         late = {label for label, places in _places_by_label(chunk.problem, chunk.places) if max(places) >= first}

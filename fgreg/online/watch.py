@@ -15,7 +15,8 @@ from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
 from fgreg.online.beside import Beside
-from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test
+from fgreg.online.early import EarlyCase, early_test
+from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test, tested_last
 from fgreg.online.moves import MoveSettings
 from fgreg.online.returns import ReturnSettings, default_return_settings
 from fgreg.registration import SoundSpeedPrior
@@ -33,9 +34,11 @@ class WatchSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """What is to be tested after a pair; a return is not asked about where the camera has just moved."""
+    """What is to be tested after a pair of an epoch; a return is not asked about where the camera has just moved."""
 
+    epoch: int
     move: MoveCase | None
+    early: EarlyCase | None
     back: ReturnCase | None
 
 
@@ -43,10 +46,12 @@ def tested(
     case: Case, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: WatchSettings
 ) -> Found | None:
     """What the tests of a case find."""
-    if case.move is not None:
-        found = found_by(case.move, proper_test(case.move, model, config, prior, settings.moves))
-        if found is not None:
-            return found
+    of = (model, config, prior, settings.moves)
+    last = None if case.move is None else tested_last(case.move, proper_test(case.move, *of))
+    first = None if case.early is None else early_test(case.early, *of)
+    found = found_by(case.epoch, [test for test in (first, last) if test is not None], settings.moves.threshold)
+    if found is not None:
+        return found
     if case.back is None:
         return None
     return returned_by(case.back, return_tests(case.back, model, config, prior, settings.returns))

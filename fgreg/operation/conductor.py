@@ -23,6 +23,7 @@ from fgreg.operation.view import (
     Follow,
     Halt,
     Heard,
+    Known,
     StageView,
     Sweep,
     TakeAim,
@@ -47,6 +48,11 @@ PATIENCE_S = 6.0
 """A spot at which nothing happens for so long is not worth waiting at."""
 DEAF = 8
 """Pulses in a row that are not heard where they should be before the operator is told."""
+
+
+def _why(known: Known) -> str:
+    """The first reason for a refusal."""
+    return known.reasons[0] if known.reasons else "no registration"
 
 
 class Stage(StrEnum):
@@ -105,6 +111,7 @@ class Conductor:
         self._hunt: Hunt | None = None
         self._done_at: FloatArray | None = None
         self._pms, self._epoch = 0, 0
+        self._told_refused = 0
         self._deaf = 0
         self._wanted: Said | None = None
         self._wanted_s = -math.inf
@@ -127,6 +134,7 @@ class Conductor:
             return tuple(out)
         if view.known.epoch != self._epoch:
             self._epoch, self._pms, self._done_at, self._deaf = view.known.epoch, 0, None, 0
+            self._told_refused = 0
             self._hunt = None
             out.append(Tell("the camera has moved: the registration begins anew"))
         self._advance(view, out)
@@ -201,9 +209,12 @@ class Conductor:
             if self._pms >= enough and self._hunt is None:
                 self.stage = Stage.FOLLOWING
                 out.append(Tell("registered", done=True))
+        elif self.stage is Stage.COLLECTING and self._pms >= self._told_refused + self._settings.most_pms:
+            self._told_refused = self._pms
+            out.append(Tell(f"{self._pms} PMs, and refused: {_why(known)}; if the camera was moved, say so (moved)"))
         elif self.stage is Stage.FOLLOWING and not usable:
-            self.stage, self._pms = Stage.COLLECTING, 0
-            why = known.reasons[0] if known.reasons else "no registration"
+            self.stage, self._pms, self._told_refused = Stage.COLLECTING, 0, 0
+            why = _why(known)
             out += [Halt(f"the registration is refused: {why}"), Tell("hold the fibre at the tissue: registering")]
 
     # --- searching --------------------------------------------------------------------------------------------------

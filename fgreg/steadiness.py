@@ -1,0 +1,121 @@
+"""Whether PMs in a row agree on one registration, or rather on two: odds of a camera move among them, in closed form.
+
+Of Gaussians throughout: no junk, no windows, no large moves. With everything known so far, the last PMs in it, a move
+of prior covariance S before PM j has the Bayes factor
+
+    |1 + S F|^(-1/2) exp(h' (1 + S F)^(-1) S h / 2),
+
+F the information that the PMs from j on have on the move, the shared variables free, and h their pull. Neither side of
+the move has to know a registration by itself. The sum over all j grows by one per PM on average while nothing happens,
+so it seldom passes a threshold (Shiryaev, 1963; Roberts, 1966).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced import pm_contributions
+from fgreg.graph.reduced_solver import Optimum
+
+DOUBT = 2.5
+"""Log of that sum from which a move is to be reckoned with."""
+ALARM = 5.4
+"""Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and more than one odd pair has."""
+
+_SIX = np.arange(6)
+
+
+def logsumexp(values: FloatArray, axis: int | None = None) -> FloatArray:
+    """Log of the sum of exponentials; as scipy's, without what that does for arrays of other kinds."""
+    top = np.max(values, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        out = np.log(np.sum(np.exp(values - top), axis=axis, keepdims=True)) + top
+    return np.asarray(out.reshape(()) if axis is None else np.squeeze(out, axis=axis))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MoveScales:
+    """Prior of the move: a mixture of zero-mean Gaussians about the camera, sigmas (K,) rad and mm, shares (K,)."""
+
+    rotation_rad: FloatArray
+    translation_mm: FloatArray
+    share: FloatArray
+
+    def __post_init__(self) -> None:
+        sizes = {len(self.rotation_rad), len(self.translation_mm), len(self.share)}
+        if len(sizes) != 1 or not len(self.share):
+            raise ValueError("scales need as many rotations as translations and shares, at least one")
+        if not (self.share > 0).all() or abs(float(self.share.sum()) - 1.0) > 1e-9:
+            raise ValueError("shares have to be positive and add up to 1")
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(K, 6, 6) of the move's right tangent."""
+        sigma = np.concatenate(
+            [np.repeat(self.rotation_rad[:, None], 3, axis=1), np.repeat(self.translation_mm[:, None], 3, axis=1)], 1
+        )
+        return np.asarray(sigma[:, :, None] ** 2 * np.eye(6))
+
+
+def default_scales() -> MoveScales:
+    """A nudge, a shift, a large move, and the camera put back anywhere."""
+    degrees, mm = [0.5, 1.2, 4.0, 10.0, 40.0], [1.0, 2.5, 10.0, 30.0, 120.0]
+    return MoveScales(np.radians(degrees), np.array(mm), np.array([0.25, 0.45, 0.15, 0.1, 0.05]))
+
+
+def log_move_odds(
+    hessian: FloatArray, pull: FloatArray, covariance: FloatArray, scales: MoveScales, pose: slice
+) -> FloatArray:
+    """(n,) log Bayes factor of a move before each of n PMs, oldest first, against none.
+
+    Args:
+        hessian, pull: (n, D, D), (n, D) of each PM's half chi square and its negative gradient, at the optimum of all.
+        covariance: (D, D) of the shared variables, given all.
+        scales: prior of the move.
+        pose: columns of the registration.
+    """
+    hessian, pull = np.cumsum(hessian[::-1], axis=0)[::-1], np.cumsum(pull[::-1], axis=0)[::-1, pose]
+    across = hessian[:, pose, :]
+    information = across[:, :, pose] - across @ covariance @ np.swapaxes(across, -1, -2)
+    return logsumexp(_log_factors(scales.covariance, information, pull) + np.log(scales.share), axis=1)
+
+
+def odds_in_epoch(
+    problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
+) -> tuple[tuple[int, ...], FloatArray]:
+    """A registration's own odds: the PMs of one epoch in the order of the problem, which is that of time, and
+    :func:`log_move_odds` (n - 1,) of a move before each but the first.
+
+    Args:
+        problem: of the PMs that count. optimum: one hypothesis. covariance: (D, D) there.
+        epoch: of ``problem.columns``.
+    """
+    mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
+    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
+    pose = slice(6 * epoch, 6 * epoch + 6)
+    log = log_move_odds(parts.hessian[mine], -parts.gradient[mine], covariance, default_scales(), pose)
+    return tuple(problem.pms[pm] for pm in mine), log[1:]
+
+
+def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:
+    """(n, K) log Bayes factors of moves of prior covariances (K, 6, 6, diagonal), F (n, 6, 6) and h (n, 6)."""
+    root = np.sqrt(prior.diagonal(axis1=1, axis2=2))
+    pulled = pull[:, None] * root
+    bound = np.sum(pulled * pulled, axis=-1) + 1.0
+    bordered = np.empty((len(pull), len(root), 7, 7))
+    bordered[..., :6, :6] = information[:, None] * (root[:, :, None] * root[:, None, :])
+    bordered[..., _SIX, _SIX] += 1.0
+    bordered[..., 6, :6] = bordered[..., :6, 6] = pulled
+    bordered[..., 6, 6] = bound
+    try:  # a third of the time that solving takes; the last pivot is what the form leaves of its bound
+        pivot = np.linalg.cholesky(bordered).diagonal(axis1=-2, axis2=-1)
+    except np.linalg.LinAlgError:  # rows that were linearised elsewhere can say more than is known
+        spread = np.eye(6) + prior @ information[:, None]
+        shrunk = np.linalg.solve(spread, prior @ pull[:, None, :, None])[..., 0]
+        return np.asarray(0.5 * (np.sum(pull[:, None] * shrunk, axis=-1) - np.linalg.slogdet(spread)[1]))
+    return np.asarray(0.5 * (bound - pivot[..., 6] ** 2) - np.log(pivot[..., :6]).sum(axis=-1))
