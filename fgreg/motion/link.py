@@ -50,8 +50,8 @@ CLOSE_S = 5.0
 """How long the watchdog may take to bring the stage to rest when it is let go."""
 READINGS = 100
 """Stage angles that are kept, one every 50 ms."""
-SILENT_S = 1.0
-"""A watchdog that says nothing for this long is gone."""
+SILENT_S = 0.8
+"""A watchdog that says nothing for this long is gone: it tells of the stage every 50 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ class StageLink:
             ours.sendall(setup.line())
             link._await_ready(start_s)
         except BaseException:
-            link._abandon()
+            link.abandon()
             raise
         ours.setblocking(False)
         _guard(link)
@@ -229,6 +229,10 @@ class StageLink:
         """Stop now, and let nothing move until :meth:`reset`. From any thread, and where the socket is stuck."""
         self._press()
         self._log(StageRecord(time.monotonic(), "emergency stop", None, reason))
+
+    def latch(self, reason: str) -> None:
+        """Let nothing move until :meth:`reset`, for a reason that is told; the stage is stopped, too."""
+        self._send(Stop(time.monotonic(), True, reason))
 
     def reset(self, by: str) -> None:
         """The operator has looked: motion may be requested again. Refused while the stage moves or is silent."""
@@ -295,7 +299,7 @@ class StageLink:
             self._unlogged.pop(0)
         reports, self._reports = self._reports, []
         if time.monotonic() - self._heard_s > SILENT_S and not reports:
-            raise self._give_up(f"the stage's watchdog has said nothing for {SILENT_S:.0f} s")
+            raise self._give_up(f"the stage's watchdog has said nothing for {SILENT_S} s")
         return reports
 
     def _receive(self) -> list[Report]:
@@ -363,10 +367,16 @@ class StageLink:
             self._process.kill()
             self._process.wait()
 
-    def _abandon(self) -> None:
-        self._let_go()
+    def abandon(self, grace_s: float = 0.0) -> None:
+        """Let go of a watchdog that is gone, or may hang: it is ended, after a moment in which it can still stop."""
+        if not self._closed:
+            self._let_go()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(grace_s)
+            return
         self._process.kill()
-        self._process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # one that the system holds in a call to the device
+            self._process.wait(CLOSE_S)
 
     def _let_go(self) -> None:
         global _links

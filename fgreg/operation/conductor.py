@@ -23,6 +23,7 @@ from fgreg.operation.view import (
     Follow,
     Halt,
     Heard,
+    Release,
     StageView,
     Sweep,
     TakeAim,
@@ -107,6 +108,7 @@ class Conductor:
         self._pms, self._epoch = 0, 0
         self._deaf = 0
         self._wanted: Said | None = None
+        self._latched = ""
         self._wanted_s = -math.inf
         self._waits_s = -math.inf
 
@@ -114,13 +116,13 @@ class Conductor:
         """What to do now."""
         out: list[Action] = []
         for command in view.commands:
-            out += self._obey(command)
+            out += self._obey(command, view)
         if view.known.epoch != self._epoch:
             self._epoch, self._pms, self._done_at, self._deaf = view.known.epoch, 0, None, 0
             self._hunt = None
             out.append(Tell("the camera has moved: the registration begins anew"))
         self._advance(view, out)
-        if any(isinstance(action, Ask | Halt) for action in out):
+        if any(isinstance(action, Ask | Halt | Release) for action in out):
             self._hunt = None
             return tuple(out)  # what the stage is asked for next depends on how it takes that
         if view.stage is not None and self._may_turn(view, view.stage, out):
@@ -135,6 +137,14 @@ class Conductor:
 
     def _may_turn(self, view: View, stage: StageView, out: list[Action]) -> bool:
         """Whether the stage knows its zero and has the operator's request for what comes next; asks where not."""
+        if stage.latched != self._latched:
+            self._latched, self._wanted = stage.latched, None  # told at once, and what it needs after it, too
+            if not stage.latched:
+                out.append(Tell("the stage is free again, and moves once it is asked to"))
+        if stage.latched:
+            text = f"the stage is latched ({stage.latched}): look at it and the probe, and when it may move again"
+            self._want(Said.RESET, text, view.now_s, out)
+            return False
         if not stage.homed:
             self._want(Said.HOME, "the stage has to find its zero position", view.now_s, out)
             return False
@@ -158,7 +168,7 @@ class Conductor:
 
     # --- the session's course ---------------------------------------------------------------------------------------
 
-    def _obey(self, command: Command) -> list[Action]:
+    def _obey(self, command: Command, view: View) -> list[Action]:
         match command.said:
             case Said.HOME:
                 return [Ask(MotionKind.HOME)]
@@ -177,6 +187,10 @@ class Conductor:
             case Said.STOP:
                 self._hunt = None
                 return [Halt("the operator has stopped the stage")]
+            case Said.RESET:
+                if view.stage is not None and view.stage.latched:
+                    return [Release()]
+                return [Tell(f"no reset: the stage is not {'there' if view.stage is None else 'latched'}")]
         return []
 
     def _advance(self, view: View, out: list[Action]) -> None:

@@ -6,11 +6,9 @@ source is located in a process of its own, and a pulse is handed on once the mar
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,9 +20,9 @@ from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
 from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
-from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.drivers.base import PaFrame, StereoFrame
-from fgreg.models import ProbeModel, SessionModel
+from fgreg.models import SessionModel
+from fgreg.operation.locating import Locator
 from fgreg.operation.view import Heard
 from fgreg.pairing import DeviceClock, PairRefused, PoseHistory, TimedPose
 
@@ -32,6 +30,8 @@ POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled anew after so many markers found, over so many."""
 GIVE_UP_S = 0.5
 """A pulse waits for the poses about it no longer than this."""
+TRIES = 2
+"""A frame during which the locating process ended is given to the next one; not for ever: it may be to blame."""
 STOOD_RAD = 0.002
 """The plane stands if it has turned by no more than this about the pulse."""
 
@@ -70,12 +70,13 @@ class Eyes:
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """A pulse under way: its frame until that is looked into, where the plane stood, what is located."""
+    """A pulse under way: its frame until that was looked into, where the plane stood, what is located."""
 
     pulse_s: float
     data: npt.NDArray[Any] | None
     scan_rad: float | None = None
     located: Future[PaFind | NoSignal] | None = None
+    tries: int = 0
 
 
 class Ears:
@@ -83,16 +84,19 @@ class Ears:
 
     Attributes:
         listening: whether anybody wants to know what is heard: locating a source takes time.
-        trouble: why nothing is located any more; empty where it is.
     """
 
     def __init__(self, model: SessionModel) -> None:
-        self._probe: ProbeModel = model.probe
+        self._locator = Locator(model.probe)
         self._clock = DeviceClock()
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
-        self._pool = _pool()
-        self.listening, self.trouble = True, ""
+        self.listening, self._unread = True, ""
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing is located now; empty where it is."""
+        return self._locator.trouble or self._unread
 
     @property
     def waiting(self) -> int:
@@ -112,13 +116,13 @@ class Ears:
     def heard(self, now_s: float, poses: PoseHistory) -> tuple[Heard, ...]:
         """The pulses that are complete, in their order."""
         out = []
+        self._locator.look_after(now_s)
         for pulse in self._waiting:
             self._look_into(pulse, now_s)
         while self._waiting:
             first = self._waiting[0]
             overdue = now_s - first.pulse_s > GIVE_UP_S
-            looked = first.data is None and (first.located is None or first.located.done())
-            if not (looked and (poses.can_tell(first.pulse_s) or overdue)):
+            if first.data is not None or not (poses.can_tell(first.pulse_s) or overdue):
                 break
             self._waiting.popleft()
             out.append(self._complete(first, poses))
@@ -128,17 +132,20 @@ class Ears:
         """Have the source located, once it is known that the plane stood at the pulse; a turning one is of no use."""
         if pulse.data is None:
             return
-        if (not self._planes or self._planes[-1][0] <= pulse.pulse_s) and now_s - pulse.pulse_s < GIVE_UP_S:
+        if pulse.located is None:
+            if (not self._planes or self._planes[-1][0] <= pulse.pulse_s) and now_s - pulse.pulse_s < GIVE_UP_S:
+                return
+            pulse.scan_rad = self._stood(pulse.pulse_s)
+            if pulse.scan_rad is None:
+                pulse.data = None
+                return
+        elif not pulse.located.done():
             return
-        data, pulse.data = pulse.data, None
-        pulse.scan_rad = self._stood(pulse.pulse_s)
-        if pulse.scan_rad is None:
+        elif not _ended_under(pulse.located) or pulse.tries >= TRIES:
+            pulse.data = None
             return
-        try:
-            pulse.located = self._pool.submit(locate_in_frame, data, self._probe)
-        except BrokenProcessPool:
-            self._pool = _pool()
-            self.trouble = "the process that locates sources had ended; it was started again"
+        pulse.tries += 1
+        pulse.located = self._locator.submit(pulse.data)
 
     def _complete(self, pulse: _Waiting, poses: PoseHistory) -> Heard:
         heard = Heard(pulse.pulse_s, pulse.scan_rad)
@@ -151,8 +158,9 @@ class Ears:
         try:
             found = pulse.located.result()
         except Exception as error:  # of one frame: the next one may be as it should
-            self.trouble = f"a frame of the probe could not be looked into: {error}"
-            return heard
+            self._unread = f"a frame of the probe could not be looked into: {error}"
+            return replace(heard, scan_rad=None)  # nobody knows whether anything was heard there
+        self._unread = ""
         if isinstance(found, NoSignal):
             return heard
         return replace(
@@ -172,13 +180,9 @@ class Ears:
 
     def close(self) -> None:
         """End the process."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._locator.close()
 
 
-def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_ignore_interrupt)
-
-
-def _ignore_interrupt() -> None:
-    """Ctrl-C is the main program's business."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _ended_under(located: Future[PaFind | NoSignal]) -> bool:
+    """Whether the process was gone before it had looked."""
+    return located.cancelled() or isinstance(located.exception(), BrokenProcessPool)

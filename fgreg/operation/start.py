@@ -16,8 +16,9 @@ from fgreg.drivers.base import host_now
 from fgreg.errors import InputError
 from fgreg.live import LiveSession
 from fgreg.models import SessionModel
+from fgreg.motion.keeper import StageKeeper
 from fgreg.motion.limits import MotionLimits
-from fgreg.motion.link import StageLink, StageRecord
+from fgreg.motion.link import StageLink, StageRecord, emergency_stop_all
 from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import Devices, LiveLoop
@@ -141,20 +142,25 @@ def running(
         stack.callback(reader.close)
         loop = LiveLoop(model, devices, recorder, reader, conductor, start_s)
         stack.callback(loop.close)
-        yield Running(folder, model, loop, recorder, session)
-        if devices.stage is not None:
-            devices.stage.close()  # first of all; the rest follows in the stack's order
+        try:
+            yield Running(folder, model, loop, recorder, session)
+        except BaseException:
+            emergency_stop_all()
+            raise
+        finally:
+            if devices.stage is not None:
+                devices.stage.close()  # first of all; the rest follows in the stack's order
 
 
 def _open_stage(
     stage: StageSetup, model: SessionModel, session: LiveSession, start_s: float, folder: Path
-) -> StageLink:
+) -> StageKeeper:
     def log(record: StageRecord) -> None:
         t = max(0.0, record.host_s - start_s)
         session.journal.append(record.event(t, model.stage), durable=False, late=True)
 
     limits = MotionLimits.of_session(model.stage, **stage.limits)
-    return StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG)
+    return StageKeeper(lambda: StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG))
 
 
 def default_folder() -> Path:
