@@ -186,8 +186,8 @@ class Command:
 
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
     ``search``, ``follow``: the stage may turn in search of PMs, after the beam; ``next``: leave this spot; ``moved``:
-    the camera has moved; ``stop`` the stage at once; ``reset``: the latched stage was looked at, and may be asked to move
-    again.
+    the camera has moved; ``stop`` the stage at once; ``reset``: the latched stage was looked at, and may be asked to
+    move again.
     """
 
     said: Said

@@ -21,7 +21,7 @@ SILENT_S = 0.7
 """A video without pictures for so long has stopped, whatever its driver says."""
 VIDEO_S = 0.15
 """Longer between pictures is no video: then there is nothing to expect."""
-NOTHING_NEW_S = 0.5
+NOTHING_NEW_S = 0.4
 """Pictures that repeat or show nothing for so long mean trouble."""
 FLAT = 4.0
 """Standard deviation, in grey levels, below which a picture shows nothing but its sensor's noise."""

@@ -17,11 +17,11 @@ from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.models import ProbeModel
 
-ASK_S = 0.3
+ASK_S = 0.2
 """It is asked this often whether it is there, also where there is nothing to locate."""
-MUTE_S = 0.5
+MUTE_S = 0.7
 """Without an answer for so long it is told to be gone."""
-HANGS_S = 3.0
+HANGS_S = 10.0
 """And ended after so long, for another to take over."""
 START_S = 30.0
 """So long it may take for its first answer."""

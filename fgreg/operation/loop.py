@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -106,7 +106,7 @@ class Figures:
 
     Attributes:
         latency_ms: from a frame's arrival to its order, or to the knowledge that there is none.
-        frames, skipped: frames looked into, and dropped for newer ones here.
+        frames, skipped: frames looked into, and left out here: for newer ones, or the same as before.
         found: frames in which the marker was found. pulses: taken in. orders: sent to the stage.
     """
 
@@ -211,6 +211,11 @@ class LiveLoop:
         self._look_after(host_now())
         return True
 
+    @property
+    def lost(self) -> Mapping[str, str]:
+        """Why devices are lost, by role."""
+        return self._health.lost
+
     def status(self) -> Status:
         """The session now."""
         return Status(
@@ -236,9 +241,10 @@ class LiveLoop:
     def _look(self, frames: Sequence[StereoFrame]) -> TimedPose | None:
         if not frames:
             return None
-        self.figures.frames += 1
-        self.figures.skipped += len(frames) - 1
-        if not self._pictures.is_new(frames[-1], host_now()):
+        new = self._pictures.is_new(frames[-1], host_now())
+        self.figures.frames += new
+        self.figures.skipped += len(frames) - new
+        if not new:
             return None
         pose = self.eyes.see(frames[-1])
         self.figures.found += pose is not None

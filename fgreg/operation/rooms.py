@@ -35,6 +35,11 @@ def simulated_room(
         FgregError: it did not start.
     """
     room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
+    return session_in(room, seed, aims, bump_every_s, width_px)
+
+
+def session_in(room: RoomProcess, seed: int, aims: int, bump_every_s: float, width_px: int) -> LiveSetup:
+    """A session in a room that runs, made with the same arguments."""
 
     def open_devices(devices: ExitStack, _model: SessionModel) -> Devices:
         found = Devices(SimulatedCamera(room.path), SimulatedProbe(room.path), SimulatedOperator(room.path))

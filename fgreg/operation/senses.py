@@ -20,7 +20,7 @@ from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
 from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
-from fgreg.drivers.base import PaFrame, StereoFrame
+from fgreg.drivers.base import PaFrame, StereoFrame, host_now
 from fgreg.models import SessionModel
 from fgreg.operation.locating import Locator
 from fgreg.operation.view import Heard
@@ -32,6 +32,8 @@ GIVE_UP_S = 0.5
 """A pulse waits for the poses about it no longer than this."""
 TRIES = 2
 """A frame during which the locating process ended is given to the next one; not for ever: it may be to blame."""
+UNREAD_S = 2.0
+"""So long it is told that a frame could not be looked into."""
 STOOD_RAD = 0.002
 """The plane stands if it has turned by no more than this about the pulse."""
 
@@ -91,11 +93,14 @@ class Ears:
         self._clock = DeviceClock()
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
-        self.listening, self._unread = True, ""
+        self.listening = True
+        self._unread, self._unread_s = "", -np.inf
 
     @property
     def trouble(self) -> str:
         """Why nothing is located now; empty where it is."""
+        if host_now() - self._unread_s > UNREAD_S:
+            self._unread = ""
         return self._locator.trouble or self._unread
 
     @property
@@ -158,9 +163,9 @@ class Ears:
         try:
             found = pulse.located.result()
         except Exception as error:  # of one frame: the next one may be as it should
+            self._unread_s = host_now()
             self._unread = f"a frame of the probe could not be looked into: {error}"
             return replace(heard, scan_rad=None)  # nobody knows whether anything was heard there
-        self._unread = ""
         if isinstance(found, NoSignal):
             return heard
         return replace(
