@@ -67,7 +67,7 @@ class Recorder:
         self._state = RecorderState(
             known_of(session.estimate), session.estimate, aims=len(taken.aims), pairs=len(taken.pairs)
         )
-        self._ended = False
+        self._ended, self._left = False, 0
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -75,7 +75,8 @@ class Recorder:
     def state(self) -> RecorderState:
         """As it is now."""
         with self._lock:
-            return replace(self._state, waiting=self._waiting.qsize() + bool(self._state.stuck))
+            waits = self._left or self._waiting.qsize() + bool(self._state.stuck)
+            return replace(self._state, waiting=waits)
 
     def hand_over(self, event: Recorded) -> None:
         """Have an event recorded, and return at once.
@@ -105,7 +106,7 @@ class Recorder:
                 return
             while not self._take(event):
                 if self._ended:
-                    self._waiting.put(event)
+                    self._left = self._waiting.qsize()  # the mark of the end stands for this event
                     return
                 self._refresh(holding=True)
                 time.sleep(REFRESH_S)

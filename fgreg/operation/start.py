@@ -135,7 +135,7 @@ def running(
             say("starting the stage's watchdog")
             devices.stage = stack.enter_context(_open_stage(live.stage, model, session, start_s, folder))
         recorder = Recorder(session, on_taken)
-        stack.callback(recorder.close)
+        stack.callback(_end_recording, recorder, say)
         taken = session.measurements()
         conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
         reader = engines[-1].reader()
@@ -150,6 +150,12 @@ def running(
         finally:
             if devices.stage is not None:
                 devices.stage.close()  # first of all; the rest follows in the stack's order
+
+
+def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:
+    recorder.close()
+    if recorder.state.waiting:
+        say(f"the last {recorder.state.waiting} events could not be recorded: {recorder.state.stuck}")
 
 
 def _open_stage(
