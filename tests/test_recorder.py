@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fgreg.events import AimEvent, Event, NoteEvent, PairEvent
+from fgreg.events import AimEvent, NoteEvent, PairEvent
 from fgreg.live import LiveSession
 from fgreg.operation.recorder import Recorder
 from fgreg.session.reading import read_session
@@ -24,7 +24,7 @@ def wait_for(condition: Callable[[], object]) -> None:
         time.sleep(0.01)
 
 
-def fed(session: Path) -> list[Event]:
+def fed(session: Path) -> list[AimEvent | PairEvent]:
     """The session's shots; its folder is left without events."""
     events = [event for event in read_session(session).events if isinstance(event, AimEvent | PairEvent)]
     (session / "events.jsonl").unlink()
@@ -38,12 +38,12 @@ def test_with_a_full_disk_events_wait_and_are_recorded_when_there_is_room(
     with LiveSession.open(pose_session, make_engine=BatchEngine, late=True) as live:
         recorder = Recorder(live)
         for event in events[:3]:
-            recorder.hand_over(event)  # type: ignore[arg-type]
+            recorder.hand_over(event)
         wait_for(lambda: recorder.state.aims == 3)
         with monkeypatch.context() as broken:
             failing("_write", errno.ENOSPC, broken)
             for event in events[3:]:
-                recorder.hand_over(event)  # type: ignore[arg-type]
+                recorder.hand_over(event)
             recorder.hand_over(NoteEvent(events[-1].t, 0, "recording lost"))
             wait_for(lambda: recorder.state.stuck)
             time.sleep(0.5)
@@ -65,7 +65,7 @@ def test_a_recorder_ends_although_the_disk_stays_full_and_says_what_it_could_not
         recorder = Recorder(live)
         failing("_write", errno.ENOSPC, monkeypatch)
         for event in events:
-            recorder.hand_over(event)  # type: ignore[arg-type]
+            recorder.hand_over(event)
         began = time.monotonic()
         recorder.close()
         assert time.monotonic() - began < 30.0

@@ -16,9 +16,10 @@ from fgreg.drivers.base import host_now
 from fgreg.errors import InputError
 from fgreg.live import LiveSession
 from fgreg.models import SessionModel
+from fgreg.motion.guard import emergency_stop_all
 from fgreg.motion.keeper import StageKeeper
 from fgreg.motion.limits import MotionLimits
-from fgreg.motion.link import StageLink, StageRecord, emergency_stop_all
+from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import Devices, LiveLoop
