@@ -66,6 +66,10 @@ def main() -> int:
                 notes = [e for e in read_session(Path(folder) / "session").events if isinstance(e, NoteEvent)]
                 lost = sum(one.text.startswith(f"{fault.role} lost") for one in notes)
                 told = sum(said.startswith(f"{fault.role} lost") for _, said in case.operator.told)
+                others = [said for _, said in case.operator.told if " lost: " in said]
+                others = [said for said in others if not said.startswith(f"{fault.role} lost")]
+                for said in others:
+                    print(f"{name}: also told: {said}")
                 if comes_back and lost != told:
                     print(f"{name}: told {told} times, recorded {lost} times")
                     in_time = False

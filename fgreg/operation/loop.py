@@ -67,7 +67,7 @@ STEP_S = 0.02
 """Without frames the rest goes on at this pace."""
 SEND_S = 0.2
 """Between sendings of the registration where nothing has changed."""
-STALE_S = 0.9
+STALE_S = 0.75
 """An engine that has not stirred for so long has ended or hangs: nobody would notice that the camera moves."""
 LATENCIES = 100_000
 
