@@ -179,6 +179,7 @@ class Said(StrEnum):
     FOLLOW = "follow"
     MOVED = "moved"
     STOP = "stop"
+    RESET = "reset"
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +188,8 @@ class Command:
 
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
     ``search``, ``follow``: the stage may turn in search of PMs, after the beam; ``next``: leave this spot; ``moved``:
-    the camera has moved; ``stop`` the stage at once.
+    the camera has moved; ``stop`` the stage at once; ``reset``: the latched stage was looked at, and may be asked to
+    move again.
     """
 
     said: Said

@@ -17,11 +17,12 @@ LETTERS = {
     "m": Said.MOVED,
     "x": Said.STOP,
 }
-"""One letter for each word. ``s`` is search: stopping has an empty line, and ``x``."""
+"""One letter for a word. ``s`` is search: stopping has an empty line, and ``x``. ``reset`` has none: a slip of the
+finger must not free a stage that stopped for trouble."""
 
 EXPECTED = (
     "home (h), aim COLUMN ROW (a), register (r), search (s), follow (f), next (n), moved (m), "
-    "stop (x, or an empty line)"
+    "stop (x, or an empty line), reset"
 )
 LARGEST_CORNER = 199
 """Of a board, as session.yaml bounds it."""
@@ -68,5 +69,5 @@ def asked(text: str, wants: Said | None) -> str:
     """What the operator is told, on one line, with what he is asked to say."""
     if wants is None:
         return one_line(text)
-    letter = next(letter for letter, said in LETTERS.items() if said is wants)
-    return f"{one_line(text)}: say {wants} ({letter})"
+    letter = next((f" ({letter})" for letter, said in LETTERS.items() if said is wants), "")
+    return f"{one_line(text)}: say {wants}{letter}"

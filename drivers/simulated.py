@@ -86,6 +86,21 @@ class RoomProcess:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def fault(self, device: str, what: str) -> None:
+        """Break one of its devices, or mend it with an empty word (fgreg.drivers.simulated_room.FAULTS).
+
+        Raises:
+            FgregError: there is no such device or fault.
+        """
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+            try:
+                connection.connect(os.fspath(self.path))
+                send(connection, {"role": "control"})
+                send(connection, {"device": device, "fault": what})
+                receive(connection)
+            except (OSError, WireClosed):
+                raise FgregError(f"the simulated room has no {device} that could be {what!r}") from None
+
     def close(self) -> None:
         """End it."""
         if self._child.stdin is not None:
@@ -112,7 +127,7 @@ class _Feed(Generic[Item]):
         self._most, self._lock = most, threading.Lock()
         self._connection: socket.socket | None = None
         self._end, self._lost, self._dropped = threading.Event(), "", 0
-        self._heard_s = -np.inf
+        self._heard_s = self._since_s = -np.inf
         self._index: int | None = None
         self._thread = threading.Thread(target=self._run, name=f"simulated {role}", daemon=True)
         self._thread.start()
@@ -125,7 +140,13 @@ class _Feed(Generic[Item]):
     @property
     def connected(self) -> bool:
         """Whether the device is there, and sends where it should."""
-        return self._connection is not None and (not self._sends or host_now() - self._heard_s < SILENT_S)
+        if self._connection is None:
+            return False
+        return host_now() - self._heard_s < SILENT_S if self._sends else self._steady()
+
+    def _steady(self) -> bool:
+        """Whether the room has kept the connection: one to a device that is out of order it closes at once."""
+        return host_now() - self._since_s > AGAIN_S
 
     @property
     def dropped(self) -> int:
@@ -169,15 +190,16 @@ class _Feed(Generic[Item]):
                 connection.close()
                 self._end.wait(AGAIN_S)
                 continue
-            self._connection, self._index = connection, None
+            self._connection, self._index, self._since_s = connection, None, host_now()
             try:
                 while not self._end.is_set():
                     self._take(*receive(connection))
             except WireClosed as error:
                 self._shut()
-                if not self._end.is_set():
+                if self._steady() and not self._end.is_set():
                     with self._lock:
                         self._lost = f"{self.name} is gone ({error})"
+                self._end.wait(AGAIN_S)
 
     def _take(self, header: dict[str, Any], payload: bytearray) -> None:
         index = header.get("index")

@@ -4,7 +4,8 @@
 
 Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe`` and ``motion`` (the holder of
 the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon, who says what he does and can
-be asked to go on. Camera and probe stamp with clocks of their own. The process ends with the one that started it (its
+be asked to go on. ``control`` breaks devices and mends them: ``{"device": "camera", "fault": "frozen"}``
+(:data:`FAULTS`). Camera and probe stamp with clocks of their own. The process ends with the one that started it (its
 standard input closes), or on SIGTERM.
 """
 
@@ -35,6 +36,16 @@ SETTLE_S = 0.4
 """The surgeon says that he aims once the fibre has been still for so long."""
 SAY_AGAIN_S = 3.0
 """And says so again while nothing comes of it."""
+LOOKS_S = 1.5
+"""Asked to reset the stage, he looks at it first for so long."""
+FAULTS = {
+    "camera": ("", "gone", "silent", "frozen", "black"),
+    "probe": ("", "gone", "silent"),
+    "motion": ("", "gone", "silent"),
+    "stage": ("", "gone"),
+    "operator": ("", "gone"),
+}
+"""What can be wrong with each device: nothing; its cable is out; it sends nothing; the same, or a black, picture."""
 
 
 @dataclass(slots=True, eq=False)
@@ -103,6 +114,24 @@ class RoomServer:
         self._scan_rad = 0.0  # where the plane truly stands
         self.start_s = time.monotonic()
         self._said_s = -math.inf
+        self._faults = dict.fromkeys(FAULTS, "")
+        self._frozen: tuple[bytes | memoryview, ...] | None = None
+        self._stages: list[socket.socket] = []
+        self._answers: list[tuple[float, str]] = []  # of the surgeon, and when he gives them
+
+    def fault(self, device: str, what: str) -> None:
+        """Break a device, or mend it. Raises ValueError where it is none of :data:`FAULTS`."""
+        if what not in FAULTS.get(device, ()):
+            raise ValueError(f"{device} {what!r}, expected one of {FAULTS}")
+        self._faults[device], self._frozen = what, None
+        if what == "gone":
+            with self._lock:
+                stages = self._stages if device == "stage" else []
+            for client in self._to(device):
+                client.close()
+            for connection in stages:
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
 
     # --- clients ----------------------------------------------------------------------------------------------------
 
@@ -123,6 +152,12 @@ class RoomServer:
             connection.close()
             return
         role = header.get("role")
+        if role == "control":
+            self._control(connection)
+            return
+        if self._faults.get(str(role)) == "gone":
+            connection.close()
+            return
         if role == "stage":
             self._turn(connection)
             return
@@ -145,12 +180,25 @@ class RoomServer:
 
     def _turn(self, connection: socket.socket) -> None:
         """The stage tells where it is."""
+        with self._lock:
+            self._stages.append(connection)
         try:
             while True:
                 header, _ = receive(connection)
                 self._scan_rad = float(header["scan"])
         except (WireClosed, KeyError, TypeError, ValueError):
             connection.close()
+        with self._lock:
+            self._stages.remove(connection)
+
+    def _control(self, connection: socket.socket) -> None:
+        """Somebody breaks devices and mends them; each order is answered once it is carried out."""
+        with contextlib.suppress(WireClosed, KeyError, ValueError):
+            while True:
+                header, _ = receive(connection)
+                self.fault(header["device"], header["fault"])
+                send(connection, {"done": True})
+        connection.close()
 
     def _to(self, role: str) -> list[_Client]:
         with self._lock:
@@ -189,20 +237,25 @@ class RoomServer:
         self._end.set()
 
     def _frame(self, t_s: float, index: int) -> None:
-        for holder in self._to("motion"):
+        for holder in self._to("motion") if self._faults["motion"] != "silent" else ():
             pose = self.room.base_T_camera(t_s, index)
             holder.put({"index": index, "device_s": CAMERA_CLOCK_S + t_s, "pose": pose.tolist()})
-        clients = self._to("camera")
-        if not clients:
+        clients, fault = self._to("camera"), self._faults["camera"]
+        if not clients or fault == "silent":
             return
         left, right = self.room.pictures(t_s, index)
         header = {"index": index, "device_s": CAMERA_CLOCK_S + t_s, "shape": list(left.shape)}
+        sent: tuple[bytes | memoryview, ...] = (left.data.cast("B"), right.data.cast("B"))
+        if fault == "frozen":
+            self._frozen = sent = self._frozen or sent
+        elif fault == "black":  # but for the sensor's noise
+            sent = tuple((side % 4).astype(side.dtype).tobytes() for side in (left, right))
         for client in clients:
-            client.put(header, left.data.cast("B"), right.data.cast("B"))
+            client.put(header, *sent)
 
     def _pulse(self, t_s: float, index: int) -> None:
         clients = self._to("probe")
-        if not clients:
+        if not clients or self._faults["probe"] == "silent":
             return
         data = self.room.channel_data(t_s, self._scan_rad, index)
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
@@ -221,7 +274,10 @@ class RoomServer:
                 asked = self._asked.get_nowait()
                 go_on |= asked.get("next") is True
                 if isinstance(asked.get("say"), str):
-                    self._say({"says": asked["say"]})
+                    self._answers.append((now_s + LOOKS_S * (asked["say"] == "reset"), asked["say"]))
+        for answer in [answer for answer in self._answers if answer[0] <= now_s]:
+            self._answers.remove(answer)
+            self._say({"says": answer[1]})
         rested = now_s - room.arrives_s()
         roams = room.place.corner is None and rested > self._roam_s
         if (go_on and rested > 0) or roams:

@@ -75,6 +75,9 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         stage searches the sound, the registration forms, and the stage follows the beam. Now and then somebody bumps
         into the camera. With CONFIG your devices are used, each by the driver that it names.
 
+        Devices that disappear are told within a second and used again when they are back. A stage that stopped for
+        trouble is latched: it says why, and moves again after `reset` and a new request.
+
         Ctrl-C ends it: the stage stops first, the session in FOLDER is complete and solved once more as a whole.
         Replay it: fgreg replay FOLDER. Exit status 1 where the verdict is refused.
         """
@@ -153,7 +156,7 @@ def _conduct(
         ended = True
 
     with _display(silent) as (say, show), painted(rrd, folder.name, live=viewer, say=say) as painter:
-        before = signal.signal(signal.SIGTERM, end)
+        before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
         try:
             with running(setup, folder, config, painter.taken, say) as session:
                 painter.session(session.model)
@@ -174,7 +177,8 @@ def _conduct(
                     say("ending")
                 return session.loop.figures
         finally:
-            signal.signal(signal.SIGTERM, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def figures_dict(figures: Figures) -> dict[str, Any]:

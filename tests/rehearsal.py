@@ -25,6 +25,7 @@ from fgreg.operation.view import (
     Halt,
     Heard,
     Known,
+    Release,
     StageView,
     Sweep,
     TakeAim,
@@ -50,6 +51,7 @@ class Rehearsal:
     Attributes:
         obliging: the operator says what he is asked to say.
         deaf_from_s: from then on the probe hears nothing. blind_from_s: nor does the camera see the marker.
+        latched: why the stage may not move, as the gate would say it; a release ends it.
         told: all that the operator was told, with the time. asked: all actions but words.
         errors_deg: while the stage follows a beam held still, how far its plane is off, at the end of each hold.
     """
@@ -59,6 +61,7 @@ class Rehearsal:
     obliging: bool = True
     deaf_from_s: float = math.inf
     blind_from_s: float = math.inf
+    latched: str = ""
     now_s: float = 0.0
     told: list[tuple[float, Tell]] = field(default_factory=list)
     asked: list[tuple[float, Action]] = field(default_factory=list)
@@ -110,7 +113,7 @@ class Rehearsal:
         view = View(
             now,
             self.poses,
-            StageView(status.scan_rad, status.moving, status.homed, now, self.requested),
+            StageView(status.scan_rad, status.moving, status.homed, now, self.requested, self.latched),
             tuple(heard),
             tuple(self._said),
             Known(
@@ -152,6 +155,8 @@ class Rehearsal:
             case Halt():
                 self.requested = None
                 self.stage.stop()
+            case Release():
+                self.latched = ""
             case TakeAim():
                 self._aim()
             case TakeMove():

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from fgreg.motion.device import MAX_CALL_S
 from fgreg.motion.watchdog import TICK_S
@@ -44,6 +47,54 @@ def main_program(folder: Path, end: str) -> Iterator[tuple[subprocess.Popen[str]
         process.wait()
         if process.stdout is not None:
             process.stdout.close()
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGSTOP)
+"""What ends or halts a main program: Ctrl-C, a polite kill, a closed terminal, a rude kill, a suspension."""
+
+
+@contextmanager
+def live_program(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``fgreg live`` in the simulated room, which homes the stage and searches; its session is in ``folder``."""
+    code = "import sys; from fgreg.cli import main; sys.exit(main())"
+    words = ["live", "--no-viewer", "--aims", "0", "--bump-every", "inf", "--out", os.fspath(folder)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *words],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def orders(folder: Path) -> list[dict[str, Any]]:
+    """What the watchdog of a live program has ordered so far."""
+    path = folder / "stage-orders.log"
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def live_stopped_after(folder: Path, phase: str, number: signal.Signals) -> float:
+    """Seconds from a signal to a live program, sent while its stage homes or searches, to the next order to stop.
+
+    The stage gets no other order after that.
+    """
+    with live_program(folder) as process:
+        wait_until(lambda: any(order["command"] == phase for order in orders(folder)), 120.0)
+        sent = time.monotonic()
+        process.send_signal(number)
+        wait_until(lambda: any(order["command"] == "stop" and order["t"] >= sent for order in orders(folder)))
+        time.sleep(1.0)
+        after = [order for order in orders(folder) if order["t"] >= sent]
+    stop = next(i for i, order in enumerate(after) if order["command"] == "stop")
+    assert {order["command"] for order in after[stop:]} == {"stop"}
+    return float(after[stop]["t"]) - sent
 
 
 def wait_until(condition: Callable[[], object], seconds: float = 10.0) -> None:

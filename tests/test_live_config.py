@@ -175,6 +175,16 @@ def test_without_an_operator_it_is_the_keyboard_and_without_a_stage_nothing_turn
         assert config.live_setup(stack, lambda _: None).stage is None
 
 
+def test_the_gate_reckons_with_the_brakes_that_the_stage_is_told_to_use(tmp_path: Path) -> None:
+    data = live_configs.config()
+    data["stage"]["acceleration_deg_s2"] = 5
+    with ExitStack() as stack:
+        setup = read_config(live_configs.write(tmp_path, data)).live_setup(stack, lambda _: None).stage
+    assert setup is not None
+    assert setup.limits["deceleration"] == pytest.approx(math.radians(5.0))
+    assert setup.limits["search_speed"] == pytest.approx(math.radians(20.0))
+
+
 SESSIONS: list[tuple[str, str, str]] = [
     ("board", "a session.yaml without board", "settings.aims: 0"),
     ("marker", "a session.yaml without marker", "one with marker"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pytest
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.models import StageModel
+from fgreg.motion.device import StageStatus
 from fgreg.motion.gate import Gate
 from fgreg.motion.limits import MotionKind, MotionLimits
 from fgreg.motion.messages import (
@@ -54,6 +55,12 @@ class _Room:
     hearing: bool = True
     number: int = 0
     limits: MotionLimits = LIMITS
+    delay: int = 0  # ticks by which the status is older than the gate's clock
+    heard: list[StageStatus] = field(default_factory=list)
+
+    def status(self) -> StageStatus:
+        self.heard.append(self.stage.status())
+        return self.heard[max(0, len(self.heard) - 1 - self.delay)]
 
     def do(self, actions: list[Action]) -> list[Action]:
         for action in actions:
@@ -76,7 +83,7 @@ class _Room:
                 self.marker_s = self.now - 0.03
             if self.beating:
                 actions += self.do(self.gate.handle(Beat(self.now, self.marker_s, self.registration), self.now))
-            actions += self.do(self.gate.tick(self.now, self.stage.status() if self.hearing else None))
+            actions += self.do(self.gate.tick(self.now, self.status() if self.hearing else None))
         return actions
 
     def request(self, kind: MotionKind) -> list[Action]:
@@ -148,6 +155,77 @@ def test_held_tracking_goes_on_when_the_marker_is_back_even_the_other_way() -> N
     assert isinstance(room.command(MotionKind.TRACK, -10.0)[0], Drive)
     assert Arrived(room.number) in room.run(6.0)
     assert room.gate.latched is None
+
+
+@pytest.mark.parametrize("delay", [0, 3, 10])
+@pytest.mark.parametrize("between_s", [0.0, 0.1, 0.5])
+def test_search_asked_for_while_tracking_turns_about_without_a_latch(delay: int, between_s: float) -> None:
+    fast = replace(LIMITS, track_speed=math.radians(20.0), search_speed=math.radians(5.0))
+    room = _room(limits=fast)
+    room.delay = delay
+    room.go(MotionKind.TRACK, 35.0, speed_deg_s=20.0)
+    assert not _halts(room.run(1.2))
+    before = math.degrees(room.stage.status().scan_rad)
+    assert room.request(MotionKind.SEARCH) == [Halt("the operator asked to search", latched=False)]
+    room.run(between_s)
+    assert isinstance(room.command(MotionKind.SEARCH, before - 10.0, speed_deg_s=5.0)[0], Drive)
+    furthest = before
+    for _ in range(400):
+        assert not _halts(room.run(0.02)), room.gate.latched
+        furthest = max(furthest, math.degrees(room.stage.status().scan_rad))
+        if room.gate.moving is None:
+            break
+    assert furthest > before + 5.0  # that is what its brakes need
+    assert math.degrees(room.stage.status().scan_rad) == pytest.approx(before - 10.0, abs=0.1)
+
+
+@settings(max_examples=60, derandomize=True, deadline=None)
+@given(
+    st.integers(0, 12),
+    st.lists(st.tuples(st.floats(-55.0, 38.0), st.floats(5.0, 20.0), st.integers(1, 60)), min_size=2, max_size=8),
+    st.floats(20.0, 400.0),
+)
+def test_good_stage_is_never_latched_however_it_is_turned_about(
+    delay: int, orders: list[tuple[float, float, int]], acceleration: float
+) -> None:
+    room = _room(limits=replace(LIMITS, track_speed=math.radians(20.0)))
+    room.stage._acceleration, room.delay = math.radians(acceleration), delay
+    room.request(MotionKind.TRACK)
+    for target, speed, ticks in orders:
+        assert isinstance(room.command(MotionKind.TRACK, target, speed_deg_s=speed)[0], Drive)
+        room.run(0.02 * ticks)
+        if ticks % 5 == 0:  # the marker is hidden for a moment
+            room.run(0.3, marker=False)
+            room.run(0.02)
+        assert room.gate.latched is None
+
+
+@pytest.mark.parametrize("delay", [0, 5])
+def test_stage_that_goes_on_where_it_should_turn_about_is_found_within_its_brakes_way(delay: int) -> None:
+    """A long way that lies behind it is no excuse: what counts is how far it can still get."""
+    room = _room()
+    room.delay = delay
+    room.go(MotionKind.TRACK, -50.0)
+    room.run(4.0)
+    room.command(MotionKind.TRACK, 38.0)
+    room.run(2.0)
+    turned = math.degrees(room.stage.status().scan_rad)
+    room.command(MotionKind.TRACK, turned + 15.0)
+    room.stage.wrong.reversed = True
+    while room.gate.latched is None:
+        assert math.degrees(room.stage.status().scan_rad) > turned - 25.0
+        room.run(0.02)
+    assert "off its way" in room.gate.latched
+    reach = math.degrees(LIMITS.reach_rad(math.radians(10.0), 0.02 * delay))
+    late = 10.0 * 0.02 * (2 * delay + 2)  # what it had turned since its status, and turns before the next shows it
+    assert turned - math.degrees(room.stage.status().scan_rad) < reach + 0.5 + late
+
+
+def test_reach_is_what_is_turned_before_the_order_and_what_the_brakes_need() -> None:
+    limits = replace(LIMITS, deceleration=math.radians(20.0))
+    # by hand: 20 deg/s for 0.05 s of status and 0.1 s of the driver's call, then 20^2 / (2 * 20)
+    assert math.degrees(limits.reach_rad(math.radians(20.0), 0.05)) == pytest.approx(3.0 + 10.0)
+    assert limits.reach_rad(0.0, 0.3) == 0.0
 
 
 def test_tracking_that_cannot_go_on_stops_and_does_not_search() -> None:

@@ -18,18 +18,27 @@ from hypothesis import strategies as st
 
 from fgreg.drivers.base import Command, DeviceLost, Operator, Said
 from fgreg.drivers.keyboard import MAX_LINE_BYTES, MOST_WAITING, KeyboardOperator
-from fgreg.drivers.operator_words import EXPECTED, LETTERS, understand
+from fgreg.drivers.operator_words import EXPECTED, LETTERS, asked, understand
 from fgreg.drivers.operators import IgtlOperator, Operators
 from fgreg.drivers.tcp_link import Endpoint
 from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
 
 
-@pytest.mark.parametrize("said", [said for said in Said if said is not Said.AIM])
+@pytest.mark.parametrize("said", [said for said in Said if said not in (Said.AIM, Said.RESET)])
 def test_each_word_and_its_letter_are_understood_in_any_case(said: Said) -> None:
     letter = next(letter for letter, meant in LETTERS.items() if meant is said)
     for line in (said.value, said.value.upper(), letter, f"  {letter} \r"):
         assert understand(line) == Command(said)
+
+
+def test_a_reset_has_to_be_said_in_full() -> None:
+    assert understand(" Reset ") == Command(Said.RESET)
+    assert Said.RESET not in LETTERS.values()
+    assert isinstance(understand("res"), str)
+    assert isinstance(understand("reset the stage"), str)
+    assert understand("reset, no: stop") == Command(Said.STOP)
+    assert asked("the stage is latched", Said.RESET) == "the stage is latched: say reset"
 
 
 @pytest.mark.parametrize("line", ["aim 3 2", "a 3 2", "aim 3,2", "AIM 3, 2"])

@@ -318,9 +318,6 @@ class Processes:
         ):
             if part in words:
                 return name
-        link = self._session.loop._devices.stage
-        if link is not None and pid == link.pid:
-            return "watchdog"
         if parents.get(pid) == own:
             return "engine" if pid == min(engines) else "locator"
         return "beside the engine"

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fgreg.motion.device import StageStatus
+from fgreg.motion.device import MAX_CALL_S, StageStatus
 from fgreg.motion.limits import MotionKind, MotionLimits
 from fgreg.motion.messages import Action, Arrived, Beat, Command, Drive, Halt, Message, Refusal, Request, Reset, Stop
 
@@ -28,15 +28,22 @@ TRACKABLE = ("ok", "warning")
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """A motion under way: within ``low_rad`` and ``high_rad``, no faster than ``speed``, over by ``deadline_s``."""
+    """A motion under way: within ``low_rad`` and ``high_rad``, over by ``deadline_s``, no faster than its command says
+    or, until ``carried_until_s``, than the motion before it that it has to brake (``carried_speed``)."""
 
     command: Command
     began_s: float
     start_rad: float
     low_rad: float
     high_rad: float
-    speed: float
     deadline_s: float
+    carried_speed: float
+    carried_until_s: float
+
+    def speed_at(self, t_s: float) -> float:
+        """Highest speed at a time."""
+        speed = self.command.speed_rad_s
+        return max(speed, self.carried_speed) if t_s <= self.carried_until_s else speed
 
 
 class Gate:
@@ -189,21 +196,38 @@ class Gate:
         reason, status = self._forbidden(command, now), self._status
         if reason is not None or status is None:
             return [Refusal(f"{command.kind} refused: {reason}", command.number)]
-        here, target, old = status.scan_rad, command.scan_rad, self._motion
-        if old is None and self._halted_s is not None and now - self._halted_s <= self.limits.stop_s:
-            old = self._braking
-        travel = self.limits.homing_travel() if target is None else abs(target - here)
-        ends = [here] if target is None else [here, target]
-        speed = command.speed_rad_s
-        if old is not None and old.command.kind is command.kind:  # until it has turned about, it goes on as it was
-            ends += [old.low_rad, old.high_rad]
-            speed = max(speed, old.speed)
-        deadline = now + 1.5 * travel / command.speed_rad_s + self.limits.slack_s
+        here, target, limits = status.scan_rad, command.scan_rad, self.limits
+        low, high, carried = self._carried(status, now)
+        if target is None:
+            travel = limits.homing_travel()
+        else:
+            travel = max(abs(target - low), abs(target - high))
+            low, high = min(low, target), max(high, target)
+        deadline = now + 1.5 * travel / command.speed_rad_s + limits.slack_s
+        until = now + MAX_CALL_S + carried / limits.deceleration
         self._seen_moving = False
-        self._motion = _Motion(command, now, here, min(ends), max(ends), speed, deadline)
+        self._motion = _Motion(command, now, here, low, high, deadline, carried, until)
         if command.kind is MotionKind.HOME:
             self._request = None  # one request, one homing
         return [Drive(command.kind, target, command.speed_rad_s, command.reason, command.number)]
+
+    def _carried(self, status: StageStatus, now: float) -> tuple[float, float, float]:
+        """Where the motion before may still take the stage (lowest and highest angle), and how fast.
+
+        As far as it can get before it has turned about (:meth:`MotionLimits.reach_rad`), but never off the way it was
+        on: whatever it is told now, it goes no farther than it would have gone.
+        """
+        here, limits, old = status.scan_rad, self.limits, self._motion
+        speed = 0.0
+        if old is not None:
+            speed = old.speed_at(now)
+        elif self._braking is not None and self._halted_s is not None:
+            old, braked_s = self._braking, status.stamp.host_s - self._halted_s - MAX_CALL_S
+            speed = max(0.0, old.speed_at(self._halted_s) - limits.deceleration * max(0.0, braked_s))
+        if old is None or old.command.kind is MotionKind.HOME:
+            return here, here, 0.0
+        reach = limits.reach_rad(speed, now - status.stamp.host_s)
+        return min(here, max(here - reach, old.low_rad)), max(here, min(here + reach, old.high_rad)), speed
 
     def _stale(self, sent_s: float, now: float) -> str | None:
         age = now - sent_s
@@ -292,7 +316,7 @@ class Gate:
         reason = self._misbehaves(self._motion, before, status, now)
         if reason is not None:
             return self._latch(reason)
-        return self._ended(self._motion, status, now)
+        return self._ended(self._motion, status)
 
     def _at_rest(self, status: StageStatus, now: float) -> list[Action]:
         """Nothing is to move; braking takes a moment."""
@@ -300,7 +324,7 @@ class Gate:
             return []
         if status.homed and not self.limits.inside(status.scan_rad, self.limits.tolerance_rad):
             return self._latch(f"the stage is at {math.degrees(status.scan_rad):.1f} deg, outside its limits")
-        braking = self._halted_s is not None and now - self._halted_s <= self.limits.stop_s
+        braking = self._halted_s is not None and now - self._halted_s <= self.limits.standing_s()
         if braking:
             return []
         halted = self._halted_s
@@ -313,7 +337,7 @@ class Gate:
         limits, here = self.limits, status.scan_rad
         if status.fault:
             return status.fault
-        bound = limits.overspeed * motion.speed
+        bound = limits.overspeed * motion.speed_at(status.stamp.host_s if before is None else before.stamp.host_s)
         slack = limits.tolerance_rad
         if abs(status.velocity_rad_s) > bound + slack:
             return f"the stage turns at {math.degrees(abs(status.velocity_rad_s)):.1f} deg/s: too fast"
@@ -333,9 +357,9 @@ class Gate:
             return f"the stage is at {math.degrees(here):.1f} deg, off its way"
         return "the motion takes longer than it can" if now > motion.deadline_s else None
 
-    def _ended(self, motion: _Motion, status: StageStatus, now: float) -> list[Action]:
-        limits, here, took = self.limits, status.scan_rad, now - motion.began_s
-        if status.stamp.host_s <= motion.began_s:
+    def _ended(self, motion: _Motion, status: StageStatus) -> list[Action]:
+        limits, here, took = self.limits, status.scan_rad, status.stamp.host_s - motion.began_s
+        if took <= 0.0:
             return []
         if status.moving or status.homing:
             self._seen_moving = True
@@ -350,6 +374,7 @@ class Gate:
             arrived = abs(here - motion.command.scan_rad) <= limits.tolerance_rad
         if arrived:
             self._come_to_rest()
+            self._braking = None
             return [Arrived(motion.command.number)]
         if took > limits.stop_s:
             return self._halt(f"the stage stopped by itself at {math.degrees(here):.1f} deg")

@@ -9,6 +9,7 @@ from enum import StrEnum
 from typing import Any, Self
 
 from fgreg.models import StageModel
+from fgreg.motion.device import MAX_CALL_S
 
 
 class MotionKind(StrEnum):
@@ -43,8 +44,9 @@ class MotionLimits:
         clock_gap_s: the watchdog looks at its clock far more often than this; a longer gap means it did not run.
         request_s: an operator's request ends by itself after this.
         tolerance_rad: of positions: reading, settling, overshoot.
+        deceleration: least of a stage that is told to stop or to turn about, rad/s^2.
         overspeed: factor above the commanded speed that is taken for a fault.
-        stop_s: time in which a stopped stage has to stand.
+        stop_s: time in which a stopped stage has to stand, where its deceleration does not ask for more.
         slack_s: time that a motion may take beyond its distance at its speed.
     """
 
@@ -62,6 +64,7 @@ class MotionLimits:
     clock_gap_s: float = 0.5
     request_s: float = 600.0
     tolerance_rad: float = math.radians(0.5)
+    deceleration: float = math.radians(20.0)
     overspeed: float = 1.25
     stop_s: float = 1.5
     slack_s: float = 3.0
@@ -70,6 +73,7 @@ class MotionLimits:
         for name in (
             *("home_speed", "search_speed", "track_speed", "track_sigma_rad", "marker_age_s", "heartbeat_s"),
             *("command_age_s", "status_age_s", "clock_gap_s", "request_s", "tolerance_rad", "stop_s", "slack_s"),
+            "deceleration",
         ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -112,6 +116,19 @@ class MotionLimits:
             MotionKind.TRACK: self.track_speed,
         }
         return speeds[kind]
+
+    def reach_rad(self, speed: float, age_s: float) -> float:
+        """How far from where it was told ``age_s`` ago a stage can get before an order of now has turned it about.
+
+        It goes on at its speed until the order reaches it, at most a driver's call from now, and then brakes:
+        ``speed (age + call) + speed^2 / (2 deceleration)``.
+        """
+        return speed * (age_s + MAX_CALL_S) + speed * speed / (2.0 * self.deceleration)
+
+    def standing_s(self) -> float:
+        """Time after a stop from which on the stage has to be heard standing."""
+        fastest = max(self.speed(kind) for kind in MotionKind)
+        return max(self.stop_s, MAX_CALL_S + fastest / self.deceleration + self.status_age_s)
 
     def homing_travel(self) -> float:
         """Most travel of homing: the limits' span unless said otherwise."""

@@ -9,19 +9,17 @@
 
 The heartbeat has to come from the loop whose stalling matters: a thread of its own would go on beating. Every order is
 handed to ``log`` before it is sent; if that raises, it is not sent, but for stops. Leaving the ``with`` block by an
-exception, Ctrl-C, an uncaught exception in any thread, the end of the interpreter and :func:`emergency_stop_all` all
+exception, Ctrl-C, an uncaught exception in any thread, the end of the interpreter and ``guard.emergency_stop_all`` all
 stop the stage; so does a main program that is killed or stalls, by the watchdog.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import json
 import math
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -31,11 +29,12 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Self
 
 from fgreg.events import StageEvent
 from fgreg.models import StageModel
+from fgreg.motion import guard
 from fgreg.motion.device import StageError, StageLost, StageStatus
 from fgreg.motion.limits import MotionKind, MotionLimits
 from fgreg.motion.messages import Beat, Command, Message, Request, Reset, Stop, encode
@@ -50,8 +49,8 @@ CLOSE_S = 5.0
 """How long the watchdog may take to bring the stage to rest when it is let go."""
 READINGS = 100
 """Stage angles that are kept, one every 50 ms."""
-SILENT_S = 1.0
-"""A watchdog that says nothing for this long is gone."""
+SILENT_S = 0.8
+"""A watchdog that says nothing for this long is gone: it tells of the stage every 50 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,10 +182,10 @@ class StageLink:
             ours.sendall(setup.line())
             link._await_ready(start_s)
         except BaseException:
-            link._abandon()
+            link.abandon()
             raise
         ours.setblocking(False)
-        _guard(link)
+        guard.add(link)
         return link
 
     @property
@@ -227,8 +226,12 @@ class StageLink:
 
     def emergency_stop(self, reason: str) -> None:
         """Stop now, and let nothing move until :meth:`reset`. From any thread, and where the socket is stuck."""
-        self._press()
+        self.press()
         self._log(StageRecord(time.monotonic(), "emergency stop", None, reason))
+
+    def latch(self, reason: str) -> None:
+        """Let nothing move until :meth:`reset`, for a reason that is told; the stage is stopped, too."""
+        self._send(Stop(time.monotonic(), True, reason))
 
     def reset(self, by: str) -> None:
         """The operator has looked: motion may be requested again. Refused while the stage moves or is silent."""
@@ -265,14 +268,14 @@ class StageLink:
         except (OSError, ValueError) as error:  # a line cut short is unreadable: the watchdog stops the stage for it
             raise self._give_up(f"the stage's watchdog does not listen: {error}") from error
 
-    def _press(self) -> None:
-        """The emergency pipe: one byte, no lock, safe in a signal handler."""
+    def press(self) -> None:
+        """Emergency stop by the pipe: one byte, no lock, safe in a signal handler."""
         with contextlib.suppress(OSError):
             os.write(self._emergency_fd, b"!")
 
     def _give_up(self, reason: str) -> StageLost:
         self._lost = reason
-        self._press()
+        self.press()
         return StageLost(reason)
 
     # -- what comes back
@@ -295,7 +298,7 @@ class StageLink:
             self._unlogged.pop(0)
         reports, self._reports = self._reports, []
         if time.monotonic() - self._heard_s > SILENT_S and not reports:
-            raise self._give_up(f"the stage's watchdog has said nothing for {SILENT_S:.0f} s")
+            raise self._give_up(f"the stage's watchdog has said nothing for {SILENT_S} s")
         return reports
 
     def _receive(self) -> list[Report]:
@@ -363,16 +366,20 @@ class StageLink:
             self._process.kill()
             self._process.wait()
 
-    def _abandon(self) -> None:
-        self._let_go()
+    def abandon(self, grace_s: float = 0.0) -> None:
+        """Let go of a watchdog that is gone, or may hang: it is ended, after a moment in which it can still stop."""
+        if not self._closed:
+            self._let_go()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(grace_s)
+            return
         self._process.kill()
-        self._process.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # one that the system holds in a call to the device
+            self._process.wait(CLOSE_S)
 
     def _let_go(self) -> None:
-        global _links
         self._closed = True
-        with _GUARDED:
-            _links = tuple(link for link in _links if link is not self)
+        guard.release(self)
         emergency_fd, self._emergency_fd = self._emergency_fd, -1  # the number may soon be somebody else's
         self._socket.close()
         os.close(emergency_fd)
@@ -384,62 +391,5 @@ class StageLink:
         self, kind: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None
     ) -> None:
         if error is not None and not self._closed:
-            self._press()
+            self.press()
         self.close()
-
-
-_links: tuple[StageLink, ...] = ()
-"""Those that are open; replaced, never changed, so that a signal handler can go through it at any time."""
-_GUARDED = threading.Lock()
-_guards_set = False
-
-
-def emergency_stop_all(_reason: str = "") -> None:
-    """Emergency stop of every stage of this program; takes no lock, writes no log, never raises.
-
-    A program that sets a handler of its own for SIGINT after opening a link calls this from it.
-    """
-    for link in _links:
-        link._press()
-
-
-def _guard(link: StageLink) -> None:
-    """Have the stage stopped on Ctrl-C, on an uncaught exception of any thread, and at the interpreter's end."""
-    global _guards_set, _links
-    with _GUARDED:
-        _links = (*_links, link)
-        if _guards_set:
-            return
-        _guards_set = True
-    atexit.register(_at_exit)
-    main_hook, thread_hook = sys.excepthook, threading.excepthook
-
-    def on_crash(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        emergency_stop_all()
-        main_hook(kind, error, trace)
-
-    def on_thread_crash(crash: threading.ExceptHookArgs) -> None:
-        emergency_stop_all()
-        thread_hook(crash)
-
-    sys.excepthook, threading.excepthook = on_crash, on_thread_crash
-    if threading.current_thread() is threading.main_thread():
-        _guard_interrupt()
-
-
-def _guard_interrupt() -> None:
-    before = signal.getsignal(signal.SIGINT)
-
-    def on_interrupt(number: int, frame: FrameType | None) -> None:
-        emergency_stop_all()
-        if callable(before):
-            before(number, frame)
-
-    if callable(before):
-        signal.signal(signal.SIGINT, on_interrupt)
-
-
-def _at_exit() -> None:
-    emergency_stop_all()
-    for link in _links:
-        link.close()

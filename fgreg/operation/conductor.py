@@ -24,6 +24,7 @@ from fgreg.operation.view import (
     Halt,
     Heard,
     Known,
+    Release,
     StageView,
     Sweep,
     TakeAim,
@@ -114,6 +115,7 @@ class Conductor:
         self._told_refused = 0
         self._deaf = 0
         self._wanted: Said | None = None
+        self._latched = ""
         self._wanted_s = -math.inf
         self._waits_s = -math.inf
         self._not_before_s = -math.inf  # pulses of before are another epoch's
@@ -127,7 +129,8 @@ class Conductor:
         """What to do now."""
         out: list[Action] = []
         for command in view.commands:
-            out += self._obey(command)
+            out += self._obey(command, view)
+        latched = view.stage is not None and self._is_latched(view.stage, view.now_s, out)
         if view.unsettled_s is not None:
             # What is known holds no more. The stage's request stays: the gate holds the motion, as long as this lasts.
             self._hunt, self._not_before_s = None, max(self._not_before_s, view.now_s)
@@ -138,10 +141,10 @@ class Conductor:
             self._hunt = None
             out.append(Tell("the camera has moved: the registration begins anew"))
         self._advance(view, out)
-        if any(isinstance(action, Ask | Halt) for action in out):
+        if any(isinstance(action, Ask | Halt | Release) for action in out):
             self._hunt = None
             return tuple(out)  # what the stage is asked for next depends on how it takes that
-        if view.stage is not None and self._may_turn(view, view.stage, out):
+        if view.stage is not None and not latched and self._may_turn(view, view.stage, out):
             searches = view.stage.requested is MotionKind.SEARCH
             if self.stage is Stage.COLLECTING or (self.stage is Stage.FOLLOWING and searches):
                 self._collect(view, view.stage, out)
@@ -150,6 +153,17 @@ class Conductor:
         else:
             self._hunt = None
         return tuple(out)
+
+    def _is_latched(self, stage: StageView, now_s: float, out: list[Action]) -> bool:
+        """Whether nothing may move until the operator's reset; asks for it."""
+        if stage.latched != self._latched:
+            self._latched, self._wanted = stage.latched, None  # told at once, and what it needs after it, too
+            if not stage.latched:
+                out.append(Tell("the stage is free again, and moves once it is asked to"))
+        if stage.latched:
+            text = f"the stage is latched ({stage.latched}): look at it and the probe, and when it may move again"
+            self._want(Said.RESET, text, now_s, out)
+        return bool(stage.latched)
 
     def _may_turn(self, view: View, stage: StageView, out: list[Action]) -> bool:
         """Whether the stage knows its zero and has the operator's request for what comes next; asks where not."""
@@ -176,7 +190,7 @@ class Conductor:
 
     # --- the session's course ---------------------------------------------------------------------------------------
 
-    def _obey(self, command: Command) -> list[Action]:
+    def _obey(self, command: Command, view: View) -> list[Action]:
         match command.said:
             case Said.HOME:
                 return [Ask(MotionKind.HOME)]
@@ -196,6 +210,10 @@ class Conductor:
             case Said.STOP:
                 self._hunt = None
                 return [Halt("the operator has stopped the stage")]
+            case Said.RESET:
+                if view.stage is not None and view.stage.latched:
+                    return [Release()]
+                return [Tell(f"no reset: the stage is not {'there' if view.stage is None else 'latched'}")]
         return []
 
     def _advance(self, view: View, out: list[Action]) -> None:

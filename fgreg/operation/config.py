@@ -127,7 +127,10 @@ class LiveConfig:
         if chosen is None:
             return None
         options = {"path": os.fspath(around.room)} if chosen[0].entry.room and around.room else chosen[0].options
-        return StageSetup(chosen[0].entry.factory, options, self.stage_limits)
+        limits = dict(self.stage_limits)
+        if (acceleration := chosen[0].options.get("acceleration_deg_s2")) is not None:
+            limits["deceleration"] = math.radians(acceleration)  # what a driver is told to use is what it brakes with
+        return StageSetup(chosen[0].entry.factory, options, limits)
 
     def open_bmode(self, stack: ExitStack) -> BmodeSource | None:
         """The scanner's pictures for overlay, where the file names one; closed with the stack."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,26 +31,26 @@ from fgreg.drivers.base import (
     TransformSink,
     host_now,
 )
-from fgreg.errors import FgregError
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord
 from fgreg.measurements import MarkerObservation, Track
 from fgreg.models import SessionModel
-from fgreg.motion.device import StageError
-from fgreg.motion.limits import MotionKind
-from fgreg.motion.link import Report, StageLink
+from fgreg.motion.keeper import StageKeeper
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.operation.conductor import Conductor
+from fgreg.operation.health import Health, Pictures, Source
 from fgreg.operation.holder import Holder, HolderSettings
 from fgreg.operation.recorder import Recorder, RecorderState
 from fgreg.operation.senses import Ears, Eyes
 from fgreg.operation.spots import one_spot
+from fgreg.operation.steering import Steering
 from fgreg.operation.view import (
     Action,
     Ask,
     Follow,
     Halt,
     Heard,
+    Release,
     StageView,
     Sweep,
     TakeAim,
@@ -66,12 +66,10 @@ IDLE_S = 0.002
 """Between looks for a frame."""
 STEP_S = 0.02
 """Without frames the rest goes on at this pace."""
-AGAIN_RAD, AGAIN_S = math.radians(0.1), 0.5
-"""An order to follow is repeated once the goal has moved by so much, or after so long."""
 SEND_S = 0.2
 """Between sendings of the registration where nothing has changed."""
-START_S = 5.0
-"""So long devices may take to send for the first time."""
+STALE_S = 0.75
+"""An engine that has not stirred for so long has ended or hangs: nobody would notice that the camera moves."""
 LATENCIES = 100_000
 
 
@@ -82,7 +80,7 @@ class Devices:
     camera: StereoCamera
     probe: PhotoacousticSource
     operator: Operator
-    stage: StageLink | None = None
+    stage: StageKeeper | None = None
     motion: MotionSource | None = None
     sinks: Sequence[TransformSink] = ()
 
@@ -109,7 +107,7 @@ class Figures:
 
     Attributes:
         latency_ms: from a frame's arrival to its order, or to the knowledge that there is none.
-        frames, skipped: frames looked into, and dropped for newer ones here.
+        frames, skipped: frames looked into, and left out here: for newer ones, or the same as before.
         found: frames in which the marker was found. pulses: taken in. orders: sent to the stage.
     """
 
@@ -175,12 +173,15 @@ class LiveLoop:
         self._holder = Holder(holder or HolderSettings(), latencies.holder_s)
         self._unsettled_s: float | None = None
         self.figures = Figures()
-        self._lost: dict[str, str] = {}
-        self._seen: set[str] = set()
         self._began_s = host_now()
+        self._health, self._pictures = Health(), Pictures()
+        self._sources = {
+            role: Source(device, self._began_s, sends=role in ("camera", "probe"))
+            for role, device in devices.roles().items()
+        }
+        self._steering = Steering(devices.stage, self._health, lambda text: self._tell(Tell(text)), self._began_s)
         self._commands: list[Command] = []
         self._text, self._number = "", 0
-        self._followed: tuple[float, float] = (math.nan, -math.inf)
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
         self._answer: TrackEstimate | None = None
@@ -197,39 +198,44 @@ class LiveLoop:
 
     def turn(self) -> bool:
         """One turn; whether there was anything to do."""
-        frames = self._poll("camera", self._devices.camera)
+        frames = self._sources["camera"].poll()
         now = host_now()
         if not frames and now - self._stepped_s < STEP_S:
             return False
         pose = self._look(frames)
         self._listen()
-        self._hold()
-        self._stage_reports()
+        self._follow_camera()
+        if (plane := self._steering.listen()) is not None:
+            self.ears.plane(plane.at_s, plane.scan_rad, plane.moving)
         self._answer = self._where_to(pose)
         self._stepped_s = now
-        self._beat()
+        newest, verdict = self.eyes.poses.newest(), self._verdict()
+        self._steering.beat(None if newest is None else newest.t_s, None if verdict is None else verdict.value)
         for action in self._conductor.step(self._view(now)):
             self._do(action)
         self._take_aim()
         if frames:
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
-        self._health()
+        self._look_after(host_now())
         return True
+
+    @property
+    def lost(self) -> Mapping[str, str]:
+        """Why devices are lost, by role."""
+        return self._health.lost
 
     def status(self) -> Status:
         """The session now."""
-        link = self._devices.stage
-        view = None if link is None else link.view
         return Status(
             host_now(),
             self._conductor.stage,
             self._text,
             self._recorder.state,
             self._answer,
-            self._plane(),
-            "" if view is None or view.latched is None else view.latched,
-            tuple(self._lost),
+            self._steering.view,
+            self._steering.latched,
+            tuple(self._health.lost),
             self.eyes.poses.newest(),
             self.eyes.newest,
         )
@@ -241,33 +247,29 @@ class LiveLoop:
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
-    def _poll(self, role: str, device: Any) -> Sequence[Any]:
-        try:
-            return device.poll()  # type: ignore[no-any-return]
-        except DeviceLost as error:
-            self._is_lost(role, str(error))
-            return ()
-
     def _look(self, frames: Sequence[StereoFrame]) -> TimedPose | None:
         if not frames:
             return None
-        self.figures.frames += 1
-        self.figures.skipped += len(frames) - 1
+        new = self._pictures.is_new(frames[-1], host_now())
+        self.figures.frames += new
+        self.figures.skipped += len(frames) - new
+        if not new:
+            return None
         pose = self.eyes.see(frames[-1])
         self.figures.found += pose is not None
         return pose
 
     def _listen(self) -> None:
         self.ears.listening = self._conductor.listens
-        pulses = self._poll("probe", self._devices.probe)
+        pulses = self._sources["probe"].poll()
         self.figures.pulses += len(pulses)
         self.ears.hear(pulses)
-        self._commands += self._poll("operator", self._devices.operator)
+        self._commands += self._sources["operator"].poll()
 
-    def _hold(self) -> None:
+    def _follow_camera(self) -> None:
         """Whether the camera is where the registration has it, by its holder's account and by what is recorded."""
         if self._devices.motion is not None:
-            move = self._holder.take(self._poll("motion", self._devices.motion), host_now())
+            move = self._holder.take(self._sources["motion"].poll(), host_now())
             if move is not None:
                 self._recorder.hand_over(
                     CameraMovedEvent(self._t(host_now()), 0, move.camera_new_T_camera_old, move.covariance)
@@ -280,43 +282,24 @@ class LiveLoop:
             self._tell(Tell("the camera moves: nothing holds until it rests and is registered again"))
         self._unsettled_s = since_s
 
-    def _stage_reports(self) -> None:
-        link = self._devices.stage
-        if link is None:
-            return
-        try:
-            for report in link.poll():
-                self._reported(report)
-        except StageError as error:
-            self._is_lost("stage", str(error))
-            return
-        view = link.view
-        if view is None or not view.connected or view.status is None:
-            if "stage" in self._seen or host_now() - self._began_s > START_S:
-                self._is_lost("stage", "the stage is not there")
-            return
-        self._seen.add("stage")
-        self.ears.plane(view.status.stamp.host_s, view.status.scan_rad, view.status.moving)
-
-    def _reported(self, report: Report) -> None:
-        if report.what in ("stopped", "trouble", "refused"):
-            self._tell(Tell(f"stage {report.what}: {report.reason}"))
-
     def _where_to(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Where to turn for a new pose, else for the last one as long as that is new enough to matter."""
-        if self._unsettled_s is not None:
+        try:
+            received = self._reader.read()
+        except NoSnapshotError:
+            return None
+        self._snapshot = received.snapshot
+        stale = received.silent_s > STALE_S or received.closed
+        self._health.found("registration", "its process has ended or hangs" if stale else "")
+        if stale or self._unsettled_s is not None:
             return None
         if pose is None:
             newest = self.eyes.poses.newest()
             return self._answer if newest is not None and host_now() - newest.t_s < 0.2 else None
-        try:
-            self._snapshot = self._reader.snapshot()
-        except NoSnapshotError:
-            return None
-        if not self._snapshot.epochs:
+        if self._snapshot is None or not self._snapshot.epochs:
             return None
         self._number += 1
-        plane = self._plane()
+        plane = self._steering.view
         query = Track(
             self._t(pose.t_s),
             self._snapshot.epochs[-1].number,
@@ -326,21 +309,13 @@ class LiveLoop:
         )
         return fast_track(query, self._snapshot)
 
-    def _plane(self) -> StageView | None:
-        link = self._devices.stage
-        view = None if link is None else link.view
-        if view is None or view.status is None or not view.connected:
-            return None
-        status = view.status
-        return StageView(status.scan_rad, status.moving, status.homed, status.stamp.host_s, view.requested)
-
     def _view(self, now: float) -> View:
         commands, self._commands = tuple(self._commands), []
         state = self._recorder.state
         return View(
             now,
             self.eyes.poses,
-            self._plane(),
+            self._steering.view,
             self.ears.heard(now, self.eyes.poses),
             commands,
             state.known,
@@ -358,21 +333,18 @@ class LiveLoop:
     def _verdict(self) -> Verdict | None:
         """Of the registration that holds now; None where there is none."""
         known = self._recorder.state.known
-        return known.verdict if known.registered and self._unsettled_s is None else None
+        return known.verdict if known.registered and not self._void() else None
 
-    def _beat(self) -> None:
-        link = self._devices.stage
-        if link is not None:
-            newest, verdict = self.eyes.poses.newest(), self._verdict()
-            try:
-                link.beat(None if newest is None else newest.t_s, None if verdict is None else verdict.value)
-            except StageError as error:
-                self._is_lost("stage", str(error))
+    def _void(self) -> str:
+        """Why what is known of the registration holds no more; empty where it does."""
+        if (lost := self._health.lost.get("registration")) is not None:
+            return f"the registration is lost: {lost}"
+        return "" if self._unsettled_s is None else "the camera is moving, or its move is not in the estimate yet"
 
     def _do(self, action: Action) -> None:
         match action:
-            case Ask() | Sweep() | Follow() | Halt():
-                self._order(action)
+            case Ask() | Sweep() | Follow() | Halt() | Release():
+                self.figures.orders += self._steering.order(action)
             case TakeAim(corner):
                 self._aim(corner)
             case TakePairs(pm, looks):
@@ -383,34 +355,6 @@ class LiveLoop:
                 self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
             case Tell():
                 self._tell(action)
-
-    def _order(self, action: Ask | Sweep | Follow | Halt) -> None:
-        link = self._devices.stage
-        if link is None:
-            return
-        try:
-            match action:
-                case Ask(kind):
-                    link.request(kind, "operator")
-                    if kind is MotionKind.HOME:
-                        link.home("asked for by the operator")
-                case Sweep(scan_rad, reason):
-                    link.search_to(scan_rad, reason)
-                case Follow(scan_rad, sigma_rad, _, reason):
-                    goal, at_s = self._followed
-                    now = host_now()
-                    if abs(scan_rad - goal) < AGAIN_RAD and now - at_s < AGAIN_S:
-                        return
-                    self._followed = (scan_rad, now)
-                    link.track_to(scan_rad, sigma_rad, reason)
-                case Halt(reason):
-                    link.stop(reason)
-        except StageError as error:
-            self._is_lost("stage", str(error))
-        except FgregError as error:  # it could not be recorded, and so was not sent
-            self._tell(Tell(str(error)))
-        else:
-            self.figures.orders += 1
 
     def _tell(self, tell: Tell) -> None:
         self._text = tell.text
@@ -470,8 +414,8 @@ class LiveLoop:
         stamp = None if self.eyes.newest is None else self.eyes.newest.stamp
         if estimate is None or stamp is None or newest is None:
             return
-        unsettled = self._unsettled_s is not None
-        refused = unsettled or estimate.verdict is Verdict.REFUSED
+        void = self._void()
+        refused = estimate.verdict is Verdict.REFUSED or bool(void)
         answer = None if refused else self._answer
         stage_rad = None if answer is None else answer.stage_rad
         registration = Registration(
@@ -481,36 +425,27 @@ class LiveLoop:
             None if refused else estimate.covariance,
             None if stage_rad is None else self._model.stage.scan_from_device(stage_rad),
             None if answer is None else answer.sigma_rad,
-            ("the camera is moving, or its move is not in the estimate yet",) if unsettled else estimate.reasons,
+            (void,) if void else estimate.reasons,
             stage_rad,
         )
         for number, sink in enumerate(self._devices.sinks):
             try:
                 sink.send(registration)
             except DeviceLost as error:
-                self._is_lost(f"sink {number + 1}", str(error))
+                self._sources[f"sink {number + 1}"].failed(str(error))
 
-    # --- devices that come and go -----------------------------------------------------------------------------------
-
-    def _is_lost(self, role: str, reason: str) -> None:
-        if role not in self._lost:
-            self._lost[role] = reason
-            self._note(f"{role} lost: {reason}")
-
-    def _health(self) -> None:
-        for role, device in self._devices.roles().items():
-            if role in self._lost and device.connected:
-                del self._lost[role]
-                self._note(f"{role} is back")
-            elif role not in self._lost and role in ("camera", "probe"):
-                if device.connected:
-                    self._seen.add(role)
-                elif role in self._seen or host_now() - self._began_s > START_S:
-                    self._is_lost(role, f"{device.name} does not answer")
-        plane = self._plane()
-        if "stage" in self._lost and plane is not None:
-            del self._lost["stage"]
-            self._note("stage is back")
+    def _look_after(self, now: float) -> None:
+        """What was lost and what is back, told and noted."""
+        health, state, steering = self._health, self._recorder.state, self._steering
+        for role, source in self._sources.items():
+            trouble = source.trouble(now)
+            health.found(role, trouble or (self._pictures.trouble(now) if role == "camera" else ""))
+        health.found("locator", self.ears.trouble)
+        if "recording" in health.lost and not (state.stuck or state.waiting):
+            steering.unwritten = ""  # the note of it has been written
+        health.found("recording", state.stuck or steering.unwritten)
+        for text in health.news():
+            self._note(text)
 
     def _note(self, text: str) -> None:
         self._tell(Tell(text))

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from fgreg.errors import EventRefused, FgregError
+from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.estimate import Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent
 from fgreg.frames import FloatArray
@@ -34,6 +35,7 @@ class RecorderState:
         aims, pairs: on disk and taken in. refused: on disk, and not taken in. waiting: handed over, not on disk yet.
         trouble: the last thing that went wrong; empty where nothing is.
         unsettled: a move of the camera was handed over and is not in the estimate: its registration holds no more.
+        stuck: why nothing can be recorded now; what waits is recorded when it can be. Empty where it can.
     """
 
     known: Known
@@ -44,6 +46,7 @@ class RecorderState:
     waiting: int = 0
     trouble: str = ""
     unsettled: bool = False
+    stuck: str = ""
 
 
 OnTaken = Callable[[Recorded, OnlineEstimate | None, FloatArray | None], None]
@@ -66,8 +69,8 @@ class Recorder:
         self._state = RecorderState(
             known_of(session.estimate), session.estimate, aims=len(taken.aims), pairs=len(taken.pairs)
         )
-        self._ended = False
         self._moves, self._move_lost = 0, False  # of the camera: handed over and waiting; one that was not taken in
+        self._ended, self._left = False, 0
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -75,7 +78,8 @@ class Recorder:
     def state(self) -> RecorderState:
         """As it is now."""
         with self._lock:
-            return replace(self._state, waiting=self._waiting.qsize())
+            waits = self._left or self._waiting.qsize() + bool(self._state.stuck)
+            return replace(self._state, waiting=waits)
 
     def hand_over(self, event: Recorded) -> None:
         """Have an event recorded, and return at once.
@@ -92,7 +96,7 @@ class Recorder:
         self._waiting.put(event)
 
     def close(self) -> None:
-        """Record what still waits, then end."""
+        """Record what still waits, then end; what the disk still refuses then is lost, and counted as waiting."""
         if not self._ended:
             self._ended = True
             self._waiting.put(None)
@@ -107,9 +111,15 @@ class Recorder:
                 continue
             if event is None:
                 return
-            self._take(event)
+            while not self._take(event):
+                if self._ended:
+                    self._left = self._waiting.qsize()  # the mark of the end stands for this event
+                    return
+                self._refresh(holding=True)
+                time.sleep(REFRESH_S)
 
-    def _take(self, event: Recorded) -> None:
+    def _take(self, event: Recorded) -> bool:
+        """Record one; whether that was possible."""
         aims = pairs = refused = 0
         trouble, estimate = "", self._session.estimate
         moved = isinstance(event, CameraMovedEvent)
@@ -121,6 +131,10 @@ class Recorder:
             else:
                 estimate = self._session.add(event)
                 aims, pairs = int(isinstance(event, AimEvent)), int(isinstance(event, PairEvent))
+        except JournalError as error:
+            with self._lock:
+                self._state = replace(self._state, trouble=str(error), stuck=str(error))
+            return False
         except EventRefused as error:
             refused, trouble = 1, f"an event was refused: {error.reason}"
         except FgregError as error:
@@ -140,16 +154,20 @@ class Recorder:
             )
         if self._on_taken is not None and not refused:
             self._on_taken(event, estimate, self._session.marker_T_laser())
+        return True
 
-    def _refresh(self) -> None:
+    def _refresh(self, *, holding: bool = False) -> None:
+        """``holding``: an event waits for the disk."""
         try:
             estimate = self._session.refresh()
         except FgregError as error:
+            stuck = str(error) if isinstance(error, JournalError) else self._state.stuck
             with self._lock:
-                self._state = replace(self._state, trouble=str(error))
+                self._state = replace(self._state, trouble=str(error), stuck=stuck)
             return
         with self._lock:
-            self._state = replace(self._state, known=known_of(estimate), estimate=estimate)
+            stuck = self._state.stuck if holding else ""
+            self._state = replace(self._state, known=known_of(estimate), estimate=estimate, stuck=stuck)
 
 
 def known_of(estimate: OnlineEstimate | None) -> Known:

@@ -7,12 +7,9 @@ that process cannot keep up, pulses are handed on as if the plane had turned, an
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,9 +21,9 @@ from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
 from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
-from fgreg.detection.photoacoustic import locate_in_frame
-from fgreg.drivers.base import PaFrame, StereoFrame
-from fgreg.models import ProbeModel, SessionModel
+from fgreg.drivers.base import PaFrame, StereoFrame, host_now
+from fgreg.models import SessionModel
+from fgreg.operation.locating import Locator
 from fgreg.operation.view import Heard
 from fgreg.pairing import DeviceClock, PairRefused, PoseHistory, TimedPose
 
@@ -36,8 +33,10 @@ GIVE_UP_S = 0.5
 """A pulse waits for the poses about it no longer than this."""
 MOST_UNDER_WAY, LOCATE_S = 3, 2.0
 """Pulses that the locating process has to do at a time, and how long one is waited for."""
-BEHIND = 5
-"""By so much the process that locates sources stands back."""
+TRIES = 2
+"""A frame during which the locating process ended is given to the next one; not for ever: it may be to blame."""
+UNREAD_S = 2.0
+"""So long it is told that a frame could not be looked into."""
 STOOD_RAD = 0.002
 """The plane stands if it has turned by no more than this about the pulse."""
 
@@ -76,12 +75,13 @@ class Eyes:
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """A pulse under way: its frame until that is looked into, where the plane stood, what is located."""
+    """A pulse under way: its frame until that was looked into, where the plane stood, what is located."""
 
     pulse_s: float
     data: npt.NDArray[Any] | None
     scan_rad: float | None = None
     located: Future[PaFind | NoSignal] | None = None
+    tries: int = 0
 
 
 class Ears:
@@ -89,18 +89,23 @@ class Ears:
 
     Attributes:
         listening: whether anybody wants to know what is heard: locating a source takes time.
-        trouble: why nothing is located any more; empty where it is.
         passed_over: pulses that would have been located, had there been time.
     """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
-        self._probe: ProbeModel = model.probe
+        self._locator = Locator(model.probe)
         self._clock = DeviceClock(latency_s)
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
-        self._pool = _pool()
-        self._under_way: list[Future[PaFind | NoSignal]] = []
-        self.listening, self.trouble, self.passed_over = True, "", 0
+        self.listening, self.passed_over = True, 0
+        self._unread, self._unread_s = "", -np.inf
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing is located now; empty where it is."""
+        if host_now() - self._unread_s > UNREAD_S:
+            self._unread = ""
+        return self._locator.trouble or self._unread
 
     @property
     def waiting(self) -> int:
@@ -120,15 +125,15 @@ class Ears:
     def heard(self, now_s: float, poses: PoseHistory) -> tuple[Heard, ...]:
         """The pulses that are complete, in their order."""
         out = []
+        self._locator.look_after(now_s)
         for pulse in self._waiting:
             self._look_into(pulse, now_s)
+            if pulse.located is not None and not pulse.located.done() and now_s - pulse.pulse_s > LOCATE_S:
+                self._pass_over(pulse)
         while self._waiting:
             first = self._waiting[0]
             overdue = now_s - first.pulse_s > GIVE_UP_S
-            if first.located is not None and not first.located.done() and now_s - first.pulse_s > LOCATE_S:
-                self._pass_over(first)
-            looked = first.data is None and (first.located is None or first.located.done())
-            if not (looked and (poses.can_tell(first.pulse_s) or overdue)):
+            if first.data is not None or not (poses.can_tell(first.pulse_s) or overdue):
                 break
             self._waiting.popleft()
             out.append(self._complete(first, poses))
@@ -138,26 +143,27 @@ class Ears:
         """Have the source located, once it is known that the plane stood at the pulse; a turning one is of no use."""
         if pulse.data is None:
             return
-        if (not self._planes or self._planes[-1][0] <= pulse.pulse_s) and now_s - pulse.pulse_s < GIVE_UP_S:
+        if pulse.located is None:
+            if (not self._planes or self._planes[-1][0] <= pulse.pulse_s) and now_s - pulse.pulse_s < GIVE_UP_S:
+                return
+            pulse.scan_rad = self._stood(pulse.pulse_s)
+            if pulse.scan_rad is None:
+                pulse.data = None
+                return
+        elif not pulse.located.done():
             return
-        data, pulse.data = pulse.data, None
-        pulse.scan_rad = self._stood(pulse.pulse_s)
-        if pulse.scan_rad is None:
+        elif not _ended_under(pulse.located) or pulse.tries >= TRIES:
+            pulse.data = None
             return
-        self._under_way = [located for located in self._under_way if not located.done()]
-        if len(self._under_way) >= MOST_UNDER_WAY:
+        if sum(other.located is not None and not other.located.done() for other in self._waiting) >= MOST_UNDER_WAY:
             self._pass_over(pulse)
             return
-        try:
-            pulse.located = self._pool.submit(locate_in_frame, data, self._probe)
-            self._under_way.append(pulse.located)
-        except BrokenProcessPool:
-            self._pool = _pool()
-            self.trouble = "the process that locates sources had ended; it was started again"
+        pulse.tries += 1
+        pulse.located = self._locator.submit(pulse.data)
 
     def _pass_over(self, pulse: _Waiting) -> None:
         """Nobody knows whether anything was heard: then the pulse says nothing of any angle."""
-        pulse.scan_rad = pulse.located = None
+        pulse.data = pulse.scan_rad = pulse.located = None
         self.passed_over += 1
 
     def _complete(self, pulse: _Waiting, poses: PoseHistory) -> Heard:
@@ -171,8 +177,9 @@ class Ears:
         try:
             found = pulse.located.result()
         except Exception as error:  # of one frame: the next one may be as it should
-            self.trouble = f"a frame of the probe could not be looked into: {error}"
-            return heard
+            self._unread_s = host_now()
+            self._unread = f"a frame of the probe could not be looked into: {error}"
+            return replace(heard, scan_rad=None)  # nobody knows whether anything was heard there
         if isinstance(found, NoSignal):
             return heard
         return replace(
@@ -191,15 +198,10 @@ class Ears:
         return float(np.interp(t_s, (t0, t1), (first, second)))
 
     def close(self) -> None:
-        """End the process, after what it is at."""
-        self._pool.shutdown(cancel_futures=True)
+        """End the process."""
+        self._locator.close()
 
 
-def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin)
-
-
-def _begin() -> None:
-    """Frames come first: sources are located in what they leave. Ctrl-C is the main program's business."""
-    os.nice(BEHIND)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _ended_under(located: Future[PaFind | NoSignal]) -> bool:
+    """Whether the process was gone before it had looked."""
+    return located.cancelled() or isinstance(located.exception(), BrokenProcessPool)

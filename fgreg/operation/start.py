@@ -16,6 +16,8 @@ from fgreg.drivers.base import host_now
 from fgreg.errors import InputError
 from fgreg.live import LiveSession
 from fgreg.models import SessionModel
+from fgreg.motion.guard import emergency_stop_all
+from fgreg.motion.keeper import StageKeeper
 from fgreg.motion.limits import MotionLimits
 from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
@@ -141,7 +143,7 @@ def running(
             say("starting the stage's watchdog")
             devices.stage = stack.enter_context(_open_stage(live.stage, model, session, start_s, folder))
         recorder = Recorder(session, on_taken)
-        stack.callback(recorder.close)
+        stack.callback(_end_recording, recorder, say)
         taken = session.measurements()
         conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
         reader = engines[-1].reader()
@@ -149,20 +151,31 @@ def running(
         loop = LiveLoop(model, devices, recorder, reader, conductor, start_s, live.holder, live.latencies)
         stack.callback(loop.close)
         stack.enter_context(undisturbed())
-        yield Running(folder, model, loop, recorder, session)
-        if devices.stage is not None:
-            devices.stage.close()  # first of all; the rest follows in the stack's order
+        try:
+            yield Running(folder, model, loop, recorder, session)
+        except BaseException:
+            emergency_stop_all()
+            raise
+        finally:
+            if devices.stage is not None:
+                devices.stage.close()  # first of all; the rest follows in the stack's order
+
+
+def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:
+    recorder.close()
+    if recorder.state.waiting:
+        say(f"the last {recorder.state.waiting} events could not be recorded: {recorder.state.stuck}")
 
 
 def _open_stage(
     stage: StageSetup, model: SessionModel, session: LiveSession, start_s: float, folder: Path
-) -> StageLink:
+) -> StageKeeper:
     def log(record: StageRecord) -> None:
         t = max(0.0, record.host_s - start_s)
         session.journal.append(record.event(t, model.stage), durable=False, late=True)
 
     limits = MotionLimits.of_session(model.stage, **stage.limits)
-    return StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG)
+    return StageKeeper(lambda: StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG))
 
 
 def default_folder() -> Path:

@@ -45,13 +45,15 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class StageView:
-    """Of the stage: where its plane stands, whether it knows its zero, and what motion the operator has asked for."""
+    """Of the stage: where its plane stands, whether it knows its zero, what motion the operator has asked for, and why
+    nothing may move until a reset (``latched``; empty: it may)."""
 
     scan_rad: float
     moving: bool
     homed: bool
     at_s: float
     requested: MotionKind | None = None
+    latched: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +120,11 @@ class Halt:
 
 
 @dataclass(frozen=True, slots=True)
+class Release:
+    """The operator has looked at the latched stage: it may be asked to move again."""
+
+
+@dataclass(frozen=True, slots=True)
 class TakeAim:
     """Record a calibration shot at this corner, from the newest frames."""
 
@@ -149,4 +156,4 @@ class Tell:
     wants: Said | None = None
 
 
-Action = Ask | Sweep | Follow | Halt | TakeAim | TakePairs | TakeMove | Tell
+Action = Ask | Sweep | Follow | Halt | Release | TakeAim | TakePairs | TakeMove | Tell

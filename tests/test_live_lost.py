@@ -1,0 +1,37 @@
+"""Devices that disappear from a live session: told and recorded, the rest goes on, what comes back is used again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from fgreg.events import NoteEvent
+from fgreg.session.reading import read_session
+from tests.live_rig import ONCE, STUDIED, Rig, rig, trial
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    with rig(tmp_path_factory.mktemp("lost") / "session") as case:
+        yield case
+
+
+@pytest.mark.parametrize("name", [*(name for name in STUDIED if name not in ONCE), *ONCE])
+def test_what_is_lost_is_told_and_the_rest_goes_on(case: Rig, name: str) -> None:
+    fault = STUDIED[name]
+    found = trial(case, fault, 1.5, comes_back=name not in ONCE)
+    assert found.told_s == found.told_s, f"never told: {case.operator.told[-5:]}"
+    frames, pulses, _ = found.rates
+    assert fault.role == "camera" or frames > 0.0
+    assert fault.role == "probe" or pulses > 0.0
+    if name in ONCE:
+        assert case.session.loop.status().lost == (fault.role,)
+        return
+    assert found.back_s == found.back_s, f"never back: {case.session.loop.lost} {case.operator.told[-5:]}"
+    assert found.order_s == found.order_s, f"the stage is not used again: {case.operator.told[-5:]}"
+    assert case.session.loop.status().lost == ()
+    lines = [event.text for event in read_session(case.session.folder).events if isinstance(event, NoteEvent)]
+    assert sum(line.startswith(f"{fault.role} lost") for line in lines) == sum(
+        said.startswith(f"{fault.role} lost") for _, said in case.operator.told
+    )

@@ -1,0 +1,81 @@
+"""Devices of a live session that disappear and come back: how soon it is told, how soon they are used again.
+
+A session is conducted in the simulated room (a process of its own) by the machinery of ``fgreg live``. Faults are made
+one after another, each for some seconds and several times. Printed for each: time from the fault until the operator is
+told, until it is told that the device is back, counted from when it was mended, and until the stage got its next order;
+and what the rest of the session did during the fault, per second: frames looked into, pulses taken in, orders given.
+Exit status 1 where something was told later than a second after it happened, or not at all.
+
+    python tools/study_lost.py --repeat 10 --fault camera-frozen watchdog-killed
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
+from fgreg.events import NoteEvent
+from fgreg.session.reading import read_session
+from tests.live_rig import ONCE, STUDIED, Trial, rig, trial
+
+TOLD_S = 1.0
+
+
+def show(name: str, trials: Sequence[Trial]) -> bool:
+    """One line; whether all was told in time."""
+
+    def column(values: Sequence[float]) -> str:
+        known = [value for value in values if math.isfinite(value)]
+        return f"{np.median(known):6.2f} {max(known):6.2f}" if known else "     -      -"
+
+    told = [one.told_s for one in trials]
+    rates = np.mean([one.rates for one in trials], axis=0)
+    print(
+        f"{name:<16} {len(trials):>3}  {column(told)}   {column([one.back_s for one in trials])}   "
+        f"{column([one.order_s for one in trials])}   {rates[0]:6.1f} {rates[1]:6.1f} {rates[2]:6.1f}",
+        flush=True,
+    )
+    return all(value <= TOLD_S for value in told)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeat", type=int, default=10)
+    parser.add_argument("--lasts", type=float, default=3.0, help="seconds that a fault lasts (default: %(default)s)")
+    parser.add_argument("--fault", nargs="+", choices=sorted(STUDIED), default=list(STUDIED))
+    arguments = parser.parse_args()
+    print("                          told s         back s      next order s     frames pulses orders, per s meanwhile")
+    print("fault          times  median    max   median    max   median    max")
+    in_time = True
+    for name in arguments.fault:
+        fault, comes_back = STUDIED[name], name not in ONCE
+        trials: list[Trial] = []
+        while len(trials) < arguments.repeat:
+            with tempfile.TemporaryDirectory() as folder, rig(Path(folder) / "session") as case:
+                times = arguments.repeat if comes_back else 1
+                trials += [trial(case, fault, arguments.lasts, comes_back=comes_back) for _ in range(times)]
+                case.session.recorder.close()
+                notes = [e for e in read_session(Path(folder) / "session").events if isinstance(e, NoteEvent)]
+                lost = sum(one.text.startswith(f"{fault.role} lost") for one in notes)
+                told = sum(said.startswith(f"{fault.role} lost") for _, said in case.operator.told)
+                others = [said for _, said in case.operator.told if " lost: " in said]
+                others = [said for said in others if not said.startswith(f"{fault.role} lost")]
+                for said in others:
+                    print(f"{name}: also told: {said}")
+                if comes_back and lost != told:
+                    print(f"{name}: told {told} times, recorded {lost} times")
+                    in_time = False
+        in_time &= show(name, trials)
+    return 0 if in_time else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
