@@ -14,7 +14,7 @@ import yaml
 
 from fgreg.config import SolveConfig
 from fgreg.drivers.base import Command, MotionSample, PaFrame, Registration, Said, StereoFrame, host_now
-from fgreg.errors import JournalError
+from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.estimate import Verdict
 from fgreg.events import CameraMovedEvent
 from fgreg.frames import FloatArray, make_transform
@@ -24,6 +24,7 @@ from fgreg.motion.device import StageStatus
 from fgreg.motion.limits import MotionKind
 from fgreg.motion.link import Report, StageView
 from fgreg.online.engine import OnlineRegistration
+from fgreg.online.shared_snapshot import Received
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import Recorder
@@ -33,7 +34,6 @@ from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import read_session
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
-from fgreg.tracking import Snapshot
 
 MOVED = make_transform(np.eye(3), np.array([6.0, 0.0, 0.0]))
 
@@ -69,6 +69,10 @@ class Link:
         self.orders: list[float] = []
 
     @property
+    def link(self) -> Link:
+        return self
+
+    @property
     def view(self) -> StageView:
         now = host_now()
         status = StageStatus(Stamp(now, now), 0.0, 0.0, moving=False, homed=True, homing=False, fault="")
@@ -102,8 +106,8 @@ class Stand:
         conductor = Conductor(model, ConductorSettings(aims=0, pms=1, most_pms=1, hearing_threshold=0.1))
 
         class Reader:
-            def snapshot(self) -> Snapshot:
-                return engine.snapshot()
+            def read(self) -> Received:
+                return Received(engine.snapshot(), 1, 0.0, 0.0, False)
 
         reader: Any = Reader()
         self.loop = LiveLoop(model, devices, self.recorder, reader, conductor, host_now() - 1000.0)
@@ -210,26 +214,43 @@ def test_a_move_that_the_operator_tells_holds_until_it_is_in_the_estimate(
     assert len(stand.moves()) == 1
 
 
-def test_a_move_that_cannot_be_recorded_holds_and_the_next_one_ties_nothing(
-    stand: Stand, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    add = stand.session.add
-    full = [True]
+def refusing_moves(stand: Stand, monkeypatch: pytest.MonkeyPatch, error: FgregError) -> list[bool]:
+    """Moves are not taken in while the list's entry is true."""
+    add, refuses = stand.session.add, [True]
 
     def refusing(event: Any) -> Any:
-        if full[0]:
-            raise JournalError("events.jsonl", "no space left on the disk", "room for events")
+        if refuses[0]:
+            raise error
         return add(event)
 
     monkeypatch.setattr(stand.session, "add", refusing)
+    return refuses
+
+
+def test_a_move_that_the_disk_refuses_holds_until_it_is_recorded(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = refusing_moves(stand, monkeypatch, JournalError("events.jsonl", "no space left", "room for events"))
     stand.base_T_camera = MOVED
     stand.turn(1.5)
     assert stand.recorder.state.unsettled
     assert stand.link.beats[-1] is None
     assert "no space left" in stand.recorder.state.trouble
     full[0] = False
+    stand.turn(10.0, lambda: not stand.recorder.state.unsettled)
+    (move,) = stand.moves()
+    assert move.camera_new_T_camera_old is not None
+
+
+def test_a_move_that_is_not_taken_in_holds_and_the_next_one_ties_nothing(
+    stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuses = refusing_moves(stand, monkeypatch, EventRefused("of no use"))
+    stand.base_T_camera = MOVED
+    stand.turn(1.5)
+    assert stand.recorder.state.unsettled
+    assert stand.link.beats[-1] is None
+    refuses[0] = False
     stand.base_T_camera = MOVED @ MOVED
-    stand.turn(5.0, lambda: bool(stand.moves()) and not stand.recorder.state.unsettled)
+    stand.turn(10.0, lambda: bool(stand.moves()) and not stand.recorder.state.unsettled)
     (move,) = stand.moves()
     assert move.camera_new_T_camera_old is None
     assert stand.recorder.state.known.verdict is Verdict.REFUSED
