@@ -82,7 +82,7 @@ class RoomServer:
         room: the world.
         path: of the Unix socket; its folder should be this user's alone.
         frame_rate, pulse_rate: of camera and laser, per second.
-        roam_s: the surgeon goes on by himself after so long at a place at tissue, without being asked.
+        roam_s: where the stage follows him, the surgeon goes on by himself after so long at a place.
 
     Attributes:
         start_s: host time of the room's begin.
@@ -102,6 +102,7 @@ class RoomServer:
         self._scan_rad = 0.0  # where the plane truly stands
         self.start_s = time.monotonic()
         self._said_s = -math.inf
+        self._followed = False
 
     # --- clients ----------------------------------------------------------------------------------------------------
 
@@ -217,9 +218,10 @@ class RoomServer:
                 asked = self._asked.get_nowait()
                 go_on |= asked.get("next") is True
                 if isinstance(asked.get("say"), str):
+                    self._followed = asked["say"] == "follow"
                     self._say({"says": asked["say"]})
         rested = now_s - room.arrives_s()
-        roams = room.place.corner is None and rested > self._roam_s
+        roams = self._followed and rested > self._roam_s
         if (go_on and rested > 0) or roams:
             room.proceed(now_s)
             self._said_s = -math.inf

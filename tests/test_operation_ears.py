@@ -81,7 +81,7 @@ def test_what_the_locating_process_has_no_time_for_is_handed_on_as_unknown_and_c
 
 def test_a_process_that_keeps_up_passes_nothing_over(ears: tuple[Ears, SlowPool]) -> None:
     found, pool = ears
-    handed = []
+    handed: list[Heard] = []
     for k in range(50):
         handed += pulses(found, k, 1)
         pool.finish()
