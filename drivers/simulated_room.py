@@ -94,7 +94,7 @@ class RoomServer:
         room: the world.
         path: of the Unix socket; its folder should be this user's alone.
         frame_rate, pulse_rate: of camera and laser, per second.
-        roam_s: the surgeon goes on by himself after so long at a place at tissue, without being asked.
+        roam_s: where the stage follows him, the surgeon goes on by himself after so long at a place.
 
     Attributes:
         start_s: host time of the room's begin.
@@ -114,6 +114,7 @@ class RoomServer:
         self._scan_rad = 0.0  # where the plane truly stands
         self.start_s = time.monotonic()
         self._said_s = -math.inf
+        self._followed = False
         self._faults = dict.fromkeys(FAULTS, "")
         self._frozen: tuple[bytes | memoryview, ...] | None = None
         self._stages: list[socket.socket] = []
@@ -274,12 +275,13 @@ class RoomServer:
                 asked = self._asked.get_nowait()
                 go_on |= asked.get("next") is True
                 if isinstance(asked.get("say"), str):
+                    self._followed = asked["say"] == "follow"
                     self._answers.append((now_s + LOOKS_S * (asked["say"] == "reset"), asked["say"]))
         for answer in [answer for answer in self._answers if answer[0] <= now_s]:
             self._answers.remove(answer)
             self._say({"says": answer[1]})
         rested = now_s - room.arrives_s()
-        roams = room.place.corner is None and rested > self._roam_s
+        roams = self._followed and rested > self._roam_s
         if (go_on and rested > 0) or roams:
             room.proceed(now_s)
             self._said_s = -math.inf

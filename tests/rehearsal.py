@@ -196,6 +196,8 @@ class Rehearsal:
         amplitude = float(config.elevation.amplitude(room.plane_rad(t_s) - scan, width))
         amplitude *= math.exp(0.05 * rng.standard_normal())
         where = None if moving else scan + config.noise.scan_rad * rng.standard_normal()
+        if not self.conductor.listens:  # then nobody looks into it (fgreg.operation.senses)
+            return Heard(t_s, None, marker, unpaired)
         if amplitude < self.threshold or t_s >= self.deaf_from_s:
             return Heard(t_s, where, marker, unpaired)
         x = float(source[0]) + config.noise.lateral_mm * rng.standard_normal()

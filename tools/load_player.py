@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--socket", type=Path, required=True)
     parser.add_argument("--pictures", type=Path, required=True, help="made by fgreg.simulation.played_room")
     parser.add_argument("--figures", type=Path, required=True, help="written at the end")
-    parser.add_argument("--stay-s", type=float, default=12.0, help="at a spot, where nobody asks to go on")
+    parser.add_argument("--stay-s", type=float, default=12.0, help="at a spot, while the stage follows")
     for name in ("--seed", "--width", "--aims", "--spots", "--laps"):
         parser.add_argument(name, type=int, required=True)
     parser.add_argument("--bump-every-s", type=float, help="not used: bumps come where the list has them")

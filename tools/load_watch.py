@@ -91,8 +91,8 @@ class Spent:
 def _until(times_s: FloatArray, last_s: float) -> tuple[int, int]:
     """How many there were up to one, and how many were left out between them by a player that could not keep up."""
     sent = times_s[times_s <= last_s + TINY_S]
-    period = float(np.diff(times_s).min())
-    return len(sent), round(float(np.ptp(sent)) / period) + 1 - len(sent)
+    rate = round(1.0 / float(np.diff(times_s).min()))
+    return len(sent), round(float(np.ptp(sent)) * rate) + 1 - len(sent)
 
 
 def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Callable[..., Any]:

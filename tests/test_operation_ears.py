@@ -1,0 +1,99 @@
+"""Pulses on their way through the ears: none is lost, none piles up, and none that nobody looked into seems silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fgreg.detection.find import NoSignal
+from fgreg.drivers.base import PaFrame
+from fgreg.operation.senses import LOCATE_S, MOST_UNDER_WAY, Ears
+from fgreg.operation.view import Heard
+from fgreg.pairing import PoseHistory, Stamp, TimedPose
+from tests.forward import make_session
+
+PERIOD_S = 0.1
+
+
+class SlowPool:
+    """A process that takes as long as the test says."""
+
+    def __init__(self) -> None:
+        self.under_way: list[Future[Any]] = []
+
+    def submit(self, *_work: Any) -> Future[Any]:
+        self.under_way.append(Future())
+        return self.under_way[-1]
+
+    def finish(self) -> None:
+        for future in self.under_way:
+            if not future.done():
+                future.set_result(NoSignal("nothing"))
+
+    def shutdown(self, **_how: Any) -> None:
+        """Nothing to end."""
+
+
+@pytest.fixture
+def ears() -> Iterator[tuple[Ears, SlowPool]]:
+    found, pool = Ears(make_session()), SlowPool()
+    found.close()
+    found._pool = pool  # type: ignore[assignment]
+    yield found, pool
+    found.close()
+
+
+def pulses(ears: Ears, first: int, count: int) -> tuple[Heard, ...]:
+    """Pulses at the laser's pace, with the plane standing and the marker seen all the time; what was handed on."""
+    poses = PoseHistory()
+    out: list[Heard] = []
+    for k in range(first, first + count):
+        t = 100.0 + k * PERIOD_S
+        ears.hear([PaFrame(Stamp(t, t), np.zeros((2, 2), dtype=np.int16), k)])
+        for at in (t - 0.02, t + 0.02):
+            ears.plane(at, 0.1, moving=False)
+            poses.add(TimedPose(at, np.eye(4), np.eye(6)))
+        out += ears.heard(t + 0.03, poses)
+    return tuple(out)
+
+
+def test_what_the_locating_process_has_no_time_for_is_handed_on_as_unknown_and_counted(
+    ears: tuple[Ears, SlowPool],
+) -> None:
+    found, pool = ears
+    handed = pulses(found, 0, 200)
+    most = round(LOCATE_S / PERIOD_S) + 2
+    assert len(pool.under_way) == MOST_UNDER_WAY, "it gets no more while it does nothing"
+    assert found.waiting <= most
+    assert len(handed) == 200 - found.waiting, "none is lost"
+    assert [heard.scan_rad for heard in handed] == [None] * len(handed), "nobody knows whether anything was heard"
+    assert found.passed_over >= len(handed)
+    pool.finish()
+    later = pulses(found, 200, 5)
+    pool.finish()
+    later += pulses(found, 205, 1)
+    assert any(heard.scan_rad == pytest.approx(0.1) for heard in later), "it goes on where it can"
+
+
+def test_a_process_that_keeps_up_passes_nothing_over(ears: tuple[Ears, SlowPool]) -> None:
+    found, pool = ears
+    handed: list[Heard] = []
+    for k in range(50):
+        handed += pulses(found, k, 1)
+        pool.finish()
+    assert found.passed_over == 0
+    assert len(handed) == 49
+    assert [heard.scan_rad for heard in handed] == pytest.approx([0.1] * 49)
+
+
+def test_pulses_that_nobody_listens_to_say_nothing_and_are_not_looked_into(ears: tuple[Ears, SlowPool]) -> None:
+    found, pool = ears
+    found.listening = False
+    handed = pulses(found, 0, 20)
+    assert len(handed) == 20
+    assert not pool.under_way
+    assert {heard.scan_rad for heard in handed} == {None}

@@ -1,0 +1,31 @@
+"""What a live session asks of the interpreter and of linear algebra, and that it is as before afterwards."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+
+import pytest
+
+from fgreg.operation.interpreter import SWITCH_S, undisturbed
+from fgreg.threads import NAMES, one_thread_each
+
+
+def test_processes_get_one_thread_each_unless_the_user_has_said_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in NAMES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(NAMES[1], "3")
+    with one_thread_each():
+        assert [os.environ[name] for name in NAMES] == ["1", "3", "1", "1"]
+    assert [os.environ.get(name) for name in NAMES] == [None, "3", None, None]
+
+
+def test_the_interpreter_is_as_before_when_a_session_ends_however_it_does() -> None:
+    before = sys.getswitchinterval()
+    with pytest.raises(KeyboardInterrupt), undisturbed():
+        assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+        assert gc.get_freeze_count() > 0
+        raise KeyboardInterrupt
+    assert sys.getswitchinterval() == before
+    assert gc.get_freeze_count() == 0
