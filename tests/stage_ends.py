@@ -81,7 +81,7 @@ def orders(folder: Path) -> list[dict[str, Any]]:
 
 
 def live_stopped_after(folder: Path, phase: str, number: signal.Signals) -> float:
-    """Seconds from a signal to a live program, sent while its stage homes or searches, to the order that ends all motion.
+    """Seconds from a signal to a live program, sent while its stage homes or searches, to the order that ends motion.
 
     0 where a busy machine had the stage stopped by then for want of a heartbeat.
     """
