@@ -113,9 +113,7 @@ def _pid_of(case: Rig, what: str) -> int:
         assert link is not None
         return link.pid
     if what == "locator":
-        locator = case.session.loop.ears._locator
-        case.run(PATIENCE_S, lambda: locator._pid is not None and not locator.trouble)
-        pid = locator._pid
+        pid = case.session.loop.ears._locator._pid
         assert pid is not None
         return pid
     (engine,) = [child for child in multiprocessing.active_children() if child.name == "fgreg-engine"]
@@ -192,9 +190,12 @@ class Trial:
     rates: Sequence[float] = (math.nan,) * 3
 
 
-def trial(case: Rig, fault: Fault, lasts_s: float, *, comes_back: bool) -> Trial:
-    """Make a fault, mend it, and let the session go on."""
-    found = Trial()
+def trial(
+    case: Rig, fault: Fault, lasts_s: float, *, comes_back: bool, orders: bool = True, rest_s: float = 2.0
+) -> Trial:
+    """Make a fault where all is well, mend it, and let the session go on: until the next order, and a while more."""
+    found, ears = Trial(), case.session.loop.ears
+    case.run(PATIENCE_S, lambda: not case.session.loop.lost and ears._locator._pid is not None)
     before, began = case.counts(), time.monotonic()
     mend = fault.begin(case, fault.what)
     lost, back = f"{fault.role} lost", f"{fault.role} is back"
@@ -208,8 +209,8 @@ def trial(case: Rig, fault: Fault, lasts_s: float, *, comes_back: bool) -> Trial
         return found
     if case.run(PATIENCE_S, lambda: case.told_after(began, back) is not None):
         found.back_s = max(0.0, (case.told_after(began, back) or 0.0) + began - mended)
-    orders = case.counts()[2]
-    if case.run(PATIENCE_S, lambda: case.counts()[2] > orders and not case.session.loop.status().latched):
+    before = case.counts()
+    if orders and case.run(PATIENCE_S, lambda: case.counts()[2] > before[2] and not case.session.loop.status().latched):
         found.order_s = time.monotonic() - mended
-    case.run(2.0)
+    case.run(rest_s)
     return found

@@ -21,7 +21,7 @@ from fgreg.motion.link import CLOSE_S, Report, StageLink, StageView
 
 RETRY_S = 1.0
 """Between attempts to start a watchdog."""
-GRACE_S = 0.3
+GRACE_S = 0.15
 """A watchdog that still lives has told its stage to stop long before; then it is ended."""
 
 

@@ -49,7 +49,7 @@ CLOSE_S = 5.0
 """How long the watchdog may take to bring the stage to rest when it is let go."""
 READINGS = 100
 """Stage angles that are kept, one every 50 ms."""
-SILENT_S = 0.8
+SILENT_S = 0.7
 """A watchdog that says nothing for this long is gone: it tells of the stage every 50 ms."""
 
 
