@@ -17,7 +17,7 @@ from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.evidence import Tested, size_of
+from fgreg.online.evidence import MIN_BEFORE, Tested, size_of
 from fgreg.online.moves import MoveSettings, check_for_move, quick_score, relinearisation
 from fgreg.online.state import Setting, State, kept_by_place
 from fgreg.online.store import MeasurementStore
@@ -25,7 +25,7 @@ from fgreg.online.white import Gaussian, linearise, pose_columns
 from fgreg.registration import Registration, SoundSpeedPrior, pack_session, register
 from fgreg.robust import plausible_cost
 from fgreg.steadiness import DOUBT, logsumexp, odds_in_epoch
-from fgreg.verdict import FEW_PMS
+from fgreg.verdict import FEW_PMS, WARN_LEFT_OUT
 
 LEAST_AFTER = 7
 """PMs after a move that have to agree on a registration of their own: one more than it takes."""
@@ -57,7 +57,7 @@ def early_case(state: State, setting: Setting, store: MeasurementStore, settings
     for place in range(state.now.first, state.pairs):
         looks.setdefault(store.number(place), []).append(place)
     size = 0 if window is None else size_of(state, window)
-    early = min(len(looks) - size - 1, len(looks) - LEAST_AFTER)
+    early = min(len(looks) - size - 1, len(looks) - LEAST_AFTER, MIN_BEFORE)
     if early < 1 or len(looks) > FEW_PMS:
         return None
     pms = tuple(tuple(store.pair(place, 0, n) for place in mine) for n, mine in enumerate(looks.values()))
@@ -100,7 +100,8 @@ def early_test(
 def _is_sound(found: Registration) -> bool:
     """Whether the PMs of a registration agree, on one only, and the first of them with the last."""
     shots = found.shots
-    deviates = bool((shots.pm_deviant & shots.pm_kept).any()) or shots.pm_kept.sum() < LEAST_AFTER
+    few = shots.pm_kept.sum() < LEAST_AFTER or float(np.mean(~shots.pm_kept)) > WARN_LEFT_OUT
+    deviates = bool((shots.pm_deviant & shots.pm_kept).any())
     plausible = float(found.optimum.evaluation.cost[0]) <= plausible_cost(found.problem)
     steady = logsumexp(odds_in_epoch(found.problem, found.optimum, found.covariance, 0)[1]) <= DOUBT
-    return plausible and not deviates and not found.ambiguous and bool(steady)
+    return plausible and not few and not deviates and not found.ambiguous and bool(steady)
