@@ -2,7 +2,8 @@
 
     python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
 
-Devices, each by a connection that begins with ``{"role": ...}``: ``camera`` and ``probe`` only send; ``stage`` tells
+Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe`` and ``scanner`` only
+send; ``stage`` tells
 where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp
 with clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
 """
@@ -28,6 +29,8 @@ from fgreg.simulation.room import BUMP_EVERY_S, Room, RoomConfig, room_config
 
 CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
 """What the devices' clocks read when the room begins."""
+PICTURE_RATE = 4.0
+"""B-mode pictures per second, at most: they come between pulses."""
 FRAMES_WAITING, PULSES_WAITING = 2, 64
 """What a slow receiver may leave unread before the oldest is dropped."""
 SETTLE_S = 0.4
@@ -100,7 +103,8 @@ class RoomServer:
         self._end = threading.Event()
         self._scan_rad = 0.0  # where the plane truly stands
         self._start_s = time.monotonic()
-        self._said_s = -math.inf
+        self._said_s = self._pictured_s = -math.inf
+        self._pictures = 0
 
     # --- clients ----------------------------------------------------------------------------------------------------
 
@@ -124,10 +128,12 @@ class RoomServer:
         if role == "stage":
             self._turn(connection)
             return
-        if role not in ("camera", "probe", "operator"):
+        if role not in ("camera", "probe", "scanner", "operator"):
             connection.close()
             return
-        client = _Client(role, connection, queue.Queue(FRAMES_WAITING if role == "camera" else PULSES_WAITING))
+        client = _Client(
+            role, connection, queue.Queue(PULSES_WAITING if role in ("probe", "operator") else FRAMES_WAITING)
+        )
         with self._lock:
             self._clients.append(client)
         threading.Thread(target=client.run, daemon=True).start()
@@ -174,6 +180,7 @@ class RoomServer:
             self._live(now)
             if due_pulse <= due_frame:
                 self._pulse(due_pulse, pulse)
+                self._picture(due_pulse)
                 pulse = max(pulse + 1, math.floor((now - 0.2) * self._pulse_rate))
             else:
                 self._frame(due_frame, frame)
@@ -203,6 +210,23 @@ class RoomServer:
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
         for client in clients:
             client.put(header, data.tobytes())
+
+    def _picture(self, t_s: float) -> None:
+        clients = self._to("scanner")
+        if not clients or t_s - self._pictured_s < 1.0 / PICTURE_RATE:
+            return
+        self._pictured_s = t_s
+        image, pixel_mm, origin_mm = self.room.bmode(self._scan_rad, self._pictures)
+        header = {
+            "index": self._pictures,
+            "device_s": PROBE_CLOCK_S + t_s,
+            "shape": list(image.shape),
+            "pixel_mm": pixel_mm,
+            "origin_mm": origin_mm,
+        }
+        self._pictures += 1
+        for client in clients:
+            client.put(header, image.tobytes())
 
     # --- the surgeon ------------------------------------------------------------------------------------------------
 

@@ -19,8 +19,9 @@ from fgreg.errors import InputError
 
 if TYPE_CHECKING:
     from fgreg.config import SolveConfig
-    from fgreg.operation.loop import Figures, LiveLoop, Status
+    from fgreg.operation.loop import LiveLoop
     from fgreg.operation.start import LiveSetup
+    from fgreg.operation.status import Figures, Status
     from fgreg.pipeline import SolveReport
 
 MakeExtras = Callable[["SolveReport"], Any]
@@ -61,6 +62,9 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             float,
             typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
         ] = 240.0,
+        width: Annotated[
+            int, typer.Option("--width", metavar="PX", help="Of the simulated camera's images: 160 to 1920.")
+        ] = 640,
         limit_mm: LimitOption = 3.0,
         example_config: Annotated[
             bool, typer.Option("--example-config", help="Print a CONFIG.yaml with every driver and key, explained.")
@@ -93,11 +97,12 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         folder = default_folder() if out is None else out
         silent = as_json or quiet
         with ExitStack() as stack:
-            if config is None:
-                setup = _room(stack, seed, aims, bumps)
-            else:
-                setup, settings = _configured(stack, config, silent=silent)
             viewer = not (no_viewer or silent)
+            seen = viewer or rrd is not None
+            if config is None:
+                setup = _room(stack, seed, aims, bumps, width, seen=seen)
+            else:
+                setup, settings = _configured(stack, config, silent=silent, seen=seen)
             figures = _conduct(setup, folder, settings, duration, rrd, viewer=viewer, silent=silent)
         report = solve_session(SolveRequest(folder, None, None), settings, None)
         extras = make_extras(report)
@@ -111,23 +116,27 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             raise typer.Exit(EXIT_REFUSED)
 
 
-def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float) -> LiveSetup:
+def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> LiveSetup:
     from fgreg.operation.rooms import simulated_room
 
+    if not 0 <= seed < 2**31:
+        raise InputError("--seed", str(seed), "0 to 2147483647")
+    if not 160 <= width_px <= 1920:
+        raise InputError("--width", str(width_px), "160 to 1920")
     if not 0 <= aims <= 100:
         raise InputError("--aims", str(aims), "0 to 100")
     if not bump_every_s > 0:
         raise InputError("--bump-every", str(bump_every_s), "seconds > 0, or inf")
-    return simulated_room(stack, seed, aims, bump_every_s)
+    return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
 
 
-def _configured(stack: ExitStack, path: Path, *, silent: bool) -> tuple[LiveSetup, SolveConfig]:
+def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> tuple[LiveSetup, SolveConfig]:
     from fgreg.operation.config import read_config
 
     found = read_config(path)
     for warning in found.warnings:
         sys.stderr.write(f"fgreg: warning: {warning}\n")
-    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo), found.solve
+    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo, seen=seen), found.solve
 
 
 def _conduct(

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,18 +17,7 @@ import numpy as np
 from fgreg.detection.board import BoardFit, board_corner, detect_board
 from fgreg.detection.joint import NotFound
 from fgreg.detection.noise import pool_corner_noise
-from fgreg.drivers.base import (
-    Command,
-    DeviceLost,
-    MotionSource,
-    Operator,
-    PhotoacousticSource,
-    Registration,
-    StereoCamera,
-    StereoFrame,
-    TransformSink,
-    host_now,
-)
+from fgreg.drivers.base import BmodeFrame, Command, DeviceLost, Registration, StereoFrame, host_now
 from fgreg.errors import FgregError
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord
@@ -38,12 +25,13 @@ from fgreg.measurements import MarkerObservation, Track
 from fgreg.models import SessionModel
 from fgreg.motion.device import StageError
 from fgreg.motion.limits import MotionKind
-from fgreg.motion.link import Report, StageLink
+from fgreg.motion.link import Report
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.operation.conductor import Conductor
-from fgreg.operation.recorder import Recorder, RecorderState
+from fgreg.operation.recorder import Recorder
 from fgreg.operation.senses import Ears, Eyes
 from fgreg.operation.spots import one_spot
+from fgreg.operation.status import Devices, Figures, Status
 from fgreg.operation.view import (
     Action,
     Ask,
@@ -69,77 +57,10 @@ AGAIN_RAD, AGAIN_S = math.radians(0.1), 0.5
 """An order to follow is repeated once the goal has moved by so much, or after so long."""
 SEND_S = 0.2
 """Between sendings of the registration where nothing has changed."""
+SENDERS = ("camera", "probe", "bmode")
+"""They send by themselves."""
 START_S = 5.0
 """So long devices may take to send for the first time."""
-LATENCIES = 100_000
-
-
-@dataclass(slots=True, eq=False)
-class Devices:
-    """What is connected: one device a role, any number of sinks."""
-
-    camera: StereoCamera
-    probe: PhotoacousticSource
-    operator: Operator
-    stage: StageLink | None = None
-    motion: MotionSource | None = None
-    sinks: Sequence[TransformSink] = ()
-
-    def roles(self) -> dict[str, Any]:
-        """Those that can be lost, by role."""
-        found: dict[str, Any] = {"camera": self.camera, "probe": self.probe, "operator": self.operator}
-        if self.motion is not None:
-            found["motion"] = self.motion
-        for number, sink in enumerate(self.sinks):
-            found[f"sink {number + 1}"] = sink
-        return found
-
-    def close(self) -> None:
-        """Let go of all, the stage first."""
-        if self.stage is not None:
-            self.stage.close()
-        for device in self.roles().values():
-            device.close()
-
-
-@dataclass(slots=True, eq=False)
-class Figures:
-    """What the loop measures of itself.
-
-    Attributes:
-        latency_ms: from a frame's arrival to its order, or to the knowledge that there is none.
-        frames, skipped: frames looked into, and dropped for newer ones here.
-        found: frames in which the marker was found. pulses: taken in. orders: sent to the stage.
-    """
-
-    latency_ms: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES))
-    frames: int = 0
-    skipped: int = 0
-    found: int = 0
-    pulses: int = 0
-    orders: int = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Status:
-    """The session at one moment, for whoever shows it.
-
-    Attributes:
-        now_s: host time. stage: how far it has come. text: last told to the operator.
-        answer: where to turn for the newest pose. plane: the stage. lost: devices that are gone, by role.
-        pose, frame: newest.
-    """
-
-    now_s: float
-    stage: str
-    text: str
-    recorder: RecorderState
-    answer: TrackEstimate | None
-    plane: StageView | None
-    latched: str
-    lost: tuple[str, ...]
-    pose: TimedPose | None
-    frame: StereoFrame | None
 
 
 class LiveLoop:
@@ -171,7 +92,9 @@ class LiveLoop:
         self._seen: set[str] = set()
         self._began_s = host_now()
         self._commands: list[Command] = []
-        self._text, self._number = "", 0
+        self._text, self._task, self._number = "", "", 0
+        self._bmode: BmodeFrame | None = None
+        self._unshown = 0
         self._followed: tuple[float, float] = (math.nan, -math.inf)
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
@@ -195,6 +118,7 @@ class LiveLoop:
             return False
         pose = self._look(frames)
         self._listen()
+        self._show()
         self._stage_reports()
         self._answer = self._where_to(pose)
         self._stepped_s = now
@@ -213,9 +137,11 @@ class LiveLoop:
         link = self._devices.stage
         view = None if link is None else link.view
         return Status(
-            host_now(),
+            now := host_now(),
+            self._t(now),
             self._conductor.stage,
             self._text,
+            self._task,
             self._recorder.state,
             self._answer,
             self._plane(),
@@ -223,6 +149,7 @@ class LiveLoop:
             tuple(self._lost),
             self.eyes.poses.newest(),
             self.eyes.newest,
+            self._bmode,
         )
 
     def close(self) -> None:
@@ -255,6 +182,20 @@ class LiveLoop:
         self.ears.hear(pulses)
         self._commands += self._poll("operator", self._devices.operator)
 
+    def _show(self) -> None:
+        """The newest B-mode picture; nothing is measured in it."""
+        device = self._devices.bmode
+        if device is None:
+            return
+        pictures = self._poll("bmode", device)
+        if pictures:
+            self.figures.pictures += len(pictures)
+            self._unshown += len(pictures) - 1
+            self._bmode = pictures[-1]
+        elif not device.connected:
+            self._bmode = None  # an old picture must not look like a new one
+        self.figures.unshown = self._unshown + device.dropped
+
     def _stage_reports(self) -> None:
         link = self._devices.stage
         if link is None:
@@ -275,7 +216,7 @@ class LiveLoop:
 
     def _reported(self, report: Report) -> None:
         if report.what in ("stopped", "trouble", "refused"):
-            self._tell(Tell(f"stage {report.what}: {report.reason}"))
+            self._news(Tell(f"stage {report.what}: {report.reason}"))
 
     def _where_to(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Where to turn for a new pose, else for the last one as long as that is new enough to matter."""
@@ -385,6 +326,11 @@ class LiveLoop:
             self.figures.orders += 1
 
     def _tell(self, tell: Tell) -> None:
+        self._task = tell.text
+        self._news(tell)
+
+    def _news(self, tell: Tell) -> None:
+        """What asks nothing of the operator, so that what was asked before still holds."""
         self._text = tell.text
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
 
@@ -472,7 +418,7 @@ class LiveLoop:
             if role in self._lost and device.connected:
                 del self._lost[role]
                 self._note(f"{role} is back")
-            elif role not in self._lost and role in ("camera", "probe"):
+            elif role not in self._lost and role in SENDERS:
                 if device.connected:
                     self._seen.add(role)
                 elif role in self._seen or host_now() - self._began_s > START_S:
@@ -483,8 +429,5 @@ class LiveLoop:
             self._note("stage is back")
 
     def _note(self, text: str) -> None:
-        self._tell(Tell(text))
+        self._news(Tell(text))
         self._recorder.hand_over(NoteEvent(self._t(host_now()), 0, text))
-
-
-__all__ = ["Devices", "Figures", "LiveLoop", "Status"]

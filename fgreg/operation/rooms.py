@@ -6,11 +6,17 @@ import math
 import os
 from contextlib import ExitStack
 
-from fgreg.drivers.simulated import RoomProcess, SimulatedCamera, SimulatedOperator, SimulatedProbe
+from fgreg.drivers.simulated import (
+    RoomProcess,
+    SimulatedCamera,
+    SimulatedOperator,
+    SimulatedProbe,
+    SimulatedScanner,
+)
 from fgreg.models import SessionModel
 from fgreg.operation.conductor import ConductorSettings
-from fgreg.operation.loop import Devices
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
+from fgreg.operation.status import Devices
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import BUMP_EVERY_S, room_config
 
@@ -20,7 +26,13 @@ SPEED_RAD_S = math.radians(20.0)
 
 
 def simulated_room(
-    stack: ExitStack, seed: int = 1, aims: int = 8, bump_every_s: float = BUMP_EVERY_S, width_px: int = 640
+    stack: ExitStack,
+    seed: int = 1,
+    aims: int = 8,
+    bump_every_s: float = BUMP_EVERY_S,
+    width_px: int = 640,
+    *,
+    seen: bool = True,
 ) -> LiveSetup:
     """A room that runs until the stack is left.
 
@@ -30,6 +42,7 @@ def simulated_room(
         aims: calibration shots before the surgeon turns to the tissue.
         bump_every_s: mean time between moves of the camera.
         width_px: of its images.
+        seen: whether anybody sees pictures that are only to be shown.
 
     Raises:
         FgregError: it did not start.
@@ -37,7 +50,12 @@ def simulated_room(
     room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
 
     def open_devices(devices: ExitStack, _model: SessionModel) -> Devices:
-        found = Devices(SimulatedCamera(room.path), SimulatedProbe(room.path), SimulatedOperator(room.path))
+        found = Devices(
+            SimulatedCamera(room.path),
+            SimulatedProbe(room.path),
+            SimulatedOperator(room.path),
+            bmode=SimulatedScanner(room.path) if seen else None,
+        )
         for device in found.roles().values():
             devices.callback(device.close)
         return found

@@ -20,8 +20,9 @@ from fgreg.motion.limits import MotionLimits
 from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
-from fgreg.operation.loop import Devices, LiveLoop
+from fgreg.operation.loop import LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
+from fgreg.operation.status import Devices
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
 

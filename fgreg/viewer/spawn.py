@@ -17,6 +17,8 @@ from fgreg.errors import FgregError
 START_S = 30.0
 STABLE_S = 1.5
 """A viewer that finds no screen ends soon after it listens."""
+MEMORY = "2GB"
+"""Beyond this the viewer drops what is oldest: a live session may go on for hours."""
 _INSTEAD = "record with --rrd FILE instead and open that where there is a screen"
 
 
@@ -65,7 +67,13 @@ def spawn_viewer(executable: Path | None = None) -> str:
     with tempfile.TemporaryFile() as log:
         try:
             child = subprocess.Popen(
-                [str(program), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen"],
+                [
+                    str(program),
+                    "--bind=127.0.0.1",
+                    f"--port={port}",
+                    "--hide-welcome-screen",
+                    f"--memory-limit={MEMORY}",
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
