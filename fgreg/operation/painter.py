@@ -159,7 +159,10 @@ class RerunPainter:
 
     def _run(self) -> None:
         while (seen := self._waiting.get()) is not None:
-            self._draw(seen)
+            try:
+                self._draw(seen)
+            except Exception:  # one picture that cannot be drawn must not freeze the view
+                self.left_out += 1
 
     def _draw(self, seen: _Seen) -> None:
         known, number, status = seen.estimate, self._number, seen.status

@@ -13,7 +13,6 @@ from fgreg.estimate import PredictedTre, Verdict
 from fgreg.models import StageModel
 from fgreg.viewer.text import HEADINGS
 
-
 NEEDED = ("camera", "probe", "stage", "operator")
 """Without one of these a session does not go on."""
 

@@ -40,7 +40,7 @@ from fgreg.viewer.pa import pa_picture, texture
 from fgreg.viewer.result import ResultPainter, Truth
 from fgreg.viewer.shapes import Image8
 
-LARGEST_TEXTURE = 320
+LARGEST_TEXTURE = 160
 """Larger side of a B-mode picture on the image plane, pixels."""
 ShotKind = Literal["aim", "pair", "track"]
 
