@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 
 MakeExtras = Callable[["SolveReport"], Any]
 EXIT_REFUSED = 1
+IN_CONFIG = {
+    "seed": "room.seed",
+    "aims": "settings.aims",
+    "bumps": "room.bump_every_s",
+    "width": "room.width",
+    "limit_mm": "settings.limit_mm",
+}
+"""Parameters of the command, and where a CONFIG.yaml has them."""
 SHOW_S = 0.25
 
 
@@ -34,6 +42,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
     @app.command()
     def live(
+        context: typer.Context,
         config: Annotated[
             Path | None,
             typer.Argument(metavar="[CONFIG]", help="A driver per role (CONFIG.yaml). Default: a simulated room."),
@@ -56,7 +65,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             Path | None,
             typer.Option("--rrd", metavar="FILE", help="Record what a viewer would show."),
         ] = None,
-        seed: Annotated[int, typer.Option("--seed", help="Of the simulated room.")] = 1,
+        seed: Annotated[int, typer.Option("--seed", help="Of all that is random in the simulated room.")] = 1,
         aims: Annotated[int, typer.Option("--aims", help="Calibration shots in the simulated room.")] = 8,
         bumps: Annotated[
             float,
@@ -93,6 +102,8 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         if duration is not None and not 0 < duration < math.inf:
             raise InputError("--duration", str(duration), "seconds > 0")
+        if config is not None:
+            _alone(context)
         settings = solve_config(limit_mm, "")
         folder = default_folder() if out is None else out
         silent = as_json or quiet
@@ -116,6 +127,15 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             raise typer.Exit(EXIT_REFUSED)
 
 
+def _alone(context: typer.Context) -> None:
+    """With a CONFIG.yaml, options that it has keys for would go unheard. Raises InputError."""
+    for name, key in IN_CONFIG.items():
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + {"bumps": "bump-every"}.get(name, name.replace("_", "-"))
+            raise InputError(option, "it, and a CONFIG.yaml", f"{key} in the CONFIG.yaml instead")
+
+
 def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> LiveSetup:
     from fgreg.operation.rooms import simulated_room
 
@@ -125,8 +145,8 @@ def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px:
         raise InputError("--width", str(width_px), "160 to 1920")
     if not 0 <= aims <= 100:
         raise InputError("--aims", str(aims), "0 to 100")
-    if not bump_every_s > 0:
-        raise InputError("--bump-every", str(bump_every_s), "seconds > 0, or inf")
+    if not bump_every_s >= 1:
+        raise InputError("--bump-every", str(bump_every_s), "1 s or more, or inf")
     return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
 
 

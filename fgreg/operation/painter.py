@@ -211,7 +211,7 @@ class RerunPainter:
             status.latched,
             None if told is None else self._model.stage.scan_from_device(told),
             None if answer is None else answer.sigma_rad,
-            "" if answer is None else answer.reason,
+            "" if answer is None or status.recorder.known.verdict is Verdict.REFUSED else answer.reason,
             ended,
         )
 

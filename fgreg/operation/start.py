@@ -83,7 +83,8 @@ def make_folder(folder: Path, setup: str) -> None:
                 raise InputError(str(path), "another set-up", f"the same as now, or a new folder for {EVENTS_FILE}")
             return
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(str(folder), "a folder that is not empty", "a new or empty folder, or a session")
+            found = "a folder that is not empty" if folder.is_dir() else "a file"
+            raise InputError(str(folder), found, "a new or empty folder, or a session")
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(setup, encoding="utf-8")
     except OSError as error:

@@ -112,8 +112,12 @@ class LivePainter:
             label = f"beam at {goal_line(now, stage)}"
             rec.log("world/goal/label", shapes.point(corners[3], shapes.GOAL, 1.0, label))
             rec.log("online/stage_deg/beam", rr.Scalars(goal_deg))
-        if "camera" in now.lost:
-            rec.clear("world/camera/left", "world/camera/right", "world/camera/marker")  # an old picture looks like new
+        camera = self._model.camera
+        if "camera" in now.lost and camera is not None:  # an old picture looks like a new one
+            rec.log("world/camera/left", shapes.no_picture(camera.left.image_size))
+            if camera.right is not None:
+                rec.log("world/camera/right", shapes.no_picture(camera.right.image_size))
+            rec.log("world/camera/marker", shapes.transform(None))
         word, color = banner(moment)
         rec.log("verdict", shapes.flat(color))
         rec.log("verdict/word", shapes.points_2d(np.array([[shapes.BANNER[1] / 2.0, 0.0]]), shapes.MARKER, 0.5, [word]))

@@ -323,7 +323,8 @@ class Viewer:
         rec.at(t, index)
         if picture is None:
             if "bmode" in self._shown:
-                rec.clear("bmode")
+                rec.log("bmode", shapes.no_picture((4, 4)))
+                rec.log("bmode/caption", shapes.points_2d(np.array([[2.0, 2.0]]), shapes.REFUSED, 0.5, ["no picture"]))
             return
         image, pixel_mm, origin_mm = picture.image, picture.pixel_mm, picture.origin_mm
         self._shown.add("bmode")

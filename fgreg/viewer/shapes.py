@@ -200,14 +200,13 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
     import rerun as rr
 
     triangles = [[0, 1, 2], [0, 2, 3]]
-    if picture is None:
-        return rr.Mesh3D(vertex_positions=corners_mm, triangle_indices=triangles, albedo_factor=(*PLANE, 110))
     return rr.Mesh3D(
         vertex_positions=corners_mm,
         triangle_indices=triangles,
         vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
-        albedo_texture=picture,
-        albedo_factor=(255, 255, 255, 160),
+        # Without one, the picture before it would stay.
+        albedo_texture=np.full((1, 1, 3), 255, dtype=np.uint8) if picture is None else picture,
+        albedo_factor=(*PLANE, 110) if picture is None else (255, 255, 255, 160),
     )
 
 
@@ -272,6 +271,11 @@ def flat(color: Color) -> rr.Image:
     import rerun as rr
 
     return rr.Image(np.full((*BANNER, 3), color, dtype=np.uint8))
+
+
+def no_picture(image_size: tuple[int, int]) -> rr.EncodedImage | rr.Image:
+    """Black, (width, height), in place of an old picture: Rerun's 2D view goes on showing one that is cleared."""
+    return picture(np.zeros(image_size[::-1], dtype=np.uint8))
 
 
 def points_2d(pixels: FloatArray, color: Color, size: float, labels: Sequence[str] | None = None) -> rr.Points2D:
