@@ -6,6 +6,7 @@ import json
 import math
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -19,8 +20,8 @@ from fgreg.errors import InputError
 
 if TYPE_CHECKING:
     from fgreg.config import SolveConfig
-    from fgreg.operation.loop import LiveLoop
-    from fgreg.operation.start import LiveSetup
+    from fgreg.models import StageModel
+    from fgreg.operation.start import LiveSetup, Running
     from fgreg.operation.status import Figures, Status
     from fgreg.pipeline import SolveReport
 
@@ -35,6 +36,8 @@ IN_CONFIG = {
 }
 """Parameters of the command, and where a CONFIG.yaml has them."""
 SHOW_S = 0.25
+MOST_REASONS, REASON_WIDTH = 2, 170
+"""Of the verdict, in the panel: it has to fit a small terminal."""
 
 
 def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
@@ -191,7 +194,7 @@ def _conduct(
                     painter.status(status)
                     if status.now_s - shown > SHOW_S:
                         shown = status.now_s
-                        show(session.loop, status)
+                        show(session, status)
 
                 say(f"recording to {folder}")
                 try:
@@ -231,14 +234,14 @@ def figures_line(figures: Figures) -> str:
 
 
 Say = Callable[[str], None]
-Show = Callable[["LiveLoop", "Status"], None]
+Show = Callable[["Running", "Status"], None]
 
 
 @contextmanager
 def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
     """A panel that changes on a terminal, else a line whenever something new is told."""
     if silent:
-        yield lambda _text: None, lambda _loop, _status: None
+        yield lambda _text: None, lambda _session, _status: None
         return
     from rich.console import Console
     from rich.live import Live
@@ -247,7 +250,7 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
     if not sys.stdout.isatty():
         last: list[str] = [""]
 
-        def line(_loop: LiveLoop, status: Status) -> None:
+        def line(_session: Running, status: Status) -> None:
             if status.text != last[0]:
                 last[0] = status.text
                 console.print(status_line(status), soft_wrap=True)
@@ -256,8 +259,8 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
         return
     with Live(console=console, refresh_per_second=4, transient=True) as area:
 
-        def panel(loop: LiveLoop, status: Status) -> None:
-            area.update(status_panel(loop, status))
+        def panel(session: Running, status: Status) -> None:
+            area.update(status_panel(session.loop.figures, session.model.stage, status))
 
         yield lambda text: console.print(text, style="dim"), panel
 
@@ -271,37 +274,47 @@ def status_line(status: Status) -> str:
     return f"{status.stage:<11} {state:<36} {status.text}{lost}"
 
 
-def status_panel(loop: LiveLoop, status: Status) -> Any:
-    """The session as a panel."""
+def status_panel(figures: Figures, stage: StageModel, status: Status) -> Any:
+    """The session as a panel: what has to be seen at a glance first, the same as in the viewer."""
     from rich.panel import Panel
     from rich.table import Table
+    from rich.text import Text
 
+    from fgreg.operation.painter import now_of
     from fgreg.report import STYLES
+    from fgreg.viewer.now import error_line, next_line, stage_line
 
-    state, plane, answer = status.recorder, status.plane, status.answer
+    state, now = status.recorder, now_of(status, stage)
     known, estimate = state.known, state.estimate
     table = Table.grid(padding=(0, 2))
-    table.add_row("stage of the session", status.stage)
-    verdict = known.verdict.value if known.registered else "no registration yet"
-    worst = "" if estimate is None or estimate.predicted_tre is None else f"{estimate.predicted_tre.worst_mm:.2f} mm"
-    looks = f"epoch {known.epoch}, {known.pairs} looks"
-    table.add_row("registration", f"[{STYLES[known.verdict]}]{verdict}[/]  {looks}  {worst}")
-    for reason in known.reasons[:2]:
-        table.add_row("", reason)
-    if plane is None:
-        table.add_row("stage", "not there")
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+
+    def row(title: str, text: str, style: str = "") -> None:
+        table.add_row(title, Text(text, style=style))  # what devices say is no markup
+
+    if known.registered:
+        row("registration", known.verdict.value.upper(), STYLES[known.verdict])
+        row(
+            "predicted error",
+            f"{error_line(None if estimate is None else estimate.predicted_tre)} (95 %, worst target)",
+        )
     else:
-        told = None if answer is None else answer.stage_rad
-        wanted = "" if told is None else f"  beam at {math.degrees(told):.1f} deg"
-        asked = f"  ({plane.requested})" if plane.requested is not None else ""
-        table.add_row("stage", f"{math.degrees(plane.scan_rad):.1f} deg{asked}{wanted}  {status.latched}")
-    figures = loop.figures
-    latency = f"  {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
-    table.add_row("camera", f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}")
-    events = f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting"
-    table.add_row("recorded", events)
-    if status.lost or state.trouble:
-        troubles = [*(f"{role} lost" for role in status.lost), *filter(None, [state.trouble])]
-        table.add_row("[red]trouble[/]", "; ".join(troubles))
-    table.add_row("now", f"[bold]{status.text}[/]")
+        row("registration", "none yet")
+    for reason in known.reasons[:MOST_REASONS]:
+        row("", textwrap.shorten(reason, REASON_WIDTH, placeholder=" ..."))
+    if status.lost:
+        row("LOST", ", ".join(status.lost), "bold white on red")
+    if state.trouble:
+        row("trouble", state.trouble, "red")
+    row("next", next_line(now), "bold")
+    row("stage", stage_line(now, stage))
+    if now.news != now.task:
+        row("told last", now.news)
+    row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it")
+    latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
+    row("camera", f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}")
+    if figures.pictures:
+        row("B-mode", f"{figures.pictures} pictures, {figures.unshown} left out for newer ones")
+    row("recorded", f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting")
     return Panel(table, title="fgreg live", subtitle="Ctrl-C ends the session", expand=True)

@@ -18,7 +18,7 @@ from fgreg.estimate import Verdict
 from fgreg.events import AimEvent, NoteEvent, PairEvent
 from fgreg.frames import FloatArray, as_float_array
 from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track
-from fgreg.models import SessionModel
+from fgreg.models import SessionModel, StageModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.operation.recorder import Recorded
 from fgreg.operation.status import Status
@@ -165,7 +165,9 @@ class RerunPainter:
                 self.left_out += 1
 
     def _draw(self, seen: _Seen) -> None:
-        known, number, status = seen.estimate, self._number, seen.status
+        known, number, status, model = seen.estimate, self._number, seen.status, self._model
+        if model is None:
+            raise AssertionError("the session comes first")
         self._number += 1
         if seen.frame is not None:
             kind: ShotKind = "track"
@@ -190,30 +192,30 @@ class RerunPainter:
                 nis=known.nis if known is not None and isinstance(seen.shot, Pair) else None,
                 used=known is not None and known.used,
                 answer=None if status is None or not isinstance(seen.shot, Track) else status.answer,
-                now=None if status is None else self._now(status, ended=seen.ended),
+                now=None if status is None else now_of(status, model.stage, ended=seen.ended),
                 epoch=0 if known is None else known.epoch,
             )
         )
 
-    def _now(self, status: Status, *, ended: bool) -> Now:
-        plane, answer = status.plane, status.answer
-        told = None if answer is None else answer.stage_rad
-        if self._model is None:
-            raise AssertionError("the session comes first")
-        return Now(
-            status.stage,
-            status.task,
-            status.text,
-            status.lost,
-            None if plane is None else plane.scan_rad,
-            plane is not None and plane.homed,
-            plane is not None and plane.moving,
-            status.latched,
-            None if told is None else self._model.stage.scan_from_device(told),
-            None if answer is None else answer.sigma_rad,
-            "" if answer is None or status.recorder.known.verdict is Verdict.REFUSED else answer.reason,
-            ended,
-        )
+
+def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
+    """What has to be seen at a glance of a moment."""
+    plane, answer = status.plane, status.answer
+    told = None if answer is None else answer.stage_rad
+    return Now(
+        status.stage,
+        status.task,
+        status.text,
+        status.lost,
+        None if plane is None else plane.scan_rad,
+        plane is not None and plane.homed,
+        plane is not None and plane.moving,
+        status.latched,
+        None if told is None else stage.scan_from_device(told),
+        None if answer is None else answer.sigma_rad,
+        "" if answer is None or status.recorder.known.verdict is Verdict.REFUSED else answer.reason,
+        ended,
+    )
 
 
 def _frame(status: Status | None) -> StereoFrame | None:

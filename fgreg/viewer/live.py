@@ -74,7 +74,10 @@ class LivePainter:
         self._rec.at(*self._last)
         self._registration(moment)
         shot = moment.shot
-        if shot is not None:
+        blind = moment.now is not None and "camera" in moment.now.lost
+        if blind:
+            self._blind()
+        elif shot is not None:
             self._rec.log("world/camera/marker", shapes.transform(shot.marker.camera_T_marker))
         if not isinstance(shot, Pair | Track) or not (isinstance(shot, Pair) or shot.looks):
             self._rec.clear("world/shot/arc", "world/shot/sound")
@@ -90,6 +93,14 @@ class LivePainter:
         if moment.now is not None:
             self._now(moment, moment.now)
         self._figures(moment)
+
+    def _blind(self) -> None:
+        """The camera is gone: an old picture would look like a new one."""
+        self._rec.log("world/camera/marker", shapes.transform(None))
+        camera = self._model.camera
+        for side, there in (("left", camera and camera.left), ("right", camera and camera.right)):
+            if there:
+                self._rec.log(f"world/camera/{side}", shapes.no_picture(there.image_size))
 
     def _now(self, moment: Moment, now: Now) -> None:
         """Where the stage is and where it should be, and the verdict as a colour."""
@@ -112,12 +123,6 @@ class LivePainter:
             label = f"beam at {goal_line(now, stage)}"
             rec.log("world/goal/label", shapes.point(corners[3], shapes.GOAL, 1.0, label))
             rec.log("online/stage_deg/beam", rr.Scalars(goal_deg))
-        camera = self._model.camera
-        if "camera" in now.lost and camera is not None:  # an old picture looks like a new one
-            rec.log("world/camera/left", shapes.no_picture(camera.left.image_size))
-            if camera.right is not None:
-                rec.log("world/camera/right", shapes.no_picture(camera.right.image_size))
-            rec.log("world/camera/marker", shapes.transform(None))
         word, color = banner(moment)
         rec.log("verdict", shapes.flat(color))
         rec.log("verdict/word", shapes.points_2d(np.array([[shapes.BANNER[1] / 2.0, 0.0]]), shapes.MARKER, 0.5, [word]))
