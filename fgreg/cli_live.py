@@ -36,6 +36,8 @@ IN_CONFIG = {
 }
 """Parameters of the command, and where a CONFIG.yaml has them."""
 SHOW_S = 0.25
+SLOW_MS = 250.0
+"""From a frame to its angle: beyond this the stage lags behind the beam, and its watchdog may miss the heartbeat."""
 MOST_REASONS, REASON_WIDTH = 2, 170
 """Of the verdict, in the panel: it has to fit a small terminal."""
 
@@ -62,7 +64,10 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             float | None, typer.Option("--duration", metavar="S", help="End after so many seconds. Default: at Ctrl-C.")
         ] = None,
         no_viewer: Annotated[
-            bool, typer.Option("--no-viewer", help="Show the session in the terminal only, not in Rerun.")
+            bool,
+            typer.Option(
+                "--no-viewer", help="Show the session in the terminal only, not in Rerun: where there is no screen."
+            ),
         ] = False,
         rrd: Annotated[
             Path | None,
@@ -75,7 +80,10 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
         ] = 240.0,
         width: Annotated[
-            int, typer.Option("--width", metavar="PX", help="Of the simulated camera's images: 160 to 1920.")
+            int,
+            typer.Option(
+                "--width", metavar="PX", help="Of the simulated camera's images; below 640 boards may not be found."
+            ),
         ] = 640,
         limit_mm: LimitOption = 3.0,
         example_config: Annotated[
@@ -89,6 +97,13 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         Without CONFIG a simulated operating room runs: a surgeon calibrates the fibre at a board, points at tissue, the
         stage searches the sound, the registration forms, and the stage follows the beam. Now and then somebody bumps
         into the camera. With CONFIG your devices are used, each by the driver that it names.
+
+        \b
+          fgreg live --aims 6 --duration 120 --no-viewer  the room, in the terminal
+          fgreg live --rrd session.rrd             in Rerun's viewer, and recorded
+          fgreg live --example-config > room.yaml  a CONFIG with every key to choose
+          fgreg devices room.yaml                  which of its devices answer
+          fgreg live room.yaml --out SESSION       a session with your devices
 
         Ctrl-C ends it: the stage stops first, the session in FOLDER is complete and solved once more as a whole.
         Replay it: fgreg replay FOLDER. Exit status 1 where the verdict is refused.
@@ -313,7 +328,9 @@ def status_panel(figures: Figures, stage: StageModel, status: Status) -> Any:
         row("told last", now.news)
     row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it")
     latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
-    row("camera", f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}")
+    slow = bool(figures.latency_ms) and figures.latency_ms[-1] > SLOW_MS
+    seen = f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}"
+    row("camera", seen + (": this machine cannot keep up" if slow else ""), "yellow" if slow else "")
     if figures.pictures:
         row("B-mode", f"{figures.pictures} pictures, {figures.unshown} left out for newer ones")
     row("recorded", f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting")

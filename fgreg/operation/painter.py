@@ -31,6 +31,9 @@ LOOK_S = 0.5
 FRESH_S = 0.5
 """A marker seen longer ago is not where it was."""
 WAITING = 64
+INSTEAD = (
+    "with --no-viewer the session is shown in the terminal only; --no-viewer --rrd FILE records what it would show"
+)
 
 
 class Painter(Protocol):
@@ -237,7 +240,7 @@ def painted(rrd: Path | None, name: str, *, live: bool, say: Callable[[str], Non
     url = None
     if live:
         say("starting the viewer")
-        url = spawn_viewer()
+        url = spawn_viewer(instead=INSTEAD)
     with open_viewer(rrd, name, url) as viewer:
         painter = RerunPainter(viewer)
         try:

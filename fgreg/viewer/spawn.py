@@ -56,8 +56,12 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def spawn_viewer(executable: Path | None = None) -> str:
+def spawn_viewer(executable: Path | None = None, instead: str = _INSTEAD) -> str:
     """Start a viewer and return the address to send a recording to; the viewer stays open when this program ends.
+
+    Args:
+        executable: of the viewer, where it is not the installed one.
+        instead: what to do where it cannot be started.
 
     Raises:
         ViewerError: no viewer, no screen for it, or it did not start in time.
@@ -80,12 +84,12 @@ def spawn_viewer(executable: Path | None = None) -> str:
                 start_new_session=True,
             )
         except OSError as error:
-            raise ViewerError(f"the rerun viewer cannot be started ({error.strerror}); {_INSTEAD}") from None
+            raise ViewerError(f"the rerun viewer cannot be started ({error.strerror}); {instead}") from None
         deadline, heard = time.monotonic() + START_S, None
         while time.monotonic() < deadline:
             if child.poll() is not None:
                 log.seek(0)
-                raise ViewerError(f"the rerun viewer ended at once ({_why(log.read(), child.returncode)}); {_INSTEAD}")
+                raise ViewerError(f"the rerun viewer ended at once ({_why(log.read(), child.returncode)}); {instead}")
             if heard is None:
                 with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5):
                     heard = time.monotonic()
@@ -94,7 +98,7 @@ def spawn_viewer(executable: Path | None = None) -> str:
             time.sleep(0.1)
     child.kill()
     child.wait()
-    raise ViewerError(f"the rerun viewer did not start within {START_S:.0f} s; {_INSTEAD}")
+    raise ViewerError(f"the rerun viewer did not start within {START_S:.0f} s; {instead}")
 
 
 def _why(log: bytes, status: int) -> str:
