@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
-from fgreg.estimate import SessionEstimate
+from fgreg.estimate import SessionEstimate, Verdict
 from fgreg.frames import FloatArray, exp_so3
 from fgreg.measurements import Measurements, Track
 from fgreg.models import ProbeModel, SessionModel
@@ -404,7 +404,7 @@ class Viewer:
             self._live = LivePainter(self._rec, self._model)
         if moment.now is not None:
             self._shown.add("now")
-            if moment.trus_T_camera is not None:
+            if moment.trus_T_camera is not None and moment.verdict is not Verdict.REFUSED:
                 self._shown.add("registered")
         contents = self._contents(result=True)
         if contents != self._arranged:  # seldom: whoever looks may have turned the view
@@ -412,7 +412,7 @@ class Viewer:
             eye = None
             if moment.now is not None:
                 points = scene.live_points_mm(self._model.probe, self._model.targets_mm)
-                if moment.trus_T_camera is not None:
+                if moment.trus_T_camera is not None and contents.registered:
                     points = np.vstack([points, moment.trus_T_camera[:3, 3]])
                 eye = scene.best_eye(points)
             self._rec.blueprint(make_blueprint(contents, None, eye))

@@ -180,7 +180,7 @@ def shots_of(estimate: SessionEstimate) -> list[Shot]:
 def live_points_mm(probe: ProbeModel, targets_mm: FloatArray) -> FloatArray:
     """(n, 3) what has to be in view before a camera stands anywhere: the probe, the targets, and room for a camera."""
     half = array_length_mm(probe) / 2.0
-    beyond = 1.3 * float(np.linalg.norm(targets_mm[:, 1:], axis=1).max())
+    beyond = 1.7 * float(np.linalg.norm(targets_mm[:, 1:], axis=1).max())
     ends = np.array([[side * half, 0.0, height] for side in (-1, 1) for height in (-probe.radius_mm, beyond)])
     return np.vstack([ends, targets_mm])
 
