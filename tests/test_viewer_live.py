@@ -22,6 +22,7 @@ from fgreg.operation.view import Known, StageView
 from fgreg.viewer.live import Moment
 from fgreg.viewer.now import Now
 from fgreg.viewer.recording import Viewer
+from fgreg.viewer.shapes import CANVAS, canvas
 from tests.recordings import Row, read_recording, transform_of, views
 from tests.test_viewer_recording import make_model
 
@@ -158,3 +159,14 @@ def test_the_panel_says_it_all_on_a_small_terminal(shown: Status, expected: list
     assert all(word in text for word in expected), text
     assert len(text.splitlines()) <= 23
     assert all(len(line) <= 80 for line in text.splitlines())
+
+
+def test_pictures_of_any_size_and_kind_are_shown_on_one_canvas() -> None:
+    grey = canvas(PICTURE)
+    assert grey.shape == (CANVAS, CANVAS, 3)
+    np.testing.assert_array_equal(grey[: 40 * 12 : 12, : 30 * 12 : 12, 1], PICTURE)  # 12 times fits, 13 would not
+    assert not grey[40 * 12 :].any()
+    colour = np.zeros((1200, 900, 3), dtype=np.uint8)
+    colour[..., 2] = 9
+    np.testing.assert_array_equal(canvas(colour)[:400, :300], colour[::3, ::3])
+    assert not canvas(colour)[400:].any()

@@ -74,9 +74,8 @@ class LivePainter:
         self._rec.at(*self._last)
         self._registration(moment)
         shot = moment.shot
-        blind = moment.now is not None and "camera" in moment.now.lost
-        if blind:
-            self._blind()
+        if moment.now is not None and "camera" in moment.now.lost:
+            self._rec.log("world/camera/marker", shapes.transform(None))
         elif shot is not None:
             self._rec.log("world/camera/marker", shapes.transform(shot.marker.camera_T_marker))
         if not isinstance(shot, Pair | Track) or not (isinstance(shot, Pair) or shot.looks):
@@ -93,14 +92,6 @@ class LivePainter:
         if moment.now is not None:
             self._now(moment, moment.now)
         self._figures(moment)
-
-    def _blind(self) -> None:
-        """The camera is gone: an old picture would look like a new one."""
-        self._rec.log("world/camera/marker", shapes.transform(None))
-        camera = self._model.camera
-        for side, there in (("left", camera and camera.left), ("right", camera and camera.right)):
-            if there:
-                self._rec.log(f"world/camera/{side}", shapes.no_picture(there.image_size))
 
     def _now(self, moment: Moment, now: Now) -> None:
         """Where the stage is and where it should be, and the verdict as a colour."""

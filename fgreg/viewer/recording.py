@@ -153,6 +153,7 @@ class Viewer:
         self._live: LivePainter | None = None
         self._model: SessionModel | None = None
         self._shown: set[str] = set()
+        self._shapes: dict[str, tuple[int, ...]] = {}
         self._pa_size: tuple[int, int] | None = None
         self._textured: set[int] = set()
         self._finished = False
@@ -238,6 +239,7 @@ class Viewer:
         for side, image in (("left", left), ("right", right)):
             if image is not None:
                 self._shown.add(side)
+                self._shapes[side] = image.shape
                 rec.log(f"world/camera/{side}", shapes.picture(image))
         if left is None:
             return
@@ -321,15 +323,15 @@ class Viewer:
             raise AssertionError("the session comes first")
         rec = self._rec
         rec.at(t, index)
+        caption = np.array([[0.5 * shapes.CANVAS, 0.03 * shapes.CANVAS]])
         if picture is None:
             if "bmode" in self._shown:
-                rec.log("bmode", shapes.no_picture((4, 4)))
-                rec.log("bmode/caption", shapes.points_2d(np.array([[2.0, 2.0]]), shapes.REFUSED, 0.5, ["no picture"]))
+                rec.log("bmode", shapes.no_picture((shapes.CANVAS, shapes.CANVAS, 3)))
+                rec.log("bmode/caption", shapes.points_2d(caption, shapes.REFUSED, 0.5, ["no picture"]))
             return
         image, pixel_mm, origin_mm = picture.image, picture.pixel_mm, picture.origin_mm
         self._shown.add("bmode")
-        rec.log("bmode", shapes.picture(image))
-        caption = np.array([[0.5 * image.shape[1], -0.04 * image.shape[0]]])
+        rec.log("bmode", shapes.picture(shapes.canvas(image)))
         text = f"t = {t:.1f} s" + ("" if pixel_mm and origin_mm else "; where it lies in the plane is not known")
         rec.log("bmode/caption", shapes.points_2d(caption, shapes.SOUND, 0.5, [text]))
         if pixel_mm is None or origin_mm is None:
@@ -416,6 +418,10 @@ class Viewer:
                     points = np.vstack([points, moment.trus_T_camera[:3, 3]])
                 eye = scene.best_eye(points)
             self._rec.blueprint(make_blueprint(contents, None, eye))
+        if moment.now is not None and "camera" in moment.now.lost:  # an old picture would look like a new one
+            self._rec.at(moment.t, moment.number)
+            for side, shape in self._shapes.items():
+                self._rec.log(f"world/camera/{side}", shapes.no_picture(shape))
         self._live.draw(moment, textured=moment.number in self._textured)
 
 

@@ -43,6 +43,8 @@ IMAGE_DISTANCE_MM = 28.0
 """From the camera to where its image is drawn."""
 LARGEST_ELLIPSOID_MM = 50.0
 """Half size beyond which an ellipsoid is not drawn."""
+CANVAS = 512
+"""Side of what pictures of changing sizes are shown on, pixels."""
 BANNER = (6, 160)
 """Rows and columns of a strip of one colour."""
 NOWHERE = "not known"
@@ -273,9 +275,22 @@ def flat(color: Color) -> rr.Image:
     return rr.Image(np.full((*BANNER, 3), color, dtype=np.uint8))
 
 
-def no_picture(image_size: tuple[int, int]) -> rr.EncodedImage | rr.Image:
-    """Black, (width, height), in place of an old picture: Rerun's 2D view goes on showing one that is cleared."""
-    return picture(np.zeros(image_size[::-1], dtype=np.uint8))
+def no_picture(shape: tuple[int, ...]) -> rr.EncodedImage | rr.Image:
+    """Black, in place of an old picture of this shape: Rerun's 2D view goes on showing one that is cleared."""
+    return picture(np.zeros(shape, dtype=np.uint8))
+
+
+def canvas(image: Image8) -> Image8:
+    """(CANVAS, CANVAS, 3) BGR with a (h, w) grey or (h, w, 3) BGR picture as large as whole steps make it.
+
+    Rerun takes JPEG pictures of one entity for a video, and loses it where their size or kind changes.
+    """
+    larger = max(image.shape[:2])
+    step, times = -(-larger // CANVAS), max(1, CANVAS // larger)
+    shown = image[::step, ::step].repeat(times, axis=0).repeat(times, axis=1)
+    out = np.zeros((CANVAS, CANVAS, 3), dtype=np.uint8)
+    out[: shown.shape[0], : shown.shape[1]] = shown[..., None] if shown.ndim == 2 else shown
+    return out
 
 
 def points_2d(pixels: FloatArray, color: Color, size: float, labels: Sequence[str] | None = None) -> rr.Points2D:
