@@ -103,10 +103,10 @@ class BmodeFrame:
 
     Attributes:
         stamp: when it was taken, as well as the device knows it.
-        image: 8 bit, (depth, lateral) grey or (depth, lateral, 3) BGR.
+        image: 8 bit, (depth, lateral) grey or (depth, lateral, 3) BGR; columns along TRUS x.
         index: counts the device's pictures, so that what was dropped shows.
         pixel_mm: size of a pixel along depth and laterally, where the device tells it.
-        origin_mm: depth and lateral position of the centre of pixel [0, 0], where the device tells it.
+        origin_mm: depth below the array's face and TRUS x of the centre of pixel [0, 0], where that is known.
     """
 
     stamp: Stamp

@@ -16,11 +16,13 @@ import math
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from fgreg.drivers.base import BmodeFrame, DeviceLost, Stamp
+from fgreg.drivers.base import BmodeFrame, Stamp
+from fgreg.drivers.linked import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
 from fgreg.errors import InputError, one_line
 
@@ -34,6 +36,7 @@ STAMP_BYTES = 4
 MAX_SIDE = 8192
 SUBSCRIBED = ("US_WIN_SIZE", "B_GEOMETRY_PIXEL", "B_GEOMETRY_TISSUE", "B_GEOMETRY_US_FRAME_GRAB")
 ASKED = ("US_WIN_SIZE", "B_GEOMETRY_PIXEL:A", "B_GEOMETRY_TISSUE:A", "B_GEOMETRY_US_FRAME_GRAB:A")
+RECTANGLES = {"B_GEOMETRY_PIXEL": "screen", "B_GEOMETRY_TISSUE": "tissue_m", "B_GEOMETRY_US_FRAME_GRAB": "grabbed"}
 FRAME = re.compile(rb"DATA:GRAB_FRAME #([1-9])")
 VALUES = re.compile(r"S?DATA:([A-Z_]+)(?::A)? (.*);")
 ASK_AGAIN_S = 1.0
@@ -127,6 +130,13 @@ class _Geometry:
     tissue_m: tuple[float, ...] | None = None  # the same
     grabbed: tuple[float, ...] | None = None  # the same of what is sent
 
+    @property
+    def falls(self) -> bool:
+        """Whether the lateral position falls from column to column."""
+        if self.screen is None or self.tissue_m is None:
+            return False
+        return (self.tissue_m[2] < self.tissue_m[0]) != (self.screen[2] < self.screen[0])
+
     def pixel_mm(self) -> tuple[float, float] | None:
         """Along depth, laterally; None where it was not told, or cannot be."""
         if self.screen is None or self.tissue_m is None:
@@ -141,16 +151,21 @@ class _Geometry:
         return size if all(0.0 < side < 10.0 for side in size) else None
 
     def origin_mm(self) -> tuple[float, float] | None:
-        """Depth and lateral position of the first grabbed pixel's centre, if all rectangles count the same pixels."""
+        """Depth and lateral position of the first grabbed pixel's centre, if all rectangles count the same pixels.
+
+        None where that was not told, or where depth is upwards in the picture.
+        """
         size = self.pixel_mm()
         if size is None or self.screen is None or self.tissue_m is None or self.grabbed is None:
             return None
+        if (self.tissue_m[3] > self.tissue_m[1]) != (self.screen[3] > self.screen[1]):
+            return None
         down, right = self.grabbed[1] - self.screen[1], self.grabbed[0] - self.screen[0]
-        lateral = math.copysign(size[1], self.tissue_m[2] - self.tissue_m[0])
+        lateral = -size[1] if self.falls else size[1]
         return 1e3 * self.tissue_m[1] + down * size[0], 1e3 * self.tissue_m[0] + right * lateral
 
 
-class BkOemScanner:
+class BkOemScanner(LinkedDevice[OemMessage]):
     """BmodeSource: a scanner that is asked for its pictures.
 
     The time stamps on the wire have no documented unit: both times are the host's.
@@ -159,9 +174,12 @@ class BkOemScanner:
         endpoint: the scanner's address; its OEM port is 7915 as a rule.
         rate_hz: pictures per second to ask for.
         silent_s: a scanner that says nothing for this long counts as lost; a frozen picture is silent.
+        flip: where the columns run against TRUS x.
     """
 
-    def __init__(self, endpoint: Endpoint, rate_hz: int = 20, silent_s: float | None = 0.8) -> None:
+    _role = "BK scanner"
+
+    def __init__(self, endpoint: Endpoint, rate_hz: int = 20, silent_s: float | None = 0.8, flip: bool = False) -> None:
         if endpoint.listen:
             raise InputError("BK scanner", str(endpoint), "an address to connect to")
         if not 1 <= rate_hz <= 100:
@@ -170,54 +188,22 @@ class BkOemScanner:
         greeting = [f"QUERY:{name};" for name in ASKED]
         greeting += [f"CONFIG:DATA:SUBSCRIBE {watched};", f'QUERY:GRAB_FRAME "ON",{rate_hz};']
         counter = itertools.count()
-        self._link: TcpLink[OemMessage] = TcpLink(
-            endpoint,
-            lambda rejections: OemDecoder(rejections, counter),
-            greeting=b"".join(encode(text) for text in greeting),
-            farewell=encode('QUERY:GRAB_FRAME "OFF";'),
-            silent_s=silent_s,
+        super().__init__(
+            TcpLink(
+                endpoint,
+                lambda rejections: OemDecoder(rejections, counter),
+                greeting=b"".join(encode(text) for text in greeting),
+                farewell=encode('QUERY:GRAB_FRAME "OFF";'),
+                silent_s=silent_s,
+            )
         )
-        self._geometry = _Geometry()
+        self._geometry, self._flip = _Geometry(), flip
         self._asked_s = -math.inf
-
-    @property
-    def name(self) -> str:
-        """Its address."""
-        return str(self._link.endpoint)
-
-    @property
-    def connected(self) -> bool:
-        """Whether it is there and sends."""
-        return self._link.connected
-
-    @property
-    def dropped(self) -> int:
-        """Pictures dropped because nobody fetched them in time."""
-        return self._link.dropped
-
-    @property
-    def rejected(self) -> int:
-        """Messages left out: cut off, of the wrong size, not understood."""
-        return self._link.rejections.count
-
-    @property
-    def last_rejection(self) -> str:
-        """Why the last one was left out."""
-        return self._link.rejections.last
-
-    def close(self) -> None:
-        """Stop the pictures and end the connection."""
-        self._link.close()
 
     def poll(self) -> Sequence[BmodeFrame]:
         """Pictures since the last call. Raises DeviceLost."""
-        messages = self._link.poll()
-        if not messages:
-            loss = self._link.take_loss()
-            if loss is not None:
-                raise DeviceLost(f"BK scanner: {loss}")
         frames = []
-        for message in messages:
+        for message in self._messages():
             try:
                 if message.index >= 0:
                     frames.append(self._picture(message))
@@ -247,9 +233,14 @@ class BkOemScanner:
             self._ask_again()
             raise ValueError(f"a grabbed frame of {told} bytes for a window of {columns} x {rows}")
         pixels = np.frombuffer(data[STAMP_BYTES:told], dtype=np.uint8)
-        image = pixels.reshape((rows, columns) if grey else (rows, columns, 3)).copy()
+        image = pixels.reshape((rows, columns) if grey else (rows, columns, 3))
+        falls = self._geometry.falls != self._flip  # TRUS x, from column to column
+        pixel_mm, origin_mm = self._geometry.pixel_mm(), self._geometry.origin_mm()
+        if pixel_mm is not None and origin_mm is not None:
+            x_mm = -origin_mm[1] if self._flip else origin_mm[1]
+            origin_mm = (origin_mm[0], x_mm - (columns - 1) * pixel_mm[1] if falls else x_mm)
         stamp = Stamp(message.host_s, message.host_s)
-        return BmodeFrame(stamp, image, message.index, self._geometry.pixel_mm(), self._geometry.origin_mm())
+        return BmodeFrame(stamp, (image[:, ::-1] if falls else image).copy(), message.index, pixel_mm, origin_mm)
 
     def _ask_again(self) -> None:
         """The window has changed and the scanner did not say so."""
@@ -265,19 +256,15 @@ class BkOemScanner:
         told = VALUES.fullmatch(text)
         if told is None:
             raise ValueError(f"not understood: {one_line(text, 60)}")
-        known = self._geometry
         name, values = told.group(1), told.group(2)
         if name == "US_WIN_SIZE":
             columns, rows = (int(value) for value in _numbers(values, 2))
             if not (1 <= columns <= MAX_SIDE and 1 <= rows <= MAX_SIDE):
                 raise ValueError(f"a window of {columns} x {rows}")
-            self._geometry = _Geometry((columns, rows), known.screen, known.tissue_m, known.grabbed)
-        elif name == "B_GEOMETRY_PIXEL":
-            self._geometry = _Geometry(known.window, _numbers(values, 4), known.tissue_m, known.grabbed)
-        elif name == "B_GEOMETRY_TISSUE":
-            self._geometry = _Geometry(known.window, known.screen, _numbers(values, 4), known.grabbed)
-        elif name == "B_GEOMETRY_US_FRAME_GRAB":
-            self._geometry = _Geometry(known.window, known.screen, known.tissue_m, _numbers(values, 4))
+            self._geometry = replace(self._geometry, window=(columns, rows))
+        elif name in RECTANGLES:
+            told_of: dict[str, Any] = {RECTANGLES[name]: _numbers(values, 4)}
+            self._geometry = replace(self._geometry, **told_of)
 
 
 def _numbers(text: str, count: int) -> tuple[float, ...]:

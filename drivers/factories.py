@@ -127,6 +127,13 @@ def simulated_motion(around: Surroundings) -> MotionSource:
     return SimulatedMotion(_room(around))
 
 
+def simulated_scanner(around: Surroundings) -> BmodeSource:
+    """The simulated room's ultrasound pictures."""
+    from fgreg.drivers.simulated import SimulatedScanner
+
+    return SimulatedScanner(_room(around))
+
+
 def simulated_operator(around: Surroundings) -> Operator:
     """The simulated room's surgeon."""
     from fgreg.drivers.simulated import SimulatedOperator
@@ -150,19 +157,31 @@ def igtl_photoacoustic(
 
 
 def igtl_bmode(
-    _around: Surroundings, *, host: str, port: int, listen: bool, device: str, silent_s: float | None
+    _around: Surroundings,
+    *,
+    host: str,
+    port: int,
+    listen: bool,
+    device: str,
+    depth_mm: float,
+    x_mm: float | None,
+    flip: bool,
+    silent_s: float | None,
 ) -> BmodeSource:
     """B-mode images over OpenIGTLink."""
     from fgreg.drivers.igtl import IgtlBmode
 
-    return IgtlBmode(_endpoint(host, port, listen), device, silent_s)
+    origin_mm = None if x_mm is None else (depth_mm, x_mm)
+    return IgtlBmode(_endpoint(host, port, listen), device, silent_s, origin_mm, flip)
 
 
-def bk_bmode(_around: Surroundings, *, host: str, port: int, rate_hz: int, silent_s: float | None) -> BmodeSource:
+def bk_bmode(
+    _around: Surroundings, *, host: str, port: int, rate_hz: int, flip: bool, silent_s: float | None
+) -> BmodeSource:
     """Pictures of a BK scanner."""
     from fgreg.drivers.bk_oem import BkOemScanner
 
-    return BkOemScanner(_endpoint(host, port, False), rate_hz, silent_s)
+    return BkOemScanner(_endpoint(host, port, False), rate_hz, silent_s, flip)
 
 
 def igtl_motion(

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.drivers.base import BmodeFrame, DeviceLost, MotionSample, PaFrame, Registration, Stamp, host_now
+from fgreg.drivers.base import BmodeFrame, MotionSample, PaFrame, Registration, Stamp, host_now
 from fgreg.drivers.igtl_messages import (
     Image,
     Message,
@@ -26,6 +26,7 @@ from fgreg.drivers.igtl_messages import (
     require_pyigtl,
 )
 from fgreg.drivers.igtl_registration import DeviceNames, registration_messages
+from fgreg.drivers.linked import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
 from fgreg.errors import InputError
 from fgreg.frames import inverse, is_rigid, make_transform, nearest_rotation
@@ -34,8 +35,8 @@ SILENT_S = 0.8
 """A stream that stops for this long counts as lost, unless told otherwise: it is said within a second."""
 
 
-class _IgtlDevice:
-    """What all of them have in common: the link, its losses, its counts."""
+class _IgtlDevice(LinkedDevice[Message]):
+    """A device of which some messages are wanted."""
 
     _role = "OpenIGTLink"
 
@@ -57,53 +58,7 @@ class _IgtlDevice:
         def decoder(rejections: Rejections) -> MessageDecoder:
             return MessageDecoder(rejections, chosen, counts)
 
-        self._link: TcpLink[Message] = TcpLink(endpoint, decoder, silent_s=silent_s, keep_latest=keep_latest)
-
-    @property
-    def name(self) -> str:
-        """Its address."""
-        return str(self._link.endpoint)
-
-    @property
-    def endpoint(self) -> Endpoint:
-        """Its address, with the port that was taken."""
-        return self._link.endpoint
-
-    @property
-    def connected(self) -> bool:
-        """Whether anybody is at the other end, and not silent."""
-        return self._link.connected
-
-    @property
-    def dropped(self) -> int:
-        """Messages dropped because nobody fetched or took them in time."""
-        return self._link.dropped
-
-    @property
-    def rejected(self) -> int:
-        """Messages left out: wrong checksum, broken content, not usable in this role."""
-        return self._link.rejections.count
-
-    @property
-    def last_rejection(self) -> str:
-        """Why the last one was left out."""
-        return self._link.rejections.last
-
-    def close(self) -> None:
-        """End the connection."""
-        self._link.close()
-
-    def _messages(self) -> list[Message]:
-        """What came; a loss is raised once what came before it is fetched."""
-        messages = self._link.poll()
-        if not messages:
-            self._raise_loss()
-        return messages
-
-    def _raise_loss(self) -> None:
-        loss = self._link.take_loss()
-        if loss is not None:
-            raise DeviceLost(f"{self._role}: {loss}")
+        super().__init__(TcpLink(endpoint, decoder, silent_s=silent_s, keep_latest=keep_latest))
 
     def _leave_out(self, message: Message, why: str) -> None:
         self._link.rejections.add(f"{message.device}: {why}")
@@ -179,12 +134,31 @@ class IgtlPhotoacoustic(_Images):
 
 
 class IgtlBmode(_Images):
-    """BmodeSource: 8-bit B-mode images of a device, for overlay; rows are depths."""
+    """BmodeSource: 8-bit B-mode images of a device, for overlay; rows are depths.
+
+    Images tell the size of their pixels, but not where they lie in the image plane.
+
+    Args:
+        endpoint: PLUS or the scanner.
+        device: e.g. ``Image_Reference``.
+        silent_s: None where the picture may be frozen.
+        origin_mm: depth and lateral position (TRUS x) of the centre of the pixel that is shown at the upper left; None
+            where that is not known.
+        flip: where the columns run against TRUS x.
+    """
 
     _role = "B-mode source"
 
-    def __init__(self, endpoint: Endpoint, device: str, silent_s: float | None = SILENT_S) -> None:
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        device: str,
+        silent_s: float | None = SILENT_S,
+        origin_mm: tuple[float, float] | None = None,
+        flip: bool = False,
+    ) -> None:
         super().__init__(endpoint, device, silent_s)
+        self._origin_mm, self._flip = origin_mm, flip
 
     def poll(self) -> Sequence[BmodeFrame]:
         """Images since the last call. Raises DeviceLost."""
@@ -195,7 +169,8 @@ class IgtlBmode(_Images):
                 continue
             along_i, along_j = (float(np.linalg.norm(image.world_T_ijk[:3, axis])) for axis in (0, 1))
             bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-            frames.append(BmodeFrame(stamp, np.array(bgr, dtype=np.uint8), index, (along_j, along_i)))
+            shown = np.array(bgr[:, ::-1] if self._flip else bgr, dtype=np.uint8)
+            frames.append(BmodeFrame(stamp, shown, index, (along_j, along_i), self._origin_mm))
         return frames
 
 

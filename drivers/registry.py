@@ -228,10 +228,27 @@ _SPOKEN = (
     _device("of its words", "Operator"),
     _device("of what it is told", "OperatorTold", name="answers"),
 )
+_FLIP = Key("flip", Kind.TRUTH, "its columns run against TRUS x", False)
+_MM = Bounds(-500.0, 500.0, unit="mm")
+_PICTURES = (
+    _device("of the images", "Image_Reference"),
+    Key("depth_mm", Kind.NUMBER, "of the first row's centre, below the array's face", 0.0, _MM),
+    Key(
+        "x_mm",
+        Kind.NUMBER,
+        "TRUS x of the leftmost pixel shown; absent: not shown in the plane",
+        None,
+        _MM,
+        example="-19",
+    ),
+    _FLIP,
+    _SILENT,
+)
 _SCANNER = (
     Key("host", Kind.TEXT, "name or address of the scanner", example="192.168.1.10", check=host_name),
     Key("port", Kind.INTEGER, "of its OEM interface", BK_PORT, Bounds(1, 65535)),
-    Key("rate_hz", Kind.INTEGER, "pictures asked for", 20, Bounds(1, 100)),
+    Key("rate_hz", Kind.INTEGER, "pictures asked for, a second", 20, Bounds(1, 100)),
+    _FLIP,
     _SILENT,
 )
 
@@ -310,11 +327,12 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.BMODE,
         "igtl",
         "B-mode images over OpenIGTLink",
-        (*_address(IGTL_PORT), _device("of the images", "Image_Reference"), _SILENT),
+        (*_address(IGTL_PORT), *_PICTURES),
         f"{_HERE}:igtl_bmode",
         "igtl",
     ),
     DriverEntry(Role.BMODE, "bk", "a BK scanner over its OEM interface", _SCANNER, f"{_HERE}:bk_bmode"),
+    _simulated(Role.BMODE, "of the simulated room", f"{_HERE}:simulated_scanner"),
     DriverEntry(
         Role.SINKS,
         "igtl",

@@ -22,7 +22,16 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from fgreg.drivers.base import Command, DeviceLost, MotionSample, PaFrame, Said, StereoFrame, host_now
+from fgreg.drivers.base import (
+    BmodeFrame,
+    Command,
+    DeviceLost,
+    MotionSample,
+    PaFrame,
+    Said,
+    StereoFrame,
+    host_now,
+)
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
@@ -231,6 +240,12 @@ def _motion(header: dict[str, Any], _payload: bytearray) -> MotionSample:
     return MotionSample(Stamp(header["device_s"], host_now()), as_float_array(header["pose"], 4, 4))
 
 
+def _bmode(header: dict[str, Any], payload: bytearray) -> BmodeFrame:
+    image = np.frombuffer(payload, dtype=np.uint8).reshape(header["shape"])
+    stamp = Stamp(header["device_s"], host_now())
+    return BmodeFrame(stamp, image, header["index"], tuple(header["pixel_mm"]), tuple(header["origin_mm"]))
+
+
 def _command(header: dict[str, Any], _payload: bytearray) -> Command:
     corner = header.get("corner")
     return Command(Said(header["says"]), None if corner is None else (int(corner[0]), int(corner[1])))
@@ -255,6 +270,13 @@ class SimulatedMotion(_Feed[MotionSample]):
 
     def __init__(self, path: Path) -> None:
         super().__init__("motion", path, 64, _motion, sends=True)
+
+
+class SimulatedScanner(_Feed[BmodeFrame]):
+    """The ultrasound machine's pictures (BmodeSource)."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("scanner", path, 2, _bmode, sends=True)
 
 
 class SimulatedOperator(_Feed[Command]):

@@ -2,11 +2,11 @@
 
     python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
 
-Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe`` and ``motion`` (the holder of
-the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon, who says what he does and can
-be asked to go on. ``control`` breaks devices and mends them: ``{"device": "camera", "fault": "frozen"}``
-(:data:`FAULTS`). Camera and probe stamp with clocks of their own. The process ends with the one that started it (its
-standard input closes), or on SIGTERM.
+Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe``, ``scanner`` (B-mode pictures)
+and ``motion`` (the holder of the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon,
+who says what he does and can be asked to go on. ``control`` breaks devices and mends them: ``{"device": "camera",
+"fault": "frozen"}`` (:data:`FAULTS`). Camera and probe stamp with clocks of their own. The process ends with the one that
+started it (its standard input closes), or on SIGTERM.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from fgreg.simulation.room import BUMP_EVERY_S, Room, RoomConfig, room_config
 
 CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
 """What the devices' clocks read when the room begins."""
+PICTURE_RATE = 4.0
+"""B-mode pictures per second, at most: they come between pulses."""
 FRAMES_WAITING, PULSES_WAITING = 2, 64
 """What a slow receiver may leave unread before the oldest is dropped."""
 SETTLE_S = 0.4
@@ -42,6 +44,7 @@ FAULTS = {
     "camera": ("", "gone", "silent", "frozen", "black"),
     "probe": ("", "gone", "silent"),
     "motion": ("", "gone", "silent"),
+    "scanner": ("", "gone"),
     "stage": ("", "gone"),
     "operator": ("", "gone"),
 }
@@ -113,7 +116,8 @@ class RoomServer:
         self._end = threading.Event()
         self._scan_rad = 0.0  # where the plane truly stands
         self.start_s = time.monotonic()
-        self._said_s = -math.inf
+        self._said_s = self._pictured_s = -math.inf
+        self._pictures = 0
         self._followed = False
         self._faults = dict.fromkeys(FAULTS, "")
         self._frozen: tuple[bytes | memoryview, ...] | None = None
@@ -162,10 +166,12 @@ class RoomServer:
         if role == "stage":
             self._turn(connection)
             return
-        if role not in ("camera", "probe", "motion", "operator"):
+        if role not in ("camera", "probe", "scanner", "motion", "operator"):
             connection.close()
             return
-        client = _Client(role, connection, queue.Queue(FRAMES_WAITING if role == "camera" else PULSES_WAITING))
+        client = _Client(
+            role, connection, queue.Queue(PULSES_WAITING if role in ("probe", "operator") else FRAMES_WAITING)
+        )
         with self._lock:
             self._clients.append(client)
         threading.Thread(target=client.run, daemon=True).start()
@@ -225,6 +231,7 @@ class RoomServer:
             self._live(now)
             if due_pulse <= due_frame:
                 self._pulse(due_pulse, pulse)
+                self._picture(due_pulse)
                 pulse = max(pulse + 1, math.floor((now - 0.2) * self._pulse_rate))
             else:
                 self._frame(due_frame, frame)
@@ -262,6 +269,23 @@ class RoomServer:
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
         for client in clients:
             client.put(header, data.tobytes())
+
+    def _picture(self, t_s: float) -> None:
+        clients = self._to("scanner")
+        if not clients or t_s - self._pictured_s < 1.0 / PICTURE_RATE:
+            return
+        self._pictured_s = t_s
+        image, pixel_mm, origin_mm = self.room.bmode(self._scan_rad, self._pictures)
+        header = {
+            "index": self._pictures,
+            "device_s": PROBE_CLOCK_S + t_s,
+            "shape": list(image.shape),
+            "pixel_mm": pixel_mm,
+            "origin_mm": origin_mm,
+        }
+        self._pictures += 1
+        for client in clients:
+            client.put(header, image.tobytes())
 
     # --- the surgeon ------------------------------------------------------------------------------------------------
 

@@ -415,6 +415,9 @@ class TcpLink(Generic[Item]):
             with contextlib.suppress(OSError):
                 if self._farewell and not peer.connecting and not peer.block:
                     peer.socket.send(self._farewell)
+                    peer.socket.shutdown(socket.SHUT_WR)
+                    while peer.socket.recv(CHUNK_BYTES):  # closed with bytes unread, it would take the farewell along
+                        pass
             peer.socket.close()
         self._state = "gone"
         for end in (self._server, self._wake, self._woken):

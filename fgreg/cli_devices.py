@@ -31,6 +31,11 @@ def add_devices(app: typer.Typer) -> None:
         Without CONFIG: libraries, video devices, Thorlabs cubes. With CONFIG, each of its devices is opened for at most
         2 s: what comes from it, how often, by whose clock, and whether that is what session.yaml says. Exit status 1
         where one of them does not answer.
+
+        \b
+          fgreg live --example-config > room.yaml  a CONFIG with every key to choose
+          fgreg devices room.yaml                  asks each of its devices
+          fgreg live room.yaml                     a session with them
         """
         from fgreg.operation import inventory
         from fgreg.operation.config import read_config

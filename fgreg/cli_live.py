@@ -6,6 +6,7 @@ import json
 import math
 import signal
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,13 +21,26 @@ from fgreg.threads import one_thread_each
 
 if TYPE_CHECKING:
     from fgreg.config import SolveConfig
-    from fgreg.operation.loop import Figures, LiveLoop, Status
-    from fgreg.operation.start import LiveSetup
+    from fgreg.models import StageModel
+    from fgreg.operation.start import LiveSetup, Running
+    from fgreg.operation.status import Figures, Status
     from fgreg.pipeline import SolveReport
 
 MakeExtras = Callable[["SolveReport"], Any]
 EXIT_REFUSED = 1
+IN_CONFIG = {
+    "seed": "room.seed",
+    "aims": "settings.aims",
+    "bumps": "room.bump_every_s",
+    "width": "room.width",
+    "limit_mm": "settings.limit_mm",
+}
+"""Parameters of the command, and where a CONFIG.yaml has them."""
 SHOW_S = 0.25
+SLOW_MS = 250.0
+"""From a frame to its angle: beyond this the stage lags behind the beam, and its watchdog may miss the heartbeat."""
+MOST_REASONS, REASON_WIDTH = 2, 170
+"""Of the verdict, in the panel: it has to fit a small terminal."""
 
 
 def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
@@ -34,6 +48,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
     @app.command()
     def live(
+        context: typer.Context,
         config: Annotated[
             Path | None,
             typer.Argument(metavar="[CONFIG]", help="A driver per role (CONFIG.yaml). Default: a simulated room."),
@@ -50,18 +65,27 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             float | None, typer.Option("--duration", metavar="S", help="End after so many seconds. Default: at Ctrl-C.")
         ] = None,
         no_viewer: Annotated[
-            bool, typer.Option("--no-viewer", help="Show the session in the terminal only, not in Rerun.")
+            bool,
+            typer.Option(
+                "--no-viewer", help="Show the session in the terminal only, not in Rerun: where there is no screen."
+            ),
         ] = False,
         rrd: Annotated[
             Path | None,
             typer.Option("--rrd", metavar="FILE", help="Record what a viewer would show."),
         ] = None,
-        seed: Annotated[int, typer.Option("--seed", help="Of the simulated room.")] = 1,
+        seed: Annotated[int, typer.Option("--seed", help="Of all that is random in the simulated room.")] = 1,
         aims: Annotated[int, typer.Option("--aims", help="Calibration shots in the simulated room.")] = 8,
         bumps: Annotated[
             float,
             typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
         ] = 240.0,
+        width: Annotated[
+            int,
+            typer.Option(
+                "--width", metavar="PX", help="Of the simulated camera's images; below 640 boards may not be found."
+            ),
+        ] = 640,
         limit_mm: LimitOption = 3.0,
         example_config: Annotated[
             bool, typer.Option("--example-config", help="Print a CONFIG.yaml with every driver and key, explained.")
@@ -77,6 +101,13 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         Devices that disappear are told within a second and used again when they are back. A stage that stopped for
         trouble is latched: it says why, and moves again after `reset` and a new request.
+
+        \b
+          fgreg live --aims 6 --duration 120 --no-viewer  the room, in the terminal
+          fgreg live --rrd session.rrd             in Rerun's viewer, and recorded
+          fgreg live --example-config > room.yaml  a CONFIG with every key to choose
+          fgreg devices room.yaml                  which of its devices answer
+          fgreg live room.yaml --out SESSION       a session with your devices
 
         Ctrl-C ends it: the stage stops first, the session in FOLDER is complete and solved once more as a whole.
         Replay it: fgreg replay FOLDER. Exit status 1 where the verdict is refused.
@@ -94,16 +125,19 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         if duration is not None and not 0 < duration < math.inf:
             raise InputError("--duration", str(duration), "seconds > 0")
+        if config is not None:
+            _alone(context)
         settings = solve_config(limit_mm, "")
         folder = default_folder() if out is None else out
         silent = as_json or quiet
         with ExitStack() as stack:
             stack.enter_context(one_thread_each())
-            if config is None:
-                setup = _room(stack, seed, aims, bumps)
-            else:
-                setup, settings = _configured(stack, config, silent=silent)
             viewer = not (no_viewer or silent)
+            seen = viewer or rrd is not None
+            if config is None:
+                setup = _room(stack, seed, aims, bumps, width, seen=seen)
+            else:
+                setup, settings = _configured(stack, config, silent=silent, seen=seen)
             figures = _conduct(setup, folder, settings, duration, rrd, viewer=viewer, silent=silent)
         report = solve_session(SolveRequest(folder, None, None), settings, None)
         extras = make_extras(report)
@@ -117,23 +151,36 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             raise typer.Exit(EXIT_REFUSED)
 
 
-def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float) -> LiveSetup:
+def _alone(context: typer.Context) -> None:
+    """With a CONFIG.yaml, options that it has keys for would go unheard. Raises InputError."""
+    for name, key in IN_CONFIG.items():
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + {"bumps": "bump-every"}.get(name, name.replace("_", "-"))
+            raise InputError(option, "it, and a CONFIG.yaml", f"{key} in the CONFIG.yaml instead")
+
+
+def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> LiveSetup:
     from fgreg.operation.rooms import simulated_room
 
+    if not 0 <= seed < 2**31:
+        raise InputError("--seed", str(seed), "0 to 2147483647")
+    if not 160 <= width_px <= 1920:
+        raise InputError("--width", str(width_px), "160 to 1920")
     if not 0 <= aims <= 100:
         raise InputError("--aims", str(aims), "0 to 100")
-    if not bump_every_s > 0:
-        raise InputError("--bump-every", str(bump_every_s), "seconds > 0, or inf")
-    return simulated_room(stack, seed, aims, bump_every_s)
+    if not bump_every_s >= 1:
+        raise InputError("--bump-every", str(bump_every_s), "1 s or more, or inf")
+    return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
 
 
-def _configured(stack: ExitStack, path: Path, *, silent: bool) -> tuple[LiveSetup, SolveConfig]:
+def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> tuple[LiveSetup, SolveConfig]:
     from fgreg.operation.config import read_config
 
     found = read_config(path)
     for warning in found.warnings:
         sys.stderr.write(f"fgreg: warning: {warning}\n")
-    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo), found.solve
+    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo, seen=seen), found.solve
 
 
 def _conduct(
@@ -168,7 +215,7 @@ def _conduct(
                     painter.status(status)
                     if status.now_s - shown > SHOW_S:
                         shown = status.now_s
-                        show(session.loop, status)
+                        show(session, status)
 
                 say(f"recording to {folder}")
                 try:
@@ -209,14 +256,14 @@ def figures_line(figures: Figures) -> str:
 
 
 Say = Callable[[str], None]
-Show = Callable[["LiveLoop", "Status"], None]
+Show = Callable[["Running", "Status"], None]
 
 
 @contextmanager
 def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
     """A panel that changes on a terminal, else a line whenever something new is told."""
     if silent:
-        yield lambda _text: None, lambda _loop, _status: None
+        yield lambda _text: None, lambda _session, _status: None
         return
     from rich.console import Console
     from rich.live import Live
@@ -225,7 +272,7 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
     if not sys.stdout.isatty():
         last: list[str] = [""]
 
-        def line(_loop: LiveLoop, status: Status) -> None:
+        def line(_session: Running, status: Status) -> None:
             if status.text != last[0]:
                 last[0] = status.text
                 console.print(status_line(status), soft_wrap=True)
@@ -234,8 +281,8 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
         return
     with Live(console=console, refresh_per_second=4, transient=True) as area:
 
-        def panel(loop: LiveLoop, status: Status) -> None:
-            area.update(status_panel(loop, status))
+        def panel(session: Running, status: Status) -> None:
+            area.update(status_panel(session.loop.figures, session.model.stage, status))
 
         yield lambda text: console.print(text, style="dim"), panel
 
@@ -249,37 +296,49 @@ def status_line(status: Status) -> str:
     return f"{status.stage:<11} {state:<36} {status.text}{lost}"
 
 
-def status_panel(loop: LiveLoop, status: Status) -> Any:
-    """The session as a panel."""
+def status_panel(figures: Figures, stage: StageModel, status: Status) -> Any:
+    """The session as a panel: what has to be seen at a glance first, the same as in the viewer."""
     from rich.panel import Panel
     from rich.table import Table
+    from rich.text import Text
 
+    from fgreg.operation.painter import now_of
     from fgreg.report import STYLES
+    from fgreg.viewer.now import error_line, next_line, stage_line
 
-    state, plane, answer = status.recorder, status.plane, status.answer
+    state, now = status.recorder, now_of(status, stage)
     known, estimate = state.known, state.estimate
     table = Table.grid(padding=(0, 2))
-    table.add_row("stage of the session", status.stage)
-    verdict = known.verdict.value if known.registered else "no registration yet"
-    worst = "" if estimate is None or estimate.predicted_tre is None else f"{estimate.predicted_tre.worst_mm:.2f} mm"
-    looks = f"epoch {known.epoch}, {known.pairs} looks"
-    table.add_row("registration", f"[{STYLES[known.verdict]}]{verdict}[/]  {looks}  {worst}")
-    for reason in known.reasons[:2]:
-        table.add_row("", reason)
-    if plane is None:
-        table.add_row("stage", "not there")
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+
+    def row(title: str, text: str, style: str = "") -> None:
+        table.add_row(title, Text(text, style=style))  # what devices say is no markup
+
+    if known.registered:
+        row("registration", known.verdict.value.upper(), STYLES[known.verdict])
+        row(
+            "predicted error",
+            f"{error_line(None if estimate is None else estimate.predicted_tre)} (95 %, worst target)",
+        )
     else:
-        told = None if answer is None else answer.stage_rad
-        wanted = "" if told is None else f"  beam at {math.degrees(told):.1f} deg"
-        asked = f"  ({plane.requested})" if plane.requested is not None else ""
-        table.add_row("stage", f"{math.degrees(plane.scan_rad):.1f} deg{asked}{wanted}  {status.latched}")
-    figures = loop.figures
-    latency = f"  {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
-    table.add_row("camera", f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}")
-    events = f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting"
-    table.add_row("recorded", events)
-    if status.lost or state.trouble:
-        troubles = [*(f"{role} lost" for role in status.lost), *filter(None, [state.trouble])]
-        table.add_row("[red]trouble[/]", "; ".join(troubles))
-    table.add_row("now", f"[bold]{status.text}[/]")
+        row("registration", "none yet")
+    for reason in known.reasons[:MOST_REASONS]:
+        row("", textwrap.shorten(reason, REASON_WIDTH, placeholder=" ..."))
+    if status.lost:
+        row("LOST", ", ".join(status.lost), "bold white on red")
+    if state.trouble:
+        row("trouble", state.trouble, "red")
+    row("next", next_line(now), "bold")
+    row("stage", stage_line(now, stage))
+    if now.news != now.task:
+        row("told last", now.news)
+    row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it")
+    latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
+    slow = bool(figures.latency_ms) and figures.latency_ms[-1] > SLOW_MS
+    seen = f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}"
+    row("camera", seen + (": this machine cannot keep up" if slow else ""), "yellow" if slow else "")
+    if figures.pictures:
+        row("B-mode", f"{figures.pictures} pictures, {figures.unshown} left out for newer ones")
+    row("recorded", f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting")
     return Panel(table, title="fgreg live", subtitle="Ctrl-C ends the session", expand=True)

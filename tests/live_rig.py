@@ -23,9 +23,10 @@ from fgreg.drivers.simulated_room import FAULTS
 from fgreg.events import NoteEvent
 from fgreg.frames import FloatArray
 from fgreg.models import SessionModel
-from fgreg.operation.loop import IDLE_S, Devices
+from fgreg.operation.loop import IDLE_S
 from fgreg.operation.rooms import room_setup
 from fgreg.operation.start import LiveSetup, Running, running
+from fgreg.operation.status import Devices
 from fgreg.session import append_file
 from fgreg.simulation.room import room_config
 

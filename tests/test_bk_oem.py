@@ -208,3 +208,29 @@ def test_a_rate_or_an_address_that_cannot_be_is_one_line() -> None:
         BkOemScanner(Endpoint("127.0.0.1", 7915), rate_hz=0)
     with pytest.raises(InputError, match="expected an address to connect to"):
         BkOemScanner(Endpoint.listening(0))
+
+
+@pytest.mark.parametrize(
+    ("tissue", "flip", "mirrored", "x_mm"),
+    [
+        (b"-0.02,0.001,0.03,0.081", False, False, -20.0 - 10 * 0.125),
+        (b"-0.02,0.001,0.03,0.081", True, True, 20.0 + 10 * 0.125 - 5 * 0.125),
+        (b"0.03,0.001,-0.02,0.081", False, True, 30.0 + 10 * 0.125 - 5 * 0.125),
+        (b"0.03,0.001,-0.02,0.081", True, False, -30.0 - 10 * 0.125),
+    ],
+)
+def test_columns_run_along_trus_x_whichever_way_the_scanner_has_them(
+    scanner: Scanner, tissue: bytes, flip: bool, mirrored: bool, x_mm: float
+) -> None:
+    driver = BkOemScanner(Endpoint("127.0.0.1", scanner.port), flip=flip)
+    try:
+        wait_for(lambda: scanner.grabbing)
+        scanner.send(b"DATA:B_GEOMETRY_TISSUE:A " + tissue + b";")
+        sent = picture(scanner)
+        scanner.send(grabbed(sent))
+        (shown,) = fetch(driver)
+    finally:
+        driver.close()
+    np.testing.assert_array_equal(shown.image, sent[:, ::-1] if mirrored else sent)
+    assert shown.pixel_mm == pytest.approx((0.2, 0.125))
+    assert shown.origin_mm == pytest.approx((1.0 - 10 * 0.2, x_mm))

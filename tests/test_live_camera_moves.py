@@ -26,9 +26,10 @@ from fgreg.motion.link import Report, StageView
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.shared_snapshot import Received
 from fgreg.operation.conductor import Conductor, ConductorSettings
-from fgreg.operation.loop import Devices, LiveLoop
+from fgreg.operation.loop import LiveLoop
 from fgreg.operation.recorder import Recorder
 from fgreg.operation.senses import Ears, Eyes
+from fgreg.operation.status import Devices
 from fgreg.pairing import Stamp, TimedPose
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import read_session
@@ -101,7 +102,7 @@ class Stand:
         )
         self.link = Link()
         self.recorder = Recorder(session)
-        devices: Any = Devices(self.camera, self.probe, self.operator, None, self.arm, (self.sink,))
+        devices: Any = Devices(self.camera, self.probe, self.operator, motion=self.arm, sinks=(self.sink,))
         devices.stage = self.link
         conductor = Conductor(model, ConductorSettings(aims=0, pms=1, most_pms=1, hearing_threshold=0.1))
 

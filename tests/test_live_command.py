@@ -94,7 +94,14 @@ def test_a_room_that_is_gone_is_said_and_the_session_survives(tmp_path: Path) ->
         (("--duration", "-1"), "--duration"),
         (("--aims", "-2"), "--aims"),
         (("--bump-every", "0"), "--bump-every"),
+        (("--bump-every", "0.5"), "--bump-every"),
         (("--limit-mm", "0"), "--limit-mm"),
+        (("--seed", "-1"), "--seed"),
+        (("--seed", "99999999999"), "--seed"),
+        (("--width", "10"), "--width"),
+        (("room.yaml", "--seed", "1"), "--seed"),
+        (("room.yaml", "--limit-mm", "1"), "--limit-mm"),
+        (("room.yaml", "--width", "640"), "--width"),
     ],
 )
 def test_mistakes_are_one_line_and_make_no_session(

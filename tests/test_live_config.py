@@ -7,7 +7,7 @@ import math
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import yaml
 
-from fgreg.drivers.base import DeviceLost
 from fgreg.drivers.registry import ENTRIES, Role, Surroundings, load
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.motion.limits import MotionLimits
@@ -404,7 +403,7 @@ def test_devices_are_those_of_the_config_and_closed_with_the_stack(tmp_path: Pat
         assert devices.camera.name == "/dev/video90 and /dev/video91"
         assert devices.probe.name == f"127.0.0.1:{data['photoacoustic']['port']}"
         assert devices.operator.name.startswith("keyboard and listening on")
-        assert list(devices.roles()) == ["camera", "probe", "operator", "motion", "sink 1", "sink 2"]
+        assert list(devices.roles()) == ["camera", "probe", "operator", "motion", "bmode", "sink 1", "sink 2"]
         for port in ports:
             socket.create_connection(("127.0.0.1", port), timeout=2.0).close()
     for port in ports:
@@ -452,17 +451,16 @@ def test_the_readme_shows_a_config_that_reads(tmp_path: Path) -> None:
     (block,) = [part.split("```")[0] for part in readme.split("```yaml\n")[1:] if part.startswith("format: fgreg-live")]
     config = read_config(live_configs.write(tmp_path, block))
     assert {role.value for role in config.devices} == {"camera", "photoacoustic", "stage", "sinks", "operator"}
-    with ExitStack() as stack:
-        assert config.open_bmode(stack) is None
 
 
-def test_a_scanner_for_overlay_is_opened_apart_from_what_is_measured(tmp_path: Path) -> None:
-    data = live_configs.config()
-    data["bmode"] = {"driver": "bk", "host": "127.0.0.1", "port": free_port()}
-    config = read_config(live_configs.write(tmp_path, data))
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_scanner_for_overlay_is_opened_only_where_somebody_looks(tmp_path: Path, seen: bool) -> None:
+    scanner = {"driver": "bk", "host": "127.0.0.1", "port": free_port()}
+    config = read_config(live_configs.write(tmp_path, live_configs.room() | {"bmode": scanner}))
     with ExitStack() as stack:
-        scanner = config.open_bmode(stack)
-        assert scanner is not None
-        assert scanner.name == f"127.0.0.1:{data['bmode']['port']}"
-        with suppress(DeviceLost):  # nobody is there: how soon that is known depends
-            assert scanner.poll() == []
+        live = config.live_setup(stack, lambda _: None, seen=seen)
+        devices = live.open_devices(stack, config.model)
+        assert ("bmode" in devices.roles()) == seen
+        assert (None if devices.bmode is None else devices.bmode.name) == (
+            f"127.0.0.1:{scanner['port']}" if seen else None
+        )

@@ -19,13 +19,15 @@ from tests.forward import make_session
 PERIOD_S = 0.1
 
 
-class SlowPool:
+class SlowLocator:
     """A process that takes as long as the test says."""
+
+    trouble = ""
 
     def __init__(self) -> None:
         self.under_way: list[Future[Any]] = []
 
-    def submit(self, *_work: Any) -> Future[Any]:
+    def submit(self, _data: Any) -> Future[Any]:
         self.under_way.append(Future())
         return self.under_way[-1]
 
@@ -34,16 +36,19 @@ class SlowPool:
             if not future.done():
                 future.set_result(NoSignal("nothing"))
 
-    def shutdown(self, **_how: Any) -> None:
+    def look_after(self, _now_s: float) -> None:
+        """It is there."""
+
+    def close(self) -> None:
         """Nothing to end."""
 
 
 @pytest.fixture
-def ears() -> Iterator[tuple[Ears, SlowPool]]:
-    found, pool = Ears(make_session()), SlowPool()
+def ears() -> Iterator[tuple[Ears, SlowLocator]]:
+    found, locator = Ears(make_session()), SlowLocator()
     found.close()
-    found._pool = pool  # type: ignore[assignment]
-    yield found, pool
+    found._locator = locator  # type: ignore[assignment]
+    yield found, locator
     found.close()
 
 
@@ -62,38 +67,38 @@ def pulses(ears: Ears, first: int, count: int) -> tuple[Heard, ...]:
 
 
 def test_what_the_locating_process_has_no_time_for_is_handed_on_as_unknown_and_counted(
-    ears: tuple[Ears, SlowPool],
+    ears: tuple[Ears, SlowLocator],
 ) -> None:
-    found, pool = ears
+    found, locator = ears
     handed = pulses(found, 0, 200)
     most = round(LOCATE_S / PERIOD_S) + 2
-    assert len(pool.under_way) == MOST_UNDER_WAY, "it gets no more while it does nothing"
+    assert len(locator.under_way) == MOST_UNDER_WAY, "it gets no more while it does nothing"
     assert found.waiting <= most
     assert len(handed) == 200 - found.waiting, "none is lost"
     assert [heard.scan_rad for heard in handed] == [None] * len(handed), "nobody knows whether anything was heard"
     assert found.passed_over >= len(handed)
-    pool.finish()
+    locator.finish()
     later = pulses(found, 200, 5)
-    pool.finish()
+    locator.finish()
     later += pulses(found, 205, 1)
     assert any(heard.scan_rad == pytest.approx(0.1) for heard in later), "it goes on where it can"
 
 
-def test_a_process_that_keeps_up_passes_nothing_over(ears: tuple[Ears, SlowPool]) -> None:
-    found, pool = ears
+def test_a_process_that_keeps_up_passes_nothing_over(ears: tuple[Ears, SlowLocator]) -> None:
+    found, locator = ears
     handed: list[Heard] = []
     for k in range(50):
         handed += pulses(found, k, 1)
-        pool.finish()
+        locator.finish()
     assert found.passed_over == 0
     assert len(handed) == 49
     assert [heard.scan_rad for heard in handed] == pytest.approx([0.1] * 49)
 
 
-def test_pulses_that_nobody_listens_to_say_nothing_and_are_not_looked_into(ears: tuple[Ears, SlowPool]) -> None:
-    found, pool = ears
+def test_pulses_that_nobody_listens_to_say_nothing_and_are_not_looked_into(ears: tuple[Ears, SlowLocator]) -> None:
+    found, locator = ears
     found.listening = False
     handed = pulses(found, 0, 20)
     assert len(handed) == 20
-    assert not pool.under_way
+    assert not locator.under_way
     assert {heard.scan_rad for heard in handed} == {None}

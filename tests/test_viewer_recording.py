@@ -265,7 +265,8 @@ def test_the_detection_is_marked_on_its_frame_and_cleared_where_there_is_none(re
 
 
 def test_frames_lie_on_the_image_plane_and_a_plain_plane_where_there_is_none(recorded: Recorded) -> None:
-    planes = {row.shot: "Mesh3D:albedo_texture_buffer" in row.values for row in recorded.rows["/world/stage/plane"]}
+    rows = recorded.rows["/world/stage/plane"]
+    planes = {row.shot: len(row.values["Mesh3D:albedo_texture_buffer"][0]) > 3 for row in rows}  # more than a pixel
     assert planes == {AIMS: True, AIMS + 1: True, AIMS + 2: False}
 
 
@@ -358,7 +359,9 @@ def test_an_epoch_without_a_registration_hides_its_camera_instead_of_standing_at
     rows = record(tmp_path / "lost.rrd", model, measurements, estimate)
     second = rows["/world/camera"][1]
     assert second.shot == 2
-    np.testing.assert_array_equal(second.array("Transform3D:scale"), [[0.0, 0.0, 0.0]])
+    # To a frame that is nowhere. A scale of 0 is a mistake to Rerun 0.41, which then draws the camera at the origin.
+    assert second.values["Transform3D:parent_frame"] == ["not known"]
+    assert "Transform3D:translation" not in second.values
     assert [row.shot for row in rows["/world/looks/beam"]] == [0, 1]
     assert [row.shot for row in rows["/world/looks/arc"]] == [0, 1, 2, 3]
 

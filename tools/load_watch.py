@@ -17,8 +17,8 @@ import numpy as np
 from fgreg.drivers.base import StereoCamera, StereoFrame
 from fgreg.events import PairEvent
 from fgreg.frames import FloatArray
-from fgreg.operation.loop import Status
 from fgreg.operation.start import Running
+from fgreg.operation.status import Status
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 BUSY_S = 1.0

@@ -15,7 +15,7 @@ from typing import Any
 
 from fgreg.config import SolveConfig
 from fgreg.convert.write import camera_yaml
-from fgreg.drivers.base import BmodeSource, Operator
+from fgreg.drivers.base import Operator
 from fgreg.drivers.options import read_keys, read_path
 from fgreg.drivers.registry import DriverEntry, Role, Surroundings, drivers_of
 from fgreg.errors import InputError, one_line
@@ -31,9 +31,9 @@ from fgreg.operation.config_keys import (
     THRESHOLD,
 )
 from fgreg.operation.holder import HolderSettings
-from fgreg.operation.loop import Devices
 from fgreg.operation.rooms import HEARING_THRESHOLD
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
+from fgreg.operation.status import Devices
 from fgreg.pairing import Latencies
 from fgreg.session.reading import SETUP_FILE
 from fgreg.session.safe_yaml import load_yaml, parse_yaml, read_bounded
@@ -95,12 +95,13 @@ class LiveConfig:
         board = self.model.board
         return Surroundings(say, None if board is None else (board.columns, board.rows), self.rectified, room)
 
-    def live_setup(self, stack: ExitStack, say: Callable[[str], None]) -> LiveSetup:
+    def live_setup(self, stack: ExitStack, say: Callable[[str], None], *, seen: bool = True) -> LiveSetup:
         """What to conduct. Opens no device, but starts the simulated room where one is used.
 
         Args:
             stack: ends the room.
             say: shows one line to an operator at the terminal; called from several threads.
+            seen: whether anybody sees pictures that are only to be shown; where not, their device is not opened.
         """
         around = self.around(stack, say)
 
@@ -110,12 +111,14 @@ class LiveConfig:
                 devices.callback(device.close)
                 return device
 
-            first = {role: opened(chosen[0]) for role, chosen in self.devices.items() if role in _ONE_EACH}
+            roles = [role for role in _ONE_EACH if role in self.devices and (seen or role is not Role.BMODE)]
+            first = {role: opened(self.devices[role][0]) for role in roles}
             return Devices(
                 first[Role.CAMERA],
                 first[Role.PHOTOACOUSTIC],
                 _together([opened(chosen) for chosen in self.devices[Role.OPERATOR]]),
                 motion=first.get(Role.MOTION),
+                bmode=first.get(Role.BMODE),
                 sinks=tuple(opened(chosen) for chosen in self.devices.get(Role.SINKS, ())),
             )
 
@@ -132,17 +135,8 @@ class LiveConfig:
             limits["deceleration"] = math.radians(acceleration)  # what a driver is told to use is what it brakes with
         return StageSetup(chosen[0].entry.factory, options, limits)
 
-    def open_bmode(self, stack: ExitStack) -> BmodeSource | None:
-        """The scanner's pictures for overlay, where the file names one; closed with the stack."""
-        chosen = self.devices.get(Role.BMODE)
-        if chosen is None:
-            return None
-        device: BmodeSource = chosen[0].open(Surroundings(lambda _: None))
-        stack.callback(device.close)
-        return device
 
-
-_ONE_EACH = (Role.CAMERA, Role.PHOTOACOUSTIC, Role.MOTION)
+_ONE_EACH = (Role.CAMERA, Role.PHOTOACOUSTIC, Role.MOTION, Role.BMODE)
 
 
 def _together(operators: list[Operator]) -> Operator:

@@ -186,8 +186,10 @@ def _shape(item: Any) -> str:
             return f"{left.shape[1]} x {left.shape[0]} px, {colour}, {'one view' if right is None else 'stereo'}"
         case PaFrame(data=data):
             return f"{' x '.join(str(side) for side in data.shape)} {data.dtype}"
-        case BmodeFrame(image=image):
-            return f"{image.shape[1]} x {image.shape[0]} px"
+        case BmodeFrame(image=image, pixel_mm=pixel_mm, origin_mm=origin_mm):
+            size = "of unknown size" if pixel_mm is None else f"of {pixel_mm[1]:.3g} x {pixel_mm[0]:.3g} mm"
+            placed = "shown in the image plane" if pixel_mm and origin_mm else "its place in the image plane not known"
+            return f"{image.shape[1]} x {image.shape[0]} px {size}, {placed}"
     return ""
 
 

@@ -8,41 +8,27 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from fgreg.detection.board import BoardFit, board_corner, detect_board
 from fgreg.detection.joint import NotFound
 from fgreg.detection.noise import pool_corner_noise
-from fgreg.drivers.base import (
-    Command,
-    DeviceLost,
-    MotionSource,
-    Operator,
-    PhotoacousticSource,
-    Registration,
-    StereoCamera,
-    StereoFrame,
-    TransformSink,
-    host_now,
-)
+from fgreg.drivers.base import BmodeFrame, Command, DeviceLost, Registration, StereoFrame, host_now
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord
 from fgreg.measurements import MarkerObservation, Track
 from fgreg.models import SessionModel
-from fgreg.motion.keeper import StageKeeper
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.operation.conductor import Conductor
 from fgreg.operation.health import Health, Pictures, Source
 from fgreg.operation.holder import Holder, HolderSettings
-from fgreg.operation.recorder import Recorder, RecorderState
+from fgreg.operation.recorder import Recorder
 from fgreg.operation.senses import Ears, Eyes
 from fgreg.operation.spots import one_spot
+from fgreg.operation.status import Devices, Figures, Status
 from fgreg.operation.steering import Steering
 from fgreg.operation.view import (
     Action,
@@ -51,7 +37,6 @@ from fgreg.operation.view import (
     Halt,
     Heard,
     Release,
-    StageView,
     Sweep,
     TakeAim,
     TakeMove,
@@ -70,75 +55,8 @@ SEND_S = 0.2
 """Between sendings of the registration where nothing has changed."""
 STALE_S = 0.75
 """An engine that has not stirred for so long has ended or hangs: nobody would notice that the camera moves."""
-LATENCIES = 100_000
-
-
-@dataclass(slots=True, eq=False)
-class Devices:
-    """What is connected: one device a role, any number of sinks."""
-
-    camera: StereoCamera
-    probe: PhotoacousticSource
-    operator: Operator
-    stage: StageKeeper | None = None
-    motion: MotionSource | None = None
-    sinks: Sequence[TransformSink] = ()
-
-    def roles(self) -> dict[str, Any]:
-        """Those that can be lost, by role."""
-        found: dict[str, Any] = {"camera": self.camera, "probe": self.probe, "operator": self.operator}
-        if self.motion is not None:
-            found["motion"] = self.motion
-        for number, sink in enumerate(self.sinks):
-            found[f"sink {number + 1}"] = sink
-        return found
-
-    def close(self) -> None:
-        """Let go of all, the stage first."""
-        if self.stage is not None:
-            self.stage.close()
-        for device in self.roles().values():
-            device.close()
-
-
-@dataclass(slots=True, eq=False)
-class Figures:
-    """What the loop measures of itself.
-
-    Attributes:
-        latency_ms: from a frame's arrival to its order, or to the knowledge that there is none.
-        frames, skipped: frames looked into, and left out here: for newer ones, or the same as before.
-        found: frames in which the marker was found. pulses: taken in. orders: sent to the stage.
-    """
-
-    latency_ms: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES))
-    frames: int = 0
-    skipped: int = 0
-    found: int = 0
-    pulses: int = 0
-    orders: int = 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Status:
-    """The session at one moment, for whoever shows it.
-
-    Attributes:
-        now_s: host time. stage: how far it has come. text: last told to the operator.
-        answer: where to turn for the newest pose. plane: the stage. lost: devices that are gone, by role.
-        pose, frame: newest.
-    """
-
-    now_s: float
-    stage: str
-    text: str
-    recorder: RecorderState
-    answer: TrackEstimate | None
-    plane: StageView | None
-    latched: str
-    lost: tuple[str, ...]
-    pose: TimedPose | None
-    frame: StereoFrame | None
+SENDERS = ("camera", "probe", "bmode")
+"""They send by themselves."""
 
 
 class LiveLoop:
@@ -176,12 +94,13 @@ class LiveLoop:
         self._began_s = host_now()
         self._health, self._pictures = Health(), Pictures()
         self._sources = {
-            role: Source(device, self._began_s, sends=role in ("camera", "probe"))
-            for role, device in devices.roles().items()
+            role: Source(device, self._began_s, sends=role in SENDERS) for role, device in devices.roles().items()
         }
-        self._steering = Steering(devices.stage, self._health, lambda text: self._tell(Tell(text)), self._began_s)
+        self._steering = Steering(devices.stage, self._health, lambda text: self._news(Tell(text)), self._began_s)
         self._commands: list[Command] = []
-        self._text, self._number = "", 0
+        self._text, self._task, self._number = "", "", 0
+        self._bmode: BmodeFrame | None = None
+        self._unshown = 0
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
         self._answer: TrackEstimate | None = None
@@ -204,6 +123,7 @@ class LiveLoop:
             return False
         pose = self._look(frames)
         self._listen()
+        self._show()
         self._follow_camera()
         if (plane := self._steering.listen()) is not None:
             self.ears.plane(plane.at_s, plane.scan_rad, plane.moving)
@@ -228,9 +148,11 @@ class LiveLoop:
     def status(self) -> Status:
         """The session now."""
         return Status(
-            host_now(),
+            now := host_now(),
+            self._t(now),
             self._conductor.stage,
             self._text,
+            self._task,
             self._recorder.state,
             self._answer,
             self._steering.view,
@@ -238,6 +160,7 @@ class LiveLoop:
             tuple(self._health.lost),
             self.eyes.poses.newest(),
             self.eyes.newest,
+            self._bmode,
         )
 
     def close(self) -> None:
@@ -265,6 +188,20 @@ class LiveLoop:
         self.figures.pulses += len(pulses)
         self.ears.hear(pulses)
         self._commands += self._sources["operator"].poll()
+
+    def _show(self) -> None:
+        """The newest B-mode picture; nothing is measured in it."""
+        device = self._devices.bmode
+        if device is None:
+            return
+        pictures = self._sources["bmode"].poll()
+        if pictures:
+            self.figures.pictures += len(pictures)
+            self._unshown += len(pictures) - 1
+            self._bmode = pictures[-1]
+        elif not device.connected:
+            self._bmode = None  # an old picture must not look like a new one
+        self.figures.unshown = self._unshown + device.dropped
 
     def _follow_camera(self) -> None:
         """Whether the camera is where the registration has it, by its holder's account and by what is recorded."""
@@ -357,6 +294,11 @@ class LiveLoop:
                 self._tell(action)
 
     def _tell(self, tell: Tell) -> None:
+        self._task = tell.text
+        self._news(tell)
+
+    def _news(self, tell: Tell) -> None:
+        """What asks nothing of the operator, so that what was asked before still holds."""
         self._text = tell.text
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
 
@@ -448,8 +390,5 @@ class LiveLoop:
             self._note(text)
 
     def _note(self, text: str) -> None:
-        self._tell(Tell(text))
+        self._news(Tell(text))
         self._recorder.hand_over(NoteEvent(self._t(host_now()), 0, text))
-
-
-__all__ = ["Devices", "Figures", "LiveLoop", "Status"]

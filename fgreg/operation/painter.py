@@ -14,20 +14,26 @@ from typing import Protocol
 import numpy as np
 
 from fgreg.drivers.base import StereoFrame
-from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.events import AimEvent, PairEvent
+from fgreg.estimate import Verdict
+from fgreg.events import AimEvent, NoteEvent, PairEvent
 from fgreg.frames import FloatArray, as_float_array
 from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track
-from fgreg.models import SessionModel
+from fgreg.models import SessionModel, StageModel
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.operation.loop import Status
 from fgreg.operation.recorder import Recorded
+from fgreg.operation.status import Status
+from fgreg.viewer.now import Now
 from fgreg.viewer.recording import Moment, NullViewer, ShotKind, Viewer, open_viewer
 from fgreg.viewer.spawn import spawn_viewer
 
 LOOK_S = 0.5
 """Between pictures of the following stage: drawing takes time that the loop wants."""
+FRESH_S = 0.5
+"""A marker seen longer ago is not where it was."""
 WAITING = 64
+INSTEAD = (
+    "with --no-viewer the session is shown in the terminal only; --no-viewer --rrd FILE records what it would show"
+)
 
 
 class Painter(Protocol):
@@ -65,7 +71,8 @@ class _Seen:
     note: str
     estimate: OnlineEstimate | None
     frame: StereoFrame | None
-    answer: TrackEstimate | None
+    status: Status | None
+    ended: bool = False
 
 
 class RerunPainter:
@@ -75,7 +82,7 @@ class RerunPainter:
         self._viewer = viewer
         self._model: SessionModel | None = None
         self._waiting: queue.Queue[_Seen | None] = queue.Queue(WAITING)
-        self._frame: StereoFrame | None = None
+        self._status: Status | None = None
         self._beam: FloatArray | None = None
         self._looked_s, self._number, self._marker = -math.inf, 0, 0
         self._thread = threading.Thread(target=self._run, name="painter", daemon=True)
@@ -99,22 +106,31 @@ class RerunPainter:
             elif isinstance(event, PairEvent):
                 shot = self._pair(event, marker, 0 if estimate is None else estimate.epoch)
                 note = f"pair, PM {event.pm}"
-        self._put(_Seen(event.t, shot, note, estimate, self._frame, None))
+        if isinstance(event, NoteEvent):
+            note = event.text
+        status = self._status
+        self._put(_Seen(event.t, shot, note, estimate, _frame(status), status))
 
     def status(self, status: Status) -> None:
-        """Remember the newest picture; now and then draw where the stage is to follow."""
-        self._frame = status.frame
-        answer, pose = status.answer, status.pose
-        if status.now_s - self._looked_s < LOOK_S or answer is None or answer.stage_rad is None or pose is None:
+        """Remember the newest pictures; now and then draw how things stand."""
+        self._status = status
+        if status.now_s - self._looked_s < LOOK_S:
             return
         self._looked_s = status.now_s
-        marker = self._observation(pose.parent_T_child, pose.covariance)
-        track = Track(answer.t, status.recorder.known.epoch, marker, ())
-        self._put(_Seen(answer.t, track, "", status.recorder.estimate, status.frame, answer))
+        self._put(self._look(status))
+
+    def _look(self, status: Status, *, ended: bool = False) -> _Seen:
+        track, pose = None, status.pose
+        if pose is not None and status.now_s - pose.t_s < FRESH_S:
+            marker = self._observation(pose.parent_T_child, pose.covariance)
+            track = Track(status.t, status.recorder.known.epoch, marker, ())
+        return _Seen(status.t, track, "", status.recorder.estimate, _frame(status), status, ended)
 
     def close(self) -> None:
-        """Draw what waits, then end."""
+        """Draw what waits and that it is over, then end."""
         if self._thread.is_alive():
+            if self._status is not None:
+                self._put(self._look(self._status, ended=True))
             self._waiting.put(None)
             self._thread.join(10.0)
 
@@ -146,16 +162,23 @@ class RerunPainter:
 
     def _run(self) -> None:
         while (seen := self._waiting.get()) is not None:
-            self._draw(seen)
+            try:
+                self._draw(seen)
+            except Exception:  # one picture that cannot be drawn must not freeze the view
+                self.left_out += 1
 
     def _draw(self, seen: _Seen) -> None:
-        known, number = seen.estimate, self._number
+        known, number, status, model = seen.estimate, self._number, seen.status, self._model
+        if model is None:
+            raise AssertionError("the session comes first")
         self._number += 1
         if seen.frame is not None:
             kind: ShotKind = "track"
             if isinstance(seen.shot, Aim | Pair):
                 kind = "aim" if isinstance(seen.shot, Aim) else "pair"
-            self._viewer.shot_images(seen.t, kind, number, seen.frame.left, seen.frame.right)
+            right = None if kind == "track" else seen.frame.right  # of all the looks between, one view is enough
+            self._viewer.shot_images(seen.t, kind, number, seen.frame.left, right)
+        self._viewer.bmode(seen.t, number, None if status is None else status.bmode)
         self._viewer.moment(
             Moment(
                 t=seen.t,
@@ -171,9 +194,36 @@ class RerunPainter:
                 pairs=0 if known is None else known.pairs,
                 nis=known.nis if known is not None and isinstance(seen.shot, Pair) else None,
                 used=known is not None and known.used,
-                answer=seen.answer,
+                answer=None if status is None or not isinstance(seen.shot, Track) else status.answer,
+                now=None if status is None else now_of(status, model.stage, ended=seen.ended),
+                epoch=0 if known is None else known.epoch,
             )
         )
+
+
+def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
+    """What has to be seen at a glance of a moment."""
+    plane, answer = status.plane, status.answer
+    told = None if answer is None else answer.stage_rad
+    return Now(
+        status.stage,
+        status.task,
+        status.text,
+        status.lost,
+        None if plane is None else plane.scan_rad,
+        plane is not None and plane.homed,
+        plane is not None and plane.moving,
+        status.latched,
+        None if told is None else stage.scan_from_device(told),
+        None if answer is None else answer.sigma_rad,
+        "" if answer is None or status.recorder.known.verdict is Verdict.REFUSED else answer.reason,
+        ended,
+    )
+
+
+def _frame(status: Status | None) -> StereoFrame | None:
+    """The newest picture; none where its camera is gone."""
+    return None if status is None or "camera" in status.lost else status.frame
 
 
 @contextmanager
@@ -190,7 +240,7 @@ def painted(rrd: Path | None, name: str, *, live: bool, say: Callable[[str], Non
     url = None
     if live:
         say("starting the viewer")
-        url = spawn_viewer()
+        url = spawn_viewer(instead=INSTEAD)
     with open_viewer(rrd, name, url) as viewer:
         painter = RerunPainter(viewer)
         try:

@@ -7,11 +7,17 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from fgreg.drivers.simulated import RoomProcess, SimulatedCamera, SimulatedOperator, SimulatedProbe
+from fgreg.drivers.simulated import (
+    RoomProcess,
+    SimulatedCamera,
+    SimulatedOperator,
+    SimulatedProbe,
+    SimulatedScanner,
+)
 from fgreg.models import SessionModel
 from fgreg.operation.conductor import ConductorSettings
-from fgreg.operation.loop import Devices
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
+from fgreg.operation.status import Devices
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import BUMP_EVERY_S, RoomConfig, room_config
 
@@ -21,7 +27,13 @@ SPEED_RAD_S = math.radians(20.0)
 
 
 def simulated_room(
-    stack: ExitStack, seed: int = 1, aims: int = 8, bump_every_s: float = BUMP_EVERY_S, width_px: int = 640
+    stack: ExitStack,
+    seed: int = 1,
+    aims: int = 8,
+    bump_every_s: float = BUMP_EVERY_S,
+    width_px: int = 640,
+    *,
+    seen: bool = True,
 ) -> LiveSetup:
     """A room that runs until the stack is left.
 
@@ -31,19 +43,25 @@ def simulated_room(
         aims: calibration shots before the surgeon turns to the tissue.
         bump_every_s: mean time between moves of the camera.
         width_px: of its images.
+        seen: whether anybody sees pictures that are only to be shown.
 
     Raises:
         FgregError: it did not start.
     """
     room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
-    return room_setup(room.path, room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s))
+    return room_setup(room.path, room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s), seen=seen)
 
 
-def room_setup(path: Path, config: RoomConfig) -> LiveSetup:
-    """How to conduct a session with the room whose socket is at ``path``."""
+def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSetup:
+    """How to conduct a session with the room whose socket is at ``path``; ``seen`` as of :func:`simulated_room`."""
 
     def open_devices(devices: ExitStack, _model: SessionModel) -> Devices:
-        found = Devices(SimulatedCamera(path), SimulatedProbe(path), SimulatedOperator(path))
+        found = Devices(
+            SimulatedCamera(path),
+            SimulatedProbe(path),
+            SimulatedOperator(path),
+            bmode=SimulatedScanner(path) if seen else None,
+        )
         for device in found.roles().values():
             devices.callback(device.close)
         return found

@@ -97,6 +97,7 @@ class Ears:
         self._clock = DeviceClock(latency_s)
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
+        self._under_way: list[Future[PaFind | NoSignal]] = []
         self.listening, self.passed_over = True, 0
         self._unread, self._unread_s = "", -np.inf
 
@@ -155,11 +156,13 @@ class Ears:
         elif not _ended_under(pulse.located) or pulse.tries >= TRIES:
             pulse.data = None
             return
-        if sum(other.located is not None and not other.located.done() for other in self._waiting) >= MOST_UNDER_WAY:
+        self._under_way = [located for located in self._under_way if not located.done()]
+        if len(self._under_way) >= MOST_UNDER_WAY:
             self._pass_over(pulse)
             return
         pulse.tries += 1
         pulse.located = self._locator.submit(pulse.data)
+        self._under_way.append(pulse.located)
 
     def _pass_over(self, pulse: _Waiting) -> None:
         """Nobody knows whether anything was heard: then the pulse says nothing of any angle."""

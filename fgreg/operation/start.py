@@ -24,8 +24,9 @@ from fgreg.online.engine_process import EngineProcess
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.holder import HolderSettings
 from fgreg.operation.interpreter import undisturbed
-from fgreg.operation.loop import Devices, LiveLoop
+from fgreg.operation.loop import LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
+from fgreg.operation.status import Devices
 from fgreg.pairing import Latencies
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
@@ -91,7 +92,8 @@ def make_folder(folder: Path, setup: str) -> None:
                 raise InputError(str(path), "another set-up", f"the same as now, or a new folder for {EVENTS_FILE}")
             return
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(str(folder), "a folder that is not empty", "a new or empty folder, or a session")
+            found = "a folder that is not empty" if folder.is_dir() else "a file"
+            raise InputError(str(folder), found, "a new or empty folder, or a session")
         folder.mkdir(parents=True, exist_ok=True)
         path.write_text(setup, encoding="utf-8")
     except OSError as error:

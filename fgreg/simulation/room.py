@@ -34,6 +34,7 @@ BUMP_S = 0.5
 """A bump moves the camera for so long."""
 SCENES = 6
 """Scenes that are drawn before a configuration is given up as one in which the camera sees no marker."""
+BMODE_PIXEL_MM, BMODE_DEPTH_MM = 0.3, 60.0
 REACH_MM = 140.0
 """Beams that meet no tissue within this distance end there."""
 
@@ -303,3 +304,22 @@ class Room:
         depth = sweeps.range_mm(source, np.asarray(scan_rad), config.probe.radius_mm)
         width = float(sweeps.half_width_rad(config.probe.sensitivity, depth)) + self.scene.window_edge_rad
         return LookPicture(source, scan_rad, width, (self.config.seed, index, 2)).record(config)
+
+    def bmode(self, scan_rad: float, index: int) -> tuple[UInt8Image, tuple[float, float], tuple[float, float]]:
+        """What the scanner shows with its plane at ``scan_rad``: speckle up to the tissue's surface, nothing beyond.
+
+        Returns:
+            The picture (depth, lateral), its pixels' size along depth and laterally, and depth and TRUS x of the centre
+            of its first pixel, mm. ``index`` seeds what flickers.
+        """
+        probe = self.config.scene.probe
+        x = np.arange(probe.element_x_mm.min(), probe.element_x_mm.max(), BMODE_PIXEL_MM)
+        depth = np.arange(0.0, BMODE_DEPTH_MM, BMODE_PIXEL_MM)
+        surface = self.scene.tissue.point(x, np.full_like(x, scan_rad))
+        below = np.hypot(surface[:, 1], surface[:, 2]) - probe.radius_mm - depth[:, None]
+        still = np.random.default_rng((self.config.seed, round(math.degrees(scan_rad)) % 360))
+        speckle = np.hypot(*still.standard_normal((2, *below.shape))) + 0.1 * np.random.default_rng(
+            (self.config.seed, index, 3)
+        ).standard_normal(below.shape)
+        grey = 40.0 * np.abs(speckle) * (below > 0.0) + 160.0 * np.exp(-np.square(below / 0.6))
+        return np.clip(grey, 0.0, 255.0).astype(np.uint8), (BMODE_PIXEL_MM,) * 2, (0.0, float(x[0]))

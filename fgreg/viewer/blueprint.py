@@ -29,13 +29,19 @@ ACCUMULATED = ("world/looks/arc", "world/looks/beam", "world/looks/pm", "world/l
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What there is to show, so that no view stands empty; ``pa_size`` in pixels, (rows, columns)."""
+    """What there is to show, so that no view stands empty; ``pa_size`` in pixels, (rows, columns).
+
+    ``online``: moments; ``now``: of a session under way, which ``registered`` tells to have a registration.
+    """
 
     left: bool = False
     right: bool = False
     pa_size: tuple[int, int] | None = None
     result: bool = False
     online: bool = False
+    bmode: bool = False
+    now: bool = False
+    registered: bool = False
 
 
 def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None) -> rrb.Blueprint:
@@ -55,7 +61,7 @@ def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None)
     world = rrb.Spatial3DView(
         origin="world",
         contents=["world/**", "- world/camera/right/**"],
-        name=WORLD_NAME[verdict],
+        name="World: TRUS frame, mm (live)" if contents.now else WORLD_NAME[verdict],
         background=BACKGROUND[verdict],
         line_grid=False,
         overrides=dict.fromkeys(ACCUMULATED, until_now),
@@ -82,23 +88,31 @@ def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None)
         bounds = rrb.VisualBounds2D(x_range=[-0.08 * columns, 1.04 * columns], y_range=[-0.12 * rows, 1.02 * rows])
         name = "Photoacoustic frame (x, range; mm)"
         images.append(rrb.Spatial2DView(origin="pa", name=name, visual_bounds=bounds))
+    if contents.bmode:
+        images.append(rrb.Spatial2DView(origin="bmode", name="B-mode"))
     hidden = rrb.PlotLegend(visible=False)
-    text: list[rrb.View] = [rrb.TextDocumentView(origin="summary", name="Summary")] if contents.result else []
+    text: list[rrb.View] = (
+        [rrb.TextDocumentView(origin="summary", name="Now" if contents.now else "Summary")] if contents.result else []
+    )
     text.append(rrb.TextLogView(origin="log", name="Log"))
     rows_right: list[rrb.View | rrb.Container] = []
     shares: list[float] = []
+    if contents.now:
+        rows_right.append(rrb.Spatial2DView(origin="verdict", name="Verdict"))
+        shares.append(0.28)
     if images:
         rows_right.append(rrb.Horizontal(*images, column_shares=[1.35, 1.0][: len(images)]))
         shares.append(1.0)
     rows_right.append(rrb.Tabs(*text, active_tab=0))
     shares.append(1.1)
     if contents.online:
+        second = ("online/stage_deg", "Stage, deg") if contents.now else ("online/nis", "NIS as it came")
         rows_right.append(
             rrb.Horizontal(
                 rrb.TimeSeriesView(
                     origin="online/predicted_worst_mm", name="Predicted worst TRE, mm", plot_legend=hidden
                 ),
-                rrb.TimeSeriesView(origin="online/nis", name="NIS as it came", plot_legend=hidden),
+                rrb.TimeSeriesView(origin=second[0], name=second[1], plot_legend=rrb.PlotLegend(visible=contents.now)),
                 rrb.TimeSeriesView(origin="online/pairs", name="Pairs in the epoch", plot_legend=hidden),
             )
         )

@@ -14,6 +14,7 @@ from fgreg.measurements import Aim, Look, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
+from fgreg.viewer.now import Now, goal_line, now_markdown
 
 LARGEST_PLOTTED_MM = 30.0
 """A predicted error beyond this says no more than that nothing is known yet."""
@@ -35,6 +36,8 @@ class Moment:
         marker_T_laser: (4, 4) the beam.
         tre, verdict, reasons, pairs, nis, used: as in an online estimate.
         answer: to a track.
+        now: of a session that is under way; None where one is replayed.
+        epoch: of the camera.
     """
 
     t: float
@@ -51,6 +54,8 @@ class Moment:
     nis: float | None
     used: bool
     answer: TrackEstimate | None = None
+    now: Now | None = None
+    epoch: int = 0
 
 
 class LivePainter:
@@ -69,7 +74,9 @@ class LivePainter:
         self._rec.at(*self._last)
         self._registration(moment)
         shot = moment.shot
-        if shot is not None:
+        if moment.now is not None and "camera" in moment.now.lost:
+            self._rec.log("world/camera/marker", shapes.transform(None))
+        elif shot is not None:
             self._rec.log("world/camera/marker", shapes.transform(shot.marker.camera_T_marker))
         if not isinstance(shot, Pair | Track) or not (isinstance(shot, Pair) or shot.looks):
             self._rec.clear("world/shot/arc", "world/shot/sound")
@@ -82,7 +89,34 @@ class LivePainter:
                 self._track(moment, shot)
             case _:
                 self._rec.clear("world/shot/pm", "world/shot/beam")
+        if moment.now is not None:
+            self._now(moment, moment.now)
         self._figures(moment)
+
+    def _now(self, moment: Moment, now: Now) -> None:
+        """Where the stage is and where it should be, and the verdict as a colour."""
+        import rerun as rr
+
+        rec, stage = self._rec, self._model.stage
+        if now.scan_rad is None:
+            rec.log("world/stage", shapes.transform(None))
+        else:
+            device_deg = math.degrees(stage.device_from_scan(now.scan_rad))
+            self._stage(now.scan_rad, f"image plane, stage {device_deg:.1f}°")
+            rec.log("online/stage_deg/plane", rr.Scalars(device_deg))
+        if now.goal_rad is None:
+            rec.clear("world/goal")
+        else:
+            goal_deg = math.degrees(stage.device_from_scan(now.goal_rad))
+            corners = scene.plane_corners_mm(self._model.probe, self._depth_mm)
+            rec.log("world/goal", shapes.transform(scene.trus_T_plane(now.goal_rad)))
+            rec.log("world/goal/outline", shapes.plane_outline(corners, shapes.GOAL))
+            label = f"beam at {goal_line(now, stage)}"
+            rec.log("world/goal/label", shapes.point(corners[3], shapes.GOAL, 1.0, label))
+            rec.log("online/stage_deg/beam", rr.Scalars(goal_deg))
+        word, color = banner(moment)
+        rec.log("verdict", shapes.flat(color))
+        rec.log("verdict/word", shapes.points_2d(np.array([[shapes.BANNER[1] / 2.0, 0.0]]), shapes.MARKER, 0.5, [word]))
 
     def _registration(self, moment: Moment) -> None:
         transform, covariance = moment.trus_T_camera, moment.covariance
@@ -127,7 +161,7 @@ class LivePainter:
             self._rec.clear("world/shot/pm")
         else:
             self._rec.log("world/shot/pm", shapes.point(spot, shapes.PM, 5.0, "predicted spot"))
-        if answer is not None and answer.stage_rad is not None:
+        if moment.now is None and answer is not None and answer.stage_rad is not None:
             label = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°"
             self._stage(self._model.stage.scan_from_device(answer.stage_rad), label)
 
@@ -171,13 +205,37 @@ class LivePainter:
         rec.log("online/pairs/used", rr.Scalars(float(moment.pairs)))
         if moment.nis is not None and math.isfinite(moment.nis):
             rec.log("online/nis/pair", rr.Scalars(moment.nis))
-        level = {Verdict.OK: "INFO", Verdict.WARNING: "WARN", Verdict.REFUSED: "ERROR"}[moment.verdict]
-        rec.log("log", rr.TextLog(f"{moment.note} [{moment.verdict.value}]", level=level))
-        rec.log("summary", rr.TextDocument(moment_markdown(moment), media_type="text/markdown"))
+        if moment.note:
+            level = {Verdict.OK: "INFO", Verdict.WARNING: "WARN", Verdict.REFUSED: "ERROR"}[moment.verdict]
+            state = moment.verdict.value
+            if moment.trus_T_camera is None:
+                level, state = "INFO", "no registration yet"
+            rec.log("log", rr.TextLog(f"{moment.note} [{state}]", level=level))
+        rec.log("summary", rr.TextDocument(self._page(moment), media_type="text/markdown"))
+
+    def _page(self, moment: Moment) -> str:
+        if moment.now is None:
+            return moment_markdown(moment)
+        verdict = None if moment.trus_T_camera is None else moment.verdict
+        return now_markdown(
+            moment.now, self._model.stage, verdict, moment.tre, moment.pairs, moment.epoch, moment.reasons
+        )
 
     def to_end(self) -> None:
         """What is logged next belongs to the last moment."""
         self._rec.at(*self._last)
+
+
+def banner(moment: Moment) -> tuple[str, shapes.Color]:
+    """The verdict in a word and a colour; a lost device counts for more than a good registration."""
+    lost = () if moment.now is None else moment.now.lost
+    gone = f"; LOST: {', '.join(lost)}" if lost else ""
+    if moment.trus_T_camera is None:
+        return f"no registration yet{gone}", shapes.WARNING if lost else shapes.UNUSED
+    word = f"{moment.verdict.value.upper()}{gone}"
+    if moment.verdict is Verdict.REFUSED:
+        return word, shapes.REFUSED
+    return word, shapes.WARNING if lost or moment.verdict is Verdict.WARNING else shapes.BEAM
 
 
 def moment_markdown(moment: Moment) -> str:

@@ -9,6 +9,7 @@ Entities, all in TRUS millimetres unless a parent's transform says otherwise:
 - ``world/camera``: ``trus_T_camera`` of the epoch; ``left`` and ``right`` are pinholes with the endoscope's images,
   ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines below.
 - ``world/targets``: 95 % ellipsoids of the predicted error; ``world/truth``: PMs and camera where they are known.
+- Of a session under way: ``world/goal``, the plane in which the beam will be heard; ``bmode``; ``verdict``.
 - ``pa``: the shot's photoacoustic frame with its detection; ``plots/*``; ``summary``; ``log``.
 
 Timelines: ``shot`` (number among all aims, pairs and tracks, from 0) and ``time`` (seconds, as in the events).
@@ -26,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
-from fgreg.estimate import SessionEstimate
+from fgreg.estimate import SessionEstimate, Verdict
 from fgreg.frames import FloatArray, exp_so3
 from fgreg.measurements import Measurements, Track
 from fgreg.models import ProbeModel, SessionModel
@@ -34,10 +35,13 @@ from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LivePainter, Moment
+from fgreg.viewer.now import BmodePicture
 from fgreg.viewer.pa import pa_picture, texture
 from fgreg.viewer.result import ResultPainter, Truth
 from fgreg.viewer.shapes import Image8
 
+LARGEST_TEXTURE = 160
+"""Larger side of a B-mode picture on the image plane, pixels."""
 ShotKind = Literal["aim", "pair", "track"]
 
 
@@ -77,6 +81,9 @@ class NullViewer:
         covariance: FloatArray | None,
         probe: ProbeModel,
     ) -> None:
+        """Nothing is drawn."""
+
+    def bmode(self, t: float, index: int, picture: BmodePicture | None) -> None:
         """Nothing is drawn."""
 
     def moment(self, moment: Moment) -> None:
@@ -146,9 +153,11 @@ class Viewer:
         self._live: LivePainter | None = None
         self._model: SessionModel | None = None
         self._shown: set[str] = set()
+        self._shapes: dict[str, tuple[int, ...]] = {}
         self._pa_size: tuple[int, int] | None = None
         self._textured: set[int] = set()
         self._finished = False
+        self._arranged: Contents | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -158,7 +167,7 @@ class Viewer:
     ) -> None:
         """Finish the file and give it its name, or remove it after an exception."""
         try:
-            if not self._finished:
+            if not self._finished and self._live is None:
                 self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
             self._rec.close()
             if kind is None and self._part is not None and self._rrd is not None:
@@ -192,6 +201,8 @@ class Viewer:
         rec.static("world/camera/marker/label", shapes.point([0.0, 0.0, 0.0], shapes.MARKER, 1.0, "marker"))
         limit = rr.SeriesLines(colors=[shapes.UNUSED], names=["95 % of good looks are below"], widths=[1.0])
         rec.static("plots/nis/limit_95", limit)
+        for name, color in (("plane", shapes.SOUND), ("beam", shapes.GOAL)):
+            rec.static(f"online/stage_deg/{name}", rr.SeriesLines(colors=[color], names=[name], widths=[2.0]))
         for plot in ("residual_mm", "nis", "rotation_deg", "lambda_mm"):
             for name, color, shape in (
                 ("pair", shapes.PM, rr.components.MarkerShape.Circle),
@@ -228,6 +239,7 @@ class Viewer:
         for side, image in (("left", left), ("right", right)):
             if image is not None:
                 self._shown.add(side)
+                self._shapes[side] = image.shape
                 rec.log(f"world/camera/{side}", shapes.picture(image))
         if left is None:
             return
@@ -299,6 +311,40 @@ class Viewer:
             front = front[front[:, 1] <= picture.image.shape[0]]
             rec.log("pa/detection/wavefront", shapes.points_2d(front, shapes.PM, 1.3))
 
+    def bmode(self, t: float, index: int, picture: BmodePicture | None) -> None:
+        """Show a scanner's picture beside the others and, where it is known how it lies, on the image plane.
+
+        Args:
+            t: seconds.
+            index: number of the moment, which is to be drawn next.
+            picture: None where the scanner is gone: then the last one is taken away.
+        """
+        if self._model is None:
+            raise AssertionError("the session comes first")
+        rec = self._rec
+        rec.at(t, index)
+        caption = np.array([[0.5 * shapes.CANVAS, 0.03 * shapes.CANVAS]])
+        if picture is None:
+            if "bmode" in self._shown:
+                rec.log("bmode", shapes.no_picture((shapes.CANVAS, shapes.CANVAS, 3)))
+                rec.log("bmode/caption", shapes.points_2d(caption, shapes.REFUSED, 0.5, ["no picture"]))
+            return
+        image, pixel_mm, origin_mm = picture.image, picture.pixel_mm, picture.origin_mm
+        self._shown.add("bmode")
+        rec.log("bmode", shapes.picture(shapes.canvas(image)))
+        text = f"t = {t:.1f} s" + ("" if pixel_mm and origin_mm else "; where it lies in the plane is not known")
+        rec.log("bmode/caption", shapes.points_2d(caption, shapes.SOUND, 0.5, [text]))
+        if pixel_mm is None or origin_mm is None:
+            return
+        self._textured.add(index)
+        rows, columns = image.shape[:2]
+        corners = scene.picture_corners_mm(self._model.probe, (rows, columns), pixel_mm, origin_mm)
+        step = -(-max(rows, columns) // LARGEST_TEXTURE)
+        small = image[::step, ::step]
+        rgb = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small[..., ::-1]
+        rec.log("world/stage/plane", shapes.plane_mesh(corners, np.ascontiguousarray(rgb)))
+        rec.log("world/stage/outline", shapes.plane_outline(corners))
+
     def result(
         self,
         model: SessionModel,
@@ -337,18 +383,45 @@ class Viewer:
         self._finished = True
 
     def _contents(self, *, result: bool) -> Contents:
-        return Contents("left" in self._shown, "right" in self._shown, self._pa_size, result, self._live is not None)
+        shown = self._shown
+        return Contents(
+            "left" in shown,
+            "right" in shown,
+            self._pa_size,
+            result,
+            self._live is not None,
+            "bmode" in shown,
+            "now" in shown,
+            "registered" in shown,
+        )
 
     def moment(self, moment: Moment) -> None:
         """Draw a shot with what is known at its time: the recording then shows the registration as it moves.
 
         To be called after :meth:`session` and the shot's images.
         """
+        if self._model is None:
+            raise AssertionError("the session comes first")
         if self._live is None:
-            if self._model is None:
-                raise AssertionError("the session comes first")
             self._live = LivePainter(self._rec, self._model)
-            self._rec.blueprint(make_blueprint(self._contents(result=True), None, None))
+        if moment.now is not None:
+            self._shown.add("now")
+            if moment.trus_T_camera is not None and moment.verdict is not Verdict.REFUSED:
+                self._shown.add("registered")
+        contents = self._contents(result=True)
+        if contents != self._arranged:  # seldom: whoever looks may have turned the view
+            self._arranged = contents
+            eye = None
+            if moment.now is not None:
+                points = scene.live_points_mm(self._model.probe, self._model.targets_mm)
+                if moment.trus_T_camera is not None and contents.registered:
+                    points = np.vstack([points, moment.trus_T_camera[:3, 3]])
+                eye = scene.best_eye(points)
+            self._rec.blueprint(make_blueprint(contents, None, eye))
+        if moment.now is not None and "camera" in moment.now.lost:  # an old picture would look like a new one
+            self._rec.at(moment.t, moment.number)
+            for side, shape in self._shapes.items():
+                self._rec.log(f"world/camera/{side}", shapes.no_picture(shape))
         self._live.draw(moment, textured=moment.number in self._textured)
 
 

@@ -70,6 +70,23 @@ def plane_corners_mm(probe: ProbeModel, depth_mm: float) -> FloatArray:
     return np.array([[-half, 0.0, near], [half, 0.0, near], [half, 0.0, far], [-half, 0.0, far]])
 
 
+def picture_corners_mm(
+    probe: ProbeModel, shape: tuple[int, int], pixel_mm: tuple[float, float], origin_mm: tuple[float, float]
+) -> FloatArray:
+    """(4, 3) corners of a picture (rows, columns) in the image plane's frame, as :func:`plane_corners_mm` has them.
+
+    Args:
+        probe: of which the array's face is where depth begins.
+        shape: rows and columns.
+        pixel_mm: size of a pixel along depth and x.
+        origin_mm: depth and x of the centre of the first pixel.
+    """
+    near = probe.radius_mm + origin_mm[0] - pixel_mm[0] / 2.0
+    left = origin_mm[1] - pixel_mm[1] / 2.0
+    far, right = near + shape[0] * pixel_mm[0], left + shape[1] * pixel_mm[1]
+    return np.array([[left, 0.0, near], [right, 0.0, near], [right, 0.0, far], [left, 0.0, far]])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipsoid:
     """Half sizes (3,) mm along the columns of ``rotation`` (3, 3), a proper rotation."""
@@ -158,6 +175,14 @@ def shots_of(estimate: SessionEstimate) -> list[Shot]:
     listed += [(track.t, 2, position) for position, track in enumerate(estimate.tracks)]
     kinds = ("aim", "pair", "track")
     return [Shot(number, t, kinds[kind], position) for number, (t, kind, position) in enumerate(sorted(listed))]
+
+
+def live_points_mm(probe: ProbeModel, targets_mm: FloatArray) -> FloatArray:
+    """(n, 3) what has to be in view before a camera stands anywhere: the probe, the targets, and room for a camera."""
+    half = array_length_mm(probe) / 2.0
+    beyond = 1.7 * float(np.linalg.norm(targets_mm[:, 1:], axis=1).max())
+    ends = np.array([[side * half, 0.0, height] for side in (-1, 1) for height in (-probe.radius_mm, beyond)])
+    return np.vstack([ends, targets_mm])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,6 +32,8 @@ BEAM: Color = (70, 240, 110)
 PM: Color = (255, 175, 50)
 CAMERA: Color = (120, 150, 255)
 REFUSED: Color = (255, 60, 60)
+GOAL: Color = (70, 240, 110)
+WARNING: Color = (240, 160, 30)
 UNUSED: Color = (130, 130, 130)
 MARKER: Color = (245, 245, 245)
 TARGET: Color = (120, 112, 165)
@@ -41,6 +43,12 @@ IMAGE_DISTANCE_MM = 28.0
 """From the camera to where its image is drawn."""
 LARGEST_ELLIPSOID_MM = 50.0
 """Half size beyond which an ellipsoid is not drawn."""
+CANVAS = 512
+"""Side of what pictures of changing sizes are shown on, pixels."""
+BANNER = (6, 160)
+"""Rows and columns of a strip of one colour."""
+NOWHERE = "not known"
+"""Name of a frame that nothing else is connected to."""
 JPEG_QUALITY = 80
 
 
@@ -106,11 +114,14 @@ def ui(points: float) -> float:
 
 
 def transform(a_T_b: FloatArray | None) -> rr.Transform3D:
-    """A transform; where there is none, scale 0, at which Rerun does not show what is below."""
+    """A transform; where there is none, one to a frame that is nowhere: Rerun does not show what is below then.
+
+    A scale of 0 would not do: Rerun takes it for a mistake and shows everything at the parent's origin.
+    """
     import rerun as rr
 
     if a_T_b is None:
-        return rr.Transform3D(scale=0.0)
+        return rr.Transform3D(parent_frame=NOWHERE)
     return rr.Transform3D(translation=a_T_b[:3, 3], mat3x3=a_T_b[:3, :3])
 
 
@@ -191,20 +202,19 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
     import rerun as rr
 
     triangles = [[0, 1, 2], [0, 2, 3]]
-    if picture is None:
-        return rr.Mesh3D(vertex_positions=corners_mm, triangle_indices=triangles, albedo_factor=(*PLANE, 110))
     return rr.Mesh3D(
         vertex_positions=corners_mm,
         triangle_indices=triangles,
         vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
-        albedo_texture=picture,
-        albedo_factor=(255, 255, 255, 160),
+        # Without one, the picture before it would stay.
+        albedo_texture=np.full((1, 1, 3), 255, dtype=np.uint8) if picture is None else picture,
+        albedo_factor=(*PLANE, 110) if picture is None else (255, 255, 255, 160),
     )
 
 
-def plane_outline(corners_mm: FloatArray) -> rr.LineStrips3D:
+def plane_outline(corners_mm: FloatArray, color: Color = PLANE) -> rr.LineStrips3D:
     """The edge of the image plane; the plane itself is hardly seen where light does not fall on it."""
-    return strips([np.vstack([corners_mm, corners_mm[:1]])], PLANE, 0.8)
+    return strips([np.vstack([corners_mm, corners_mm[:1]])], color, 0.8)
 
 
 def probe(length_mm: float, radius_mm: float) -> rr.Capsules3D:
@@ -256,6 +266,31 @@ def picture(image: Image8) -> rr.EncodedImage | rr.Image:
 
     image = np.ascontiguousarray(image)
     return rr.Image(image, color_model="BGR" if image.ndim == 3 else "L").compress(jpeg_quality=JPEG_QUALITY)
+
+
+def flat(color: Color) -> rr.Image:
+    """A strip of one colour."""
+    import rerun as rr
+
+    return rr.Image(np.full((*BANNER, 3), color, dtype=np.uint8))
+
+
+def no_picture(shape: tuple[int, ...]) -> rr.EncodedImage | rr.Image:
+    """Black, in place of an old picture of this shape: Rerun's 2D view goes on showing one that is cleared."""
+    return picture(np.zeros(shape, dtype=np.uint8))
+
+
+def canvas(image: Image8) -> Image8:
+    """(CANVAS, CANVAS, 3) BGR with a (h, w) grey or (h, w, 3) BGR picture as large as whole steps make it.
+
+    Rerun takes JPEG pictures of one entity for a video, and loses it where their size or kind changes.
+    """
+    larger = max(image.shape[:2])
+    step, times = -(-larger // CANVAS), max(1, CANVAS // larger)
+    shown = image[::step, ::step].repeat(times, axis=0).repeat(times, axis=1)
+    out = np.zeros((CANVAS, CANVAS, 3), dtype=np.uint8)
+    out[: shown.shape[0], : shown.shape[1]] = shown[..., None] if shown.ndim == 2 else shown
+    return out
 
 
 def points_2d(pixels: FloatArray, color: Color, size: float, labels: Sequence[str] | None = None) -> rr.Points2D:

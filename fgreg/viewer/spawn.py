@@ -17,6 +17,8 @@ from fgreg.errors import FgregError
 START_S = 30.0
 STABLE_S = 1.5
 """A viewer that finds no screen ends soon after it listens."""
+MEMORY = "2GB"
+"""Beyond this the viewer drops what is oldest: a live session may go on for hours."""
 _INSTEAD = "record with --rrd FILE instead and open that where there is a screen"
 
 
@@ -54,8 +56,12 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def spawn_viewer(executable: Path | None = None) -> str:
+def spawn_viewer(executable: Path | None = None, instead: str = _INSTEAD) -> str:
     """Start a viewer and return the address to send a recording to; the viewer stays open when this program ends.
+
+    Args:
+        executable: of the viewer, where it is not the installed one.
+        instead: what to do where it cannot be started.
 
     Raises:
         ViewerError: no viewer, no screen for it, or it did not start in time.
@@ -65,19 +71,25 @@ def spawn_viewer(executable: Path | None = None) -> str:
     with tempfile.TemporaryFile() as log:
         try:
             child = subprocess.Popen(
-                [str(program), "--bind=127.0.0.1", f"--port={port}", "--hide-welcome-screen"],
+                [
+                    str(program),
+                    "--bind=127.0.0.1",
+                    f"--port={port}",
+                    "--hide-welcome-screen",
+                    f"--memory-limit={MEMORY}",
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
         except OSError as error:
-            raise ViewerError(f"the rerun viewer cannot be started ({error.strerror}); {_INSTEAD}") from None
+            raise ViewerError(f"the rerun viewer cannot be started ({error.strerror}); {instead}") from None
         deadline, heard = time.monotonic() + START_S, None
         while time.monotonic() < deadline:
             if child.poll() is not None:
                 log.seek(0)
-                raise ViewerError(f"the rerun viewer ended at once ({_why(log.read(), child.returncode)}); {_INSTEAD}")
+                raise ViewerError(f"the rerun viewer ended at once ({_why(log.read(), child.returncode)}); {instead}")
             if heard is None:
                 with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=0.5):
                     heard = time.monotonic()
@@ -86,7 +98,7 @@ def spawn_viewer(executable: Path | None = None) -> str:
             time.sleep(0.1)
     child.kill()
     child.wait()
-    raise ViewerError(f"the rerun viewer did not start within {START_S:.0f} s; {_INSTEAD}")
+    raise ViewerError(f"the rerun viewer did not start within {START_S:.0f} s; {instead}")
 
 
 def _why(log: bytes, status: int) -> str:

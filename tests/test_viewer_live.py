@@ -1,0 +1,172 @@
+"""A session under way as the viewer and the terminal show it: where things are, what comes next, what is gone."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from fgreg.cli_live import status_panel
+from fgreg.drivers.base import BmodeFrame, Stamp
+from fgreg.estimate import PredictedTre, TrackEstimate, Verdict
+from fgreg.measurements import MarkerObservation, Track
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.operation.recorder import RecorderState
+from fgreg.operation.status import Figures, Status
+from fgreg.operation.view import Known, StageView
+from fgreg.viewer.live import Moment
+from fgreg.viewer.now import Now
+from fgreg.viewer.recording import Viewer
+from fgreg.viewer.shapes import CANVAS, canvas
+from tests.recordings import Row, read_recording, transform_of, views
+from tests.test_viewer_recording import make_model
+
+SCAN_RAD, GOAL_RAD = math.radians(20.0), math.radians(26.0)
+NOW = Now("following", "go on", scan_rad=SCAN_RAD, homed=True, goal_rad=GOAL_RAD, sigma_rad=math.radians(0.8))
+TRUS_T_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0]) + np.array([[0, 0, 0, 5.0], [0] * 4, [0, 0, 0, 120.0], [0] * 4])
+PICTURE = np.arange(40 * 30, dtype=np.uint32).astype(np.uint8).reshape(40, 30)
+
+
+def bmode(placed: bool = True) -> BmodeFrame:
+    return BmodeFrame(Stamp(0.0, 0.0), PICTURE, 0, (0.5, 0.25), (2.0, -3.0) if placed else None)
+
+
+def moment(number: int, now: Now, verdict: Verdict | None = Verdict.OK) -> Moment:
+    """``verdict`` None: no registration."""
+    track = Track(float(number), 0, MarkerObservation(np.eye(4), np.eye(6), number), ())
+    return Moment(
+        float(number),
+        number,
+        track,
+        "",
+        None if verdict is None else TRUS_T_CAMERA,
+        None if verdict is None else 0.01 * np.eye(6),
+        None,
+        None if verdict is None else PredictedTre(0.9, 1.2, 1.5),
+        verdict or Verdict.REFUSED,
+        ("a reason",),
+        9,
+        None,
+        False,
+        now=now,
+        epoch=2,
+    )
+
+
+def recorded(path: Path, shown: list[tuple[Moment, BmodeFrame | None]]) -> dict[str, list[Row]]:
+    with Viewer(path, "live") as viewer:
+        viewer.session(make_model())
+        for one, picture in shown:
+            viewer.bmode(one.t, one.number, picture)
+            viewer.moment(one)
+    return read_recording(path)
+
+
+def page(rows: dict[str, list[Row]], number: int) -> str:
+    (found,) = [row.values["TextDocument:text"][0] for row in rows["/summary"] if row.shot == number]
+    return str(found)
+
+
+def test_the_plane_stands_where_the_stage_is_and_the_goal_where_the_beam_will_be_heard(tmp_path: Path) -> None:
+    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), None)])
+    for entity, scan_rad in (("/world/stage", SCAN_RAD), ("/world/goal", GOAL_RAD)):
+        up = transform_of(rows[entity][-1])[:3, :3] @ [0.0, 0.0, 1.0]
+        np.testing.assert_allclose(up, [0.0, math.sin(scan_rad), math.cos(scan_rad)], atol=1e-6)
+    # The model's stage counts the other way from 5 degrees: its own angles are what is written.
+    assert rows["/world/stage/label"][-1].values["Points3D:labels"] == ["image plane, stage -15.0°"]
+    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8°"]
+    text = page(rows, 0)
+    assert text.startswith("# OK")
+    assert "## Next: go on" in text
+    assert "at -15.0°; beam at -21.0° ± 0.8°, 6.0° away" in text
+    assert "1.50 mm" in text
+    assert "9 pairs in camera epoch 2" in text
+    assert {"Now", "Verdict", "World: TRUS frame, mm (live)"} <= set(views(tmp_path / "a.rrd").values())
+
+
+def test_a_bmode_picture_lies_in_the_plane_with_its_pixels_size_and_goes_when_its_scanner_goes(tmp_path: Path) -> None:
+    lost = replace(NOW, lost=("bmode",))
+    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), bmode()), (moment(1, lost), None)])
+    with_it, without = rows["/world/stage/plane"]
+    corners = with_it.array("Mesh3D:vertex_positions")
+    radius = make_model().probe.radius_mm
+    # Centre of the first pixel: 2 mm deep, x = -3; 40 rows of 0.5 mm, 30 columns of 0.25 mm.
+    np.testing.assert_allclose(corners[0], [-3.125, 0.0, radius + 1.75], atol=1e-5)
+    np.testing.assert_allclose(corners[2], [-3.125 + 7.5, 0.0, radius + 1.75 + 20.0], atol=1e-5)
+    assert len(with_it.values["Mesh3D:albedo_texture_buffer"][0]) == 40 * 30 * 3
+    assert len(without.values["Mesh3D:albedo_texture_buffer"][0]) == 3  # not the picture before it
+    assert rows["/bmode/caption"][-1].values["Points2D:labels"] == ["no picture"]
+    assert "# LOST: bmode" in page(rows, 1)
+    assert rows["/verdict/word"][-1].values["Points2D:labels"] == ["OK; LOST: bmode"]
+
+
+def test_a_picture_whose_place_is_not_known_is_shown_beside_only_and_says_so(tmp_path: Path) -> None:
+    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), bmode(placed=False))])
+    assert "where it lies in the plane is not known" in rows["/bmode/caption"][-1].values["Points2D:labels"][0]
+    (plane,) = rows["/world/stage/plane"]
+    assert len(plane.values["Mesh3D:albedo_texture_buffer"][0]) == 3
+
+
+def test_without_a_registration_no_camera_stands_anywhere_and_lost_devices_are_to_be_got_back(tmp_path: Path) -> None:
+    gone = replace(NOW, lost=("camera", "stage", "sink 1"), scan_rad=None, goal_rad=None)
+    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW, None), bmode()), (moment(1, gone, None), None)])
+    for entity in ("/world/camera", "/world/stage", "/world/camera/marker"):
+        assert rows[entity][-1].values["Transform3D:parent_frame"] == ["not known"]
+    text = page(rows, 1)
+    assert text.startswith("# No registration yet")
+    assert "## Next: get the camera and the stage back" in text
+    assert "**Stage:** LOST" in text
+    assert rows["/world/goal"][-1].values["Clear:is_recursive"] == [True]
+
+
+def test_the_last_picture_says_that_the_session_is_over(tmp_path: Path) -> None:
+    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), None), (moment(1, replace(NOW, ended=True)), None)])
+    assert page(rows, 1).startswith("# THE SESSION HAS ENDED")
+    assert "Next:" not in page(rows, 1)
+    assert "Now" in views(tmp_path / "a.rrd").values()  # closing takes no view away
+
+
+def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[str, ...] = ()) -> Status:
+    known = Known(verdict or Verdict.REFUSED, reasons, 1, 12, verdict is not None)
+    estimate = OnlineEstimate(
+        1.0, 1, None, None, PredictedTre(1.0, 1.5, 1.87), None, False, known.verdict, reasons, 12, None, True
+    )
+    device = make_model().stage.device_from_scan(GOAL_RAD)
+    answer = TrackEstimate(1.0, device, math.radians(0.8), 30.0, causal=True)
+    plane = None if "stage" in lost else StageView(SCAN_RAD, False, True, 1.0)
+    state = RecorderState(known, estimate, 8, 12, trouble="No space left on device" if lost else "")
+    return Status(1.0, 1.0, "following", "news [red]", "hold it still", state, answer, plane, "", lost, None, None)
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (status(Verdict.OK), ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8°", "news [red]"]),
+        (status(None, ("camera", "stage")), ["none yet", "camera, stage", "get the camera and the stage back", "LOST"]),
+        (status(Verdict.REFUSED, ("bmode",), ("long " * 300, "short", "third")), ["REFUSED", "bmode", "No space left"]),
+    ],
+)
+def test_the_panel_says_it_all_on_a_small_terminal(shown: Status, expected: list[str]) -> None:
+    console = Console(width=80, height=24, force_terminal=False, highlight=False, record=True, file=io.StringIO())
+    figures = Figures(frames=89_000, skipped=120, found=76_000, pictures=12_000, unshown=333)
+    console.print(status_panel(figures, make_model().stage, shown))
+    text = console.export_text()
+    assert all(word in text for word in expected), text
+    assert len(text.splitlines()) <= 23
+    assert all(len(line) <= 80 for line in text.splitlines())
+
+
+def test_pictures_of_any_size_and_kind_are_shown_on_one_canvas() -> None:
+    grey = canvas(PICTURE)
+    assert grey.shape == (CANVAS, CANVAS, 3)
+    np.testing.assert_array_equal(grey[: 40 * 12 : 12, : 30 * 12 : 12, 1], PICTURE)  # 12 times fits, 13 would not
+    assert not grey[40 * 12 :].any()
+    colour = np.zeros((1200, 900, 3), dtype=np.uint8)
+    colour[..., 2] = 9
+    np.testing.assert_array_equal(canvas(colour)[:400, :300], colour[::3, ::3])
+    assert not canvas(colour)[400:].any()
