@@ -5,8 +5,8 @@
 Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe``, ``scanner`` (B-mode pictures)
 and ``motion`` (the holder of the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon,
 who says what he does and can be asked to go on. ``control`` breaks devices and mends them: ``{"device": "camera",
-"fault": "frozen"}`` (:data:`FAULTS`). Camera and probe stamp with clocks of their own. The process ends with the one that
-started it (its standard input closes), or on SIGTERM.
+"fault": "frozen"}`` (:data:`FAULTS`). Camera and probe stamp with clocks of their own. The process ends with the one
+that started it (its standard input closes), or on SIGTERM.
 """
 
 from __future__ import annotations

@@ -136,9 +136,7 @@ class Watch:
         recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
         loop.eyes.see = self._timed(loop.eyes.see, "look")  # type: ignore[method-assign]
         loop.turn = self._timed(loop.turn, "turn")  # type: ignore[method-assign]
-        link = loop._devices.stage
-        for name in ("request", "home", "search_to", "track_to"):
-            setattr(link, name, self._timed(getattr(link, name), "order"))
+        loop._steering.order = self._timed(loop._steering.order, "order")  # type: ignore[method-assign]
 
     def _timed(self, call: Callable[..., Any], name: str) -> Callable[..., Any]:
         spent, figures = self._spent[name], self._session.loop.figures
