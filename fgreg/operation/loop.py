@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from fgreg.models import SessionModel
 from fgreg.motion.device import StageError
 from fgreg.motion.limits import MotionKind
 from fgreg.motion.link import Report, StageLink
-from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
+from fgreg.online.shared_snapshot import NoSnapshotError
 from fgreg.operation.conductor import Conductor
 from fgreg.operation.recorder import Recorder, RecorderState
 from fgreg.operation.senses import Ears, Eyes
@@ -72,6 +72,13 @@ SEND_S = 0.2
 START_S = 5.0
 """So long devices may take to send for the first time."""
 LATENCIES = 100_000
+
+
+class Snapshots(Protocol):
+    """Where the estimate's snapshots come from."""
+
+    def snapshot(self) -> Snapshot:
+        """The latest; raises NoSnapshotError where there is none yet."""
 
 
 @dataclass(slots=True, eq=False)
@@ -159,7 +166,7 @@ class LiveLoop:
         model: SessionModel,
         devices: Devices,
         recorder: Recorder,
-        reader: SnapshotReader,
+        reader: Snapshots,
         conductor: Conductor,
         start_s: float,
     ) -> None:

@@ -1,13 +1,16 @@
 """Records events and has them estimated, on a thread of its own: the loop hands over and goes on.
 
 Nothing that was handed over is dropped: what waits is counted, and what the disk refuses is said. Each event is on disk
-before it is counted as recorded (fgreg.session.journal).
+before it is counted as recorded (fgreg.session.journal). Where the registration's process ends, a new one goes on from
+what is on disk; the last estimate stands until then, as a warning at most, since nobody notices if the camera moves.
 """
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -16,11 +19,16 @@ from fgreg.estimate import Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent
 from fgreg.frames import FloatArray
 from fgreg.live import LiveSession
+from fgreg.online.engine_process import EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.operation.view import Known
 
 REFRESH_S = 0.2
 """Between looks at what was found out meanwhile."""
+AGAIN_S = 5.0
+"""Between attempts to go on with a new process."""
+REVIVED = "the registration's process had ended; another one has taken in what is recorded"
+UNWATCHED = "the registration's process has ended, and another one is being started: what came since is not in here"
 
 Recorded = AimEvent | PairEvent | CameraMovedEvent | NoteEvent
 
@@ -53,18 +61,16 @@ class Recorder:
 
     Args:
         session: opened; the recorder is the only one that adds to it from now on.
-        on_taken: called on the recorder's thread after each event that was taken in.
+        on_taken: called on the recorder's thread after each event that was taken in, but for those that a new process
+            of the registration took in when it began.
     """
 
     def __init__(self, session: LiveSession, on_taken: OnTaken | None = None) -> None:
         self._session, self._on_taken = session, on_taken
         self._waiting: queue.Queue[Recorded | None] = queue.Queue()
         self._lock = threading.Lock()
-        taken = session.measurements()
-        self._state = RecorderState(
-            known_of(session.estimate), session.estimate, aims=len(taken.aims), pairs=len(taken.pairs)
-        )
-        self._ended = False
+        self._state = self._recorded()
+        self._ended, self._revived_s = False, -math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -102,6 +108,31 @@ class Recorder:
                 return
             self._take(event)
 
+    def _recorded(self) -> RecorderState:
+        """What the session has."""
+        taken, estimate = self._session.measurements(), self._session.estimate
+        return RecorderState(known_of(estimate), estimate, aims=len(taken.aims), pairs=len(taken.pairs))
+
+    def _revive(self) -> None:
+        """Go on with a new engine, unless that has just been tried."""
+        with self._lock:
+            standing = _unwatched(self._state.estimate)
+            self._state = replace(self._state, known=known_of(standing), estimate=standing, trouble=UNWATCHED)
+        if time.monotonic() < self._revived_s + AGAIN_S:
+            return
+        self._revived_s = time.monotonic()
+        try:
+            self._session.revive()
+            t = self._session.journal.last_t
+            self._session.record(NoteEvent(0.0 if t is None else t, 0, REVIVED))
+            state = self._recorded()
+        except FgregError as error:
+            with self._lock:
+                self._state = replace(self._state, trouble=f"{UNWATCHED}: {error}")
+            return
+        with self._lock:
+            self._state = replace(state, refused=self._state.refused)
+
     def _take(self, event: Recorded) -> None:
         aims = pairs = refused = 0
         trouble, estimate = "", self._session.estimate
@@ -111,6 +142,9 @@ class Recorder:
             else:
                 estimate = self._session.add(event)
                 aims, pairs = int(isinstance(event, AimEvent)), int(isinstance(event, PairEvent))
+        except EngineGone:  # the event is on disk
+            self._revive()
+            return
         except EventRefused as error:
             refused, trouble = 1, f"an event was refused: {error.reason}"
         except FgregError as error:
@@ -126,17 +160,33 @@ class Recorder:
                 trouble=trouble,
             )
         if self._on_taken is not None and not refused:
-            self._on_taken(event, estimate, self._session.marker_T_laser())
+            try:
+                beam = self._session.marker_T_laser()
+            except EngineGone:
+                self._revive()
+                return
+            self._on_taken(event, estimate, beam)
 
     def _refresh(self) -> None:
         try:
             estimate = self._session.refresh()
+        except EngineGone:
+            self._revive()
+            return
         except FgregError as error:
             with self._lock:
                 self._state = replace(self._state, trouble=str(error))
             return
         with self._lock:
             self._state = replace(self._state, known=known_of(estimate), estimate=estimate)
+
+
+def _unwatched(estimate: OnlineEstimate | None) -> OnlineEstimate | None:
+    """An estimate that nothing is added to, and that nobody looks after."""
+    if estimate is None or UNWATCHED in estimate.reasons:
+        return estimate
+    verdict = max(estimate.verdict, Verdict.WARNING, key=lambda v: v.severity)
+    return replace(estimate, verdict=verdict, reasons=(UNWATCHED, *estimate.reasons))
 
 
 def known_of(estimate: OnlineEstimate | None) -> Known:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,18 @@ import yaml
 from fgreg.config import SolveConfig
 from fgreg.drivers.base import host_now
 from fgreg.errors import InputError
-from fgreg.live import LiveSession
+from fgreg.live import Engine, LiveSession
 from fgreg.models import SessionModel
 from fgreg.motion.limits import MotionLimits
 from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
+from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import Devices, LiveLoop
 from fgreg.operation.recorder import OnTaken, Recorder
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
+from fgreg.tracking import Snapshot
 
 WATCHDOG_LOG = "stage-orders.log"
 
@@ -67,6 +69,46 @@ class Running:
     loop: LiveLoop
     recorder: Recorder
     session: LiveSession
+
+
+class _OneProcess:
+    """Makes engines, each a process; the one before is ended."""
+
+    def __init__(self) -> None:
+        self._engine: EngineProcess | None = None
+
+    def __call__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
+        self.close()
+        self._engine = EngineProcess(model, config, prior)
+        return self._engine
+
+    def close(self) -> None:
+        """End the last one."""
+        if self._engine is not None:
+            self._engine.close()
+
+
+class NewestSnapshots:
+    """The snapshots of a session's engine, whichever process that is by now; for one thread.
+
+    While a new process takes in what is recorded, those of the one before stand.
+    """
+
+    def __init__(self, session: LiveSession) -> None:
+        self._session = session
+        self._engine: Engine | None = None
+        self._reader: SnapshotReader | None = None
+
+    def snapshot(self) -> Snapshot:
+        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.snapshot`."""
+        engine = self._session.engine
+        if engine is not self._engine and isinstance(engine, EngineProcess):
+            with suppress(FileNotFoundError):  # that one has ended as well
+                self._reader = engine.reader()
+            self._engine = engine
+        if self._reader is None:
+            raise NoSnapshotError("the registration's process has ended")
+        return self._reader.snapshot()
 
 
 def make_folder(folder: Path, setup: str) -> None:
@@ -118,12 +160,8 @@ def running(
     make_folder(folder, live.setup)
     with ExitStack() as stack:
         say("starting the registration")
-        engines: list[EngineProcess] = []
-
-        def make_engine(model: SessionModel, settings: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
-            engines.append(stack.enter_context(EngineProcess(model, settings, prior)))
-            return engines[-1]
-
+        make_engine = _OneProcess()
+        stack.callback(make_engine.close)  # after the recorder, whichever process is there then
         session = stack.enter_context(LiveSession.open(folder, config, make_engine, late=True))
         model = session.journal.model
         last_t = session.journal.last_t
@@ -137,9 +175,7 @@ def running(
         stack.callback(recorder.close)
         taken = session.measurements()
         conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
-        reader = engines[-1].reader()
-        stack.callback(reader.close)
-        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s)
+        loop = LiveLoop(model, devices, recorder, NewestSnapshots(session), conductor, start_s)
         stack.callback(loop.close)
         yield Running(folder, model, loop, recorder, session)
         if devices.stage is not None:
