@@ -6,6 +6,7 @@ A connection that is lost is looked for again by itself, as with a real device.
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import shutil
@@ -266,6 +267,32 @@ class RoomStage(SimulatedStage):
         """Brake and let go."""
         super().close()
         self._room.close()
+
+
+def ask_truth(path: Path, camera_s: Sequence[float], spots_s: Sequence[float]) -> dict[str, Any]:
+    """How things truly were in a room: for who judges an estimate, never for who makes one.
+
+    Args:
+        path: of the room's socket.
+        camera_s, spots_s: host times, s, at which to tell ``trus_T_camera`` (4x4 each) and ``spots_mm`` (the beam's end
+            in TRUS, 3 each). Told as well: ``marker_T_laser`` (4x4), ``moved_s`` (when the camera began to move) and
+            ``seed``.
+
+    Raises:
+        FgregError: the room does not answer.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(START_S)
+        try:
+            connection.connect(os.fspath(path))
+            send(connection, {"role": "truth"})
+            send(connection, {}, json.dumps({"camera_s": [*camera_s], "spots_s": [*spots_s]}).encode())
+            told = json.loads(receive(connection)[1])
+        except (OSError, WireClosed, ValueError) as error:
+            raise FgregError(f"the simulated room does not tell the truth ({error})") from None
+    if not isinstance(told, dict):
+        raise FgregError("the simulated room does not tell the truth")
+    return told
 
 
 def open_stage(model: StageModel, path: str) -> RoomStage:

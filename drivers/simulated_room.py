@@ -3,14 +3,16 @@
     python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
 
 Devices, each by a connection that begins with ``{"role": ...}``: ``camera`` and ``probe`` only send; ``stage`` tells
-where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. Camera and probe stamp
-with clocks of their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
+where its plane is; ``operator`` is the surgeon, who says what he does and can be asked to go on. ``truth`` is no
+device: it answers how things truly were, for whoever judges a recorded session. Camera and probe stamp with clocks of
+their own. The process ends with the one that started it (its standard input closes), or on SIGTERM.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import os
 import queue
@@ -124,6 +126,9 @@ class RoomServer:
         if role == "stage":
             self._turn(connection)
             return
+        if role == "truth":
+            self._tell_truth(connection)
+            return
         if role not in ("camera", "probe", "operator"):
             connection.close()
             return
@@ -149,6 +154,24 @@ class RoomServer:
                 self._scan_rad = float(header["scan"])
         except (WireClosed, KeyError, TypeError, ValueError):
             connection.close()
+
+    def _tell_truth(self, connection: socket.socket) -> None:
+        """How things were at the host times (s) that are asked for, and when the camera was moved."""
+        room, start = self.room, self._start_s
+        try:
+            _, payload = receive(connection)
+            asked = json.loads(payload)
+            told = {
+                "trus_T_camera": [room.trus_T_camera(t - start).tolist() for t in asked["camera_s"]],
+                "spots_mm": [room.spot_mm(t - start).tolist() for t in asked["spots_s"]],
+                "marker_T_laser": room.marker_T_laser.tolist(),
+                "moved_s": [t + start for t in room.moved_s],
+                "seed": room.config.seed,
+            }
+            send(connection, {}, json.dumps(told).encode())
+        except (WireClosed, ValueError, KeyError, TypeError, StopIteration):
+            pass
+        connection.close()
 
     def _to(self, role: str) -> list[_Client]:
         with self._lock:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
+from functools import partial
 
 from fgreg.drivers.simulated import RoomProcess, SimulatedCamera, SimulatedOperator, SimulatedProbe
 from fgreg.models import SessionModel
 from fgreg.operation.conductor import ConductorSettings
 from fgreg.operation.loop import Devices
+from fgreg.operation.room_truth import write_room_truth
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import BUMP_EVERY_S, room_config
@@ -48,6 +50,5 @@ def simulated_room(
         {"path": os.fspath(room.path)},
         {"search_speed": SPEED_RAD_S, "track_speed": SPEED_RAD_S, "home_speed": SPEED_RAD_S},
     )
-    return LiveSetup(
-        setup_text(document), open_devices, stage, ConductorSettings(aims=aims, hearing_threshold=HEARING_THRESHOLD)
-    )
+    settings = ConductorSettings(aims=aims, hearing_threshold=HEARING_THRESHOLD)
+    return LiveSetup(setup_text(document), open_devices, stage, settings, partial(write_room_truth, room.path))

@@ -13,7 +13,7 @@ import yaml
 
 from fgreg.config import SolveConfig
 from fgreg.drivers.base import host_now
-from fgreg.errors import InputError
+from fgreg.errors import FgregError, InputError
 from fgreg.live import Engine, LiveSession
 from fgreg.models import SessionModel
 from fgreg.motion.limits import MotionLimits
@@ -34,6 +34,11 @@ OpenDevices = Callable[[ExitStack, SessionModel], Devices]
 """Opens the devices but the stage; what it opens is closed with the stack."""
 
 
+TellTruth = Callable[[Path, float, float], None]
+"""Writes a session's ground truth, from its folder, the host time of session time 0, and the session time after which
+its events are this run's."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class StageSetup:
     """The stage's driver (``package.module:factory``), its options, and limits beyond the session's."""
@@ -52,12 +57,14 @@ class LiveSetup:
         open_devices: all but the stage.
         stage: None where there is none: then nothing turns.
         settings: of the conductor.
+        tell_truth: called when all is recorded, where somebody knows the truth.
     """
 
     setup: str
     open_devices: OpenDevices
     stage: StageSetup | None
     settings: ConductorSettings
+    tell_truth: TellTruth | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,6 +173,7 @@ def running(
         model = session.journal.model
         last_t = session.journal.last_t
         start_s = host_now() - (0.0 if last_t is None else max(last_t, 0.0) + 1.0)
+        stack.callback(_tell_truth, live.tell_truth, folder, start_s, -1.0 if last_t is None else last_t, say)
         say("opening the devices")
         devices = live.open_devices(stack, model)
         if live.stage is not None:
@@ -180,6 +188,17 @@ def running(
         yield Running(folder, model, loop, recorder, session)
         if devices.stage is not None:
             devices.stage.close()  # first of all; the rest follows in the stack's order
+
+
+def _tell_truth(
+    tell: TellTruth | None, folder: Path, start_s: float, begin_t: float, say: Callable[[str], None]
+) -> None:
+    """The session is what it is without."""
+    if tell is not None:
+        try:
+            tell(folder, start_s, begin_t)
+        except FgregError as error:
+            say(f"no ground truth: {error}")
 
 
 def _open_stage(
