@@ -270,13 +270,7 @@ class RoomStage(SimulatedStage):
 
 
 def ask_truth(path: Path, camera_s: Sequence[float], spots_s: Sequence[float]) -> dict[str, Any]:
-    """How things truly were in a room: for who judges an estimate, never for who makes one.
-
-    Args:
-        path: of the room's socket.
-        camera_s, spots_s: host times, s, at which to tell ``trus_T_camera`` (4x4 each) and ``spots_mm`` (the beam's end
-            in TRUS, 3 each). Told as well: ``marker_T_laser`` (4x4), ``moved_s`` (when the camera began to move) and
-            ``seed``.
+    """As :meth:`fgreg.simulation.room.Room.truth_at` of the room whose socket is at ``path``, in host time.
 
     Raises:
         FgregError: the room does not answer.

@@ -156,20 +156,16 @@ class RoomServer:
             connection.close()
 
     def _tell_truth(self, connection: socket.socket) -> None:
-        """How things were at the host times (s) that are asked for, and when the camera was moved."""
-        room, start = self.room, self._start_s
+        """As :meth:`Room.truth_at`, all times on the host's clock."""
+        start = self._start_s
         try:
             _, payload = receive(connection)
             asked = json.loads(payload)
-            told = {
-                "trus_T_camera": [room.trus_T_camera(t - start).tolist() for t in asked["camera_s"]],
-                "spots_mm": [room.spot_mm(t - start).tolist() for t in asked["spots_s"]],
-                "marker_T_laser": room.marker_T_laser.tolist(),
-                "moved_s": [t + start for t in room.moved_s],
-                "seed": room.config.seed,
-            }
+            camera, spots = ([float(t) - start for t in asked[key]] for key in ("camera_s", "spots_s"))
+            told = self.room.truth_at(camera, spots)
+            told["moved_s"] = [t + start for t in told["moved_s"]]
             send(connection, {}, json.dumps(told).encode())
-        except (WireClosed, ValueError, KeyError, TypeError, StopIteration):
+        except (WireClosed, ValueError, KeyError, TypeError):
             pass
         connection.close()
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fgreg.drivers.simulated import ask_truth
 from fgreg.errors import FgregError, InputError
 from fgreg.measurements import Measurements
 from fgreg.recognition import recognise
@@ -17,19 +17,24 @@ from fgreg.session.reading import TRUTH_FILE, read_ground_truth, read_session
 from fgreg.simulation.documents import rows
 from fgreg.simulation.write import yaml_text
 
+Ask = Callable[[Sequence[float], Sequence[float]], dict[str, Any]]
+"""As :meth:`fgreg.simulation.room.Room.truth_at`."""
 
-def write_room_truth(room: Path, folder: Path, start_s: float, begin_t: float) -> None:
+
+def write_room_truth(ask: Ask, folder: Path, start_s: float, begin_t: float) -> None:
     """Write the truth about a session that was recorded in a room that still runs.
 
     Epochs are the session's own. Each gets the pose in which the camera stood at the epoch's last pair: if it was moved
     within an epoch and nobody noticed, the registration that was told at the epoch's end is wrong, and is found to be.
-    ``x_moved_s`` are the times at which the camera truly began to move.
+    ``x_moved_s`` are the times at which the camera truly began to move in this room, ``x_stood`` where it stood at the
+    start and after each.
 
     Args:
-        room: path of its socket.
+        ask: tells the truth.
         folder: of the session, complete.
-        start_s: host time of session time 0. begin_t: session time after which this room's events are; those before
-            are another room's, and what the file says of them stays.
+        start_s: of session time 0, on the clock of who tells it.
+        begin_t: session time after which this room's events are; those before are another room's, and what the file
+            says of them stays.
 
     Raises:
         FgregError: the room does not answer, or nobody knows the truth about the epochs before.
@@ -42,7 +47,7 @@ def write_room_truth(room: Path, folder: Path, start_s: float, begin_t: float) -
     old = sum(t <= begin_t for t in at_t)
     first = {pair.pm: pair.t for pair in reversed(measured.pairs)}
     fresh = {pm: t for pm, t in sorted(first.items()) if t > begin_t}
-    told = ask_truth(room, [start_s + t for t in at_t[old:]], [start_s + t for t in fresh.values()])
+    told = ask([start_s + t for t in at_t[old:]], [start_s + t for t in fresh.values()])
     text = yaml_text(_document(told, earlier, old, list(fresh), start_s))
     path = folder / TRUTH_FILE
     part = path.with_name(f".{TRUTH_FILE}.tmp")
@@ -78,4 +83,5 @@ def _document(
         "tracks": [],
         "x_seed": told["seed"],
         "x_moved_s": [round(t - start_s, 3) for t in told["moved_s"]],
+        "x_stood": [rows(np.array(pose)) for pose in told["stood"]],
     }

@@ -7,7 +7,7 @@ import os
 from contextlib import ExitStack
 from functools import partial
 
-from fgreg.drivers.simulated import RoomProcess, SimulatedCamera, SimulatedOperator, SimulatedProbe
+from fgreg.drivers.simulated import RoomProcess, SimulatedCamera, SimulatedOperator, SimulatedProbe, ask_truth
 from fgreg.models import SessionModel
 from fgreg.operation.conductor import ConductorSettings
 from fgreg.operation.loop import Devices
@@ -51,4 +51,5 @@ def simulated_room(
         {"search_speed": SPEED_RAD_S, "track_speed": SPEED_RAD_S, "home_speed": SPEED_RAD_S},
     )
     settings = ConductorSettings(aims=aims, hearing_threshold=HEARING_THRESHOLD)
-    return LiveSetup(setup_text(document), open_devices, stage, settings, partial(write_room_truth, room.path))
+    truth = partial(write_room_truth, partial(ask_truth, room.path))
+    return LiveSetup(setup_text(document), open_devices, stage, settings, truth)

@@ -78,7 +78,7 @@ class Running:
     session: LiveSession
 
 
-class _OneProcess:
+class OneProcess:
     """Makes engines, each a process; the one before is ended."""
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ def running(
     make_folder(folder, live.setup)
     with ExitStack() as stack:
         say("starting the registration")
-        make_engine = _OneProcess()
+        make_engine = OneProcess()
         stack.callback(make_engine.close)  # after the recorder, whichever process is there then
         session = stack.enter_context(LiveSession.open(folder, config, make_engine, late=True))
         model = session.journal.model
