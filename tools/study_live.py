@@ -212,7 +212,7 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
         met = len(told.events) == len(found)
         if every:
             print(
-                f"  {'t, s':>7}  {'event':<6} {'live':<16} {'replay':<16}   sigma     deg      mm    true error, predicted, mm"
+                f"  {'t, s':>7}  {'event':<6} {'live':<16} {'replay':<16}   sigma     deg      mm     off, predicted, mm"
             )
         worst: list[float] = []
         wrong = 0
@@ -259,7 +259,7 @@ def settled_same(told: Told, replayed: OnlineEstimate | None, engine: OnlineRegi
 def report_truth(
     folder: Path, told: Told | None, replayed: OnlineEstimate | None, epochs: tuple[EpochEstimate, ...]
 ) -> None:
-    """Errors of the epoch that lasts, at its last pair, beside what is predicted; the true moves beside those noticed."""
+    """Errors of the epoch that lasts, at its last pair, beside what is predicted; true moves beside those noticed."""
     stood, events = Stood(folder), read_session(folder).events
     last = max((event.t for event in events if isinstance(event, PairEvent)), default=0.0)
     began = [round(e.t if e.since_t is None else e.since_t, 1) for e in events if isinstance(e, CameraMovedEvent)]
