@@ -211,9 +211,7 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
         print(f"  events taken in: live {len(told.events)}, replay {len(found)}    target the same")
         met = len(told.events) == len(found)
         if every:
-            print(
-                f"  {'t, s':>7}  {'event':<6} {'live':<16} {'replay':<16}   sigma     deg      mm     off, predicted, mm"
-            )
+            print(f"  {'t, s':>7}  {'event':<6} {'live':<16} {'replay':<16}   sigma     deg      mm     off, predicted")
         worst: list[float] = []
         wrong = 0
         stood = Stood(folder)
