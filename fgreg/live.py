@@ -31,7 +31,7 @@ from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.engine_process import EngineGone
+from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.recognition import EventRecogniser
@@ -133,7 +133,8 @@ class LiveSession:
         self._make_engine = make_engine
         self._untaken: list[Event] = []  # on disk, not in the estimate yet: something came between
         self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
-        self._ended_at: Event | None = None  # the event that the engine's process ended at
+        self._gone = False  # the engine's process has ended: nothing goes into the estimate before a revival
+        self._ended_at: Event | None = None  # the event that it ended at
         self._deaths: dict[int, int] = {}  # ends of the engine's process while it took an event in, by its line
         self._begin_with(make_engine(journal.model, config, None))
 
@@ -180,6 +181,7 @@ class LiveSession:
             EngineGone: the new one has ended too; try again.
             FgregError: it did not start, or the disk refuses.
         """
+        self._gone = True  # whatever goes wrong here: an engine that has taken in some of it is not gone on with
         event, self._ended_at = self._ended_at, None
         if event is not None:
             self._deaths[event.line] = self._deaths.get(event.line, 0) + 1
@@ -190,6 +192,7 @@ class LiveSession:
         self._begin_with(self._make_engine(self.journal.model, self.config, None))
         self._take_up(self.journal.reread())
         self._untaken.clear()
+        self._gone = False
         self._write_waiting()
         return self.estimate
 
@@ -264,6 +267,7 @@ class LiveSession:
         Raises:
             InputError: not a query that a session may hold.
             JournalError: the disk refuses the record.
+            EngineGone: :meth:`revive` is due.
         """
         if record:
             self._catch_up()
@@ -292,7 +296,11 @@ class LiveSession:
         """What the engine has found out since, without an event; a move of the camera that it found is recorded."""
         self._catch_up()
         before = self._feed.epoch
-        estimate = self._engine.refresh()
+        try:
+            estimate = self._engine.refresh()
+        except EngineGone:
+            self._gone = True
+            raise
         if self.estimate is not None or estimate.epoch > before:
             self.estimate = estimate
         self._feed.notice(estimate)
@@ -326,7 +334,10 @@ class LiveSession:
 
         Raises:
             JournalError: the disk still refuses.
+            EngineGone: :meth:`revive` is due.
         """
+        if self._gone:
+            raise EngineGone(GONE)
         while self._untaken:
             with contextlib.suppress(EventRefused):
                 self._take_in()
@@ -366,7 +377,7 @@ class LiveSession:
             self._refuse(event, event.line, reason)
             raise EventRefused(reason) from error
         except EngineGone:
-            self._ended_at = event
+            self._gone, self._ended_at = True, event
             raise
         if estimate is not None:
             self.estimate = estimate
@@ -410,7 +421,7 @@ class LiveSession:
             try:
                 document = event_document(event, self.journal.folder)
             except InputError:  # a frame from elsewhere has no name here
-                document = _brief(event)
+                document = {"type": type_of(event), "t": event.t}
         self._unwritten.append(RefusedEvent(t, 0, writable(document), reason))
 
     def _write_waiting(self, *, patient: bool = True) -> None:
@@ -430,10 +441,6 @@ class LiveSession:
                 self._unwritten[0] = replace(event, event=repr(event.event)[:1000])
                 continue
             self._unwritten.pop(0)
-
-
-def _brief(event: Event) -> dict[str, object]:
-    return {"type": type_of(event), "t": event.t}
 
 
 def online_engine(model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> Engine:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from fgreg.config import SolveConfig
+from fgreg.errors import FgregError
 from fgreg.estimate import Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent
 from fgreg.live import MOST_DEATHS, LiveSession
@@ -167,6 +168,38 @@ def test_a_killed_registration_is_revived_without_the_session_being_closed(sessi
     shots = [(type(e), e.t) for e in recorded.events if isinstance(e, AimEvent | PairEvent | CameraMovedEvent)]
     assert shots == [(type(e), e.t) for e in events]
     assert sum(isinstance(e, NoteEvent) for e in recorded.events) == 3
+    with LiveSession.open(folder) as live:
+        same(live.settle(), found, 1e-6)
+
+
+def test_a_revival_that_fails_half_way_counts_nothing_twice_and_blames_no_event(
+    session: tuple[Path, Shots], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, events = session
+    with processes() as engines, LiveSession.open(folder, make_engine=engines) as live:
+        for event in events[:14]:
+            live.add(event)
+        engines.kill()
+        with pytest.raises(EngineGone):
+            live.add(events[14])
+        with monkeypatch.context() as broken:
+
+            def no_memory() -> object:
+                raise FgregError("out of memory")
+
+            broken.setattr(live.journal, "reread", no_memory)
+            for _ in range(MOST_DEATHS + 1):
+                with pytest.raises(FgregError, match="out of memory"):
+                    live.revive()
+        assert engines.made[-1].alive
+        with pytest.raises(EngineGone):  # one that has not taken in everything is not gone on with
+            live.add(events[15])
+        with pytest.raises(EngineGone):
+            live.refresh()
+        live.revive()
+        found = live.settle()
+        assert len(live.measurements().pairs) == sum(isinstance(event, PairEvent) for event in events[:16])
+    assert not [event for event in read_session(folder).events if isinstance(event, RefusedEvent)]
     with LiveSession.open(folder) as live:
         same(live.settle(), found, 1e-6)
 

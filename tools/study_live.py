@@ -223,7 +223,7 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
             if gap is not None and same_epoch:
                 worst.append(gap[0])
             if every:
-                kind = {AimEvent: "aim", PairEvent: "pair", CameraMovedEvent: "moved"}[type(event)]  # type: ignore[index]
+                kind = {AimEvent: "aim", PairEvent: "pair", CameraMovedEvent: "moved"}[type(event)]
                 gaps = 24 * " " if gap is None else f"{gap[0]:8.3f} {gap[1]:7.3f} {gap[2]:7.3f}"
                 print(f"  {step.event.t:7.1f}  {kind:<6} {text(estimate):<16} {text(step.estimate):<16} {gaps} {claim}")
         if worst:
