@@ -37,6 +37,8 @@ AGAIN_S = 0.2
 SILENT_S = 0.5
 """A device that sends by itself and has not for so long is gone."""
 START_S = 60.0
+TRUTH_S = 20.0
+"""So long a room may take to tell the truth."""
 
 BEGINS_RAD = math.radians(-17.0)
 """Where the stage stands at power-on; it does not know."""
@@ -276,7 +278,7 @@ def ask_truth(path: Path, camera_s: Sequence[float], spots_s: Sequence[float]) -
         FgregError: the room does not answer.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(START_S)
+        connection.settimeout(TRUTH_S)
         try:
             connection.connect(os.fspath(path))
             send(connection, {"role": "truth"})
