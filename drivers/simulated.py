@@ -6,6 +6,7 @@ A connection that is lost is looked for again by itself, as with a real device.
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import shutil
@@ -46,6 +47,8 @@ AGAIN_S = 0.2
 SILENT_S = 0.5
 """A device that sends by itself and has not for so long is gone."""
 START_S = 60.0
+TRUTH_S = 20.0
+"""So long a room may take to tell the truth."""
 
 BEGINS_RAD = math.radians(-17.0)
 """Where the stage stands at power-on; it does not know."""
@@ -329,6 +332,26 @@ class RoomStage(SimulatedStage):
         """Brake and let go."""
         super().close()
         self._room.close()
+
+
+def ask_truth(path: Path, camera_s: Sequence[float], spots_s: Sequence[float]) -> dict[str, Any]:
+    """As :meth:`fgreg.simulation.room.Room.truth_at` of the room whose socket is at ``path``, in host time.
+
+    Raises:
+        FgregError: the room does not answer.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(TRUTH_S)
+        try:
+            connection.connect(os.fspath(path))
+            send(connection, {"role": "truth"})
+            send(connection, {}, json.dumps({"camera_s": [*camera_s], "spots_s": [*spots_s]}).encode())
+            told = json.loads(receive(connection)[1])
+        except (OSError, WireClosed, ValueError) as error:
+            raise FgregError(f"the simulated room does not tell the truth ({error})") from None
+    if not isinstance(told, dict):
+        raise FgregError("the simulated room does not tell the truth")
+    return told
 
 
 def open_stage(model: StageModel, path: str) -> RoomStage:

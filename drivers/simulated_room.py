@@ -4,15 +4,17 @@
 
 Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe``, ``scanner`` (B-mode pictures)
 and ``motion`` (the holder of the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon,
-who says what he does and can be asked to go on. ``control`` breaks devices and mends them: ``{"device": "camera",
-"fault": "frozen"}`` (:data:`FAULTS`). Camera and probe stamp with clocks of their own. The process ends with the one
-that started it (its standard input closes), or on SIGTERM.
+who says what he does and can be asked to go on. No devices are ``control``, which breaks devices and mends them
+(``{"device": "camera", "fault": "frozen"}``, :data:`FAULTS`), and ``truth``, which answers how things truly were, for
+whoever judges a recorded session. Camera and probe stamp with clocks of their own. The process ends with the one that
+started it (its standard input closes), or on SIGTERM.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import math
 import os
 import queue
@@ -166,6 +168,9 @@ class RoomServer:
         if role == "stage":
             self._turn(connection)
             return
+        if role == "truth":
+            self._tell_truth(connection)
+            return
         if role not in ("camera", "probe", "scanner", "motion", "operator"):
             connection.close()
             return
@@ -205,6 +210,20 @@ class RoomServer:
                 header, _ = receive(connection)
                 self.fault(header["device"], header["fault"])
                 send(connection, {"done": True})
+        connection.close()
+
+    def _tell_truth(self, connection: socket.socket) -> None:
+        """As :meth:`Room.truth_at`, all times on the host's clock."""
+        start = self.start_s
+        try:
+            _, payload = receive(connection)
+            asked = json.loads(payload)
+            camera, spots = ([float(t) - start for t in asked[key]] for key in ("camera_s", "spots_s"))
+            told = self.room.truth_at(camera, spots)
+            told["moved_s"] = [t + start for t in told["moved_s"]]
+            send(connection, {}, json.dumps(told).encode())
+        except (WireClosed, ValueError, KeyError, TypeError):
+            pass
         connection.close()
 
     def _to(self, role: str) -> list[_Client]:

@@ -20,6 +20,7 @@ import numpy as np
 from fgreg import __version__
 from fgreg.config import SolveConfig
 from fgreg.detection.noise import Misfit
+from fgreg.errors import FgregError
 from fgreg.events import AimEvent, Event, MarkerRecord, PairEvent, refused_lines
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
@@ -91,6 +92,7 @@ class Checkpoints:
     Attributes:
         note: why none was taken up when the session was opened; empty where one was.
         trouble: why the last one was not written; empty where it was.
+        spent: whether the engine that :meth:`resume` was given has tried in vain, and another one is needed.
     """
 
     def __init__(self, folder: Path, config: SolveConfig) -> None:
@@ -99,6 +101,7 @@ class Checkpoints:
         made_by = (__version__, np.__version__, version("gtsam"), CONSTANTS, config)
         self._made_by = hashlib.sha256(repr(made_by).encode()).hexdigest()
         self.note = self.trouble = ""
+        self.spent = False
         self._next: Moment | None = None
         self._thread: Thread | None = None
         self._lock = Lock()
@@ -151,14 +154,13 @@ class Checkpoints:
     def resume(self, events: Sequence[Event], model: SessionModel, engine: Resumable) -> Resumed | None:
         """Take up the engine where the checkpoint has it; None where there is none to use.
 
-        An engine that has tried in vain is spent.
-
         Args:
             events: all that are recorded.
             model: the session's set-up.
             engine: that has taken in nothing yet.
         """
         sweep_up(self._path)
+        self.spent, self.note = False, ""
         try:
             found = read_checkpoint(self._path, len(events))
             of = found.of
@@ -168,9 +170,13 @@ class Checkpoints:
                 raise NoCheckpointError("it is of other events, another session.yaml or another program")
             if any(line <= of.lines < event.line for event in events for line in refused_lines([event])):
                 raise NoCheckpointError("an event that it holds was refused since")
-            return _resumed(found, events, model, engine)
+            self.spent = True  # as long as it has not succeeded
+            resumed = _resumed(found, events, model, engine)
+            self.spent = False
+            return resumed
         except (
             NoCheckpointError,
+            FgregError,
             ValueError,
             ArithmeticError,
             LookupError,

@@ -31,6 +31,7 @@ from fgreg.frames import FloatArray
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.engine import OnlineRegistration
+from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.recognition import EventRecogniser
@@ -44,6 +45,8 @@ Estimating = AimEvent | PairEvent | CameraMovedEvent
 
 EARLIEST_S = 1e9
 """Times before minus this are nobody's clock."""
+MOST_DEATHS = 3
+"""An event at which an engine's process has ended so many times is refused: it may be the reason."""
 
 
 class Engine(Protocol):
@@ -117,20 +120,31 @@ class LiveSession:
         config: of the estimate.
         late: events may be handed over later than others that happened after them: they get the last one's time.
         checkpoints: what spares it to take in all events again when it is opened.
+        engine: that has taken in what is recorded; a revived session has another one.
     """
 
-    def __init__(self, journal: Journal, engine: Engine, config: SolveConfig) -> None:
+    engine: Engine
+
+    def __init__(self, journal: Journal, make_engine: MakeEngine, config: SolveConfig) -> None:
         self.journal, self.config = journal, config
         self.estimate: OnlineEstimate | None = None
         self.late = False
-        self._engine, self._feed = engine, EpochFeed(engine)
-        self._recogniser = EventRecogniser(journal.model)
         self.checkpoints = Checkpoints(journal.folder, config)
+        self._make_engine = make_engine
+        self._untaken: list[Event] = []  # on disk, not in the estimate yet: something came between
+        self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
+        self._gone = False  # the engine's process has ended: nothing goes into the estimate before a revival
+        self._ended_at: Event | None = None  # the event that it ended at
+        self._deaths: dict[int, int] = {}  # ends of the engine's process while it took an event in, by its line
+        self._begin_with(make_engine(journal.model, config, None))
+
+    def _begin_with(self, engine: Engine) -> None:
+        """Nothing is taken in yet."""
+        self._engine, self._feed = engine, EpochFeed(engine)
+        self._recogniser = EventRecogniser(self.journal.model)
         self._moment: Moment | None = None  # the last one that a checkpoint can be made of, while events of before come
         self._begin, self._opening = 0, False
         self._taken = array("q")  # lines of the events that are measurements in the engine
-        self._untaken: list[Event] = []  # on disk, not in the estimate yet: an interrupt came between
-        self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
 
     @classmethod
     def open(
@@ -147,21 +161,40 @@ class LiveSession:
             InputError: the session's files, or frames that they name, are not as they should be.
             JournalError: another program records to it, or the disk refuses.
         """
-        config = config or SolveConfig()
         journal = Journal.open(folder)
         try:
-            found = cls(journal, (make_engine or online_engine)(journal.model, config, None), config)
-            events = journal.take_recorded()
-            if isinstance(found._engine, Resumable) and not found._resume(events, found._engine):
-                note = found.checkpoints.note
-                found = cls(journal, (make_engine or online_engine)(journal.model, config, None), config)
-                found.checkpoints.note = note
+            found = cls(journal, make_engine or online_engine, config or SolveConfig())
             found.late = late
-            found._take_recorded(events)
+            found._take_up(journal.take_recorded())
         except BaseException:
             journal.close()
             raise
         return found
+
+    def revive(self) -> OnlineEstimate | None:
+        """Go on with a new engine where the old one's process has ended: from the checkpoint and what is on disk.
+
+        Nothing is lost, and the session stays open. An event at which that has happened :data:`MOST_DEATHS` times is
+        recorded as refused.
+
+        Raises:
+            EngineGone: the new one has ended too; try again.
+            FgregError: it did not start, or the disk refuses.
+        """
+        self._gone = True  # whatever goes wrong here: an engine that has taken in some of it is not gone on with
+        event, self._ended_at = self._ended_at, None
+        if event is not None:
+            self._deaths[event.line] = self._deaths.get(event.line, 0) + 1
+            if self._deaths[event.line] >= MOST_DEATHS:
+                self._refuse(event, event.line, f"the registration's process has ended {MOST_DEATHS} times at it")
+        self._write_waiting(patient=False)
+        self.checkpoints.close()
+        self._begin_with(self._make_engine(self.journal.model, self.config, None))
+        self._take_up(self.journal.reread())
+        self._untaken.clear()
+        self._gone = False
+        self._write_waiting()
+        return self.estimate
 
     def __enter__(self) -> Self:
         return self
@@ -176,17 +209,16 @@ class LiveSession:
         self.checkpoints.close()
         self.journal.close()
 
-    def _resume(self, events: Sequence[Event], engine: Resumable) -> bool:
-        """Go on from the checkpoint; whether there is one to go on from. If not, this session is spent."""
-        found = self.checkpoints.resume(events, self.journal.model, engine)
-        if found is None:
-            return False
-        self._begin, self._taken, self._recogniser = found.line, found.taken, found.recogniser
-        self._feed.epoch, self._feed.noticed = found.epoch, found.noticed
-        self.estimate = self._engine.estimate
-        return True
-
-    def _take_recorded(self, events: Sequence[Event]) -> None:
+    def _take_up(self, events: Sequence[Event]) -> None:
+        """Take in what is recorded, from the checkpoint on where there is one to go on from."""
+        if isinstance(self._engine, Resumable):
+            found = self.checkpoints.resume(events, self.journal.model, self._engine)
+            if found is not None:
+                self._begin, self._taken, self._recogniser = found.line, found.taken, found.recogniser
+                self._feed.epoch, self._feed.noticed = found.epoch, found.noticed
+                self.estimate = self._engine.estimate
+            elif self.checkpoints.spent:
+                self._begin_with(self._make_engine(self.journal.model, self.config, None))
         refused = refused_lines(events)
         self._opening = True
         with self._engine.catching_up():
@@ -196,7 +228,7 @@ class LiveSession:
                         self._take(event)
         if self.estimate is not None:
             self.estimate = self._engine.estimate
-        self._opening = False
+        self._opening, self.engine = False, self._engine
         if self._moment is not None:
             self.checkpoints.offer(self._moment)
         self._tell_moves()
@@ -211,8 +243,9 @@ class LiveSession:
             InputError: not an event that a session may hold; recorded as refused.
             EventRefused: it could not be taken into the estimate; recorded as refused, later ones work.
             JournalError: the disk refuses; neither recorded nor taken in. The estimate and :meth:`track` stay usable.
+            EngineGone: it is recorded, and will be taken in by :meth:`revive`, or when the session is opened again.
         """
-        self._catch_up()
+        gone = self._catch_up_or_gone()
         try:
             kept = self.journal.append(event, late=self.late).event
         except InputError as error:
@@ -220,6 +253,8 @@ class LiveSession:
             self._write_waiting()
             raise
         self._untaken.append(kept)
+        if gone is not None:
+            raise gone
         try:
             self._take_in()
         finally:
@@ -232,6 +267,7 @@ class LiveSession:
         Raises:
             InputError: not a query that a session may hold.
             JournalError: the disk refuses the record.
+            EngineGone: :meth:`revive` is due.
         """
         if record:
             self._catch_up()
@@ -249,15 +285,22 @@ class LiveSession:
         Raises:
             InputError: not an event that a session may hold.
             JournalError: the disk refuses.
+            EngineGone: it is recorded, and :meth:`revive` is due.
         """
-        self._catch_up()
+        gone = self._catch_up_or_gone()
         self.journal.append(event, late=self.late)
+        if gone is not None:
+            raise gone
 
     def refresh(self) -> OnlineEstimate | None:
         """What the engine has found out since, without an event; a move of the camera that it found is recorded."""
         self._catch_up()
         before = self._feed.epoch
-        estimate = self._engine.refresh()
+        try:
+            estimate = self._engine.refresh()
+        except EngineGone:
+            self._gone = True
+            raise
         if self.estimate is not None or estimate.epoch > before:
             self.estimate = estimate
         self._feed.notice(estimate)
@@ -278,12 +321,23 @@ class LiveSession:
         """The beam, (4, 4), as the estimate has it; None where there is none yet."""
         return self._engine.marker_T_laser()
 
+    def _catch_up_or_gone(self) -> EngineGone | None:
+        """As :meth:`_catch_up`; where the engine is gone, that: what comes is recorded all the same."""
+        try:
+            self._catch_up()
+        except EngineGone as gone:
+            return gone
+        return None
+
     def _catch_up(self) -> None:
         """What an interrupt or a full disk left undone comes before the next event.
 
         Raises:
             JournalError: the disk still refuses.
+            EngineGone: :meth:`revive` is due.
         """
+        if self._gone:
+            raise EngineGone(GONE)
         while self._untaken:
             with contextlib.suppress(EventRefused):
                 self._take_in()
@@ -322,6 +376,9 @@ class LiveSession:
             reason = error.reason if isinstance(error, EventRefused) else str(error)
             self._refuse(event, event.line, reason)
             raise EventRefused(reason) from error
+        except EngineGone:
+            self._gone, self._ended_at = True, event
+            raise
         if estimate is not None:
             self.estimate = estimate
             if not isinstance(event, CameraMovedEvent):
@@ -364,7 +421,7 @@ class LiveSession:
             try:
                 document = event_document(event, self.journal.folder)
             except InputError:  # a frame from elsewhere has no name here
-                document = _brief(event)
+                document = {"type": type_of(event), "t": event.t}
         self._unwritten.append(RefusedEvent(t, 0, writable(document), reason))
 
     def _write_waiting(self, *, patient: bool = True) -> None:
@@ -384,10 +441,6 @@ class LiveSession:
                 self._unwritten[0] = replace(event, event=repr(event.event)[:1000])
                 continue
             self._unwritten.pop(0)
-
-
-def _brief(event: Event) -> dict[str, object]:
-    return {"type": type_of(event), "t": event.t}
 
 
 def online_engine(model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> Engine:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -72,6 +73,52 @@ def test_ctrl_c_ends_it_with_the_session_complete(tmp_path: Path) -> None:
     assert orders[-1]["command"] == "stop"
     told = {event.command.split()[0] for event in session.events if isinstance(event, StageEvent)}
     assert {"request", "home"} <= told <= {"request", "home", "search", "track", "stop", "emergency", "reset"}
+
+
+def descendants(process: subprocess.Popen[str]) -> set[int]:
+    """Processes that it started, and those that they did."""
+    parents: dict[int, int] = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError, ValueError):
+            parents[int(folder.name)] = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
+    found, more = set[int](), {process.pid}
+    while more := {pid for pid, parent in parents.items() if parent in more}:
+        found |= more
+    return found
+
+
+def wait_for_word(process: subprocess.Popen[str], text: str) -> None:
+    """Until it has printed a text."""
+    if process.stdout is None:
+        raise AssertionError("no pipe")
+    for line in process.stdout:
+        if text in line:
+            return
+    raise AssertionError(f"it ended before it printed {text!r}")
+
+
+@pytest.mark.parametrize("phase", ["starting the registration", "opening the devices", "aim at corner", "ending"])
+def test_ctrl_c_in_any_phase_leaves_a_session_and_no_process(tmp_path: Path, phase: str) -> None:
+    folder = tmp_path / "session"
+    process = start(folder, "--aims", "3", "--bump-every", "inf")
+    if phase == "ending":  # it is interrupted twice: the second time while all of it is solved, or just before
+        wait_for(folder, '"aim"', process)
+        process.send_signal(signal.SIGINT)
+    wait_for_word(process, phase)
+    mine = descendants(process)
+    assert mine
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode in ((0, 1, 130) if phase != "aim at corner" else (0, 1)), err
+    assert "Traceback" not in err
+    end = time.monotonic() + PATIENCE_S
+    while (left := {pid for pid in mine if Path(f"/proc/{pid}").exists()}) and time.monotonic() < end:
+        time.sleep(0.2)
+    assert not left
+    if phase != "starting the registration":  # else there may be no event yet
+        session = read_session(folder)
+        assert not session.warnings
+        assert (folder / "result.yaml").is_file() or process.returncode == 130
 
 
 def test_a_room_that_is_gone_is_said_and_the_session_survives(tmp_path: Path) -> None:

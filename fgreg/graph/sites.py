@@ -26,6 +26,10 @@ SETTLED = 0.02
 """Sites have settled when no look's rotation moves by more than this share of its own standard deviation."""
 DAMPING = 0.8
 """Share of a site's change that is made at once."""
+FARTHEST_SIGMA = 100.0
+"""Sites that ask for an optimum farther away than this are fitted to nothing: where they settle it is a few."""
+HALVINGS = 6
+"""So often a step is halved before the sites are given up."""
 LEAST_SITE = 1e-3
 """Precision of a site that says nothing, rad^-2."""
 
@@ -68,18 +72,32 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
         centre = pull / precision
         problem = with_sites(problem, centre, precision)
         # One Gauss-Newton step with the sites as they are now; they are refitted before the next.
-        at = evaluate(problem, state, private)
-        step = -np.linalg.solve(at.hessian[0], at.gradient[0])
-        state = state.retract(step[None], problem.columns)
-        points = at.private.trus_p_pm + (at.point_gain @ step[None, None, :, None])[..., 0]
-        private = replace(at.private, trus_p_pm=points)
-        at = evaluate(problem, state, private)
-        private = at.private
-        if not np.isfinite(at.cost).all():
+        stepped = _step(problem, state, evaluate(problem, state, private))
+        if stepped is None:
             return None
+        state, at = stepped
+        private = at.private
     if not settled:
         return None
     return problem, optimize(problem, state, private, tolerance=1e-9)
+
+
+def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[SharedState, Evaluation] | None:
+    """One Gauss-Newton step, shortened until it leads down; None where it does not, or leads anywhere.
+
+    Among few pairs the whole step can end far off; sites that are fitted there lead on, to numbers without meaning.
+    """
+    step = -np.linalg.solve(at.hessian[0], at.gradient[0])
+    if not -(step @ at.gradient[0]) <= FARTHEST_SIGMA**2:
+        return None
+    for _ in range(HALVINGS):
+        moved = state.retract(step[None], problem.columns)
+        points = at.private.trus_p_pm + (at.point_gain @ step[None, None, :, None])[..., 0]
+        there = evaluate(problem, moved, replace(at.private, trus_p_pm=points))
+        if there.cost[0] <= at.cost[0] + 1e-9 * (1.0 + at.cost[0]):
+            return moved, there
+        step = 0.5 * step
+    return None
 
 
 def inverse_hessian(hessian: FloatArray) -> FloatArray | None:

@@ -101,6 +101,7 @@ class OnlineRegistration:
         self._noticed: dict[int, str] = {}
         self._suspicion = ""
         self._judge: Judge | None = None if judge is None else kinds[judge]()
+        self._on_schedule = judge != "process"
         self._estimate = self._report(self._state, 0.0, None)
 
     def __enter__(self) -> OnlineRegistration:
@@ -276,13 +277,15 @@ class OnlineRegistration:
 
     @contextmanager
     def catching_up(self) -> Iterator[None]:
-        """While many events of before are taken in again: judged once, at the end, where the last judgement was due.
+        """While many events of before are taken in again: judged once, at the end.
 
-        What is reported afterwards is what ``inline`` reports after the same events, but for the time that it takes.
-        Moves that were found out are among the events; only after the last one they are looked for again.
+        ``inline`` judges where the last judgement was due: what is reported afterwards is what it reports after the
+        same events, but for the time that it takes. ``process`` judges all of it, and so does ``inline`` where nothing
+        was due since a rest of such an engine. Moves that were found out are among the events; only after the last one
+        they are looked for again.
         """
         usual, deferred = self._judge, DeferredJudge()
-        self._judge = None if usual is None else deferred
+        self._judge = deferred if usual is not None and self._on_schedule else None
         self._guard.pause()
         self._caught = None
         try:
@@ -291,20 +294,27 @@ class OnlineRegistration:
             self._judge = usual
         if self._guard.resume(self._state, self._serial, self._tools.store):
             self._adopt_found(self._t)
-        if deferred.case is not None:
-            found, _ = judge(deferred.case, self._model, self._config, self._prior)
+        case = deferred.case
+        if case is None and usual is not None and self._serial and (self._judgement is None or not self._on_schedule):
+            case = self._case()
+        if case is not None:
+            found, _ = judge(case, self._model, self._config, self._prior)
             self._caught, self._surface = found, found.surface or self._surface
             if found.epoch == self._state.epoch:
                 self._judgement = found
                 self._estimate = self._report(self._state, self._estimate.t, found)
 
     def rest(self) -> Callable[[Sink], None] | None:
-        """What writes down the engine as it is now (at any later time), where the last event ended with a rest."""
+        """What writes down the engine as it is now (at any later time), where the last event ended with a rest.
+
+        What a judging process says comes when it comes, and is not written: whoever goes on from here judges anew.
+        """
         state = self._state
         if state.window is None or state.window.seed is None:
             return None
         noticed = Noticed(tuple(self._moves), tuple(self._returns), self._suspicion)
-        found = Rest(state, self._t, self._serial, self._estimate.t, self._judgement, self._surface, noticed)
+        judgement = self._judgement if self._on_schedule else None
+        found = Rest(state, self._t, self._serial, self._estimate.t, judgement, self._surface, noticed)
         if isinstance(self._judge, DeferredJudge):
             return partial(self._write_caught, found, self._judge.case)
         return partial(self._write, found)

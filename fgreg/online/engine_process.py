@@ -11,8 +11,9 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
@@ -27,6 +28,7 @@ from fgreg.online.beside import BEHIND
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
+from fgreg.online.numbers import Numbers, Sink, Source
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.registration import SoundSpeedPrior
@@ -35,6 +37,9 @@ from fgreg.tracking import fast_track
 START_S = 60.0
 IDLE_S = 0.1
 """Between looks at what the judge has found, while no event comes."""
+
+
+GONE = "the registration's process has ended: open the session again"
 
 
 class EngineGone(FgregError):  # noqa: N818
@@ -53,16 +58,22 @@ class EngineProcess:
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
+        self._writing, their_writing = context.Pipe()
         # Not a daemon: it has children of its own. It ends when this end of the pipe is closed, by whatever.
         self._process = context.Process(
-            target=_serve, args=(theirs, model, config, sound_speed_prior), name="fgreg-engine", daemon=False
+            target=_serve,
+            args=(theirs, their_writing, model, config, sound_speed_prior),
+            name="fgreg-engine",
+            daemon=False,
         )
-        self._turn = threading.Lock()
+        self._turn, self._writing_turn = threading.Lock(), threading.Lock()
+        self._rest: int | None = None
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
         self._returns: tuple[DetectedReturn, ...] = ()
         self._process.start()
         theirs.close()
+        their_writing.close()
         try:
             if not self._connection.poll(START_S):
                 raise EngineGone(f"the registration's process did not start within {START_S:.0f} s")
@@ -92,9 +103,9 @@ class EngineProcess:
         with self._turn:
             try:
                 self._connection.send((name, arguments))
-                how, value, self._estimate, self._moves, self._returns = self._connection.recv()
+                how, value, self._estimate, self._moves, self._returns, self._rest = self._connection.recv()
             except (EOFError, OSError):
-                raise EngineGone("the registration's process has ended: open the session again") from None
+                raise EngineGone(GONE) from None
         if how == "refused":
             raise EventRefused(value)
         if how == "failed":
@@ -149,6 +160,34 @@ class EngineProcess:
         finally:
             self._call("caught up")
 
+    def rest(self) -> Callable[[Sink], None] | None:
+        """As :meth:`fgreg.online.engine.OnlineRegistration.rest`, where the last call was an event that ended with one.
+
+        It is written down beside the events, by a thread of the process; what writes it raises EngineGone, and
+        RuntimeError where a later rest has taken its place.
+        """
+        return None if self._rest is None else partial(self._write, self._rest)
+
+    def _write(self, number: int, sink: Sink) -> None:
+        with self._writing_turn:
+            try:
+                self._writing.send(number)
+                found = self._writing.recv()
+            except (EOFError, OSError):
+                raise EngineGone(GONE) from None
+        if not isinstance(found, Numbers):
+            raise RuntimeError(found)
+        sink.append(found)
+
+    def resume(self, source: Source) -> OnlineEstimate:
+        """As :meth:`fgreg.online.engine.OnlineRegistration.resume`. Raises ValueError, EngineGone."""
+        try:
+            return self._known(self._call("resume", source.rest()))
+        except EngineGone:
+            raise
+        except FgregError as error:
+            raise ValueError(str(error)) from None
+
     @property
     def estimate(self) -> OnlineEstimate | None:
         """After the last call."""
@@ -166,8 +205,9 @@ class EngineProcess:
 
     def close(self) -> None:
         """End the process."""
-        with suppress(OSError):
-            self._connection.close()
+        for connection in (self._connection, self._writing):
+            with suppress(OSError):
+                connection.close()
         self._process.join(5.0)
         if self._process.is_alive():
             self._process.kill()
@@ -175,7 +215,11 @@ class EngineProcess:
 
 
 def _serve(
-    connection: Connection[Any, Any], model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None
+    connection: Connection[Any, Any],
+    writing: Connection[Any, Any],
+    model: SessionModel,
+    config: SolveConfig,
+    prior: SoundSpeedPrior | None,
 ) -> None:
     """The process."""
     os.nice(BEHIND)
@@ -185,14 +229,48 @@ def _serve(
         SharedSnapshot(Layout.of(model)) as shared,
         suppress(EOFError, OSError),
     ):
+        rests = _Rests(writing)
         connection.send(shared.name)
-        _Server(connection, engine, shared).run()
+        _Server(connection, engine, shared, rests).run()
     os._exit(0)  # there is nothing to save, and nobody to wait for
 
 
+class _Rests:
+    """Writes rests down in a thread of its own, the latest only: events do not wait for it."""
+
+    def __init__(self, connection: Connection[Any, Any]) -> None:
+        self._connection = connection
+        self._latest: tuple[int, Callable[[Sink], None] | None] = (0, None)
+        threading.Thread(target=self._run, name="rests", daemon=True).start()
+
+    def keep(self, write: Callable[[Sink], None]) -> int:
+        """Keep a rest; its number."""
+        self._latest = (self._latest[0] + 1, write)
+        return self._latest[0]
+
+    def _run(self) -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                wanted = self._connection.recv()
+                self._connection.send(self._written(wanted))
+
+    def _written(self, wanted: int) -> Numbers | str:
+        number, write = self._latest
+        if number != wanted or write is None:
+            return "a later rest has taken its place"
+        sink = Sink()
+        try:
+            write(sink)
+        except Exception as error:  # the session does without
+            return f"{type(error).__name__}: {error}"
+        return sink.numbers()
+
+
 class _Server:
-    def __init__(self, connection: Connection[Any, Any], engine: OnlineRegistration, shared: SharedSnapshot) -> None:
-        self._connection, self._engine, self._shared = connection, engine, shared
+    def __init__(
+        self, connection: Connection[Any, Any], engine: OnlineRegistration, shared: SharedSnapshot, rests: _Rests
+    ) -> None:
+        self._connection, self._engine, self._shared, self._rests = connection, engine, shared, rests
         self._published: OnlineEstimate | None = None
         self._catching_up: Any = None
 
@@ -206,14 +284,17 @@ class _Server:
                 self._publish()
                 continue
             name, arguments = self._connection.recv()
+            rest = None
             try:
                 answer = ("done", self._do(name, arguments))
+                if name == "add" and (write := self._engine.rest()) is not None:
+                    rest = self._rests.keep(write)
             except EventRefused as error:
                 answer = ("refused", error.reason)
             except Exception as error:  # a defect: the estimate stands, and the caller is told
                 answer = ("failed", f"{type(error).__name__}: {error}")
             self._publish()
-            self._connection.send((*answer, self._engine.estimate, self._engine.moves, self._engine.returns))
+            self._connection.send((*answer, self._engine.estimate, self._engine.moves, self._engine.returns, rest))
 
     def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
         engine = self._engine
@@ -224,6 +305,8 @@ class _Server:
                 return engine.settle()
             case "refresh":
                 return engine.refresh()
+            case "resume":
+                return engine.resume(Source(*arguments))
             case "measurements":
                 return engine.measurements()
             case "marker_T_laser":

@@ -48,6 +48,12 @@ class Sink:
     def text(self, value: str) -> None:
         self._texts.append(value)
 
+    def append(self, numbers: Numbers) -> None:
+        """All that another one was given, in its order."""
+        self._integers.append(numbers.integers)
+        self._floats.append(numbers.floats)
+        self._texts.extend(numbers.texts)
+
     def numbers(self) -> Numbers:
         """All that was put in."""
         return Numbers(
@@ -117,6 +123,13 @@ class Source:
             raise ValueError("too few texts")
         self._text += 1
         return self._numbers.texts[self._text - 1]
+
+    def rest(self) -> Numbers:
+        """All that is left; nothing is then."""
+        found = self._numbers
+        left = Numbers(found.integers[self._integer :], found.floats[self._float :], found.texts[self._text :])
+        self._integer, self._float, self._text = len(found.integers), len(found.floats), len(found.texts)
+        return left
 
     def finish(self) -> None:
         """All has to be used up."""

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord
 from fgreg.measurements import MarkerObservation, Track
 from fgreg.models import SessionModel
-from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
+from fgreg.online.shared_snapshot import NoSnapshotError, Received
 from fgreg.operation.conductor import Conductor
 from fgreg.operation.health import Health, Pictures, Source
 from fgreg.operation.holder import Holder, HolderSettings
@@ -53,10 +54,18 @@ STEP_S = 0.02
 """Without frames the rest goes on at this pace."""
 SEND_S = 0.2
 """Between sendings of the registration where nothing has changed."""
-STALE_S = 0.75
-"""An engine that has not stirred for so long has ended or hangs: nobody would notice that the camera moves."""
+STALE_S = 3.0
+"""An engine that has not stirred for so long hangs: nobody would notice that the camera moves. The first pairs of an
+epoch may take it a second on a busy machine."""
 SENDERS = ("camera", "probe", "bmode")
 """They send by themselves."""
+
+
+class Snapshots(Protocol):
+    """Where the estimate's snapshots come from."""
+
+    def read(self) -> Received:
+        """The latest; ``closed`` where there will be no more. Raises NoSnapshotError where there is none yet."""
 
 
 class LiveLoop:
@@ -78,7 +87,7 @@ class LiveLoop:
         model: SessionModel,
         devices: Devices,
         recorder: Recorder,
-        reader: SnapshotReader,
+        reader: Snapshots,
         conductor: Conductor,
         start_s: float,
         holder: HolderSettings | None = None,

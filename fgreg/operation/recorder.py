@@ -1,11 +1,13 @@
 """Records events and has them estimated, on a thread of its own: the loop hands over and goes on.
 
 Nothing that was handed over is dropped: what waits is counted, and what the disk refuses is said. Each event is on disk
-before it is counted as recorded (fgreg.session.journal).
+before it is counted as recorded (fgreg.session.journal). Where the registration's process ends, a new one goes on from
+what is on disk; the last estimate stands until then, as a warning at most, since nobody notices if the camera moves.
 """
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -17,11 +19,16 @@ from fgreg.estimate import Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent
 from fgreg.frames import FloatArray
 from fgreg.live import LiveSession
+from fgreg.online.engine_process import EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.operation.view import Known
 
 REFRESH_S = 0.2
 """Between looks at what was found out meanwhile."""
+AGAIN_S = 5.0
+"""Between attempts to go on with a new process."""
+REVIVED = "the registration's process had ended; another one has taken in what is recorded"
+UNWATCHED = "the registration's process has ended, and another one is being started: what came since is not in here"
 
 Recorded = AimEvent | PairEvent | CameraMovedEvent | NoteEvent
 
@@ -58,19 +65,17 @@ class Recorder:
 
     Args:
         session: opened; the recorder is the only one that adds to it from now on.
-        on_taken: called on the recorder's thread after each event that was taken in.
+        on_taken: called on the recorder's thread after each event that was taken in, but for those that a new process
+            of the registration took in when it began.
     """
 
     def __init__(self, session: LiveSession, on_taken: OnTaken | None = None) -> None:
         self._session, self._on_taken = session, on_taken
         self._waiting: queue.Queue[Recorded | None] = queue.Queue()
         self._lock = threading.Lock()
-        taken = session.measurements()
-        self._state = RecorderState(
-            known_of(session.estimate), session.estimate, aims=len(taken.aims), pairs=len(taken.pairs)
-        )
+        self._state = self._recorded()
         self._moves, self._move_lost = 0, False  # of the camera: handed over and waiting; one that was not taken in
-        self._ended, self._left = False, 0
+        self._ended, self._left, self._revived_s = False, 0, -math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
@@ -118,6 +123,31 @@ class Recorder:
                 self._refresh(holding=True)
                 time.sleep(REFRESH_S)
 
+    def _recorded(self) -> RecorderState:
+        """What the session has."""
+        taken, estimate = self._session.measurements(), self._session.estimate
+        return RecorderState(known_of(estimate), estimate, aims=len(taken.aims), pairs=len(taken.pairs))
+
+    def _revive(self) -> None:
+        """Go on with a new engine, unless that has just been tried."""
+        with self._lock:
+            standing = _unwatched(self._state.estimate)
+            self._state = replace(self._state, known=known_of(standing), estimate=standing, trouble=UNWATCHED)
+        if time.monotonic() < self._revived_s + AGAIN_S:
+            return
+        self._revived_s = time.monotonic()
+        try:
+            self._session.revive()
+            t = self._session.journal.last_t
+            self._session.record(NoteEvent(0.0 if t is None else t, 0, REVIVED))
+            state = self._recorded()
+        except FgregError as error:
+            with self._lock:
+                self._state = replace(self._state, trouble=f"{UNWATCHED}: {error}")
+            return
+        with self._lock:
+            self._state = replace(state, refused=self._state.refused, unsettled=self._moves > 0 or self._move_lost)
+
     def _take(self, event: Recorded) -> bool:
         """Record one; whether that was possible."""
         aims = pairs = refused = 0
@@ -135,6 +165,10 @@ class Recorder:
             with self._lock:
                 self._state = replace(self._state, trouble=str(error), stuck=str(error))
             return False
+        except EngineGone:  # the event is on disk, and the next engine takes it in
+            self._moves -= moved
+            self._revive()
+            return True
         except EventRefused as error:
             refused, trouble = 1, f"an event was refused: {error.reason}"
         except FgregError as error:
@@ -153,13 +187,21 @@ class Recorder:
                 unsettled=self._moves > 0 or self._move_lost,
             )
         if self._on_taken is not None and not refused:
-            self._on_taken(event, estimate, self._session.marker_T_laser())
+            try:
+                beam = self._session.marker_T_laser()
+            except EngineGone:
+                self._revive()
+                return True
+            self._on_taken(event, estimate, beam)
         return True
 
     def _refresh(self, *, holding: bool = False) -> None:
         """``holding``: an event waits for the disk."""
         try:
             estimate = self._session.refresh()
+        except EngineGone:
+            self._revive()
+            return
         except FgregError as error:
             stuck = str(error) if isinstance(error, JournalError) else self._state.stuck
             with self._lock:
@@ -168,6 +210,14 @@ class Recorder:
         with self._lock:
             stuck = self._state.stuck if holding else ""
             self._state = replace(self._state, known=known_of(estimate), estimate=estimate, stuck=stuck)
+
+
+def _unwatched(estimate: OnlineEstimate | None) -> OnlineEstimate | None:
+    """An estimate that nothing is added to, and that nobody looks after."""
+    if estimate is None or UNWATCHED in estimate.reasons:
+        return estimate
+    verdict = max(estimate.verdict, Verdict.WARNING, key=lambda v: v.severity)
+    return replace(estimate, verdict=verdict, reasons=(UNWATCHED, *estimate.reasons))
 
 
 def known_of(estimate: OnlineEstimate | None) -> Known:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from fgreg.drivers.simulated import (
@@ -13,9 +14,11 @@ from fgreg.drivers.simulated import (
     SimulatedOperator,
     SimulatedProbe,
     SimulatedScanner,
+    ask_truth,
 )
 from fgreg.models import SessionModel
 from fgreg.operation.conductor import ConductorSettings
+from fgreg.operation.room_truth import write_room_truth
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.operation.status import Devices
 from fgreg.simulation.documents import session_document
@@ -77,4 +80,5 @@ def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSet
         open_devices,
         stage,
         ConductorSettings(aims=config.aims, hearing_threshold=HEARING_THRESHOLD),
+        tell_truth=partial(write_room_truth, partial(ask_truth, path)),
     )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,15 @@ import yaml
 
 from fgreg.config import SolveConfig
 from fgreg.drivers.base import host_now
-from fgreg.errors import InputError
-from fgreg.live import LiveSession
+from fgreg.errors import FgregError, InputError
+from fgreg.live import Engine, LiveSession
 from fgreg.models import SessionModel
 from fgreg.motion.guard import emergency_stop_all
 from fgreg.motion.keeper import StageKeeper
 from fgreg.motion.limits import MotionLimits
 from fgreg.motion.link import StageLink, StageRecord
 from fgreg.online.engine_process import EngineProcess
+from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.holder import HolderSettings
 from fgreg.operation.interpreter import undisturbed
@@ -36,6 +37,11 @@ WATCHDOG_LOG = "stage-orders.log"
 
 OpenDevices = Callable[[ExitStack, SessionModel], Devices]
 """Opens the devices but the stage; what it opens is closed with the stack."""
+
+
+TellTruth = Callable[[Path, float, float], None]
+"""Writes a session's ground truth, from its folder, the host time of session time 0, and the session time after which
+its events are this run's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +64,7 @@ class LiveSetup:
         settings: of the conductor.
         holder: how far the endoscope's holder is to be believed, where there is one.
         latencies: of the devices.
+        tell_truth: called when all is recorded, where somebody knows the truth.
     """
 
     setup: str
@@ -66,6 +73,7 @@ class LiveSetup:
     settings: ConductorSettings
     holder: HolderSettings = field(default_factory=HolderSettings)
     latencies: Latencies = field(default_factory=Latencies)
+    tell_truth: TellTruth | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +85,48 @@ class Running:
     loop: LiveLoop
     recorder: Recorder
     session: LiveSession
+
+
+class OneProcess:
+    """Makes engines, each a process; the one before is ended."""
+
+    def __init__(self) -> None:
+        self._engine: EngineProcess | None = None
+
+    def __call__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
+        self.close()
+        self._engine = EngineProcess(model, config, prior)
+        return self._engine
+
+    def close(self) -> None:
+        """End the last one."""
+        if self._engine is not None:
+            self._engine.close()
+
+
+class NewestSnapshots:
+    """The snapshots of a session's engine, whichever process that is by now; for one thread.
+
+    While a new process takes in what is recorded, those of the one before stand.
+    """
+
+    def __init__(self, session: LiveSession) -> None:
+        self._session = session
+        self._engine: Engine | None = None
+        self._reader: SnapshotReader | None = None
+
+    def read(self) -> Received:
+        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.read`; closed also where the process was killed."""
+        engine = self._session.engine
+        if engine is not self._engine and isinstance(engine, EngineProcess):
+            with suppress(FileNotFoundError):  # that one has ended as well
+                self._reader = engine.reader()
+            self._engine = engine
+        if self._reader is None:
+            raise NoSnapshotError("the registration's process has ended")
+        received = self._reader.read()
+        alive = isinstance(self._engine, EngineProcess) and self._engine.alive
+        return received if alive else replace(received, closed=True)
 
 
 def make_folder(folder: Path, setup: str) -> None:
@@ -129,16 +179,13 @@ def running(
     make_folder(folder, live.setup)
     with ExitStack() as stack:
         say("starting the registration")
-        engines: list[EngineProcess] = []
-
-        def make_engine(model: SessionModel, settings: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
-            engines.append(stack.enter_context(EngineProcess(model, settings, prior)))
-            return engines[-1]
-
+        make_engine = OneProcess()
+        stack.callback(make_engine.close)  # after the recorder, whichever process is there then
         session = stack.enter_context(LiveSession.open(folder, config, make_engine, late=True))
         model = session.journal.model
         last_t = session.journal.last_t
         start_s = host_now() - (0.0 if last_t is None else max(last_t, 0.0) + 1.0)
+        stack.callback(_tell_truth, live.tell_truth, folder, start_s, -1.0 if last_t is None else last_t, say)
         say("opening the devices")
         devices = live.open_devices(stack, model)
         if live.stage is not None:
@@ -148,9 +195,8 @@ def running(
         stack.callback(_end_recording, recorder, say)
         taken = session.measurements()
         conductor = Conductor(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
-        reader = engines[-1].reader()
-        stack.callback(reader.close)
-        loop = LiveLoop(model, devices, recorder, reader, conductor, start_s, live.holder, live.latencies)
+        snapshots = NewestSnapshots(session)
+        loop = LiveLoop(model, devices, recorder, snapshots, conductor, start_s, live.holder, live.latencies)
         stack.callback(loop.close)
         stack.enter_context(undisturbed())
         try:
@@ -167,6 +213,17 @@ def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:
     recorder.close()
     if recorder.state.waiting:
         say(f"the last {recorder.state.waiting} events could not be recorded: {recorder.state.stuck}")
+
+
+def _tell_truth(
+    tell: TellTruth | None, folder: Path, start_s: float, begin_t: float, say: Callable[[str], None]
+) -> None:
+    """The session is what it is without."""
+    if tell is not None:
+        try:
+            tell(folder, start_s, begin_t)
+        except FgregError as error:
+            say(f"no ground truth: {error}")
 
 
 def _open_stage(

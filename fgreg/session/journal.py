@@ -100,6 +100,15 @@ class Journal:
         events, self._recorded = self._recorded, ()
         return events
 
+    def reread(self) -> tuple[Event, ...]:
+        """All events that are recorded, from the file; others may be appended meanwhile.
+
+        Raises:
+            InputError: somebody else has changed the session's files.
+        """
+        lines = self.lines
+        return read_session(self.folder).events[:lines]
+
     def append(self, event: Event, *, durable: bool = True, late: bool = False) -> Appended:
         """Put an event on disk, behind all others; its ``line`` is given to it here.
 

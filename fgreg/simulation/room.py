@@ -8,7 +8,9 @@ into the camera. Truth only, forward only; times are seconds since the room was 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -277,6 +279,23 @@ class Room:
     def plane_rad(self, t_s: float) -> float:
         """Angle to which the plane has to turn for the beam's end to be in it."""
         return float(sweeps.plane_angle_rad(self.spot_mm(t_s)))
+
+    def truth_at(self, camera_s: Sequence[float], spots_s: Sequence[float]) -> dict[str, Any]:
+        """How things were (plain numbers), for who judges an estimate, never for who makes one.
+
+        Args:
+            camera_s, spots_s: times at which to tell ``trus_T_camera`` (4x4 each) and ``spots_mm`` (3 each). Told as
+                well: ``marker_T_laser`` (4x4), ``moved_s`` (when the camera began to move), ``stood`` (4x4 each: where
+                it stood at the start and after each move) and ``seed``.
+        """
+        return {
+            "trus_T_camera": [self.trus_T_camera(t).tolist() for t in camera_s],
+            "spots_mm": [self.spot_mm(t).tolist() for t in spots_s],
+            "marker_T_laser": self.marker_T_laser.tolist(),
+            "moved_s": [*self.moved_s],
+            "stood": [travel.end.tolist() for travel in self._cameras],
+            "seed": self.config.seed,
+        }
 
     # --- what is taken in -------------------------------------------------------------------------------------------
 

@@ -50,10 +50,10 @@ def write_session(
     except OSError as error:
         raise InputError(str(folder), f"a place that refuses folders ({error.strerror})", "a writable one") from error
     try:
-        (partial / "session.yaml").write_text(_yaml(simulated.session), encoding="utf-8")
+        (partial / "session.yaml").write_text(yaml_text(simulated.session), encoding="utf-8")
         lines = [json.dumps(event, separators=(", ", ": ")) + "\n" for event in simulated.events]
         (partial / "events.jsonl").write_text("".join(lines), encoding="utf-8")
-        (partial / "ground_truth.yaml").write_text(_yaml(simulated.truth), encoding="utf-8")
+        (partial / "ground_truth.yaml").write_text(yaml_text(simulated.truth), encoding="utf-8")
         for done, (name, frame) in enumerate(simulated.frames.items(), start=1):
             path = partial / name
             path.parent.mkdir(exist_ok=True)
@@ -105,5 +105,6 @@ def _list(dumper: yaml.SafeDumper, values: list[Any]) -> yaml.nodes.Node:
 _Dumper.add_representer(list, _list)
 
 
-def _yaml(document: dict[str, Any]) -> str:
+def yaml_text(document: dict[str, Any]) -> str:
+    """A document as text."""
     return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=400))
