@@ -23,9 +23,14 @@ def test_processes_get_one_thread_each_unless_the_user_has_said_how_many(monkeyp
 
 def test_the_interpreter_is_as_before_when_a_session_ends_however_it_does() -> None:
     before = sys.getswitchinterval()
-    with pytest.raises(KeyboardInterrupt), undisturbed():  # noqa: PT012
+
+    @undisturbed()
+    def session() -> None:
         assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
         assert gc.get_freeze_count() > 0
         raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        session()
     assert sys.getswitchinterval() == before
     assert gc.get_freeze_count() == 0

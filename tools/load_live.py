@@ -33,7 +33,7 @@ from fgreg.operation.painter import painted
 from fgreg.operation.rooms import room_setup
 from fgreg.operation.start import running
 from fgreg.session.reading import read_session
-from fgreg.simulation.played_room import Making, make_pictures
+from fgreg.simulation.played_room import FRAME_RATE, Making, make_pictures
 from fgreg.simulation.room import room_config
 from fgreg.threads import NAMES
 
@@ -49,6 +49,7 @@ def measure(options: argparse.Namespace, making: Making, folder: Path) -> dict[s
     figures_file = folder / "player.json"
     program = [str(Path(__file__).with_name("load_player.py")), "--pictures", str(making.path)]
     program += ["--figures", str(figures_file), "--spots", str(making.spots), "--laps", str(making.laps)]
+    program += ["--frame-rate", str(options.frame_rate)]
     session_folder = folder / "session"
     with ExitStack() as stack:
         room = stack.enter_context(RoomProcess(options.seed, options.width, options.aims, program=program))
@@ -159,6 +160,7 @@ def main() -> int:
     parser.add_argument("--rrd", type=Path, metavar="FILE", help="record what a viewer would show meanwhile")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=1280, help="of the images, px (default 1280)")
+    parser.add_argument("--frame-rate", type=float, default=FRAME_RATE, help="30, 15, 10, ... a second (default 30)")
     parser.add_argument("--aims", type=int, default=8, help="calibration shots (default 8)")
     parser.add_argument("--spots", type=int, default=10, help="at tissue, for either place of the camera (default 10)")
     parser.add_argument("--laps", type=int, default=2, help="through the spots between bumps (default 2)")

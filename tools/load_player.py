@@ -18,8 +18,8 @@ from fgreg.simulation.room import room_config
 class Player(RoomServer):
     """The room's server, which writes down what it made for somebody: (the room's time, how late it was), s."""
 
-    def __init__(self, room: PlayedRoom, path: Path, stay_s: float) -> None:
-        super().__init__(room, path, frame_rate=FRAME_RATE, roam_s=stay_s)
+    def __init__(self, room: PlayedRoom, path: Path, frame_rate: float, stay_s: float) -> None:
+        super().__init__(room, path, frame_rate=frame_rate, roam_s=stay_s)
         self.made: dict[str, list[tuple[float, float]]] = {"camera": [], "probe": []}
 
     def _note(self, role: str, t_s: float) -> None:
@@ -40,6 +40,7 @@ def main() -> None:
     parser.add_argument("--socket", type=Path, required=True)
     parser.add_argument("--pictures", type=Path, required=True, help="made by fgreg.simulation.played_room")
     parser.add_argument("--figures", type=Path, required=True, help="written at the end")
+    parser.add_argument("--frame-rate", type=float, default=FRAME_RATE, help="a whole part of that of the pictures")
     parser.add_argument("--stay-s", type=float, default=12.0, help="at a spot, while the stage follows")
     for name in ("--seed", "--width", "--aims", "--spots", "--laps"):
         parser.add_argument(name, type=int, required=True)
@@ -48,7 +49,7 @@ def main() -> None:
     making = Making(room_config(given.seed, given.width, aims=given.aims), given.spots, given.laps, given.pictures)
     room = making.room()
     room.show(making.file(room, "r"))
-    server = Player(room, given.socket, given.stay_s)
+    server = Player(room, given.socket, given.frame_rate, given.stay_s)
     began = time.monotonic(), time.process_time()
     serve(server)
     lasted, used = time.monotonic() - began[0], time.process_time() - began[1]

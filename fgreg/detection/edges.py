@@ -215,7 +215,7 @@ def _fit_band(
             if iteration > 0:
                 # Pixels that do not belong (a speck, a glint) lose their say.
                 sigma = _spread(residual, np.minimum(weight, 9.0 * sigma[:, None] ** 2 / (residual**2 + 1e-12)), weight)
-                weight = band.used / (1.0 + (residual / (4.0 * sigma[:, None])) ** 4)
+                weight = band.used / (1.0 + np.square(np.square(residual / (4.0 * sigma[:, None]))))
             cost = np.sum(weight * residual**2, axis=1) / sigma**2 + np.sum(prior * (x - centre) ** 2, axis=1)
         jw = jacobian * (weight / sigma[:, None] ** 2)[:, None]
         normal = jw @ np.swapaxes(jacobian, 1, 2)
