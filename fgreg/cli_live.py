@@ -193,6 +193,7 @@ def _conduct(
     viewer: bool,
     silent: bool,
 ) -> Figures:
+    from fgreg.motion.guard import emergency_stop_all
     from fgreg.operation.painter import painted
     from fgreg.operation.start import running
 
@@ -201,6 +202,7 @@ def _conduct(
     def end(_number: int, _frame: object) -> None:
         nonlocal ended
         ended = True
+        emergency_stop_all()  # the loop ends after its turn; the stage does not wait for that
 
     with _display(silent) as (say, show), painted(rrd, folder.name, live=viewer, say=say) as painter:
         before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}

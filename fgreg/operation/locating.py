@@ -43,8 +43,8 @@ class Locator:
         self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_stand_back)
         self._pid: int | None = None
         self._waits_s = time.monotonic()  # for an answer, since
-        self._asked: Future[int] | None = None
-        self._asked_s = -1e9
+        self._asked_s, self._answers = self._waits_s, False
+        self._asked: Future[int] | None = self._pool.submit(os.getpid)  # before any frame: it may have to be ended
 
     def submit(self, data: npt.NDArray[Any]) -> Future[PaFind | NoSignal]:
         """Have a source located. The future raises BrokenProcessPool where the process ended meanwhile."""
@@ -70,6 +70,8 @@ class Locator:
                 self._asked = self._pool.submit(os.getpid)
             except BrokenProcessPool:
                 self._again("it had ended")
+        if self._answers:
+            self.trouble, self._answers = "", False
         waited = now_s - self._waits_s
         if self._asked is not None and waited > (START_S if self._pid is None else MUTE_S):
             self.trouble = self.trouble or f"it has not answered for {waited:.1f} s"
@@ -81,7 +83,7 @@ class Locator:
     def _answered(self, found: Future[PaFind | NoSignal]) -> None:
         """On a thread of the pool's: any answer is a sign of life."""
         if not found.cancelled() and not isinstance(found.exception(), BrokenProcessPool):
-            self._waits_s = max(self._waits_s, time.monotonic())
+            self._waits_s, self._answers = max(self._waits_s, time.monotonic()), True
 
     def _again(self, why: str) -> None:
         self.trouble = why
