@@ -44,6 +44,8 @@ WORTH_PREDICTING_RAD = math.radians(8.0)
 """A prediction less certain than this is no better than a sweep."""
 CHECK_RAD = math.radians(2.0)
 """While the stage follows, a PM heard with the plane so near to the answer becomes a pair."""
+CHECK_S = 0.3
+"""And so often it is listened for."""
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
 """A spot at which nothing happens for so long is not worth waiting at."""
@@ -118,16 +120,18 @@ class Conductor:
         self._latched = ""
         self._wanted_s = -math.inf
         self._waits_s = -math.inf
+        self._checks, self._checked_s = False, -math.inf
         self._not_before_s = -math.inf  # pulses of before are another epoch's
 
     @property
     def listens(self) -> bool:
-        """Whether it is of any use now to know what is heard."""
-        return self.stage is Stage.FOLLOWING or self._hunt is not None
+        """Whether it is of any use now to know what is heard: locating a source takes a processor's time."""
+        return self._checks if self._hunt is None else self._hunt.listens
 
     def step(self, view: View) -> tuple[Action, ...]:
         """What to do now."""
         out: list[Action] = []
+        self._checks = False
         for command in view.commands:
             out += self._obey(command, view)
         latched = view.stage is not None and self._is_latched(view.stage, view.now_s, out)
@@ -334,9 +338,11 @@ class Conductor:
         if held is None or abs(stage.scan_rad - plane) > CHECK_RAD:
             self._deaf = 0
             return
+        self._checks = view.now_s - self._checked_s > CHECK_S
         for pulse in view.heard:
             if pulse.scan_rad is None or abs(pulse.scan_rad - plane) > CHECK_RAD or pulse.pulse_s < self._not_before_s:
                 continue
+            self._checked_s = view.now_s
             loud = pulse.amplitude is not None and pulse.amplitude >= self._settings.hearing_threshold
             self._deaf = 0 if loud else self._deaf + 1
             if loud and pulse.marker is not None and self._is_another(held):

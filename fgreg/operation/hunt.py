@@ -29,6 +29,7 @@ class Hunt:
         held: the marker's pose at the beginning.
         cold: whether the whole field is searched.
         looks: pulses at which something was heard.
+        listens: whether the next pulse counts: the stage stands where it was to go.
     """
 
     planner: SearchPlanner
@@ -37,6 +38,7 @@ class Hunt:
     threshold: float
     started_s: float
     looks: list[Heard]
+    listens: bool = False
     _goal: Turn | None = None
     _waits_s: float = 0.0
     _stood_s: float | None = None
@@ -48,6 +50,7 @@ class Hunt:
             if stage.moving or (there and self._stood_s is None):
                 self._waits_s = now_s
             self._stood_s = (self._stood_s or stage.at_s) if there else None
+            self.listens = self._stood_s is not None and now_s > self._stood_s + QUIET_S
             pulse = None if self._stood_s is None else _first_after(self._stood_s + QUIET_S, heard)
             if pulse is None or pulse.scan_rad is None:
                 if now_s - self._waits_s < PATIENCE_S:
@@ -61,7 +64,7 @@ class Hunt:
             self._goal = None
         step = self.planner.next()
         if isinstance(step, Turn):
-            self._goal, self._waits_s, self._stood_s = step, now_s, None
+            self._goal, self._waits_s, self._stood_s, self.listens = step, now_s, None, False
         return step
 
     def kept(self, found: Found, model: SessionModel) -> tuple[Heard, ...]:

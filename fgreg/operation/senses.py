@@ -119,9 +119,10 @@ class Ears:
             self._planes.append((at_s, scan_rad, moving))
 
     def hear(self, frames: Sequence[PaFrame]) -> None:
-        """Take in pulses."""
+        """Take in pulses. One at a time is looked into: the next is of use once it is known what came of that."""
         for frame in frames:
-            self._waiting.append(_Waiting(self._clock.host_time(frame.stamp), frame.data if self.listening else None))
+            wanted = self.listening and all(pulse.data is None for pulse in self._waiting)
+            self._waiting.append(_Waiting(self._clock.host_time(frame.stamp), frame.data if wanted else None))
 
     def heard(self, now_s: float, poses: PoseHistory) -> tuple[Heard, ...]:
         """The pulses that are complete, in their order."""
