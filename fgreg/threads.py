@@ -1,6 +1,6 @@
-"""How many threads linear algebra takes: one a process, where there are as many processes as cores.
+"""How many threads linear algebra and OpenCV take: one a process, where there are as many processes as cores.
 
-NumPy's library reads that from the environment when it is loaded, so this module loads nothing.
+Their libraries read that from the environment when they are loaded, so this module loads nothing.
 """
 
 from __future__ import annotations
@@ -9,12 +9,18 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-NAMES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+NAMES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
 
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """What is started or imported within uses one thread for linear algebra, unless the user has said how many."""
+    """What is started or imported within uses one thread for these, unless the user has said how many."""
     before = {name: os.environ.get(name) for name in NAMES}
     os.environ.update({name: "1" for name, value in before.items() if value is None})
     try:

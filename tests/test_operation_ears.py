@@ -47,7 +47,7 @@ class SlowLocator:
 def ears() -> Iterator[tuple[Ears, SlowLocator]]:
     found, locator = Ears(make_session()), SlowLocator()
     found.close()
-    found._locator = locator  # type: ignore[assignment]
+    found.locator = locator  # type: ignore[assignment]
     yield found, locator
     found.close()
 

@@ -69,6 +69,15 @@ def _side(tag: FoundTag) -> float:
     return float(np.linalg.norm(np.roll(tag.corners_px, -1, axis=0) - tag.corners_px, axis=1).max())
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewCorners:
+    """What one view shows of the body: its corners, the tag id of each of their groups, and what was left out."""
+
+    corners: CornerSet | None
+    ids: tuple[int, ...]
+    left_out: tuple[str, ...]
+
+
 def view_corners(
     image: npt.NDArray[np.generic],
     camera: CameraModel,
@@ -77,8 +86,8 @@ def view_corners(
     marker: MarkerModel,
     *,
     edges: bool = True,
-) -> tuple[CornerSet | None, tuple[int, ...], list[str]]:
-    """The body's corners in one view: (corners, tag id of each group, what was left out)."""
+) -> ViewCorners:
+    """The body's corners in one view, ``view`` 0 (left) or 1 (right)."""
     picture = grey(image)
     tags: list[FoundTag] = []
     left_out: list[str] = []
@@ -89,7 +98,7 @@ def view_corners(
     if not tags and not left_out:
         tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, VIEW_NAMES[view])
     if not tags:
-        return None, (), left_out
+        return ViewCorners(None, (), tuple(left_out))
     cells = tag_cells(marker.dictionary)
     squares = square_corners(camera, picture, np.stack([tag.corners_px for tag in tags]), cells, edges=edges)
     models = {tag.id: tag for tag in marker.tags}
@@ -114,7 +123,7 @@ def view_corners(
             )
         )
         ids.append(tag.id)
-    return (join(parts) if parts else None), tuple(ids), left_out
+    return ViewCorners(join(parts) if parts else None, tuple(ids), tuple(left_out))
 
 
 def detect_marker(
@@ -134,36 +143,38 @@ def detect_marker(
     Raises:
         ValueError: a right frame without a right camera, no frame at all, an unknown dictionary, or not an image.
     """
-    if left is None and right is None:
-        raise ValueError("no frame to detect in")
-    parts: list[CornerSet] = []
-    names: list[str] = []
-    ids: list[int] = []
-    left_out: list[str] = []
+    views: list[ViewCorners | None] = [None, None]
     if left is not None:
-        corners, tags, out = view_corners(left, rig.left, 0, np.eye(4), marker, edges=edges)
-        left_out += out
-        if corners is not None:
-            parts.append(corners)
-            ids += tags
-            names += [f"tag {i} in left view" for i in tags]
+        views[0] = view_corners(left, rig.left, 0, np.eye(4), marker, edges=edges)
     if right is not None:
-        if rig.right is None or rig.right_T_left is None:
-            raise ValueError("a right frame, but the rig has no right camera")
-        corners, tags, out = view_corners(right, rig.right, 1, rig.right_T_left, marker, edges=edges)
-        left_out += out
-        if corners is not None:
-            parts.append(corners)
-            ids += tags
-            names += [f"tag {i} in right view" for i in tags]
-    where = " or ".join(name for name, image in zip(VIEW_NAMES, (left, right), strict=True) if image is not None)
+        views[1] = right_corners(right, rig, marker, edges=edges)
+    return marker_from_views(views[0], views[1], marker)
+
+
+def right_corners(
+    right: npt.NDArray[np.generic], rig: StereoRig, marker: MarkerModel, *, edges: bool = True
+) -> ViewCorners:
+    """:func:`view_corners` of the right view. Raises ValueError where the rig has none."""
+    if rig.right is None or rig.right_T_left is None:
+        raise ValueError("a right frame, but the rig has no right camera")
+    return view_corners(right, rig.right, 1, rig.right_T_left, marker, edges=edges)
+
+
+def marker_from_views(left: ViewCorners | None, right: ViewCorners | None, marker: MarkerModel) -> MarkerFit | NotFound:
+    """The marker's pose from what its views show; None for a view that was not looked into: ValueError for both."""
+    seen = [(name, view) for name, view in zip(VIEW_NAMES, (left, right), strict=True) if view is not None]
+    if not seen:
+        raise ValueError("no frame to detect in")
+    left_out = [text for _, view in seen for text in view.left_out]
+    parts = [view.corners for _, view in seen if view.corners is not None]
     if not parts:
         which = f"tag {marker.tags[0].id}" if len(marker.tags) == 1 else "no tag"
         verb = "not found" if len(marker.tags) == 1 else "found"
         extra = f" ({', '.join(left_out)})" if left_out else ""
-        return NotFound(f"marker: {which} {verb} in the {where} view{extra}")
-    everything = join(parts)
-    kept, strays = without_strays(everything, names)
+        return NotFound(f"marker: {which} {verb} in the {' or '.join(name for name, _ in seen)} view{extra}")
+    ids = [i for _, view in seen if view.corners is not None for i in view.ids]
+    names = [f"tag {i} in {name} view" for name, view in seen if view.corners is not None for i in view.ids]
+    kept, strays = without_strays(join(parts), names)
     pose = choose_pose(kept, "marker", left_out + strays)
     if isinstance(pose, NotFound):
         return pose

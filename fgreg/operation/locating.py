@@ -7,9 +7,10 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy.typing as npt
 
@@ -26,6 +27,8 @@ HANGS_S = 10.0
 """And ended after so long, for another to take over."""
 START_S = 30.0
 """So long it may take for its first answer."""
+
+Result = TypeVar("Result")
 
 
 class Locator:
@@ -48,11 +51,15 @@ class Locator:
 
     def submit(self, data: npt.NDArray[Any]) -> Future[PaFind | NoSignal]:
         """Have a source located. The future raises BrokenProcessPool where the process ended meanwhile."""
+        return self.run(locate_in_frame, data, self._probe)
+
+    def run(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Have something else done there; as :meth:`submit`."""
         try:
-            found = self._pool.submit(locate_in_frame, data, self._probe)
+            found = self._pool.submit(work, *arguments)
         except BrokenProcessPool:
             self._again("it had ended")
-            found = self._pool.submit(locate_in_frame, data, self._probe)
+            found = self._pool.submit(work, *arguments)
         found.add_done_callback(self._answered)
         return found
 
@@ -80,7 +87,7 @@ class Locator:
                     os.kill(self._pid, signal.SIGKILL)  # the pool breaks, and is begun again
                 self._pid = None
 
-    def _answered(self, found: Future[PaFind | NoSignal]) -> None:
+    def _answered(self, found: Future[Any]) -> None:
         """On a thread of the pool's: any answer is a sign of life."""
         if not found.cancelled() and not isinstance(found.exception(), BrokenProcessPool):
             self._waits_s, self._answers = max(self._waits_s, time.monotonic()), True

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from typing import Protocol
 
 import numpy as np
@@ -113,7 +113,6 @@ class LiveLoop:
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
         self._answer: TrackEstimate | None = None
-        self._worker = ThreadPoolExecutor(1, "board")
         self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
 
     def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
@@ -174,8 +173,8 @@ class LiveLoop:
 
     def close(self) -> None:
         """End what the loop has started itself."""
+        self.eyes.close()
         self.ears.close()
-        self._worker.shutdown(wait=False, cancel_futures=True)
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
@@ -321,7 +320,7 @@ class LiveLoop:
             self._tell(Tell("no aim: session.yaml has no board"))
             return
         if self._aiming is None:  # else one is being looked at
-            found = self._worker.submit(detect_board, frame.left, frame.right, rig, board)
+            found = self.ears.locator.run(detect_board, frame.left, frame.right, rig, board)
             self._aiming = (corner, pose, found)
 
     def _take_aim(self) -> None:

@@ -19,11 +19,19 @@ import numpy.typing as npt
 
 from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
+from fgreg.detection.marker import (
+    MarkerFit,
+    detect_marker,
+    marker_covariance,
+    marker_from_views,
+    right_corners,
+    view_corners,
+)
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
 from fgreg.drivers.base import PaFrame, StereoFrame, host_now
 from fgreg.models import SessionModel
 from fgreg.operation.locating import Locator
+from fgreg.operation.second_eye import SecondEye
 from fgreg.operation.view import Heard
 from fgreg.pairing import DeviceClock, PairRefused, PoseHistory, TimedPose
 
@@ -48,6 +56,7 @@ class Eyes:
         if model.camera is None or model.marker is None:
             raise ValueError("the session has no camera or no marker")
         self._rig, self._marker = model.camera, model.marker
+        self._second = SecondEye(self._rig, self._marker)
         self._clock = DeviceClock(latency_s)
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
@@ -59,7 +68,7 @@ class Eyes:
     def see(self, frame: StereoFrame) -> TimedPose | None:
         """The marker's pose at the frame's exposure; None, and ``missing`` says why, where it is not found."""
         t_s = self._clock.host_time(frame.stamp)
-        fit = detect_marker(frame.left, frame.right, self._rig, self._marker)
+        fit = self._detect(frame)
         self.newest = frame
         if isinstance(fit, NotFound):
             self.missing = fit.reason
@@ -72,6 +81,19 @@ class Eyes:
         pose = TimedPose(t_s, fit.camera_T_marker, marker_covariance(fit, self._noise))
         return pose if self.poses.add(pose) else None
 
+    def _detect(self, frame: StereoFrame) -> MarkerFit | NotFound:
+        """As :func:`fgreg.detection.marker.detect_marker`, both views at once where that is possible."""
+        rig, marker = self._rig, self._marker
+        if frame.right is None or rig.right is None or not self._second.look(frame.right):
+            return detect_marker(frame.left, frame.right, rig, marker)
+        left = view_corners(frame.left, rig.left, 0, np.eye(4), marker)
+        right = self._second.seen() or right_corners(frame.right, rig, marker)
+        return marker_from_views(left, right, marker)
+
+    def close(self) -> None:
+        """End the second eye."""
+        self._second.close()
+
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
@@ -83,6 +105,11 @@ class _Waiting:
     located: Future[PaFind | NoSignal] | None = None
     tries: int = 0
 
+    @property
+    def under_way(self) -> bool:
+        """Whether it is still to be looked into."""
+        return self.data is not None and (self.located is None or not self.located.done())
+
 
 class Ears:
     """Pulses with what was heard, where the plane stood, and where the marker was.
@@ -90,10 +117,11 @@ class Ears:
     Attributes:
         listening: whether anybody wants to know what is heard: locating a source takes time.
         passed_over: pulses that would have been located, had there been time.
+        locator: the process that locates sources; it has time for other things while nobody listens.
     """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
-        self._locator = Locator(model.probe)
+        self.locator = Locator(model.probe)
         self._clock = DeviceClock(latency_s)
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
@@ -106,7 +134,7 @@ class Ears:
         """Why nothing is located now; empty where it is."""
         if host_now() - self._unread_s > UNREAD_S:
             self._unread = ""
-        return self._locator.trouble or self._unread
+        return self.locator.trouble or self._unread
 
     @property
     def waiting(self) -> int:
@@ -121,13 +149,13 @@ class Ears:
     def hear(self, frames: Sequence[PaFrame]) -> None:
         """Take in pulses. One at a time is looked into: the next is of use once it is known what came of that."""
         for frame in frames:
-            wanted = self.listening and all(pulse.data is None for pulse in self._waiting)
+            wanted = self.listening and not any(pulse.under_way for pulse in self._waiting)
             self._waiting.append(_Waiting(self._clock.host_time(frame.stamp), frame.data if wanted else None))
 
     def heard(self, now_s: float, poses: PoseHistory) -> tuple[Heard, ...]:
         """The pulses that are complete, in their order."""
         out = []
-        self._locator.look_after(now_s)
+        self.locator.look_after(now_s)
         for pulse in self._waiting:
             self._look_into(pulse, now_s)
             if pulse.located is not None and not pulse.located.done() and now_s - pulse.pulse_s > LOCATE_S:
@@ -162,7 +190,7 @@ class Ears:
             self._pass_over(pulse)
             return
         pulse.tries += 1
-        pulse.located = self._locator.submit(pulse.data)
+        pulse.located = self.locator.submit(pulse.data)
         self._under_way.append(pulse.located)
 
     def _pass_over(self, pulse: _Waiting) -> None:
@@ -203,7 +231,7 @@ class Ears:
 
     def close(self) -> None:
         """End the process."""
-        self._locator.close()
+        self.locator.close()
 
 
 def _ended_under(located: Future[PaFind | NoSignal]) -> bool:

@@ -1,0 +1,136 @@
+"""The right view in a process of its own: the same corners, and whatever happens to it no frame is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from fgreg.detection.marker import MarkerFit, detect_marker, right_corners
+from fgreg.drivers.base import StereoFrame
+from fgreg.models import SessionModel
+from fgreg.operation.second_eye import SecondEye
+from fgreg.operation.senses import Eyes
+from fgreg.pairing import Stamp
+from fgreg.session.setup import read_setup
+from fgreg.simulation.documents import session_document
+from fgreg.simulation.render import UInt8Image
+from fgreg.simulation.room import Room, room_config
+
+Pictures = tuple[UInt8Image, UInt8Image]
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[SessionModel, list[Pictures]]:
+    config = room_config(3, 640, aims=0)
+    model = read_setup(session_document(config.scene), "session.yaml", "room", []).model
+    assert model is not None
+    made = Room(config)
+    return model, [made.pictures(0.1 * k, k) for k in range(3)]
+
+
+@pytest.fixture
+def eye(room: tuple[SessionModel, list[Pictures]]) -> Iterator[SecondEye]:
+    model = room[0]
+    assert model.camera is not None
+    assert model.marker is not None
+    found = SecondEye(model.camera, model.marker)
+    try:
+        yield found
+    finally:
+        found.close()
+
+
+def ready(eye: SecondEye, image: UInt8Image) -> None:
+    """Until it has looked at a picture."""
+    end = time.monotonic() + 60.0
+    while not eye.look(image):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def seen_of(eye: SecondEye) -> object:
+    """What it answers, on a machine that may be busy."""
+    found = None
+    end = time.monotonic() + 10.0
+    connection = eye._connection
+    assert connection is not None
+    while found is None and time.monotonic() < end and connection.poll(10.0):
+        found = eye.seen()
+    return found
+
+
+def test_it_sees_what_is_seen_here(room: tuple[SessionModel, list[Pictures]], eye: SecondEye) -> None:
+    model, pictures = room
+    assert model.camera is not None
+    assert model.marker is not None
+    for _, right in pictures:
+        ready(eye, right)
+        found = seen_of(eye)
+        here = right_corners(right, model.camera, model.marker)
+        assert found is not None
+        assert here.corners is not None
+        np.testing.assert_array_equal(found.corners.ideal_px, here.corners.ideal_px)  # type: ignore[attr-defined]
+        np.testing.assert_array_equal(found.corners.covariance, here.corners.covariance)  # type: ignore[attr-defined]
+
+
+def test_a_picture_without_a_marker_is_no_trouble(room: tuple[SessionModel, list[Pictures]], eye: SecondEye) -> None:
+    blank = np.full_like(room[1][0][1], 90)
+    ready(eye, blank)
+    found = seen_of(eye)
+    assert found is not None
+    assert found.corners is None  # type: ignore[attr-defined]
+
+
+def test_another_size_of_pictures_begins_anew(room: tuple[SessionModel, list[Pictures]], eye: SecondEye) -> None:
+    right = room[1][0][1]
+    ready(eye, right)
+    assert seen_of(eye) is not None
+    assert not eye.look(np.ascontiguousarray(right[::2, ::2]))
+    ready(eye, right)
+    assert seen_of(eye) is not None
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_where_it_ends_or_hangs_frames_are_looked_into_here_and_another_takes_over(
+    room: tuple[SessionModel, list[Pictures]], how: signal.Signals
+) -> None:
+    model, pictures = room
+    assert model.camera is not None
+    assert model.marker is not None
+    eyes = Eyes(model)
+    frames = 0
+
+    def see() -> None:
+        nonlocal frames
+        left, right = pictures[frames % len(pictures)]
+        frames += 1
+        pose = eyes.see(StereoFrame(Stamp(frames / 30.0, frames / 30.0), left, right, frames))
+        expected = detect_marker(left, right, model.camera, model.marker)  # type: ignore[arg-type]
+        assert isinstance(expected, MarkerFit)
+        assert pose is not None
+        np.testing.assert_allclose(pose.parent_T_child, expected.camera_T_marker, atol=1e-12)
+
+    def until(condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60.0
+        while not condition():
+            assert time.monotonic() < end
+            see()
+
+    try:
+        until(lambda: eyes._second._ready)
+        process = eyes._second._process
+        assert process is not None
+        assert process.pid is not None
+        os.kill(process.pid, how)
+        see()
+        see()
+        until(lambda: eyes._second._ready and eyes._second._process is not process)
+        see()
+    finally:
+        eyes.close()
+    assert eyes._second._process is None
