@@ -18,7 +18,7 @@ from unittest import mock
 import numpy as np
 
 from fgreg.drivers.base import Said
-from fgreg.drivers.simulated import RoomProcess
+from fgreg.drivers.simulated import RoomProcess, SimulatedMotion
 from fgreg.drivers.simulated_room import FAULTS
 from fgreg.events import NoteEvent
 from fgreg.frames import FloatArray
@@ -90,6 +90,8 @@ def rig(folder: Path) -> Iterator[Rig]:
         def open_devices(devices: ExitStack, model: SessionModel) -> Devices:
             opened = setup.open_devices(devices, model)
             opened.operator = Listening(opened.operator)
+            opened.motion = SimulatedMotion(room.path)
+            devices.callback(opened.motion.close)
             found.append(opened)
             return opened
 
@@ -165,8 +167,8 @@ class Fault:
 
 STUDIED = {
     f"{device}-{what}": Fault(device, _break, f"{device}-{what}")
-    for device, faults in FAULTS.items()
-    for what in faults
+    for device in ("camera", "probe", "motion", "stage", "operator")
+    for what in FAULTS[device]
     if what
 } | {
     "watchdog-killed": Fault("stage", _kill, "watchdog"),
@@ -177,8 +179,6 @@ STUDIED = {
     "engine-killed": Fault("registration", _kill, "engine"),
     "disk-full": Fault("recording", _fill_disk, ""),
 }
-ONCE = ("engine-killed",)
-"""Studied last, and once in a session: it does not go on after it."""
 
 
 @dataclass
@@ -191,9 +191,7 @@ class Trial:
     rates: Sequence[float] = (math.nan,) * 3
 
 
-def trial(
-    case: Rig, fault: Fault, lasts_s: float, *, comes_back: bool, orders: bool = True, rest_s: float = 2.0
-) -> Trial:
+def trial(case: Rig, fault: Fault, lasts_s: float, *, orders: bool = True, rest_s: float = 2.0) -> Trial:
     """Make a fault where all is well, mend it, and let the session go on: until the next order, and a while more."""
     found, ears = Trial(), case.session.loop.ears
     case.run(PATIENCE_S, lambda: not case.session.loop.lost and ears.locator._pid is not None)
@@ -206,8 +204,6 @@ def trial(
     found.rates = ((case.counts() - before) / (time.monotonic() - began)).tolist()
     mended = time.monotonic()
     mend()
-    if not comes_back:
-        return found
     if case.run(PATIENCE_S, lambda: case.told_after(began, back) is not None):
         found.back_s = max(0.0, (case.told_after(began, back) or 0.0) + began - mended)
     before = case.counts()

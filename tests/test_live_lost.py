@@ -8,7 +8,7 @@ import pytest
 
 from fgreg.events import NoteEvent
 from fgreg.session.reading import read_session
-from tests.live_rig import ONCE, STUDIED, Rig, rig, trial
+from tests.live_rig import STUDIED, Rig, rig, trial
 
 
 @pytest.fixture(scope="module")
@@ -17,18 +17,28 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         yield case
 
 
-@pytest.mark.parametrize("name", [*(name for name in STUDIED if name not in ONCE), *ONCE])
+@pytest.mark.parametrize(
+    "name",
+    (
+        "camera-gone",
+        "camera-frozen",
+        "probe-silent",
+        "motion-silent",
+        "stage-gone",
+        "watchdog-killed",
+        "locator-killed",
+        "engine-killed",
+        "disk-full",
+    ),
+)  # all of them: tools/study_lost.py
 def test_what_is_lost_is_told_and_the_rest_goes_on(case: Rig, name: str) -> None:
     fault = STUDIED[name]
     orders = fault.role in ("camera", "stage")  # what the stage's orders rest on
-    found = trial(case, fault, 1.0, comes_back=name not in ONCE, orders=orders, rest_s=0.5)
+    found = trial(case, fault, 1.0, orders=orders, rest_s=0.5)
     assert found.told_s == found.told_s, f"never told: {case.operator.told[-5:]}"
     frames, pulses, _ = found.rates
     assert fault.role == "camera" or frames > 0.0
     assert fault.role == "probe" or pulses > 0.0
-    if name in ONCE:
-        assert fault.role in case.session.loop.status().lost
-        return
     assert found.back_s == found.back_s, f"never back: {case.session.loop.lost} {case.operator.told[-5:]}"
     assert not orders or found.order_s == found.order_s, f"the stage is not used again: {case.operator.told[-5:]}"
     assert fault.role not in case.session.loop.status().lost

@@ -57,7 +57,7 @@ SEND_S = 0.2
 STALE_S = 3.0
 """An engine that has not stirred for so long hangs: nobody would notice that the camera moves. The first pairs of an
 epoch may take it a second on a busy machine."""
-SENDERS = ("camera", "probe", "bmode")
+SENDERS = ("camera", "probe", "motion", "bmode")
 """They send by themselves."""
 
 
