@@ -19,7 +19,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 @pytest.mark.parametrize(
     "name",
-    (
+    [
         "camera-gone",
         "camera-frozen",
         "probe-silent",
@@ -29,7 +29,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         "locator-killed",
         "engine-killed",
         "disk-full",
-    ),
+    ],
 )  # all of them: tools/study_lost.py
 def test_what_is_lost_is_told_and_the_rest_goes_on(case: Rig, name: str) -> None:
     fault = STUDIED[name]
