@@ -207,11 +207,11 @@ class _Feed(Generic[Item]):
                 while not self._end.is_set():
                     self._take(*receive(connection))
             except WireClosed as error:
-                self._shut()
                 if self._steady() and not self._end.is_set():
                     with self._lock:
                         self._lost = f"{self.name} is gone ({error})"
-                self._end.wait(AGAIN_S)
+            self._shut()
+            self._end.wait(AGAIN_S)
 
     def _take(self, header: dict[str, Any], payload: bytearray) -> None:
         index = header.get("index")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +16,7 @@ from fgreg.drivers.bk_oem import BkOemScanner
 from fgreg.drivers.tcp_link import Endpoint
 from fgreg.events import NoteEvent
 from fgreg.models import SessionModel
-from fgreg.online.shared_snapshot import SnapshotReader
+from fgreg.online.shared_snapshot import NoSnapshotError, Received
 from fgreg.operation.conductor import Conductor, ConductorSettings
 from fgreg.operation.loop import LiveLoop
 from fgreg.operation.recorder import Recorder, RecorderState
@@ -28,6 +27,13 @@ from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
 from tests.bk_emulator import Scanner, grabbed
 from tests.network_peers import wait_for
+
+
+class NothingYet:
+    """An estimate that has told nothing."""
+
+    def read(self) -> Received:
+        raise NoSnapshotError("nothing yet")
 
 
 class Quiet:
@@ -79,7 +85,7 @@ def live(scanner: Scanner, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Li
         session,
         Devices(quiet, quiet, quiet, bmode=device),
         cast("Recorder", notes),
-        cast("SnapshotReader", SimpleNamespace()),
+        NothingYet(),
         Conductor(session, ConductorSettings(hearing_threshold=1.0)),
         0.0,
     )
