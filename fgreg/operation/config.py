@@ -31,7 +31,7 @@ from fgreg.operation.config_keys import (
     THRESHOLD,
 )
 from fgreg.operation.holder import HolderSettings
-from fgreg.operation.rooms import HEARING_THRESHOLD
+from fgreg.operation.rooms import HEARING_THRESHOLD, room_truth
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.operation.status import Devices
 from fgreg.pairing import Latencies
@@ -122,7 +122,15 @@ class LiveConfig:
                 sinks=tuple(opened(chosen) for chosen in self.devices.get(Role.SINKS, ())),
             )
 
-        return LiveSetup(self.setup, open_devices, self.stage_setup(around), self.settings, self.holder, self.latencies)
+        return LiveSetup(
+            self.setup,
+            open_devices,
+            self.stage_setup(around),
+            self.settings,
+            self.holder,
+            self.latencies,
+            None if around.room is None else room_truth(around.room),
+        )
 
     def stage_setup(self, around: Surroundings) -> StageSetup | None:
         """The stage for the watchdog; None where there is none."""

@@ -19,7 +19,7 @@ from fgreg.drivers.simulated import (
 from fgreg.models import SessionModel
 from fgreg.operation.conductor import ConductorSettings
 from fgreg.operation.room_truth import write_room_truth
-from fgreg.operation.start import LiveSetup, StageSetup, setup_text
+from fgreg.operation.start import LiveSetup, StageSetup, TellTruth, setup_text
 from fgreg.operation.status import Devices
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import BUMP_EVERY_S, RoomConfig, room_config
@@ -80,5 +80,10 @@ def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSet
         open_devices,
         stage,
         ConductorSettings(aims=config.aims, hearing_threshold=HEARING_THRESHOLD),
-        tell_truth=partial(write_room_truth, partial(ask_truth, path)),
+        tell_truth=room_truth(path),
     )
+
+
+def room_truth(path: Path) -> TellTruth:
+    """What writes the truth about a session in the room whose socket is at ``path``."""
+    return partial(write_room_truth, partial(ask_truth, path))
