@@ -28,6 +28,9 @@ DAMPING = 0.8
 """Share of a site's change that is made at once."""
 FARTHEST_SIGMA = 100.0
 """Sites that ask for an optimum farther away than this are fitted to nothing: where they settle it is a few."""
+UPHILL = 1.0
+"""A step may raise the cost (half a chi square) by so much: it is the last round's sites and linear points that it obeys.
+Shortened for less, it would seem to have settled where it only crept."""
 HALVINGS = 6
 """So often a step is halved before the sites are given up."""
 LEAST_SITE = 1e-3
@@ -83,7 +86,7 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
 
 
 def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[SharedState, Evaluation] | None:
-    """One Gauss-Newton step, shortened until it leads down; None where it does not, or leads anywhere.
+    """One Gauss-Newton step, shortened until it leads up no more; None where it does, or leads anywhere.
 
     Among few pairs the whole step can end far off; sites that are fitted there lead on, to numbers without meaning.
     """
@@ -94,7 +97,7 @@ def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[S
         moved = state.retract(step[None], problem.columns)
         points = at.private.trus_p_pm + (at.point_gain @ step[None, None, :, None])[..., 0]
         there = evaluate(problem, moved, replace(at.private, trus_p_pm=points))
-        if there.cost[0] <= at.cost[0] + 1e-9 * (1.0 + at.cost[0]):
+        if there.cost[0] <= at.cost[0] + UPHILL:
             return moved, there
         step = 0.5 * step
     return None
