@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fgreg.detection.camera import focal_px
 from fgreg.detection.corners import grey, square_corners
+from fgreg.detection.edges import Image
 from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, choose_pose, without_strays
 from fgreg.detection.noise import CornerNoise, fit_covariance
 from fgreg.detection.pose import CornerSet, join
@@ -71,11 +72,36 @@ def _side(tag: FoundTag) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewCorners:
-    """What one view shows of the body: its corners, the tag id of each of their groups, and what was left out."""
+    """What one view shows of the body: its corners, the tag id of each of their groups, what was left out, and the
+    tags' outlines (4 n, 2) in pixels as the detector has them."""
 
     corners: CornerSet | None
     ids: tuple[int, ...]
     left_out: tuple[str, ...]
+    outlines_px: FloatArray
+
+
+Window = tuple[int, int, int, int]
+"""Part of a picture, px: first and last column, first and last row, the last ones exclusive."""
+
+
+def _tags_in(picture: Image, marker: MarkerModel, view: str, near: Window | None) -> tuple[list[FoundTag], list[str]]:
+    """The body's tags, and what was left out; anywhere, or within a window."""
+    large = len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX
+    if near is not None:
+        left, right, top, bottom = near
+        found = find_tags(np.ascontiguousarray(picture[top:bottom, left:right]), marker.dictionary, half=large)
+        corner = np.array([left, top], dtype=np.float64)
+        return _own_tags([FoundTag(tag.id, tag.corners_px + corner) for tag in found], marker, view)
+    tags: list[FoundTag] = []
+    left_out: list[str] = []
+    if large:
+        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, half=True), marker, view)
+    if not tags:
+        tags, left_out = _own_tags(find_tags(picture, marker.dictionary), marker, view)
+    if not tags and not left_out:
+        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, view)
+    return tags, left_out
 
 
 def view_corners(
@@ -86,19 +112,13 @@ def view_corners(
     marker: MarkerModel,
     *,
     edges: bool = True,
+    near: Window | None = None,
 ) -> ViewCorners:
-    """The body's corners in one view, ``view`` 0 (left) or 1 (right)."""
+    """The body's corners in one view, ``view`` 0 (left) or 1 (right); ``near``: tags are looked for there only."""
     picture = grey(image)
-    tags: list[FoundTag] = []
-    left_out: list[str] = []
-    if len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX:
-        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, half=True), marker, VIEW_NAMES[view])
+    tags, left_out = _tags_in(picture, marker, VIEW_NAMES[view], near)
     if not tags:
-        tags, left_out = _own_tags(find_tags(picture, marker.dictionary), marker, VIEW_NAMES[view])
-    if not tags and not left_out:
-        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, VIEW_NAMES[view])
-    if not tags:
-        return ViewCorners(None, (), tuple(left_out))
+        return ViewCorners(None, (), tuple(left_out), np.empty((0, 2)))
     cells = tag_cells(marker.dictionary)
     squares = square_corners(camera, picture, np.stack([tag.corners_px for tag in tags]), cells, edges=edges)
     models = {tag.id: tag for tag in marker.tags}
@@ -123,7 +143,8 @@ def view_corners(
             )
         )
         ids.append(tag.id)
-    return ViewCorners(join(parts) if parts else None, tuple(ids), tuple(left_out))
+    outlines = np.concatenate([tag.corners_px for tag in tags])
+    return ViewCorners(join(parts) if parts else None, tuple(ids), tuple(left_out), outlines)
 
 
 def detect_marker(

@@ -29,7 +29,7 @@ DAMPING = 0.8
 FARTHEST_SIGMA = 100.0
 """Sites that ask for an optimum farther away than this are fitted to nothing: where they settle it is a few."""
 UPHILL = 1.0
-"""A step may raise the cost (half a chi square) by so much: it is the last round's sites and linear points that it obeys.
+"""A step may raise the cost (half a chi square) by so much: what it obeys is the last round's sites, and linear points.
 Shortened for less, it would seem to have settled where it only crept."""
 HALVINGS = 6
 """So often a step is halved before the sites are given up."""

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.marker import ViewCorners, right_corners
+from fgreg.detection.marker import ViewCorners
+from fgreg.detection.view_watch import ViewWatch
 from fgreg.models import MarkerModel, StereoRig
 
 PATIENCE_S = 0.3
@@ -92,19 +93,27 @@ class SecondEye:
         self._end()
 
 
+def right_watch(rig: StereoRig, marker: MarkerModel) -> ViewWatch:
+    """For the right view. Raises ValueError where the rig has none."""
+    if rig.right is None or rig.right_T_left is None:
+        raise ValueError("a right frame, but the rig has no right camera")
+    return ViewWatch(rig.right, 1, rig.right_T_left, marker)
+
+
 def _look(connection: Connection[Any, Any], picture: Any, rig: StereoRig, marker: MarkerModel) -> None:
     """The process, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main program's business
+    watch = right_watch(rig, marker)
     with contextlib.suppress(EOFError, OSError):
         connection.send(True)
         while True:
             shape, kind = connection.recv()
             image = np.frombuffer(picture, np.dtype(kind)).reshape(shape)
             try:
-                found: ViewCorners | None = right_corners(image, rig, marker)
+                found: ViewCorners | None = watch.see(image)
             except Exception:  # the caller meets it as well, and says so
                 found = None
             connection.send(found)
 
 
-__all__ = ["SecondEye"]
+__all__ = ["SecondEye", "right_watch"]

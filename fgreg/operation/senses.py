@@ -19,19 +19,13 @@ import numpy.typing as npt
 
 from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import (
-    MarkerFit,
-    detect_marker,
-    marker_covariance,
-    marker_from_views,
-    right_corners,
-    view_corners,
-)
+from fgreg.detection.marker import MarkerFit, ViewCorners, marker_covariance, marker_from_views
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.detection.view_watch import ViewWatch
 from fgreg.drivers.base import PaFrame, StereoFrame, host_now
 from fgreg.models import SessionModel
 from fgreg.operation.locating import Locator
-from fgreg.operation.second_eye import SecondEye
+from fgreg.operation.second_eye import SecondEye, right_watch
 from fgreg.operation.view import Heard
 from fgreg.pairing import DeviceClock, PairRefused, PoseHistory, TimedPose
 
@@ -56,7 +50,10 @@ class Eyes:
         if model.camera is None or model.marker is None:
             raise ValueError("the session has no camera or no marker")
         self._rig, self._marker = model.camera, model.marker
-        self._second = SecondEye(self._rig, self._marker)
+        rig = self._rig
+        self._left = ViewWatch(rig.left, 0, np.eye(4), self._marker)
+        self._right = None if rig.right is None else right_watch(rig, self._marker)
+        self._second = SecondEye(rig, self._marker)
         self._clock = DeviceClock(latency_s)
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
@@ -83,12 +80,12 @@ class Eyes:
 
     def _detect(self, frame: StereoFrame) -> MarkerFit | NotFound:
         """As :func:`fgreg.detection.marker.detect_marker`, both views at once where that is possible."""
-        rig, marker = self._rig, self._marker
-        if frame.right is None or rig.right is None or not self._second.look(frame.right):
-            return detect_marker(frame.left, frame.right, rig, marker)
-        left = view_corners(frame.left, rig.left, 0, np.eye(4), marker)
-        right = self._second.seen() or right_corners(frame.right, rig, marker)
-        return marker_from_views(left, right, marker)
+        right: ViewCorners | None = None
+        helped = frame.right is not None and self._right is not None and self._second.look(frame.right)
+        left = self._left.see(frame.left)
+        if frame.right is not None and self._right is not None:
+            right = (self._second.seen() if helped else None) or self._right.see(frame.right)
+        return marker_from_views(left, right, self._marker)
 
     def close(self) -> None:
         """End the second eye."""
