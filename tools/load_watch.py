@@ -6,11 +6,12 @@ import math
 import os
 import resource
 import time
+from array import array
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,8 @@ from fgreg.operation.status import Status
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 BUSY_S = 1.0
 """After an event was handed over, something else happens for so long."""
-GROWS_FROM_MIN = 2
+GROWS_FROM_MIN = 4
+"""By then the stage follows: all that a session uses has been loaded."""
 TINY_S = 1e-4
 TRACKER = "resource tracker"
 
@@ -39,8 +41,7 @@ def percentiles(values: list[float]) -> dict[str, float]:
     return out
 
 
-@dataclass(frozen=True, slots=True)
-class _Answered:
+class _Answered(NamedTuple):
     """One frame: when it was answered, its latency, the device's time of its exposure, what else was going on."""
 
     done_s: float
@@ -48,6 +49,25 @@ class _Answered:
     device_s: float
     stage: str
     busy: bool
+
+
+class _Answers:
+    """Frames one after another, in few bytes each: the process's own memory is what is measured."""
+
+    def __init__(self) -> None:
+        self._numbers, self._stages = array("d"), [""]
+
+    def append(self, done_s: float, latency_ms: float, device_s: float, stage: str, *, busy: bool) -> None:
+        if stage not in self._stages:
+            self._stages.append(stage)
+        self._numbers.extend((done_s, latency_ms, device_s, self._stages.index(stage), busy))
+
+    def all(self) -> list[_Answered]:
+        rows = np.array(self._numbers).reshape(-1, 5).tolist()
+        return [_Answered(a, b, c, self._stages[int(k)], bool(busy)) for a, b, c, k, busy in rows]
+
+    def last_device_s(self) -> float:
+        return self._numbers[-3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +83,7 @@ class Spent:
     """What became of the wall time of calls on one thread: at work, waiting for a processor, waiting for something."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, float, float]] = []
+        self._rows = array("d")
 
     @staticmethod
     def now() -> tuple[float, float, float]:
@@ -73,8 +93,7 @@ class Spent:
 
     def add(self, before: tuple[float, float, float]) -> None:
         """A call that began at ``before`` has ended."""
-        wall, used, queued = (1e3 * (b - a) for a, b in zip(before, self.now(), strict=True))
-        self._rows.append((wall, used, queued))
+        self._rows.extend(1e3 * (b - a) for a, b in zip(before, self.now(), strict=True))
 
     def figures(self) -> dict[str, Any]:
         """Percentiles, ms; of the slowest hundredth the means."""
@@ -121,7 +140,7 @@ class Watch:
     def __init__(self, session: Running) -> None:
         self._session = session
         self._began_s = time.monotonic()
-        self._answered: list[_Answered] = []
+        self._answered = _Answers()
         self._spent = {name: Spent() for name in ("turn", "look", "order")}
         self._queues: dict[int, dict[str, int]] = defaultdict(lambda: defaultdict(int))
         self._last_queues: dict[str, int] = {}
@@ -170,9 +189,7 @@ class Watch:
             self._frames = figures.frames
             stamp, latency = status.frame.stamp, figures.latency_ms[-1]
             busy = status.now_s - self._event_s < BUSY_S or status.recorder.waiting > 0
-            self._answered.append(
-                _Answered(stamp.host_s + 1e-3 * latency, latency, stamp.device_s, str(status.stage), busy)
-            )
+            self._answered.append(stamp.host_s + 1e-3 * latency, latency, stamp.device_s, str(status.stage), busy=busy)
         devices = self._session.loop._devices
         self._last_queues = {
             "recorder": status.recorder.waiting,
@@ -192,7 +209,7 @@ class Watch:
         loop = self._session.loop
         devices, figures = loop._devices, loop.figures
         left, dropped = _rest(devices.camera)
-        self._last_frame_s = max((frame.stamp.device_s for frame in left), default=self._answered[-1].device_s)
+        self._last_frame_s = max((frame.stamp.device_s for frame in left), default=self._answered.last_device_s())
         self._end = {
             "frames_dropped_driver": dropped,
             "frames_waiting": len(left),
@@ -210,7 +227,7 @@ class Watch:
 
     def figures(self, made: Made) -> dict[str, Any]:
         """What was seen, beside what was sent: up to the last that was received, as more was on its way at the end."""
-        answered, counts, last = self._answered, self._end, self._last
+        answered, counts, last = self._answered.all(), self._end, self._last
         assert last is not None
         kinds: dict[str, list[float]] = {"all": [a.latency_ms for a in answered]}
         for a in answered:
@@ -297,6 +314,8 @@ class Processes:
 
     def _look(self) -> None:
         own, parents = os.getpid(), _parents()
+        locator = self._session.loop.ears.locator._pid
+        self._parts = {} if locator is None else {locator: "locator"}
         below = [own]
         for pid in below:
             below += [child for child, parent in sorted(parents.items()) if parent == pid]
@@ -317,11 +336,11 @@ class Processes:
             if part in words:
                 return name
         if parents.get(pid) == own:
-            return "engine" if pid == min(engines) else "locator"
+            return self._parts.get(pid) or ("engine" if pid == min(engines) else "second eye")
         return "beside the engine"
 
     def figures(self) -> dict[str, Any]:
-        """By process: memory at each minute and at the end, its growth after minute 2, share of a processor."""
+        """By process: memory at each minute and at the end, its growth since all is in use, share of a processor."""
         lasted = time.monotonic() - self._began_s
         out: dict[str, Any] = {}
         for pid, process in self._found.items():

@@ -21,7 +21,7 @@ from fgreg.online.beside import BEHIND
 
 ASK_S = 0.2
 """It is asked this often whether it is there, also where there is nothing to locate."""
-MUTE_S = 0.7
+MUTE_S = 2.0
 """Without an answer for so long it is told to be gone."""
 HANGS_S = 10.0
 """And ended after so long, for another to take over."""
