@@ -15,7 +15,7 @@ from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.measurements import Pair
 from fgreg.registration import EpochSearch, Registration
 from fgreg.robust import JUNK_P
-from fgreg.steadiness import ALARM, DOUBT
+from fgreg.steadiness import ALARM
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
@@ -38,6 +38,9 @@ MOST_SOUND_SPEED = 0.1
 """No medium is farther off than this: the cause is another."""
 FEW_PMS = 21
 """PMs up to which those before a camera move are enough to spoil a registration, and have to be looked for there."""
+ABOUT_EVEN = 0.6
+"""Bayes factor of a move before any of few PMs, each as likely, against none, from which it is to be reckoned with: one
+in twelve steady sessions of 10 to 20 PMs reaches it, and so does a move of 2 deg between 5 PMs and 6."""
 SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
@@ -197,11 +200,13 @@ def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names:
 def unsteady(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
     """Odds of a camera move among ``pms`` PMs (fgreg.steadiness), likeliest between two: no registration is of both.
 
-    What they are registered to then lies anywhere between, and the predicted error does not know. Among few PMs so few
-    are odd by chance that smaller odds count; among many the wrong ones are left out, or found by --detect-moves.
+    What they are registered to then lies anywhere between, and the predicted error does not know. Among few PMs neither
+    side of a move tells it well, so it counts where a move somewhere among them is about as likely as none; among many
+    the wrong ones are left out, or found by --detect-moves.
     """
     few, alarm = pms <= FEW_PMS, log_odds > ALARM
-    if not (alarm or (few and log_odds > DOUBT)):
+    somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1)
+    if not (alarm or (few and somewhere > ABOUT_EVEN)):
         return []
     return [
         Condition(

@@ -4,6 +4,7 @@ found, and never taken for one registration.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -23,7 +24,7 @@ from fgreg.online.moves import MoveSettings
 from fgreg.registration import register
 from fgreg.steadiness import ALARM, DOUBT, logsumexp, odds_in_epoch
 from fgreg.targets import tre_mm
-from fgreg.verdict import FEW_PMS, unsteady
+from fgreg.verdict import ABOUT_EVEN, FEW_PMS, unsteady
 from tests.forward import Truth, make_measurements
 from tests.online_streams import untold_move
 
@@ -119,10 +120,11 @@ def test_a_steady_epoch_s_first_pms_fit_its_last_ones() -> None:
 @pytest.mark.parametrize(
     ("log_odds", "pms", "verdicts"),
     [
-        (DOUBT - 0.1, 8, []),
-        (DOUBT + 0.1, 8, [Verdict.WARNING]),
+        (math.log(7 * ABOUT_EVEN) - 0.1, 8, []),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 8, [Verdict.WARNING]),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 12, []),
         (ALARM + 0.1, 8, [Verdict.REFUSED]),
-        (DOUBT + 0.1, FEW_PMS + 1, []),
+        (math.log(FEW_PMS * ABOUT_EVEN) + 0.1, FEW_PMS + 1, []),
         (ALARM + 0.1, FEW_PMS + 1, [Verdict.WARNING]),
     ],
 )
