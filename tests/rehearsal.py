@@ -53,6 +53,7 @@ class Rehearsal:
         deaf_from_s: from then on the probe hears nothing. blind_from_s: nor does the camera see the marker.
         latched: why the stage may not move, as the gate would say it; a release ends it.
         told: all that the operator was told, with the time. asked: all actions but words.
+        begun_mm: error of the registration and what was predicted, when the stage began to follow; set by the test.
         errors_deg: while the stage follows a beam held still, how far its plane is off, at the end of each hold.
     """
 
@@ -66,6 +67,7 @@ class Rehearsal:
     told: list[tuple[float, Tell]] = field(default_factory=list)
     asked: list[tuple[float, Action]] = field(default_factory=list)
     errors_deg: list[float] = field(default_factory=list)
+    begun_mm: tuple[float, float] = (math.inf, 0.0)
 
     def __post_init__(self) -> None:
         config = self.room.config.scene

@@ -27,6 +27,8 @@ from fgreg.robust import plausible_cost
 from fgreg.steadiness import DOUBT, logsumexp, odds_in_epoch
 from fgreg.verdict import FEW_PMS, WARN_LEFT_OUT
 
+EVERY = 2
+"""Where some are left out, which the cheap look cannot judge, the test is made at every so many PMs."""
 LEAST_AFTER = 7
 """PMs after a move that have to agree on a registration of their own: one more than it takes."""
 
@@ -60,8 +62,11 @@ def early_case(state: State, setting: Setting, store: MeasurementStore, settings
     early = min(len(looks) - size - 1, len(looks) - LEAST_AFTER, MIN_BEFORE)
     if early < 1 or len(looks) > FEW_PMS:
         return None
+    steady = window is not None and bool(kept_by_place(state)[state.now.first :].all())
+    if not steady and len(looks) % EVERY:
+        return None
     pms = tuple(tuple(store.pair(place, 0, n) for place in mine) for n, mine in enumerate(looks.values()))
-    if window is not None and kept_by_place(state)[state.now.first :].all():
+    if window is not None and steady:
         problem = setting.pack((), [pair for pm in pms for pair in pm])
         posterior = Gaussian(np.zeros(setting.columns.size), window.covariance)
         terms = linearise(problem, window.state)
