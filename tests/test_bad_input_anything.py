@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -176,7 +177,8 @@ def test_damaged_bytes_of_either_file(folder: Path, data: st.DataObject) -> None
     session_files.write(folder)
     path = folder / name
     path.write_bytes(data.draw(damaged(path.read_bytes())))
-    accepted(folder)
+    session = accepted(folder)
+    assert session is None or all(math.isfinite(event.t) for event in session.events)
     session_files.write(folder)
 
 

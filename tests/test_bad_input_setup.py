@@ -191,7 +191,8 @@ def test_all_problems_of_both_files_at_once(tmp_path: Path) -> None:
 def test_either_way_to_read_frames_is_enough(tmp_path: Path, section: str) -> None:
     setup = session_files.setup()
     del setup["probe"][section]
-    read_session(session_files.write(tmp_path, setup))
+    probe = read_session(session_files.write(tmp_path, setup)).model.probe
+    assert (probe.channels is None, probe.image is None) == (section == "channels", section == "image")
 
 
 def test_a_plain_board_with_two_sides_alike_is_refused_and_others_are_not(tmp_path: Path) -> None:

@@ -219,6 +219,10 @@ def test_a_receiver_that_stops_reading_and_dies_is_one_loss(programs: Programs) 
         wait_for(lambda: sink.connected, 15.0)
         programs.end()
         wait_for(lambda: not sink.connected)
+        with pytest.raises(DeviceLost, match="hung up"):
+            sink.send(registration("ok"))
+        sink.send(registration("ok"))  # to nobody, and no loss again
+        assert not sink.connected
         with socket.create_connection(("127.0.0.1", sink.endpoint.port)):
             wait_for(lambda: sink.connected)
     finally:

@@ -53,19 +53,22 @@ def read(folder: Path, content: bytes) -> LiveConfig | None:
 @QUICK
 @given(data=mutated(live_configs.config))
 def test_a_mutated_config(folder: Path, data: Any) -> None:
-    read(folder, dumped(data))
+    found = read(folder, dumped(data))
+    assert found is None or found.path == folder / "live.yaml"
 
 
 @QUICK
 @given(data=mutated(lambda: yaml.safe_load(example_config())))
 def test_a_mutated_example(folder: Path, data: Any) -> None:
-    read(folder, dumped(data))
+    found = read(folder, dumped(data))
+    assert found is None or found.path == folder / "live.yaml"
 
 
 @QUICK
 @given(data=damaged(example_config().encode()))
 def test_damaged_bytes(folder: Path, data: bytes) -> None:
-    read(folder, data)
+    found = read(folder, data)
+    assert found is None or found.path == folder / "live.yaml"
 
 
 @QUICK

@@ -348,7 +348,9 @@ def test_good_command_gets_out_and_one_fault_or_two_let_no_illegal_one_out(kind:
 @pytest.mark.parametrize("disturbance", DISTURBANCES)
 def test_motion_that_is_disturbed_is_stopped(kind: MotionKind, disturbance: str) -> None:
     for before in (0, 1, 5):
-        _machine().motion_is_disturbed(kind, 25.0, disturbance, before)
+        machine = _machine()
+        machine.motion_is_disturbed(kind, 25.0, disturbance, before)
+        assert (machine.driving is None) == (machine.gate.moving is None)
 
 
 GateMachine.TestCase.settings = settings(

@@ -329,7 +329,8 @@ def test_markers_are_in_both_images_and_face_the_camera() -> None:
 def test_every_seed_can_be_realised() -> None:
     for preset in ("phantom", "camera-move", "raw-small"):
         for seed in range(25):
-            simulate(PRESETS[preset], 1000 + seed)
+            made = simulate(PRESETS[preset], 1000 + seed)
+            assert sum(event["type"] == "pair" for event in made.events) >= PRESETS[preset].pairs
 
 
 def test_pms_span_the_tissue() -> None:

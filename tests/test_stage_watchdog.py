@@ -208,6 +208,7 @@ def test_stop_that_the_stage_does_not_take_is_tried_again(session: _Session) -> 
     session.link.stop("enough")
     session.until(lambda: session.told().count("stop") >= 5)
     session.until(lambda: not read_trace(session.folder / "trace")[-1].get("moving", True))
+    assert session.told()[-1] == "stop"
 
 
 def test_bug_in_the_driver_stops_the_stage_and_is_noticed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -231,6 +232,8 @@ def test_bug_in_the_driver_stops_the_stage_and_is_noticed(tmp_path: Path, capfd:
 def test_garbage_on_the_line_latches(session: _Session) -> None:
     session.link._socket.sendall(b"hello\n")
     session.until(lambda: any("cannot be read" in report.reason and report.latched for report in session.reports))
+    session.until(lambda: session.link.view is not None and session.link.view.latched is not None)
+    assert "cannot be read" in str(session.link.view)
 
 
 @pytest.mark.parametrize(

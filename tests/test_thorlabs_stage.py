@@ -130,7 +130,8 @@ def test_garbage_between_replies_is_skipped(garbage: bytes) -> None:
         stage = open_stage(MODEL, port=cube.port)
         cube.garbage = garbage
         stage.move_to(math.radians(8.0), math.radians(20.0))
-        _until(stage, lambda status: _rested(status) and abs(math.degrees(status.scan_rad) - 8.0) < 0.01)
+        status = _until(stage, lambda status: _rested(status) and abs(math.degrees(status.scan_rad) - 8.0) < 0.01)
+        assert not status.fault
         stage.close()
 
 

@@ -13,7 +13,7 @@ import pytest
 from fgreg.cli import main
 from fgreg.config import SolveConfig
 from fgreg.events import AimEvent, CameraMovedEvent, PairEvent
-from fgreg.frames import FloatArray, inverse, make_transform
+from fgreg.frames import FloatArray, make_transform
 from fgreg.live import LiveSession
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
@@ -29,29 +29,10 @@ from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
 from fgreg.targets import tre_mm
-from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
+from tests.forward import make_measurements
+from tests.online_streams import untold_move
 
 CONFIG = SolveConfig()
-
-
-def _session(
-    seed: int, before: int, after: int, motion: FloatArray
-) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """Pairs before and after a motion, all told to be of epoch 0."""
-    rng = np.random.default_rng(seed)
-    trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
-    again = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 1])  # so that both have one window edge
-    model, first, truth = make_measurements(
-        again[0], aims=12, pairs=before, marker_T_laser=beam, trus_T_camera=trus_T_camera
-    )
-    _, second, moved = make_measurements(
-        again[1], aims=0, pairs=after, marker_T_laser=beam, trus_T_camera=trus_T_camera @ inverse(motion)
-    )
-    t = first.pairs[-1].t
-    later = tuple(
-        replace(p, t=p.t + t, pm=p.pm + before, marker=replace(p.marker, id=p.marker.id + 1000)) for p in second.pairs
-    )
-    return model, replace(first, pairs=first.pairs + later), (truth, moved)
 
 
 def _shift(mm: float) -> FloatArray:
@@ -59,7 +40,7 @@ def _shift(mm: float) -> FloatArray:
 
 
 def test_an_untold_move_is_found_where_it_happened() -> None:
-    model, measurements, _ = _session(3, 15, 12, _shift(8.0))
+    model, measurements, _ = untold_move(3, _shift(8.0), after=12, before=15)
     (move,) = find_moves(measurements, model, CONFIG)
     assert abs(move.since - 15) <= 1
     assert move.since_t == measurements.pairs[move.since].t
@@ -88,7 +69,7 @@ def test_too_few_pairs_to_register_are_no_error() -> None:
 
 
 def test_solved_as_epochs_both_registrations_are_good() -> None:
-    model, measurements, truth = _session(7, 15, 15, _shift(10.0))
+    model, measurements, truth = untold_move(7, _shift(10.0), after=15, before=15)
     moves = find_moves(measurements, model, CONFIG)
     split = split_epochs(measurements, moves)
     found = register(split, model, CONFIG)

@@ -129,6 +129,7 @@ class LiveLoop:
         now = host_now()
         if not frames and now - self._stepped_s < STEP_S:
             return False
+        before = self.eyes.newest
         pose = self._look(frames)
         self._listen()
         self._show()
@@ -142,7 +143,7 @@ class LiveLoop:
         for action in self._conductor.step(self._view(now)):
             self._do(action)
         self._take_aim()
-        if frames:
+        if self.eyes.newest is not before:  # it was looked into
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
         self._look_after(host_now())

@@ -166,7 +166,8 @@ class Recorder:
                 self._state = replace(self._state, trouble=str(error), stuck=str(error))
             return False
         except EngineGone:  # the event is on disk, and the next engine takes it in
-            self._moves -= moved
+            with self._lock:
+                self._moves -= moved
             self._revive()
             return True
         except EventRefused as error:
