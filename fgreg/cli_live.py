@@ -293,7 +293,7 @@ def status_line(status: Status) -> str:
     """One line: how far, the estimate, what was told last."""
     known = status.recorder.known
     lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
-    verdict = known.verdict.value if known.registered else "no registration"
+    verdict = status.verdict.value if known.registered else "no registration"
     state = f"epoch {known.epoch}, {known.pairs} looks, {verdict}"
     return f"{status.stage:<11} {state:<36} {status.text}{lost}"
 
@@ -318,14 +318,12 @@ def status_panel(figures: Figures, stage: StageModel, status: Status) -> Any:
         table.add_row(title, Text(text, style=style))  # what devices say is no markup
 
     if known.registered:
-        row("registration", known.verdict.value.upper(), STYLES[known.verdict])
-        row(
-            "predicted error",
-            f"{error_line(None if estimate is None else estimate.predicted_tre)} (95 %, worst target)",
-        )
+        row("registration", status.verdict.value.upper(), STYLES[status.verdict])
+        tre = None if estimate is None or status.void else estimate.predicted_tre
+        row("predicted error", f"{error_line(tre)} (95 %, worst target)")
     else:
         row("registration", "none yet")
-    for reason in known.reasons[:MOST_REASONS]:
+    for reason in status.reasons[:MOST_REASONS]:
         row("", textwrap.shorten(reason, REASON_WIDTH, placeholder=" ..."))
     if status.lost:
         row("LOST", ", ".join(status.lost), "bold white on red")

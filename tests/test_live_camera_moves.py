@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
+from fgreg.cli_live import status_line
 from fgreg.config import SolveConfig
 from fgreg.drivers.base import Command, MotionSample, PaFrame, Registration, Said, StereoFrame, host_now
 from fgreg.errors import EventRefused, FgregError, JournalError
@@ -165,7 +166,11 @@ def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stan
     stand.base_T_camera = MOVED
     stand.turn(0.1)
     assert stand.link.beats[-1] is None
-    assert stand.loop.status().answer is None
+    shown = stand.loop.status()
+    assert shown.answer is None
+    assert shown.verdict is Verdict.REFUSED
+    assert "moving" in shown.reasons[0]
+    assert "REFUSED" in status_line(shown).upper()
     assert any("the camera moves" in told for told in stand.operator.told)
     orders = len(stand.link.orders)
     stand.turn(0.25)

@@ -147,6 +147,10 @@ def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[s
     ("shown", "expected"),
     [
         (status(Verdict.OK), ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8°", "news [red]"]),
+        (
+            replace(status(Verdict.OK), answer=None, void="the camera is moving"),
+            ["REFUSED", "not known yet", "the camera is moving"],
+        ),
         (status(None, ("camera", "stage")), ["none yet", "camera, stage", "get the camera and the stage back", "LOST"]),
         (status(Verdict.REFUSED, ("bmode",), ("long " * 300, "short", "third")), ["REFUSED", "bmode", "No space left"]),
     ],

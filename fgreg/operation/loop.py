@@ -170,6 +170,7 @@ class LiveLoop:
             self.eyes.poses.newest(),
             self.eyes.newest,
             self._bmode,
+            self._void(),
         )
 
     def close(self) -> None:

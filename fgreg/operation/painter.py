@@ -169,6 +169,7 @@ class RerunPainter:
 
     def _draw(self, seen: _Seen) -> None:
         known, number, status, model = seen.estimate, self._number, seen.status, self._model
+        void = "" if status is None else status.void
         if model is None:
             raise AssertionError("the session comes first")
         self._number += 1
@@ -188,9 +189,9 @@ class RerunPainter:
                 trus_T_camera=None if known is None else known.trus_T_camera,
                 covariance=None if known is None else known.covariance,
                 marker_T_laser=self._beam,
-                tre=None if known is None else known.predicted_tre,
-                verdict=Verdict.REFUSED if known is None else known.verdict,
-                reasons=() if known is None else known.reasons,
+                tre=None if known is None or void else known.predicted_tre,
+                verdict=Verdict.REFUSED if known is None or void else known.verdict,
+                reasons=() if known is None else tuple(filter(None, (void, *known.reasons))),
                 pairs=0 if known is None else known.pairs,
                 nis=known.nis if known is not None and isinstance(seen.shot, Pair) else None,
                 used=known is not None and known.used,
@@ -216,7 +217,7 @@ def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
         status.latched,
         None if told is None else stage.scan_from_device(told),
         None if answer is None else answer.sigma_rad,
-        "" if answer is None or status.recorder.known.verdict is Verdict.REFUSED else answer.reason,
+        "" if answer is None or status.verdict is Verdict.REFUSED else answer.reason,
         ended,
     )
 

@@ -17,7 +17,7 @@ from fgreg.drivers.base import (
     StereoFrame,
     TransformSink,
 )
-from fgreg.estimate import TrackEstimate
+from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.motion.keeper import StageKeeper
 from fgreg.operation.recorder import RecorderState
 from fgreg.operation.view import StageView
@@ -87,6 +87,7 @@ class Status:
         text: last told to the operator. task: the last of that which was no news of devices, so what comes next.
         answer: where to turn for the newest pose. plane: the stage. lost: devices that are gone, by role.
         pose, frame: newest. bmode: newest, None where its scanner is gone.
+        void: why what is known of the registration holds no more, whatever its verdict was; empty where it does.
     """
 
     now_s: float
@@ -102,3 +103,14 @@ class Status:
     pose: TimedPose | None
     frame: StereoFrame | None
     bmode: BmodeFrame | None = None
+    void: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the registration as it counts now."""
+        return Verdict.REFUSED if self.void else self.recorder.known.verdict
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why."""
+        return tuple(filter(None, (self.void, *self.recorder.known.reasons)))
