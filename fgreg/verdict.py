@@ -36,6 +36,8 @@ MILD_JUNK = 0.1
 """Junk is mostly farther off than this; so large a share is not."""
 MOST_SOUND_SPEED = 0.1
 """No medium is farther off than this: the cause is another."""
+TELLING_PMS = 6
+"""Fewer PMs know no registration, and say nothing of a second one."""
 FEW_PMS = 21
 """PMs up to which those before a camera move are enough to spoil a registration, and have to be looked for there."""
 ABOUT_EVEN = 0.6
@@ -206,7 +208,7 @@ def unsteady(log_odds: float, before: int, after: int, pms: int) -> list[Conditi
     """
     few, alarm = pms <= FEW_PMS, log_odds > ALARM
     somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1)
-    if not (alarm or (few and somewhere > ABOUT_EVEN)):
+    if not (alarm or (few and pms >= TELLING_PMS and somewhere > ABOUT_EVEN)):
         return []
     return [
         Condition(

@@ -123,6 +123,8 @@ def test_a_steady_epoch_s_first_pms_fit_its_last_ones() -> None:
         (math.log(7 * ABOUT_EVEN) - 0.1, 8, []),
         (math.log(7 * ABOUT_EVEN) + 0.1, 8, [Verdict.WARNING]),
         (math.log(7 * ABOUT_EVEN) + 0.1, 12, []),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 5, []),
+        (ALARM + 0.1, 5, [Verdict.REFUSED]),
         (ALARM + 0.1, 8, [Verdict.REFUSED]),
         (math.log(FEW_PMS * ABOUT_EVEN) + 0.1, FEW_PMS + 1, []),
         (ALARM + 0.1, FEW_PMS + 1, [Verdict.WARNING]),
