@@ -383,20 +383,6 @@ def _about_mean(
     return Posterior(columns, mean, step, tangent, weight, log, effective, covariance)
 
 
-def region_contains(posterior: Posterior, trus_T_camera: FloatArray, epoch: int = 0) -> bool:
-    """Whether a registration (4, 4) lies in the posterior's 95 % region of that epoch.
-
-    The region: an ellipsoid of the posterior's covariance in GTSAM's tangent about the estimate, as large as it takes
-    to hold 95 % of the posterior (which is not Gaussian at few pairs).
-    """
-    at = slice(6 * epoch, 6 * epoch + 6)
-    information = np.linalg.inv(posterior.covariance[at, at])
-    tangent = pose_tangent(posterior.mean.trus_T_camera(epoch)[0], trus_T_camera)
-    square = np.einsum("si,ij,sj->s", posterior.tangent[:, at], information, posterior.tangent[:, at])
-    limit = weighted_quantile(square[:, None], posterior.weight, QUANTILE)[0]
-    return bool(tangent @ information @ tangent <= limit)
-
-
 def pose_tangent(first: FloatArray, second: FloatArray) -> FloatArray:
     """(6,) ``Logmap(first^-1 second)`` of transforms (4, 4), GTSAM's: rotation rad, then translation mm."""
     back = first[:3, :3].T

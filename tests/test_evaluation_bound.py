@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from cramer_rao_bound import FullTruth, beam_covariance, truth_covariance
 
-from fgreg.evaluation.bound import FullTruth, beam_covariance, truth_covariance
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state

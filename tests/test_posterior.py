@@ -7,6 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from credible_region import ellipsoid_contains
 
 from fgreg.answer import answer
 from fgreg.config import SolveConfig
@@ -21,7 +22,6 @@ from fgreg.posterior import (
     log_density,
     pose_tangent,
     predicted_tre,
-    region_contains,
     sample_posterior,
     step_of_tangent,
     tangent_of_step,
@@ -103,7 +103,7 @@ def test_the_truth_is_where_the_posterior_says() -> None:
         posterior, _, truth = _sampled(100 + seed, pairs=10, first_hit=False)
         error = pose_tangent(posterior.mean.trus_T_camera()[0], truth)
         nees.append(error @ np.linalg.solve(posterior.covariance[:6, :6], error))
-        inside += region_contains(posterior, truth)
+        inside += ellipsoid_contains(posterior, truth)
     assert 4.0 < np.mean(nees) < 9.0
     assert inside >= 20  # of 24: fewer has a chance of 1 % where 95 % is the truth
 
@@ -113,12 +113,12 @@ def test_the_region_holds_its_share_of_the_posterior() -> None:
     moved = posterior.mean.take(np.zeros(len(posterior.step), dtype=np.int64)).retract(
         posterior.step, posterior.columns
     )
-    inside = np.array([region_contains(posterior, pose) for pose in moved.trus_T_camera()])
+    inside = np.array([ellipsoid_contains(posterior, pose) for pose in moved.trus_T_camera()])
     assert posterior.weight[inside].sum() == pytest.approx(0.95, abs=0.01)
     far = posterior.mean.trus_T_camera()[0].copy()
     far[:3, 3] += 40.0
-    assert not region_contains(posterior, far)
-    assert region_contains(posterior, posterior.mean.trus_T_camera()[0])
+    assert not ellipsoid_contains(posterior, far)
+    assert ellipsoid_contains(posterior, posterior.mean.trus_T_camera()[0])
 
 
 def test_two_minima_share_the_posterior_by_their_evidence() -> None:
@@ -176,7 +176,7 @@ def test_the_answer_keeps_the_optimum_apart_from_the_mean() -> None:
     assert np.abs(centred.optimum.evaluation.look_residual[0, :, :2]).max() < 2.0
     gaussian = answer(register(measurements, model, SolveConfig(window_shape=False)), SolveConfig(window_shape=False))
     assert gaussian.registration.problem.shapes is None
-    assert region_contains(found.posterior, truth.trus_T_camera[0])
+    assert ellipsoid_contains(found.posterior, truth.trus_T_camera[0])
 
 
 def test_a_posterior_that_runs_away_is_answered_by_the_optimum() -> None:

@@ -17,11 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from fgreg.estimate import TrackEstimate
-from fgreg.measurements import Track
-from fgreg.online.queries import Layout
-from fgreg.online.query_codec import (
+from query_codec import (
     QueryError,
     decode_answer,
     decode_query,
@@ -29,7 +25,11 @@ from fgreg.online.query_codec import (
     encode_error,
     encode_query,
 )
-from fgreg.online.query_server import QueryClient, QueryServer
+from query_server import QueryClient, QueryServer
+
+from fgreg.estimate import TrackEstimate
+from fgreg.measurements import Track
+from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import SharedSnapshot
 from fgreg.tracking import Snapshot, fast_track
 from tests.forward import make_measurements, make_session
@@ -142,8 +142,10 @@ def test_the_process_ends_with_the_one_that_started_it() -> None:
         " s = SharedSnapshot(Layout.of(make_session())); q = QueryServer(s.name)\n"
         " print(q.pid, q.address.path, flush=True); time.sleep(60)\n"
     )
-    command = [sys.executable, "-c", code]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+    command, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+    ) as process:
         assert process.stdout is not None
         pid, path = process.stdout.readline().split()
         process.send_signal(signal.SIGKILL)

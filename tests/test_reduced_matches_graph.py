@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from graph_covariance import GraphCovariance
 
 from fgreg.frames import FloatArray
 from fgreg.graph.explicit import ExplicitGraph, GraphOptions, build_graph
-from fgreg.graph.explicit_solver import GraphCovariance, GraphOptimum
+from fgreg.graph.explicit_solver import GraphOptimum
 from fgreg.graph.explicit_solver import optimize as optimize_graph
 from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
 from fgreg.graph.packing import PackedProblem, pack

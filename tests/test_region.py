@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from credible_region import credible_region
 
 from fgreg.answer import answer
 from fgreg.config import SolveConfig
@@ -13,7 +14,6 @@ from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state
 from fgreg.models import NoiseModel
 from fgreg.posterior import Mode, light, log_density, sample_posterior
-from fgreg.region import credible_region
 from fgreg.registration import register
 from tests.forward import make_measurements, make_session
 

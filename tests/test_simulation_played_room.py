@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from played_room import FRAME_RATE, LOOP_S, Making, PlayedRoom, make_pictures
 
 from fgreg.detection.marker import MarkerFit, detect_marker
 from fgreg.frames import log_so3
-from fgreg.simulation.played_room import FRAME_RATE, LOOP_S, Making, PlayedRoom, make_pictures
 from fgreg.simulation.room import RoomConfig, room_config
 
 SPOTS, LAPS, AIMS = 2, 2, 1

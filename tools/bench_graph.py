@@ -22,6 +22,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from graph_covariance import GraphCovariance
+
 from fgreg.factors.epoch_change import epoch_change_factor
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
@@ -29,7 +31,7 @@ from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
 from fgreg.frames import exp_so3, make_transform
 from fgreg.graph.explicit import GraphOptions, build_graph
-from fgreg.graph.explicit_solver import GraphCovariance, optimize
+from fgreg.graph.explicit_solver import optimize
 from fgreg.graph.explicit_values import SharedValues, initial_values
 from tests.forward import make_measurements
 

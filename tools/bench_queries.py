@@ -36,14 +36,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from query_codec import QueryError
+from query_server import QueryAddress, QueryClient, QueryServer
+
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.queries import Layout
-from fgreg.online.query_codec import QueryError
-from fgreg.online.query_server import QueryAddress, QueryClient, QueryServer
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.tracking import Snapshot, fast_track
 from tests.forward import make_measurements, make_session

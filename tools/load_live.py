@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from load_watch import GROWS_FROM_MIN, Made, Processes, Watch
+from played_room import FRAME_RATE, Making, make_pictures
 
 from fgreg.drivers.simulated import RoomProcess
 from fgreg.drivers.simulated_room import CAMERA_CLOCK_S, PROBE_CLOCK_S
@@ -33,7 +34,6 @@ from fgreg.operation.painter import painted
 from fgreg.operation.rooms import room_setup
 from fgreg.operation.start import running
 from fgreg.session.reading import read_session
-from fgreg.simulation.played_room import FRAME_RATE, Making, make_pictures
 from fgreg.simulation.room import room_config
 from fgreg.threads import NAMES
 

@@ -10,8 +10,9 @@ import json
 import time
 from pathlib import Path
 
+from played_room import FRAME_RATE, Making, PlayedRoom
+
 from fgreg.drivers.simulated_room import RoomServer, serve
-from fgreg.simulation.played_room import FRAME_RATE, Making, PlayedRoom
 from fgreg.simulation.room import room_config
 
 
@@ -38,7 +39,7 @@ class Player(RoomServer):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--socket", type=Path, required=True)
-    parser.add_argument("--pictures", type=Path, required=True, help="made by fgreg.simulation.played_room")
+    parser.add_argument("--pictures", type=Path, required=True, help="made by tools/load_live.py")
     parser.add_argument("--figures", type=Path, required=True, help="written at the end")
     parser.add_argument("--frame-rate", type=float, default=FRAME_RATE, help="a whole part of that of the pictures")
     parser.add_argument("--stay-s", type=float, default=12.0, help="at a spot, while the stage follows")

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from baseline_alternating import LinesAndArcs, register_alternating
+from baseline_point_based import register_points
+from cramer_rao_bound import FullTruth, beam_covariance, truth_covariance
 
 from fgreg.answer import answer
-from fgreg.baselines.alternating import LinesAndArcs, register_alternating
-from fgreg.baselines.point_based import register_points
 from fgreg.batch import track_context
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.evaluation.bound import FullTruth, beam_covariance, truth_covariance
 from fgreg.evaluation.pair_residual import line_to_arc
 from fgreg.evaluation.resolve import pair_residuals, predict
 from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_transform, transform_points

@@ -4,10 +4,10 @@
     python tools/reproduce_paper.py --sessions 20 --slow 1   a first look
     python tools/reproduce_paper.py --only pairs bound --markdown table.md
 
-Columns: (a) is the published alternating method (fgreg.baselines.alternating), started --guess-deg and --guess-mm from
-the truth, theta' kept within the known deviation; (b) is registration by PMs seen in both frames (closed form). fgreg
-starts from no guess. Two measures, never mixed: ``TRE`` is the true error at 27 targets, ``pair residual`` is Eq. 12 of
-the publication (line to arc of held-out pairs, lambda and theta' refitted), which is what was published as TRE.
+Columns: (a) is the published alternating method (baseline_alternating.py), started --guess-deg and --guess-mm from the
+truth, theta' kept within the known deviation; (b) is registration by PMs seen in both frames (closed form). fgreg needs
+no guess. Two measures, never mixed: ``TRE`` is the true error at 27 targets, ``pair residual`` is Eq. 12 of the
+publication (line to arc of held-out pairs, lambda and theta' refitted), which is what was published as TRE.
 ``bound`` is the posterior Cramer-Rao bound at the truth (root of the mean over targets of the trace).
 
 Scene (the publication states none): PMs on a curved tissue surface 22 to 42 mm from a probe of 10 mm radius, x within

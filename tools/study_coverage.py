@@ -33,6 +33,7 @@ from dataclasses import asdict, dataclass
 from itertools import repeat
 
 import numpy as np
+from credible_region import credible_region, ellipsoid_contains
 from scipy.stats import chi2, norm
 
 from fgreg.answer import Answer, answer
@@ -41,8 +42,7 @@ from fgreg.errors import EstimationError
 from fgreg.frames import FloatArray, inverse, transform_points
 from fgreg.graph.reduced_blocks import look_block
 from fgreg.models import NoiseModel
-from fgreg.posterior import pose_tangent, region_contains, target_errors, weighted_quantile
-from fgreg.region import credible_region
+from fgreg.posterior import pose_tangent, target_errors, weighted_quantile
 from fgreg.registration import register
 
 sys.path.insert(0, os.fspath(__import__("pathlib").Path(__file__).resolve().parent.parent))
@@ -137,7 +137,7 @@ def run(cell: Cell, seed: int) -> Outcome | None:
     turn = np.arctan2(moved[:, 1], moved[:, 2]) - np.arctan2(targets[:, 1], targets[:, 2])
     return Outcome(
         in_region=credible_region(found.modes, posterior).contains(real[None]),
-        in_ellipsoid=region_contains(posterior, real),
+        in_ellipsoid=ellipsoid_contains(posterior, real),
         targets_in=float(np.mean(error <= weighted_quantile(samples, posterior.weight, 0.95))),
         nees=float(xi @ np.linalg.solve(posterior.covariance[:6, :6], xi)),
         predicted2=float(np.mean(posterior.weight @ samples**2)),

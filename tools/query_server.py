@@ -22,9 +22,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
+
 from fgreg.estimate import TrackEstimate
 from fgreg.measurements import Track
-from fgreg.online.query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.tracking import fast_track
 

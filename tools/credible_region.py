@@ -14,6 +14,7 @@ from fgreg.frames import FloatArray
 from fgreg.graph.reduced import evaluate, log_posterior, refine
 from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.posterior import (
+    QUANTILE,
     Mode,
     Posterior,
     light,
@@ -55,6 +56,20 @@ def credible_region(modes: tuple[Mode, ...], posterior: Posterior, probability: 
     log = pose_log_density(lighter, state)
     least = weighted_quantile(log[:, None], np.full(SAMPLES, 1.0 / SAMPLES), 1.0 - probability)[0]
     return Region(lighter, posterior.mean, float(least))
+
+
+def ellipsoid_contains(posterior: Posterior, trus_T_camera: FloatArray, epoch: int = 0) -> bool:
+    """Whether a registration (4, 4) lies in the posterior's 95 % ellipsoid of that epoch.
+
+    It has the axes of the posterior's covariance in GTSAM's tangent about the estimate, and is as large as it takes to
+    hold 95 % of the posterior (which is not Gaussian at few pairs).
+    """
+    at = slice(6 * epoch, 6 * epoch + 6)
+    information = np.linalg.inv(posterior.covariance[at, at])
+    tangent = pose_tangent(posterior.mean.trus_T_camera(epoch)[0], trus_T_camera)
+    square = np.einsum("si,ij,sj->s", posterior.tangent[:, at], information, posterior.tangent[:, at])
+    limit = weighted_quantile(square[:, None], posterior.weight, QUANTILE)[0]
+    return bool(tangent @ information @ tangent <= limit)
 
 
 def pose_log_density(modes: tuple[Mode, ...], state: SharedState) -> FloatArray:
