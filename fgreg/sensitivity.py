@@ -41,20 +41,6 @@ def rotation_of_arc(delta_rad: _Angles, range_mm: _Angles, radius_mm: float) -> 
     return np.asarray(np.arctan2(r * np.sin(delta), radius_mm + r * np.cos(delta)))
 
 
-def rotation_of_arc_derivatives(
-    delta_rad: _Angles, range_mm: _Angles, radius_mm: float
-) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of :func:`rotation_of_arc` by delta (rad / rad) and by range (rad / mm).
-
-    With D^2 = R^2 + r^2 + 2 R r cos delta, the squared distance from the axis:
-    r (r + R cos delta) / D^2 and R sin delta / D^2.
-    """
-    delta, r = np.asarray(delta_rad, dtype=np.float64), np.asarray(range_mm, dtype=np.float64)
-    cosine = np.cos(delta)
-    distance2 = radius_mm * radius_mm + r * r + 2.0 * radius_mm * r * cosine
-    return np.asarray(r * (r + radius_mm * cosine) / distance2), np.asarray(radius_mm * np.sin(delta) / distance2)
-
-
 def arc_of_rotation(rotation_rad: _Angles, range_mm: _Angles, radius_mm: float) -> FloatArray:
     """Arc angle off the plane (rad) for a stage rotation: the inverse of :func:`rotation_of_arc`.
 

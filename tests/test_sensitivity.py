@@ -15,7 +15,6 @@ from fgreg.sensitivity import (
     interval_moments,
     log_interval,
     rotation_of_arc,
-    rotation_of_arc_derivatives,
     sensitivity_prior,
     sensitivity_priors,
     window_priors,
@@ -68,19 +67,6 @@ def test_rotation_out_of_reach_gives_the_arc_angle_that_comes_nearest() -> None:
     reached = rotation_of_arc(delta, 2.0, 10.0)
     every = rotation_of_arc(np.linspace(-np.pi, np.pi, 20001), 2.0, 10.0)
     np.testing.assert_allclose(reached, [every.max(), every.min()], atol=1e-7)
-
-
-def test_derivatives_against_differences() -> None:
-    rng = np.random.default_rng(43)
-    delta, r = rng.uniform(-2.0, 2.0, 100), rng.uniform(12.0, 80.0, 100)
-    by_delta, by_range = rotation_of_arc_derivatives(delta, r, 10.0)
-    h = 1e-5
-    np.testing.assert_allclose(
-        by_delta, (rotation_of_arc(delta + h, r, 10.0) - rotation_of_arc(delta - h, r, 10.0)) / (2 * h), atol=1e-9
-    )
-    np.testing.assert_allclose(
-        by_range, (rotation_of_arc(delta, r + h, 10.0) - rotation_of_arc(delta, r - h, 10.0)) / (2 * h), atol=1e-9
-    )
 
 
 def test_first_hit_is_five_degrees_ahead_not_zero() -> None:
