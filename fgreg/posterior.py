@@ -18,7 +18,8 @@ from scipy.special import logsumexp
 
 from fgreg.estimate import PredictedTre
 from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_points
-from fgreg.graph.packing import Anchor, Columns, PackedProblem, only_aims, without_aims
+from fgreg.graph.columns import Columns
+from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
 from fgreg.graph.reduced import evaluate, log_posterior, refine
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_solver import Optimum

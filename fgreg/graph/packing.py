@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fgreg.frames import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
+from fgreg.graph.columns import Columns, make_columns
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import (
     FLOOR_MM,
     POSE_FLOOR,
@@ -26,45 +27,8 @@ from fgreg.measurements import (
 from fgreg.models import SessionModel
 from fgreg.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
 
-if TYPE_CHECKING:
-    from fgreg.graph.shared_state import SharedState
-
 LINE_SIGMA_MM = 1e-3
 """Width of the beam itself: point on line is an equality; this keeps its covariance invertible (as in the factors)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """Where each shared variable sits in the vector of shared perturbations; an absent one is None.
-
-    Order: 6 per epoch (rotation rad, translation mm; right tangent), beam chart 4, window edge 1, then the optional
-    marker bias 3, sound speed ratio 1, probe radius 1.
-    """
-
-    epochs: int
-    bias: int | None
-    sound_speed: int | None
-    radius: int | None
-    size: int
-
-    @property
-    def beam(self) -> int:
-        return 6 * self.epochs
-
-    @property
-    def edge(self) -> int:
-        return 6 * self.epochs + 4
-
-
-def make_columns(epochs: int, *, bias: bool, sound_speed: bool, radius: bool) -> Columns:
-    """Lay out the shared variables."""
-    size = 6 * epochs + 5
-    bias_at = size if bias else None
-    size += 3 * bias
-    sound_at = size if sound_speed else None
-    size += sound_speed
-    radius_at = size if radius else None
-    return Columns(epochs, bias_at, sound_at, radius_at, size + radius)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ import numpy as np
 
 from fgreg.config import SolveConfig
 from fgreg.frames import BoolArray, FloatArray, exp_so3
-from fgreg.graph.packing import Columns
+from fgreg.graph.columns import Columns
 from fgreg.graph.reduced import contributions, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import SharedState

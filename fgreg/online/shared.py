@@ -17,8 +17,8 @@ from scipy.linalg import solve_triangular
 
 from fgreg.factors.adapter import Residual, custom_factor
 from fgreg.frames import FloatArray, exp_so3, hat, log_so3
+from fgreg.graph.columns import Columns
 from fgreg.graph.explicit import Variable
-from fgreg.graph.packing import Columns
 from fgreg.graph.shared_state import SharedState, step_between
 
 POSE = slice(0, 6)

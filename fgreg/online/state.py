@@ -15,8 +15,9 @@ from scipy.special import chdtri
 
 from fgreg.config import SolveConfig
 from fgreg.frames import BoolArray, FloatArray
+from fgreg.graph.columns import Columns
 from fgreg.graph.explicit import Variable
-from fgreg.graph.packing import Columns, PackedProblem
+from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair

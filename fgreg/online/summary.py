@@ -15,8 +15,9 @@ import numpy as np
 
 from fgreg.factors.epoch_change import epoch_change_factor
 from fgreg.frames import BoolArray, FloatArray, IntArray, inverse
+from fgreg.graph.columns import Columns
 from fgreg.graph.explicit import Variable
-from fgreg.graph.packing import BeamArrays, Columns, LookArrays, PackedProblem
+from fgreg.graph.packing import BeamArrays, LookArrays, PackedProblem
 from fgreg.graph.reduced import Contributions, Parts, contributions, refine
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.shared_state import SharedState, step_between

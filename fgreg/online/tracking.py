@@ -9,7 +9,7 @@ import numpy as np
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.frames import FloatArray
-from fgreg.graph.packing import Columns
+from fgreg.graph.columns import Columns
 from fgreg.graph.shared_state import SharedState
 from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.graph.packing import Columns, PackedProblem
+from fgreg.graph.columns import Columns
+from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced import Contributions, contributions, evaluate, refine
 from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times, transposed
 from fgreg.graph.shared_state import SharedState, step_between

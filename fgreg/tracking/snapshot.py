@@ -15,7 +15,7 @@ import numpy as np
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.frames import FloatArray, IntArray
-from fgreg.graph.packing import Columns
+from fgreg.graph.columns import Columns
 from fgreg.graph.shared_state import SharedState
 from fgreg.models import SensitivityModel, SessionModel, StageModel
 from fgreg.tracking.surface_map import SurfaceMap, make_surface_map
