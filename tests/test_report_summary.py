@@ -14,7 +14,6 @@ from rich.console import Console
 
 from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.frames import exp_so3, make_transform
-from fgreg.matching import measured_pairs
 from fgreg.models import SessionModel, StageModel
 from fgreg.report import (
     DetectionFigures,
@@ -25,6 +24,7 @@ from fgreg.report import (
     print_summary,
     summary_dict,
 )
+from fgreg.viewer.result import measured_pairs
 from tests.answers import answer_from_truth, random_covariance
 from tests.forward import make_measurements, make_session
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from fgreg.frames import as_float_array, exp_so3, make_transform
-from fgreg.matching import measured_pairs
 from fgreg.measurements import Look, Measurements
 from fgreg.models import CameraModel
 from fgreg.viewer import scene as scene
+from fgreg.viewer.result import measured_pairs
 from tests.answers import answer_from_truth, random_covariance
 from tests.forward import make_measurements, make_session
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from fgreg.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.frames import FloatArray, inverse, log_so3, transform_points
-from fgreg.matching import measured_pairs
 from fgreg.measurements import Look, MarkerObservation, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.viewer import scene as scene
@@ -297,3 +296,20 @@ class ResultPainter:
         ranges = [pair.look.range_mm for pair in self.measurements.pairs]
         beyond = float(np.linalg.norm(self.model.targets_mm[:, 1:], axis=1).max()) - self.model.probe.radius_mm
         return max([*ranges, beyond]) + 5.0
+
+
+def measured_pairs(pairs: Sequence[PairEstimate], measurements: Measurements) -> tuple[Pair | None, ...]:
+    """The measured pair behind each estimated look, None where nothing was measured (no marker, no sound).
+
+    Estimates list every look of the session, measurements only those that were detected; both are in event order, and
+    ``t`` and ``pm`` tell them apart. Where several looks share both, those in use are served first.
+    """
+    waiting: dict[tuple[float, int], list[Pair]] = {}
+    for pair in measurements.pairs:
+        waiting.setdefault((pair.t, pair.pm), []).append(pair)
+    found: list[Pair | None] = [None] * len(pairs)
+    for position in sorted(range(len(pairs)), key=lambda i: not pairs[i].used):
+        queue = waiting.get((pairs[position].t, pairs[position].pm))
+        if queue:
+            found[position] = queue.pop(0)
+    return tuple(found)
