@@ -10,16 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.errors import EstimationError
-from fgreg.frames import BoolArray, FloatArray
-from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
-from fgreg.graph.reduced import contributions, evaluate, refine
-from fgreg.graph.reduced_blocks import PrivateState, initial_private
-from fgreg.graph.shared_state import SharedState
-from fgreg.online.evidence import LAST, MIN_BEFORE
-from fgreg.online.moves import MoveSettings, MoveTest, check_for_move, relinearisation
-from fgreg.online.selection import private_of, select_pms
-from fgreg.online.white import (
+from fgreg.camera_moves.bayes_filter import MoveSettings, MoveTest, check_for_move, relinearisation
+from fgreg.camera_moves.whitened import (
     Gaussian,
     WhiteTerms,
     gaussian_of,
@@ -28,6 +20,14 @@ from fgreg.online.white import (
     white_terms,
     whiten,
 )
+from fgreg.errors import EstimationError
+from fgreg.frames import BoolArray, FloatArray
+from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
+from fgreg.graph.pm_selection import private_of, select_pms
+from fgreg.graph.reduced import contributions, evaluate, refine
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
+from fgreg.graph.shared_state import SharedState
+from fgreg.online.evidence import LAST, MIN_BEFORE
 from fgreg.robust import junk_p, pm_degrees_of_freedom, pm_limits
 
 MAX_STEPS = 8

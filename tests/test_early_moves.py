@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from fgreg.batch import solve
+from fgreg.camera_moves.bayes_filter import MoveSettings
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.frames import exp_so3, make_transform
@@ -20,7 +21,6 @@ from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.detect import events_in_order, find_moves, split_epochs
 from fgreg.online.early import EarlyCase, early_test
-from fgreg.online.moves import MoveSettings
 from fgreg.registration import register
 from fgreg.steadiness import ALARM, DOUBT, logsumexp, odds_in_epoch
 from fgreg.targets import tre_mm

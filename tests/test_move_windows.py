@@ -10,6 +10,17 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
+from fgreg.camera_moves.bayes_filter import MoveSettings, check_for_move, quick_score
+from fgreg.camera_moves.whitened import (
+    Gaussian,
+    WhiteTerms,
+    WindowRows,
+    add_terms,
+    linearise,
+    pivot_scale,
+    pose_columns,
+    whiten,
+)
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.packing import PackedProblem
@@ -18,8 +29,6 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.moves import MoveSettings, check_for_move, quick_score
-from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, add_terms, linearise, pivot_scale, pose_columns, whiten
 from fgreg.registration import pack_session
 from fgreg.robust import pm_degrees_of_freedom
 from fgreg.steadiness import default_scales

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgreg.camera_moves.bayes_filter import relinearisation
+from fgreg.camera_moves.loop_closure import Return, ReturnTest, default_return_settings, fits_again, which_epoch
+from fgreg.camera_moves.static_tags import TagMotion
+from fgreg.camera_moves.whitened import linearise, pose_columns
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
-from fgreg.online.moves import relinearisation
-from fgreg.online.returns import Return, ReturnTest, default_return_settings, fits_again, which_epoch
-from fgreg.online.selection import select_pms
-from fgreg.online.tags import TagMotion
-from fgreg.online.white import linearise, pose_columns
+from fgreg.graph.pm_selection import select_pms
 from fgreg.registration import pack_session, register
 from tests.epoch_follower import EpochFollower, summarise_aims
 from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera

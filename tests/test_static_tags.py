@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform
-from fgreg.online.tags import (
+from fgreg.camera_moves.static_tags import (
     TagFrame,
     TagPose,
     TagSettings,
@@ -19,6 +18,7 @@ from fgreg.online.tags import (
     tag_motion,
     watch_tags,
 )
+from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform
 from fgreg.steadiness import default_scales
 
 SIGMA = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.8])

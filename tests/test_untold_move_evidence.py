@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from fgreg.camera_moves.bayes_filter import MoveSettings, MoveTest, check_for_move
+from fgreg.camera_moves.whitened import Gaussian, WhiteTerms
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
 from fgreg.measurements import Measurements
-from fgreg.online.moves import MoveSettings, MoveTest, check_for_move
-from fgreg.online.white import Gaussian, WhiteTerms
 from fgreg.registration import pack_session, register
 from fgreg.robust import JUNK_DENSITY
 from fgreg.steadiness import MoveScales, default_scales

@@ -28,6 +28,7 @@ from move_streams import CONFIG, shift_of, two_epochs
 from study_junk import KINDS, spoil
 
 from fgreg.frames import FloatArray, inverse
+from fgreg.graph.pm_selection import select_pms
 from fgreg.graph.reduced import log_posterior, refine
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import make_state
@@ -36,7 +37,6 @@ from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.detect import events_in_order
 from fgreg.online.events import DetectedMove
-from fgreg.online.selection import select_pms
 from fgreg.registration import pack_session
 from tests.forward import Truth, make_measurements
 

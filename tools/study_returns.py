@@ -26,13 +26,13 @@ from dataclasses import replace
 import numpy as np
 from move_streams import CONFIG, ideal_covariance, ideal_tre, many_aims, shift_of, two_epochs
 
+from fgreg.camera_moves.static_tags import TagFrame, TagSettings, TagWatch, watch_tags
 from fgreg.errors import EstimationError
 from fgreg.frames import FloatArray, exp_so3, make_transform
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.detect import events_in_order
-from fgreg.online.tags import TagFrame, TagSettings, TagWatch, watch_tags
 from fgreg.registration import register
 from fgreg.targets import tre_mm
 from tests.forward import Truth

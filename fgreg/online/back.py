@@ -1,7 +1,7 @@
 """The scope put back: an earlier epoch's registration against the pairs of the one that lasts.
 
 What is known of an earlier epoch's registration is what its own pairs, those before, and the aims say; the pairs of the
-epoch that lasts are judged by that (fgreg.online.returns), as they come.
+epoch that lasts are judged by that (fgreg.camera_moves.loop_closure), as they come.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.camera_moves.bayes_filter import relinearisation
+from fgreg.camera_moves.loop_closure import ReturnSettings, ReturnTest, default_return_settings, fits_again, which_epoch
+from fgreg.camera_moves.whitened import gaussian_of, linearise, pivot_scale, pose_columns
 from fgreg.config import SolveConfig
 from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online.moves import relinearisation
-from fgreg.online.returns import ReturnSettings, ReturnTest, default_return_settings, fits_again, which_epoch
 from fgreg.online.shared import Quadratic
 from fgreg.online.state import Setting, State, passed_from, summary
 from fgreg.online.store import MeasurementStore
-from fgreg.online.white import gaussian_of, linearise, pivot_scale, pose_columns
 from fgreg.registration import SoundSpeedPrior, pack_session
 
 MOST_PAIRS = 30

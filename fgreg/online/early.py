@@ -1,10 +1,11 @@
 """Evidence of an untold move early in an epoch: the PMs before it are too few to know a registration by themselves.
 
-The same hypotheses and Bayes factors as of moves among the last PMs (fgreg.online.moves), from the other end of time:
-the last PMs are registered without the first ones, and those follow as a stream, newest first. A move between two PMs
-is as likely either way round, and so is what it leads to: its prior has zero mean. So few PMs before a move are judged
-by the many after it; and each PM is a place for a move in one of the two tests only, so that the sum of all their Bayes
-factors still grows by one per pair on average while nothing happens, which is what the threshold goes by.
+The same hypotheses and Bayes factors as of moves among the last PMs (fgreg.camera_moves.bayes_filter), from the other
+end of time: the last PMs are registered without the first ones, and those follow as a stream, newest first. A move
+between two PMs is as likely either way round, and so is what it leads to: its prior has zero mean. So few PMs before a
+move are judged by the many after it; and each PM is a place for a move in one of the two tests only, so that the sum of
+all their Bayes factors still grows by one per pair on average while nothing happens, which is what the threshold goes
+by.
 """
 
 from __future__ import annotations
@@ -13,15 +14,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.camera_moves.bayes_filter import MoveSettings, check_for_move, quick_score, relinearisation
+from fgreg.camera_moves.whitened import Gaussian, linearise, pose_columns
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.online.evidence import MIN_BEFORE, Tested, size_of
-from fgreg.online.moves import MoveSettings, check_for_move, quick_score, relinearisation
 from fgreg.online.state import Setting, State, kept_by_place
 from fgreg.online.store import MeasurementStore
-from fgreg.online.white import Gaussian, linearise, pose_columns
 from fgreg.registration import Registration, SoundSpeedPrior, pack_session, register
 from fgreg.robust import plausible_cost
 from fgreg.steadiness import DOUBT, logsumexp, odds_in_epoch

@@ -3,7 +3,7 @@
 The window holds the last pairs one by one, and beside them the summary of everything older. The pairs before the last
 :data:`LAST` and the summary are the Gaussian that a move is tested against, linearised where the estimate is now; so
 nothing has to be followed twice. The cheap look uses the rows that every pair came with (fgreg.online.window.Prepared):
-:func:`fgreg.online.moves.quick_score`, exact where nothing is odd and the windows are Gaussian.
+:func:`fgreg.camera_moves.bayes_filter.quick_score`, exact where nothing is odd and the windows are Gaussian.
 
 A registration takes :data:`MIN_BEFORE` PMs: a move before that many of an epoch are in, or before the window, is for
 the test from the other end (fgreg.online.early).
@@ -16,15 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.frames import BoolArray, FloatArray, exp_so3
-from fgreg.graph.columns import Columns
-from fgreg.graph.reduced import contributions, refine
-from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import EpochStart, Measurements
-from fgreg.models import SessionModel
-from fgreg.online.moves import (
+from fgreg.camera_moves.bayes_filter import (
     JUNK_MEMORY,
     MoveSettings,
     MoveTest,
@@ -32,10 +24,7 @@ from fgreg.online.moves import (
     quick_score,
     relinearisation,
 )
-from fgreg.online.selection import private_of, select_pms
-from fgreg.online.shared import Quadratic
-from fgreg.online.state import Setting, State, summary
-from fgreg.online.white import (
+from fgreg.camera_moves.whitened import (
     PRIVATE_ROUNDS,
     Gaussian,
     WhiteTerms,
@@ -46,6 +35,17 @@ from fgreg.online.white import (
     whiten,
     window_pms,
 )
+from fgreg.config import SolveConfig
+from fgreg.frames import BoolArray, FloatArray, exp_so3
+from fgreg.graph.columns import Columns
+from fgreg.graph.pm_selection import private_of, select_pms
+from fgreg.graph.reduced import contributions, refine
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import EpochStart, Measurements
+from fgreg.models import SessionModel
+from fgreg.online.shared import Quadratic
+from fgreg.online.state import Setting, State, summary
 from fgreg.online.window import Bundle, Group, Window
 from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import pm_degrees_of_freedom
@@ -130,7 +130,7 @@ def _history(state: State, before: tuple[Bundle, ...]) -> BoolArray:
 
 
 def cheap_score(window: Window, size: int, columns: Columns, settings: MoveSettings) -> float | None:
-    """:func:`fgreg.online.moves.quick_score` of the last ``size`` PMs; None where one of them does not count."""
+    """:func:`quick_score` of the last ``size`` PMs; None where one of them does not count."""
     groups = window.groups[-size:]
     if not all(group.kept and not group.prepared.far for group in groups):
         return None

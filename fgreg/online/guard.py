@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+from fgreg.camera_moves.static_tags import TagSettings
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnFound, return_case
@@ -14,7 +15,6 @@ from fgreg.online.evidence import GATE, move_case
 from fgreg.online.state import Setting, State
 from fgreg.online.store import MeasurementStore
 from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
-from fgreg.online.tags import TagSettings
 from fgreg.online.updates import FEW_PAIRS
 from fgreg.online.watch import Case, Found, InlineWatch, ProcessWatch, Watch, WatchSettings
 from fgreg.registration import SoundSpeedPrior

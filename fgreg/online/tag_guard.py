@@ -12,9 +12,7 @@ from dataclasses import dataclass, field
 
 from scipy.special import chdtri
 
-from fgreg.frames import FloatArray
-from fgreg.online.events import StaticTags
-from fgreg.online.tags import (
+from fgreg.camera_moves.static_tags import (
     TagFrame,
     TagPose,
     TagSettings,
@@ -25,6 +23,8 @@ from fgreg.online.tags import (
     usable_frame,
     watch_tags,
 )
+from fgreg.frames import FloatArray
+from fgreg.online.events import StaticTags
 
 REST = 6
 """Frames at rest that a motion is measured on."""

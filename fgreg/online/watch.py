@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
 
+from fgreg.camera_moves.bayes_filter import MoveSettings
+from fgreg.camera_moves.loop_closure import ReturnSettings, default_return_settings
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
 from fgreg.online.beside import Beside
 from fgreg.online.early import EarlyCase, early_test
 from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test, tested_last
-from fgreg.online.moves import MoveSettings
-from fgreg.online.returns import ReturnSettings, default_return_settings
 from fgreg.registration import SoundSpeedPrior
 
 Found = MoveFound | ReturnFound

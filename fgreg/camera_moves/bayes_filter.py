@@ -1,8 +1,8 @@
 """Whether the camera moved among the last pairs, and since which: Bayes factors, in closed form per linearisation.
 
 Given the Gaussian of the shared variables from all that came before, the marginal likelihood of the last pairs (as
-whitened equations, fgreg.online.white) under a hypothesis is a product of predictive densities, as a Kalman filter
-runs through them. Hypotheses:
+whitened equations, fgreg.camera_moves.whitened) under a hypothesis is a product of predictive densities, as a Kalman
+filter runs through them. Hypotheses:
 
 - steady: nothing happened.
 - moved before the m-th last pair: the registration is ``trus_T_camera * Exp(xi)`` from there on, xi about the camera
@@ -27,10 +27,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fgreg.camera_moves.whitened import Gaussian, WhiteTerms, WindowRows, linearise
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
-from fgreg.online.white import Gaussian, WhiteTerms, WindowRows, linearise
 from fgreg.robust import JUNK_DENSITY
 from fgreg.sensitivity import interval_moments, log_interval
 from fgreg.steadiness import ALARM, MoveScales, default_scales, log_move_odds, logsumexp

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.online.moves import MoveSettings, Relinearise, check_for_move
-from fgreg.online.tags import TagMotion, log_bayes_of_motion
-from fgreg.online.white import Gaussian, WhiteTerms
+from fgreg.camera_moves.bayes_filter import MoveSettings, Relinearise, check_for_move
+from fgreg.camera_moves.static_tags import TagMotion, log_bayes_of_motion
+from fgreg.camera_moves.whitened import Gaussian, WhiteTerms
 from fgreg.steadiness import MoveScales
 
 SEEN_SIGMAS = 3.0
