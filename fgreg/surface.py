@@ -27,6 +27,20 @@ REACH_MM = 12.0
 """Farthest from a PM that the surface is taken to be known."""
 LONGEST_MM = 30.0
 """Longest stretch (four sigmas) of a beam on which it may end."""
+ALONG_MM = np.arange(1.0, 201.0)
+"""Distances along a ray at which it is compared with the surface; linear in between."""
+SLOPE_STEP_MM = 0.1
+"""Either way of a place: for the surface's slope there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """Where a ray ends: distance along it (mm), point (3,) in TRUS, unit normal (3,), sigma of ``normal @ point``."""
+
+    distance_mm: float
+    trus_p: FloatArray
+    normal: FloatArray
+    sigma_mm: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +75,45 @@ class TissueSurface:
         variance = self.relief_mm**2 - np.sum(weights * near, axis=1)
         variance = np.maximum(variance, 0.0) + np.sum((left @ self.trend_covariance) * left, axis=1)
         return mean, self.inflation * np.sqrt(variance)
+
+    def meet(self, trus_p: FloatArray, trus_d: FloatArray) -> Meeting | None:
+        """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where that is not known.
+
+        It may miss the surface, graze it, or meet it farther than ``REACH_MM`` from all PMs.
+        """
+        points = (trus_p + ALONG_MM[:, None] * trus_d - self.centre) @ self.axes
+        height, sigma = self.height(points[:, :2])
+        gap = points[:, 2] - height
+        crossing, end = _first_rise(gap), _first_rise(gap - 2.0 * sigma)
+        # From where the ray may have met the surface to where it must have: long where it grazes it or comes near it
+        # twice.
+        begin = float(ALONG_MM[0]) if gap[0] + 2.0 * sigma[0] > 0.0 else _first_rise(gap + 2.0 * sigma)
+        if crossing is None or end is None or begin is None or end < crossing or gap[0] > 2.0 * sigma[0]:
+            return None
+        stretch = end - begin
+        met = trus_p + crossing * trus_d
+        place = ((met - self.centre) @ self.axes)[:2]
+        if stretch > LONGEST_MM or float(np.linalg.norm(self.place - place, axis=1).min()) > REACH_MM:
+            return None
+        step = SLOPE_STEP_MM * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        near, _ = self.height(place + step)
+        slope = np.array([near[0] - near[1], near[2] - near[3]]) / (2.0 * SLOPE_STEP_MM)
+        normal = self.axes @ np.array([-slope[0], -slope[1], 1.0])
+        normal = normal / np.linalg.norm(normal)
+        towards = float(normal @ trus_d)
+        if towards < GRAZING:
+            return None
+        return Meeting(crossing, met, normal, stretch / 4.0 * towards)
+
+
+def _first_rise(values: FloatArray) -> float | None:
+    """The first distance at which values at ``ALONG_MM`` rise through zero."""
+    rises = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    if not len(rises):
+        return None
+    i = int(rises[0])
+    share = values[i] / (values[i] - values[i + 1])
+    return float(ALONG_MM[i] + share * (ALONG_MM[i + 1] - ALONG_MM[i]))
 
 
 def _kernel(first: FloatArray, second: FloatArray, relief_mm: float) -> FloatArray:

@@ -22,7 +22,7 @@ from fgreg.estimate import Verdict
 from fgreg.measurements import MarkerObservation, Track
 from fgreg.online.queries import EPOCHS_KEPT, Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
-from fgreg.tracking import EpochSnapshot, Snapshot, SurfaceMap, fast_track, make_surface_map
+from fgreg.tracking import EpochSnapshot, Snapshot, fast_track
 from fgreg.tracking.snapshot import SHARED
 from tests.forward import make_measurements, make_session
 from tests.test_track_surface import some_surface
@@ -35,13 +35,9 @@ hammer()
 """
 
 
-def _surface() -> SurfaceMap:
-    return make_surface_map(some_surface(1, 12))
-
-
 def hammer() -> None:
     """Publish marked snapshots without a pause; for a process of its own."""
-    base = plain_snapshot(MODEL, _surface())
+    base = plain_snapshot(MODEL, some_surface(1, 12))
     with SharedSnapshot(Layout.of(MODEL)) as shared:
         shared.publish(marked_snapshot(base, 1))
         sys.stdout.write(f"{shared.name}\n")
@@ -127,7 +123,7 @@ def test_a_killed_writer_leaves_the_last_snapshot_with_its_age_and_no_memory() -
 @pytest.mark.parametrize("latest_moved", [False, True])
 @pytest.mark.parametrize("ended", [False, True])
 def test_a_version_written_by_half_is_not_taken(latest_moved: bool, ended: bool) -> None:
-    base = plain_snapshot(MODEL, _surface())
+    base = plain_snapshot(MODEL, some_surface(1, 12))
     with SharedSnapshot(Layout.of(MODEL)) as shared:
         shared.publish(marked_snapshot(base, 1))
         reader, fresh = SnapshotReader(shared.name), SnapshotReader(shared.name)

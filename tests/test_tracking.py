@@ -23,7 +23,6 @@ from fgreg.frames import (
 from fgreg.measurements import Look, MarkerObservation, Track, default_marker_covariance
 from fgreg.models import SessionModel
 from fgreg.surface import fit_surface
-from fgreg.tracking import make_surface_map
 from tests.forward import Truth, hear, make_measurements
 
 
@@ -177,7 +176,7 @@ def test_a_plane_is_met_where_it_is() -> None:
     surface = fit_surface(points, covariance, np.tile([0.0, 0.0, 1.0], (12, 1)))
     assert surface is not None
     ray = np.array([0.1, 0.0, 1.0]) / math.hypot(0.1, 1.0)
-    met = make_surface_map(surface).meet(np.array([1.0, 2.0, 0.0]), ray)
+    met = surface.meet(np.array([1.0, 2.0, 0.0]), ray)
     assert met is not None
     # z = 40 + 0.2 x with x = 1 + 0.1 z: z = 40.2 / 0.98
     assert met.trus_p[2] == pytest.approx(40.2 / 0.98, abs=0.02)

@@ -11,7 +11,8 @@ from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.measurements import Measurements, Pair, Track
 from fgreg.models import SessionModel
-from fgreg.tracking import EpochSnapshot, Snapshot, SurfaceMap, TrackContext
+from fgreg.surface import TissueSurface
+from fgreg.tracking import EpochSnapshot, Snapshot, TrackContext
 from fgreg.tracking.snapshot import SHARED
 
 
@@ -44,7 +45,9 @@ def marked_snapshot(base: Snapshot, value: int) -> Snapshot:
     )
     surface = base.surface
     if surface is not None:
-        surface = replace(surface, table=np.full_like(surface.table, number), place=np.full_like(surface.place, number))
+        surface = replace(
+            surface, residual=np.full_like(surface.residual, number), place=np.full_like(surface.place, number)
+        )
     return replace(base, t=number, pairs=value, epochs=(epoch,), beam=np.full(4, number), surface=surface, prepared={})
 
 
@@ -53,10 +56,10 @@ def is_whole(snapshot: Snapshot) -> bool:
     value, epoch, surface = snapshot.pairs, snapshot.epochs[0], snapshot.surface
     whole = snapshot.t == value and epoch.reason == str(value) and bool((snapshot.beam == value).all())
     whole = whole and bool((epoch.covariance == value).all() and (epoch.translation_mm == value).all())
-    return whole and (surface is None or bool((surface.table == value).all() and (surface.place == value).all()))
+    return whole and (surface is None or bool((surface.residual == value).all() and (surface.place == value).all()))
 
 
-def plain_snapshot(model: SessionModel, surface: SurfaceMap | None = None) -> Snapshot:
+def plain_snapshot(model: SessionModel, surface: TissueSurface | None = None) -> Snapshot:
     """A snapshot that no session was solved for."""
     return Snapshot(
         t=0.0,

@@ -46,7 +46,8 @@ from fgreg.online.tie import with_motion
 from fgreg.online.tracking import online_snapshot
 from fgreg.online.updates import is_kept, with_aim, with_move, with_pair
 from fgreg.registration import SoundSpeedPrior
-from fgreg.tracking import Snapshot, SurfaceMap, fast_track
+from fgreg.surface import TissueSurface
+from fgreg.tracking import Snapshot, fast_track
 from fgreg.verdict import accuracy
 
 NOT_JUDGED = "this camera epoch has not been judged by the full solve yet: take the estimate as preliminary"
@@ -88,7 +89,7 @@ class OnlineRegistration:
         self._judgement: Judgement | None = None
         self._caught: Judgement | None = None
         self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
-        self._surface: SurfaceMap | None = None
+        self._surface: TissueSurface | None = None
         kinds: dict[str, Callable[[], Judge]] = {
             "inline": lambda: InlineJudge(model, self._config, sound_speed_prior),
             "process": lambda: ProcessJudge(model, self._config, sound_speed_prior),

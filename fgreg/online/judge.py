@@ -23,7 +23,7 @@ from fgreg.models import SessionModel
 from fgreg.online.beside import Beside
 from fgreg.posterior import pose_tangent
 from fgreg.registration import SoundSpeedPrior
-from fgreg.tracking import SurfaceMap, make_surface_map
+from fgreg.surface import TissueSurface
 
 JUDGED_AT = (*range(1, 9), 10, 12, 15, 20, 25, 30, 40, 60, 80)
 """Pairs of an epoch at which it is judged; from there on whenever they have doubled."""
@@ -60,7 +60,7 @@ class Judgement:
     shift: FloatArray | None
     root: FloatArray | None
     optimum_root: FloatArray | None
-    surface: SurfaceMap | None = None
+    surface: TissueSurface | None = None
 
     def applied(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The posterior's covariance, and the tangent from optimum to mean, for an optimum of this covariance (6, 6).
@@ -104,7 +104,7 @@ def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
         shift,
         root,
         optimum_root,
-        None if context is None or context.surface is None else make_surface_map(context.surface),
+        None if context is None else context.surface,
     )
 
 

@@ -8,24 +8,10 @@ from typing import Any
 import numpy as np
 
 from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray
 from fgreg.models import SensitivityModel, SessionModel, StageModel
-from fgreg.surface import MOST_POINTS
-from fgreg.tracking import EpochSnapshot, Snapshot, SurfaceMap, fast_track, make_snapshot, make_surface_map
+from fgreg.surface import MOST_POINTS, TissueSurface
+from fgreg.tracking import EpochSnapshot, Snapshot
 from fgreg.tracking.snapshot import SHARED
-from fgreg.tracking.surface_map import NODES
-
-__all__ = [
-    "EpochSnapshot",
-    "Layout",
-    "Snapshot",
-    "SnapshotDecoder",
-    "SurfaceMap",
-    "encode_snapshot",
-    "fast_track",
-    "make_snapshot",
-    "make_surface_map",
-]
 
 Record = np.ndarray[Any, np.dtype[Any]]
 """A structured array of shape ()."""
@@ -96,11 +82,12 @@ class Layout:
                 ("axes", "f8", (3, 3)),
                 ("centre", "f8", (3,)),
                 ("place", "f8", (MOST_POINTS, 2)),
+                ("covariance_inverse", "f8", (MOST_POINTS, MOST_POINTS)),
                 ("trend", "f8", (3,)),
-                ("far_variance", "f8", (3, 3)),
-                ("origin", "f8", (2,)),
-                ("spacing", "f8", (2,)),
-                ("table", "f8", (NODES, NODES, 2)),
+                ("trend_covariance", "f8", (3, 3)),
+                ("residual", "f8", (MOST_POINTS,)),
+                ("relief_mm", "f8"),
+                ("inflation", "f8"),
             ]
         )
 
@@ -111,7 +98,7 @@ def layout_of(sensitivity: SensitivityModel, epochs: int = EPOCHS_KEPT) -> Layou
     return Layout(sensitivity.depth_mm.size, 0 if curve is None else curve.size, epochs)
 
 
-_SURFACE = ("axes", "centre", "trend", "far_variance", "origin", "spacing", "table")
+_SURFACE = ("axes", "centre", "trend", "trend_covariance", "relief_mm", "inflation")
 _SCALARS = ("t", "pairs", "origin_shift_mm", "edge_rad", "sound_speed_ratio", "radius_mm", "edge_variance")
 _ARRAYS = ("marker_T_nominal", "beam", "bias_mm")
 
@@ -144,7 +131,9 @@ def encode_snapshot(snapshot: Snapshot, record: Record) -> None:
     if surface is not None:
         for name in _SURFACE:
             record[name] = getattr(surface, name)
-        record["place"][: len(surface.place)] = surface.place
+        count = len(surface.place)
+        record["place"][:count], record["residual"][:count] = surface.place, surface.residual
+        record["covariance_inverse"][:count, :count] = surface.covariance_inverse
 
 
 def _encode_session(snapshot: Snapshot, record: Record) -> None:
@@ -188,8 +177,17 @@ class SnapshotDecoder:
         places = int(record["places"])
         surface = None
         if places:
-            parts: dict[str, FloatArray] = {name: record[name] for name in _SURFACE}
-            surface = SurfaceMap(place=record["place"][:places], **parts)
+            surface = TissueSurface(
+                axes=record["axes"],
+                centre=record["centre"],
+                place=record["place"][:places],
+                covariance_inverse=record["covariance_inverse"][:places, :places],
+                trend=record["trend"],
+                trend_covariance=record["trend_covariance"],
+                residual=record["residual"][:places],
+                relief_mm=float(record["relief_mm"]),
+                inflation=float(record["inflation"]),
+            )
         return Snapshot(
             t=float(record["t"]),
             pairs=int(record["pairs"]),

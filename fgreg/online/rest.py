@@ -33,7 +33,7 @@ from fgreg.online.window import (
     private_keys,
     windows_of,
 )
-from fgreg.tracking import SurfaceMap
+from fgreg.surface import TissueSurface
 
 LEAST_EFFORT: Final = 100
 """Effort, in events of the usual kind, after which there is a rest, or an eighth of the session's pairs where that is
@@ -80,7 +80,7 @@ class Rest:
     serial: int
     estimate_t: float
     judgement: Judgement | None
-    surface: SurfaceMap | None
+    surface: TissueSurface | None
     noticed: Noticed = Noticed()
 
 

@@ -26,8 +26,7 @@ from fgreg.online.state import EpochData, Recent, Setting, State
 from fgreg.online.store import MeasurementStore
 from fgreg.online.summary import Chunk, Shelf, plus_tally, tally_of
 from fgreg.online.window import Bundle, GroupSeed, WindowSeed
-from fgreg.tracking import SurfaceMap
-from fgreg.tracking.surface_map import NODES
+from fgreg.surface import MOST_POINTS, TissueSurface
 
 INT64 = 2**63
 MOST_ROWS, MOST_PLACES = 10_000, 1_000_000
@@ -155,11 +154,11 @@ def _put_judgement(sink: Sink, found: Judgement | None) -> None:
             sink.array(values)
 
 
-def _put_surface(sink: Sink, surface: SurfaceMap | None) -> None:
-    sink.integers(0 if surface is None else len(surface.place), 0 if surface is None else len(surface.table))
+def _put_surface(sink: Sink, surface: TissueSurface | None) -> None:
+    sink.integers(0 if surface is None else len(surface.place))
     if surface is not None:
-        for name in SurfaceMap.__slots__:
-            sink.array(getattr(surface, name))
+        for name in TissueSurface.__slots__:
+            sink.array(np.asarray(getattr(surface, name)))
 
 
 def _put_noticed(sink: Sink, noticed: Noticed) -> None:
@@ -369,14 +368,21 @@ def _judgement(source: Source, epochs: int) -> Judgement | None:
     return Judgement(serial, epoch, pairs, verdict, texts, pose, covariance, tre, shift, root, optimum_root, None)
 
 
-def _surface(source: Source) -> SurfaceMap | None:
-    places, nodes = source.integer(0, MOST_ROWS), source.integer(0, NODES)
+def _surface(source: Source) -> TissueSurface | None:
+    places = source.integer(0, MOST_POINTS)
     if not places:
         return None
-    if nodes != NODES:
-        raise ValueError("another table")
-    sizes = ((3, 3), (3,), (places, 2), (3,), (3, 3), (2,), (2,), (nodes, nodes, 2))
-    return SurfaceMap(*(source.array(*size) for size in sizes))
+    return TissueSurface(
+        axes=source.array(3, 3),
+        centre=source.array(3),
+        place=source.array(places, 2),
+        covariance_inverse=source.array(places, places),
+        trend=source.array(3),
+        trend_covariance=source.array(3, 3),
+        residual=source.array(places),
+        relief_mm=source.number(),
+        inflation=source.number(),
+    )
 
 
 def _noticed(source: Source, epochs: int, pairs: int) -> Noticed:

@@ -15,7 +15,8 @@ from fgreg.models import SessionModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.posterior import pose_tangent, step_of_tangent
 from fgreg.readout import beam_origin_shift
-from fgreg.tracking import Snapshot, SurfaceMap, make_snapshot
+from fgreg.surface import TissueSurface
+from fgreg.tracking import Snapshot, make_snapshot
 
 POSE = slice(0, 6)
 
@@ -51,7 +52,7 @@ def online_snapshot(
     config: SolveConfig,
     estimate: OnlineEstimate,
     optimum: tuple[SharedState, FloatArray, Columns] | None,
-    surface: SurfaceMap | None,
+    surface: TissueSurface | None,
 ) -> Snapshot:
     """What queries are answered from after an event: the camera epoch that lasts, and no other.
 

@@ -3,15 +3,12 @@
 from fgreg.tracking.answer import fast_track
 from fgreg.tracking.context import TrackContext, track
 from fgreg.tracking.snapshot import EpochSnapshot, Snapshot, make_snapshot
-from fgreg.tracking.surface_map import SurfaceMap, make_surface_map
 
 __all__ = [
     "EpochSnapshot",
     "Snapshot",
-    "SurfaceMap",
     "TrackContext",
     "fast_track",
     "make_snapshot",
-    "make_surface_map",
     "track",
 ]

@@ -18,7 +18,7 @@ from fgreg.frames import FloatArray, IntArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.shared_state import SharedState
 from fgreg.models import SensitivityModel, SessionModel, StageModel
-from fgreg.tracking.surface_map import SurfaceMap, make_surface_map
+from fgreg.surface import TissueSurface
 
 if TYPE_CHECKING:
     from fgreg.tracking.context import TrackContext
@@ -75,7 +75,7 @@ class Snapshot:
     stage: StageModel
     amplitude_sigma: float
     window_shape: bool
-    surface: SurfaceMap | None
+    surface: TissueSurface | None
     oldest: int = 0
     prepared: dict[int, Prepared] = field(default_factory=dict, repr=False)
     """What queries of an epoch have in common, kept from the first one."""
@@ -126,7 +126,6 @@ class Snapshot:
             t: time of its last event. pairs: how many entered.
             refused: the epochs refused, with the reason (which may be empty).
         """
-        surface = None if context.surface is None else make_surface_map(context.surface)
         return make_snapshot(
             context.model,
             context.config,
@@ -135,7 +134,7 @@ class Snapshot:
             context.posterior.columns,
             context.epochs,
             origin_shift_mm=context.origin_shift_mm,
-            surface=surface,
+            surface=context.surface,
             t=t,
             pairs=pairs,
             causal=context.causal,
@@ -168,7 +167,7 @@ def make_snapshot(
     epochs: Sequence[int],
     *,
     origin_shift_mm: float,
-    surface: SurfaceMap | None,
+    surface: TissueSurface | None,
     t: float,
     pairs: int,
     causal: bool,
