@@ -17,7 +17,7 @@ import typer
 
 from fgreg.cli_options import LimitOption, solve_config
 from fgreg.errors import InputError
-from fgreg.threads import one_thread_each
+from fgreg.workers.threads import one_thread_each
 
 if TYPE_CHECKING:
     from fgreg.config import SolveConfig

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from fgreg.operation.interpreter import SWITCH_S, undisturbed
-from fgreg.threads import NAMES, one_thread_each
+from fgreg.workers.threads import NAMES, one_thread_each
 
 
 def test_processes_get_one_thread_each_unless_the_user_has_said_how_many(monkeypatch: pytest.MonkeyPatch) -> None:

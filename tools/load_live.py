@@ -35,7 +35,7 @@ from fgreg.operation.rooms import room_setup
 from fgreg.operation.start import running
 from fgreg.session.reading import read_session
 from fgreg.simulation.room import room_config
-from fgreg.threads import NAMES
+from fgreg.workers.threads import NAMES
 
 P50_MS, P99_MS = 40.0, 100.0
 RECORDER_WAITS, PULSES_WAIT = 12, 30

@@ -26,8 +26,8 @@ from fgreg.evaluation.resolve import Resolved, resolve
 from fgreg.frames import FloatArray
 from fgreg.sensitivity import wrap_angle
 from fgreg.targets import beam_error, tre_mm
-from fgreg.threads import one_thread_each
 from fgreg.verdict import Condition
+from fgreg.workers.threads import one_thread_each
 
 Progress = Callable[[str, int, int], None]
 """Called with the step's name, items done and items in all."""

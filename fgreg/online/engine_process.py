@@ -24,7 +24,6 @@ from fgreg.estimate import TrackEstimate
 from fgreg.frames import FloatArray
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
-from fgreg.online.beside import BEHIND
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
@@ -33,6 +32,7 @@ from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.registration import SoundSpeedPrior
 from fgreg.tracking import fast_track
+from fgreg.workers.worker_process import NICENESS
 
 START_S = 60.0
 IDLE_S = 0.1
@@ -222,7 +222,7 @@ def _serve(
     prior: SoundSpeedPrior | None,
 ) -> None:
     """The process."""
-    os.nice(BEHIND)
+    os.nice(NICENESS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main program ends it, in its own time
     with (
         OnlineRegistration(model, config, judge="process", watch="process", sound_speed_prior=prior) as engine,

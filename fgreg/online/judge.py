@@ -20,10 +20,10 @@ from fgreg.estimate import PredictedTre, Verdict
 from fgreg.frames import FloatArray
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
-from fgreg.online.beside import Beside
 from fgreg.posterior import pose_tangent
 from fgreg.registration import SoundSpeedPrior
 from fgreg.surface import TissueSurface
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 JUDGED_AT = (*range(1, 9), 10, 12, 15, 20, 25, 30, 40, 60, 80)
 """Pairs of an epoch at which it is judged; from there on whenever they have doubled."""
@@ -205,37 +205,43 @@ def _judged(case: Case, model: SessionModel, config: SolveConfig, sound_speed: S
     return judge(case, model, config, sound_speed)[0]
 
 
+def _judging(model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> Work[Case, Judgement]:
+    return partial(_judged, model=model, config=config, sound_speed=sound_speed)
+
+
 class ProcessJudge:
-    """Judges in a process of its own: when it is idle and the epoch has grown by a quarter since, or by few pairs."""
+    """Judges in a worker process: when it is idle and the epoch has grown by a quarter since, or by few pairs."""
 
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
-        work = partial(_judged, model=model, config=config, sound_speed=sound_speed)
-        self._beside: Beside[Case, Judgement] = Beside(work, "fgreg-judge", "the judging process")
+        of = (model, config, sound_speed)
+        self._worker: WorkerProcess[Case, Judgement] = WorkerProcess(
+            _judging, *of, name="fgreg-judge", what="the judging process"
+        )
         self._asked: tuple[int, int] = (-1, 0)
 
     @property
     def failure(self) -> str:
         """What went wrong with the last case."""
-        return self._beside.failure
+        return self._worker.failure
 
     def ask(self, case: Callable[[], Case], pairs: int) -> None:
         """Send the case where the process is idle and enough is new."""
         _, before = self._asked
-        if self._beside.busy or before <= pairs < before + max(1, before // 4):
+        if self._worker.busy or before <= pairs < before + max(1, before // 4):
             return
         made = case()
-        if self._beside.send(made):
-            self._asked = (made.epoch, pairs)
+        self._worker.send(made)
+        self._asked = (made.epoch, pairs)
 
     def answer(self) -> Judgement | None:
         """What has come back since."""
-        found = self._beside.fetch()
+        found = self._worker.fetch()
         return None if found is None else found[0]
 
     def forgive(self) -> None:
         """The failure is of the past."""
-        self._beside.failure = ""
+        self._worker.failure = ""
 
     def close(self) -> None:
         """End the process."""
-        self._beside.close()
+        self._worker.close()

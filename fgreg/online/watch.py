@@ -16,10 +16,10 @@ from fgreg.camera_moves.loop_closure import ReturnSettings, default_return_setti
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
 from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
-from fgreg.online.beside import Beside
 from fgreg.online.early import EarlyCase, early_test
 from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test, tested_last
 from fgreg.registration import SoundSpeedPrior
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 Found = MoveFound | ReturnFound
 
@@ -109,36 +109,45 @@ class InlineWatch:
         """Nothing to stop."""
 
 
+def _testing(
+    model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: WatchSettings
+) -> Work[Case, Found | None]:
+    return partial(tested, model=model, config=config, prior=prior, settings=settings)
+
+
 class ProcessWatch:
-    """Tests in a process of its own; what comes while it is busy waits, and only the latest of that is tested."""
+    """Tests in a worker process; what comes while it is busy waits, and only the latest of that is tested."""
 
     def __init__(
         self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: WatchSettings
     ) -> None:
-        work = partial(tested, model=model, config=config, prior=sound_speed, settings=settings)
-        self._beside: Beside[Case, Found | None] = Beside(work, "fgreg-watch", "the watching process")
+        of = (model, config, sound_speed, settings)
+        self._worker: WorkerProcess[Case, Found | None] = WorkerProcess(
+            _testing, *of, name="fgreg-watch", what="the watching process"
+        )
         self._waiting: Case | None = None
         self._stale = False
 
     @property
     def failure(self) -> str:
         """Why the last case could not be tested."""
-        return self._beside.failure
+        return self._worker.failure
 
     def ask(self, case: Case) -> None:
         """Send the case, as soon as the process is idle."""
         self._waiting = case
-        if not self._beside.busy:
+        if not self._worker.busy:
             self._send()
 
     def _send(self) -> None:
         case, self._waiting = self._waiting, None
-        if case is not None and self._beside.send(case):
+        if case is not None:
+            self._worker.send(case)
             self._stale = False
 
     def answer(self) -> Found | None:
         """What has come back since."""
-        found, stale = self._beside.fetch(), self._stale
+        found, stale = self._worker.fetch(), self._stale
         if found is None:
             return None
         self._send()
@@ -146,8 +155,8 @@ class ProcessWatch:
 
     def forget(self) -> None:
         """What waits goes; an answer that is under way will not count."""
-        self._waiting, self._stale = None, self._beside.busy
+        self._waiting, self._stale = None, self._worker.busy
 
     def close(self) -> None:
         """End the process."""
-        self._beside.close()
+        self._worker.close()

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.models import ProbeModel
-from fgreg.online.beside import BEHIND
+from fgreg.workers.worker_process import NICENESS
 
 ASK_S = 0.2
 """It is asked this often whether it is there, also where there is nothing to locate."""
@@ -104,7 +104,7 @@ class Locator:
 
 def _stand_back() -> None:
     """Frames come first: sources are located in what they leave. Ctrl-C is the main program's business."""
-    os.nice(BEHIND)
+    os.nice(NICENESS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
