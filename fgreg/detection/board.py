@@ -72,22 +72,6 @@ def board_corner(fit: BoardFit, column: int, row: int, noise: CornerNoise) -> tu
     return rotation @ board_p + fit.camera_T_board[:3, 3], covariance
 
 
-def board_refusal(board: BoardModel) -> str | None:
-    """Why this board cannot be used; None where it can.
-
-    On a plain board the square at the far end from a black corner square is columns + rows squares away, so black
-    where that is even: then half a turn looks the same.
-    """
-    if board.charuco is None and min(board.columns, board.rows) < 3:
-        return f"a plain board of {board.columns} x {board.rows} inner corners is too small to be found, at least 3 x 4"
-    if board.charuco is None and (board.columns + board.rows) % 2 == 0:
-        return (
-            f"a plain board of {board.columns} x {board.rows} inner corners looks the same after half a turn; "
-            "one of columns and rows has to be odd and the other even, or use ChArUco"
-        )
-    return None
-
-
 def _find_chessboard(image: Image, board: BoardModel) -> FloatArray | None:
     """Inner corners (rows * columns, 2), in rows, from any of the ends; None where the board is not all in view."""
     size = (board.columns, board.rows)
@@ -260,9 +244,6 @@ def detect_board(
     """
     if left is None and right is None:
         raise ValueError("no frame to detect in")
-    refused = board_refusal(board)
-    if refused:
-        return NotFound(f"board: {refused}")
     parts: list[CornerSet] = []
     if left is not None:
         corners = _view_corners(left, rig.left, 0, np.eye(4), board)

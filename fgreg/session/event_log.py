@@ -25,11 +25,15 @@ from fgreg.frames import FloatArray
 from fgreg.session.frames_named import FrameKind, FrameUse, locate_frame
 from fgreg.session.safe_yaml import open_file
 from fgreg.session.schema import NOT_NEGATIVE, Bounds, Fields, Place, shown
-from fgreg.session.setup import COORDINATE_MM, LATERAL_MM, RANGE_MM, SCAN_DEG, Setup
+from fgreg.session.setup import Setup
 
 MAX_LINE_BYTES = 1_000_000
 _MAX_INTEGER_DIGITS = 30
 _SECONDS = Bounds(unit="s")
+SCAN_DEG = Bounds(-180.0, 180.0, unit="deg")
+RANGE_MM = Bounds(0.0, 300.0, above=True, unit="mm")
+LATERAL_MM = Bounds(-200.0, 200.0, unit="mm")
+COORDINATE_MM = Bounds(-2000, 2000, unit="mm")
 
 _FIELDS = {
     "aim": ("marker", "camera_p_spot_mm", "covariance", "corner"),

@@ -15,12 +15,12 @@ from pathlib import Path
 from fgreg.errors import InputError
 from fgreg.events import Event, PairEvent, TrackEvent
 from fgreg.models import SessionModel
-from fgreg.session.event_log import EventLog, read_events
+from fgreg.session.event_log import COORDINATE_MM, SCAN_DEG, EventLog, read_events
 from fgreg.session.frames_named import check_frames
 from fgreg.session.ground_truth import GroundTruth, TrackTruth
 from fgreg.session.safe_yaml import load_yaml
 from fgreg.session.schema import Bounds, Fields, Place, read_numbers, read_transform, shown
-from fgreg.session.setup import COORDINATE_MM, SCAN_DEG, Setup, read_setup
+from fgreg.session.setup import Setup, read_setup
 
 SETUP_FILE = "session.yaml"
 EVENTS_FILE = "events.jsonl"
