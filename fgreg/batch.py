@@ -31,7 +31,7 @@ from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, SoundSpeedPrior, register
 from fgreg.steadiness import logsumexp, odds_in_epoch
 from fgreg.surface import fit_surface
-from fgreg.tracking import Snapshot, TrackContext, fast_track
+from fgreg.tracking import Snapshot, make_snapshot, track
 from fgreg.verdict import (
     SURE_OF_AIMS,
     SURE_OF_PAIRS,
@@ -66,7 +66,7 @@ class Solution:
     """The answer for a session's measurements: everything but the session's name.
 
     ``pairs``, ``tracks`` and ``aims`` are in the order of what was given. ``registration``, ``posterior`` and
-    ``context`` are None where nothing could be computed.
+    ``snapshot`` (what queries are answered from) are None where nothing could be computed.
     """
 
     verdict: Verdict
@@ -78,7 +78,7 @@ class Solution:
     aims: tuple[AimEstimate, ...]
     registration: Registration | None = None
     posterior: Posterior | None = None
-    context: TrackContext | None = None
+    snapshot: Snapshot | None = None
 
     def as_session(self, name: str) -> SessionEstimate:
         """The estimate as files and reports have it."""
@@ -122,10 +122,8 @@ def solve(
     ]
     steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
     epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common, steady)
-    context = track_context(centred, posterior, model, config, readout.origin_shift_mm)
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
-    snapshot = Snapshot.from_context(context, refused=refused) if tracks else None
-    tracked = tuple(fast_track(query, snapshot) for query in tracks) if snapshot is not None else ()
+    snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
     # The last epoch is where the camera stands; an earlier one that failed is told, and no more than a warning.
     verdict = max(epochs[-1].verdict, verdict_of(common), key=lambda v: v.severity)
     if verdict is Verdict.OK and any(epoch.verdict is not Verdict.OK for epoch in epochs):
@@ -136,11 +134,11 @@ def solve(
         laser=readout.laser,
         epochs=epochs,
         pairs=pairs,
-        tracks=tracked,
+        tracks=tuple(track(query, snapshot) for query in tracks),
         aims=aims,
         registration=registration,
         posterior=posterior,
-        context=context,
+        snapshot=snapshot,
     )
 
 
@@ -346,27 +344,36 @@ def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: 
     return np.asarray(camera_d @ state.rotation[0, epoch].T)
 
 
-def track_context(
+def track_snapshot(
     registration: Registration,
-    posterior: Posterior,
     model: SessionModel,
     config: SolveConfig,
     origin_shift_mm: float,
-) -> TrackContext:
+    refused: Mapping[int, str] | None = None,
+) -> Snapshot:
+    """What queries about a solved session are answered from.
+
+    Args:
+        registration: at the posterior's mean, its covariance that of the posterior.
+        model, config: of the session.
+        origin_shift_mm: lambda of the laser frame's origin in the beam chart.
+        refused: the epochs refused, with the reason (which may be empty).
+    """
     problem, at = registration.problem, registration.optimum.evaluation
     gain = at.point_gain[0]
     covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
     state = registration.optimum.state
     camera_d = problem.beams.rotation @ state.beam_direction()[0]
     trus_d = np.einsum("bij,bj->bi", state.rotation[0, problem.beam_epoch], camera_d)
-    surface = fit_surface(at.private.trus_p_pm[0], covariance, trus_d)
-    return TrackContext(
-        model=model,
-        epochs=registration.epochs,
-        state=state,
-        covariance=registration.covariance,
-        posterior=posterior,
-        surface=surface,
+    return make_snapshot(
+        model,
+        config,
+        state,
+        registration.covariance,
+        problem.columns,
+        registration.epochs,
         origin_shift_mm=origin_shift_mm,
-        config=config,
+        surface=fit_surface(at.private.trus_p_pm[0], covariance, trus_d),
+        causal=False,
+        refused=refused,
     )

@@ -18,7 +18,7 @@ from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.events import OnlineEvent
-from fgreg.tracking import fast_track
+from fgreg.tracking import track
 from tests.forward import make_measurements
 
 Case = tuple[SessionModel, Measurements]
@@ -67,7 +67,7 @@ def test_queries_are_answered_from_its_snapshot(case: Case, started: EngineProce
     pair = case[1].pairs[3]
     query = Track(pair.t, 0, pair.marker, (pair.look,))
     reader = started.reader()
-    answer = fast_track(query, reader.snapshot())
+    answer = track(query, reader.snapshot())
     assert answer.stage_rad is not None
     assert answer.stage_rad == started.track(query).stage_rad
     reader.close()

@@ -12,7 +12,7 @@ from fgreg.config import SolveConfig
 from fgreg.measurements import Aim, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
-from fgreg.tracking import fast_track
+from fgreg.tracking import track
 from tests.forward import make_measurements
 from tests.track_cases import held_out, query_of
 
@@ -60,7 +60,7 @@ def test_a_snapshot_is_made_once_an_event() -> None:
     _ran(engine, replace(used, pairs=used.pairs[:-1]))
     first = engine.snapshot()
     assert engine.snapshot() is first
-    assert engine.track(queries[0]) == fast_track(queries[0], first)
+    assert engine.track(queries[0]) == track(queries[0], first)
     engine.add(used.pairs[-1])
     second = engine.snapshot()
     assert second is not first

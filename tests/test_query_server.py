@@ -31,9 +31,9 @@ from fgreg.estimate import TrackEstimate
 from fgreg.measurements import Track
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import SharedSnapshot
-from fgreg.tracking import Snapshot, fast_track
+from fgreg.tracking import Snapshot, track
 from tests.forward import make_measurements, make_session
-from tests.track_cases import held_out, plain_snapshot, query_of, solved_context
+from tests.track_cases import held_out, plain_snapshot, query_of, solved
 
 
 @dataclass
@@ -48,7 +48,7 @@ class _Running:
 def running() -> Iterator[_Running]:
     model, measurements, _ = make_measurements(np.random.default_rng(1), pairs=24, looks_per_pm=2, share_marker=False)
     used, out = held_out(measurements, 3)
-    snapshot = Snapshot.from_context(solved_context(used, model))
+    snapshot = solved(used, model).snapshot
     queries = [query_of(pairs, looks=looks) for pairs in out for looks in (1, 2)]
     queries += [replace(query, looks=(), look_markers=(), scan_rad=0.1) for query in queries]
     with SharedSnapshot(Layout.of(model)) as shared, QueryServer(shared.name) as server:
@@ -59,7 +59,7 @@ def test_answers_are_those_of_the_snapshot(running: _Running) -> None:
     running.shared.publish(running.snapshot)
     with running.server.client() as client:
         for query in running.queries:
-            assert client.track(query) == fast_track(query, running.snapshot)
+            assert client.track(query) == track(query, running.snapshot)
             assert 0.0 <= client.age_s < 60.0
 
 
@@ -78,7 +78,7 @@ def test_a_newer_snapshot_is_answered_from_at_once(running: _Running) -> None:
 
 def test_many_threads_get_their_own_answers(running: _Running) -> None:
     running.shared.publish(running.snapshot)
-    expected = [fast_track(query, running.snapshot) for query in running.queries]
+    expected = [track(query, running.snapshot) for query in running.queries]
     wrong: list[int] = []
 
     def ask(shared: QueryClient | None) -> None:
@@ -107,7 +107,7 @@ def test_a_query_that_cannot_be_is_told_and_the_next_one_answered(running: _Runn
         client._connection.send_bytes(b"no query")
         with pytest.raises(QueryError, match="8 bytes"):
             decode_answer(client._connection.recv_bytes())
-        assert client.track(query) == fast_track(query, running.snapshot)
+        assert client.track(query) == track(query, running.snapshot)
 
 
 def test_a_wrong_key_gets_no_answers(running: _Running) -> None:
@@ -214,4 +214,4 @@ def test_bytes_that_are_no_query_are_refused() -> None:
 def test_plain_snapshots_serve_without_a_surface() -> None:
     _, measurements, _ = make_measurements(np.random.default_rng(4), pairs=1)
     query = replace(query_of(list(measurements.pairs), looks=1), looks=(), look_markers=())
-    assert "trace no surface yet" in fast_track(query, plain_snapshot(make_session())).reason
+    assert "trace no surface yet" in track(query, plain_snapshot(make_session())).reason

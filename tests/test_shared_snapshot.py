@@ -22,11 +22,11 @@ from fgreg.estimate import Verdict
 from fgreg.measurements import MarkerObservation, Track
 from fgreg.online.queries import EPOCHS_KEPT, Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
-from fgreg.tracking import EpochSnapshot, Snapshot, fast_track
+from fgreg.tracking import EpochSnapshot, track
 from fgreg.tracking.snapshot import SHARED
 from tests.forward import make_measurements, make_session
 from tests.test_track_surface import some_surface
-from tests.track_cases import held_out, is_whole, marked_snapshot, plain_snapshot, query_of, solved_context
+from tests.track_cases import held_out, is_whole, marked_snapshot, plain_snapshot, query_of, solved
 
 MODEL = make_session(curve=True)
 WRITER = """
@@ -148,7 +148,9 @@ def test_a_version_written_by_half_is_not_taken(latest_moved: bool, ended: bool)
 def test_answers_from_shared_memory_are_the_same() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(1), pairs=22)
     used, out = held_out(measurements, 2)
-    snapshot = Snapshot.from_context(solved_context(used, model), t=12.5, pairs=20, refused={3: "too few pairs"})
+    snapshot = replace(solved(used, model).snapshot, t=12.5, pairs=20)
+    refused = replace(snapshot.epochs[0], number=3, verdict=Verdict.REFUSED, reason="too few pairs")
+    snapshot = replace(snapshot, epochs=(*snapshot.epochs, refused))
     assert snapshot.surface is not None
     with SharedSnapshot(Layout.of(model)) as shared:
         shared.publish(snapshot)
@@ -159,9 +161,7 @@ def test_answers_from_shared_memory_are_the_same() -> None:
             query = query_of(pairs, looks=1)
             query = query if looks else replace(query, looks=(), look_markers=())
             for epoch in (0, 3, 5):
-                assert fast_track(replace(query, epoch=epoch), received) == fast_track(
-                    replace(query, epoch=epoch), snapshot
-                )
+                assert track(replace(query, epoch=epoch), received) == track(replace(query, epoch=epoch), snapshot)
 
 
 def test_memory_is_private_unguessable_and_removed() -> None:
@@ -229,7 +229,7 @@ def test_of_many_epochs_the_newest_are_kept() -> None:
         received = SnapshotReader(shared.name).snapshot()
     assert [epoch.number for epoch in received.epochs] == list(range(20 - EPOCHS_KEPT, 20))
     assert received.epochs[-1].translation_mm[0] == 19.0
-    assert fast_track(query, received).reason == "camera epoch 3 is over: queries are answered from epoch 12 on"
+    assert track(query, received).reason == "camera epoch 3 is over: queries are answered from epoch 12 on"
 
 
 def test_what_does_not_fit_or_is_not_finite_leaves_the_last_one() -> None:

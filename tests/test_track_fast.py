@@ -11,21 +11,21 @@ import pytest
 
 import fgreg.graph.sites
 from fgreg.config import SolveConfig
-from fgreg.estimate import TrackEstimate
+from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.measurements import Track
 from fgreg.sensitivity import interval_moments, sensitivity_priors, window_shapes
-from fgreg.tracking import Snapshot, TrackContext, fast_track
+from fgreg.tracking import track
 from fgreg.tracking.windows import interpolated, interval_derivatives, look_window
 from tests import tracking_reference
 from tests.forward import make_measurements, make_session
-from tests.track_cases import held_out, query_of, solved_context
+from tests.track_cases import Solved, held_out, query_of, solved
 
 ANGLE_SIGMAS, SIGMA_SHARE = 0.02, 0.02
 
 
-def _agree(query: Track, context: TrackContext) -> TrackEstimate:
+def _agree(query: Track, session: Solved) -> TrackEstimate:
     """Both answers, which have to agree; the fast one."""
-    slow, fast = tracking_reference.track(query, context), fast_track(query, Snapshot.from_context(context))
+    slow, fast = tracking_reference.track(query, session), track(query, session.snapshot)
     assert slow.stage_rad is not None
     assert slow.sigma_rad is not None
     assert slow.lambda_mm is not None
@@ -50,9 +50,9 @@ def _settled_reference(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_one_look(seed: int, sweeps: bool) -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=29)
     used, out = held_out(measurements, 4)
-    context = solved_context(used, model)
+    session = solved(used, model)
     for pairs in out:
-        fast = _agree(query_of(pairs, looks=1, sweeps=sweeps), context)
+        fast = _agree(query_of(pairs, looks=1, sweeps=sweeps), session)
         assert fast.reason == ""
 
 
@@ -64,10 +64,10 @@ def test_several_looks_with_amplitudes(seed: int, own_markers: bool) -> None:
     options: dict[str, Any] = {"looks_per_pm": 3, "look_spacing_deg": 2.0, "amplitude_noise": 0.05}
     model, measurements, _ = make_measurements(rng, session=model, pairs=15, share_marker=not own_markers, **options)
     used, out = held_out(measurements, 3)
-    context = solved_context(used, model)
+    session = solved(used, model)
     for pairs in out:
         assert len({pair.marker.id for pair in pairs}) == (3 if own_markers else 1)
-        one, three = (_agree(query_of(pairs, looks=looks), context) for looks in (1, 3))
+        one, three = (_agree(query_of(pairs, looks=looks), session) for looks in (1, 3))
         assert one.sigma_rad is not None
         assert three.sigma_rad is not None
         assert three.sigma_rad < one.sigma_rad
@@ -77,9 +77,9 @@ def test_several_looks_with_amplitudes(seed: int, own_markers: bool) -> None:
 def test_several_looks_without_amplitudes(seed: int) -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=15, looks_per_pm=2)
     used, out = held_out(measurements, 3)
-    context = solved_context(used, model)
+    session = solved(used, model)
     for pairs in out:
-        assert _agree(query_of(pairs, looks=2), context).reason == ""
+        assert _agree(query_of(pairs, looks=2), session).reason == ""
 
 
 def test_sound_speed_radius_and_bias_as_variables() -> None:
@@ -87,19 +87,19 @@ def test_sound_speed_radius_and_bias_as_variables() -> None:
     model = replace(model, noise=replace(model.noise, marker_bias_mm=0.5))
     model, measurements, _ = make_measurements(np.random.default_rng(1), session=model, pairs=23)
     used, out = held_out(measurements, 3)
-    context = solved_context(used, model, SolveConfig(estimate_sound_speed=True, estimate_radius=True))
-    assert context.posterior.columns.bias is not None
-    assert context.posterior.columns.radius is not None
+    session = solved(used, model, SolveConfig(estimate_sound_speed=True, estimate_radius=True))
+    assert session.posterior.columns.bias is not None
+    assert session.posterior.columns.radius is not None
     for pairs in out:
-        assert _agree(query_of(pairs, looks=1), context).reason == ""
+        assert _agree(query_of(pairs, looks=1), session).reason == ""
 
 
 def test_windows_as_gaussians() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=23)
     used, out = held_out(measurements, 3)
-    context = solved_context(used, model, SolveConfig(window_shape=False))
+    session = solved(used, model, SolveConfig(window_shape=False))
     for pairs in out:
-        assert _agree(query_of(pairs, looks=1), context).reason == ""
+        assert _agree(query_of(pairs, looks=1), session).reason == ""
 
 
 def test_each_epoch_by_its_own_registration() -> None:
@@ -107,19 +107,19 @@ def test_each_epoch_by_its_own_registration() -> None:
     first = [pair for pair in measurements.pairs if pair.epoch == 0][-1]
     used, out = held_out(measurements, 1)
     used = replace(used, pairs=tuple(pair for pair in used.pairs if pair.pm != first.pm))
-    context = solved_context(used, model)
+    session = solved(used, model)
     for pairs in ([first], out[0]):
-        assert _agree(query_of(pairs, looks=1), context).reason == ""
+        assert _agree(query_of(pairs, looks=1), session).reason == ""
 
 
 def test_a_look_off_the_beam_by_much_is_still_answered() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=26)
     used, out = held_out(measurements, 1)
-    snapshot = Snapshot.from_context(solved_context(used, model))
+    snapshot = solved(used, model).snapshot
     query = query_of(out[0], looks=1)
     for offset in (-15.0, -5.0, 5.0, 15.0, 40.0):
         look = replace(query.looks[0], range_mm=query.looks[0].range_mm + offset)
-        answer = fast_track(replace(query, looks=(look,)), snapshot)
+        answer = track(replace(query, looks=(look,)), snapshot)
         assert answer.stage_rad is not None
         assert answer.sigma_rad is not None
         assert 0.0 < answer.sigma_rad < 0.2
@@ -128,23 +128,26 @@ def test_a_look_off_the_beam_by_much_is_still_answered() -> None:
 def test_a_refused_epoch_is_not_answered_and_says_why() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(5), pairs=20)
     used, out = held_out(measurements, 1)
-    context, query = solved_context(used, model), query_of(out[0], looks=1)
-    snapshot = Snapshot.from_context(context, refused={0: "predicted error 9.1 mm", 1: ""})
-    answer = fast_track(query, snapshot)
+    whole, query = solved(used, model).snapshot, query_of(out[0], looks=1)
+    (epoch,) = whole.epochs
+    reasons = ("predicted error 9.1 mm", "")
+    epochs = tuple(replace(epoch, number=k, verdict=Verdict.REFUSED, reason=why) for k, why in enumerate(reasons))
+    snapshot = replace(whole, epochs=epochs)
+    answer = track(query, snapshot)
     assert answer.stage_rad is None
     assert answer.reason == "the registration of camera epoch 0 is refused: predicted error 9.1 mm"
-    other = fast_track(replace(query, epoch=1), snapshot)
+    other = track(replace(query, epoch=1), snapshot)
     assert other.reason == "the registration of camera epoch 1 is refused"
-    assert fast_track(replace(query, epoch=7), snapshot).reason == "camera epoch 7 has no registration"
+    assert track(replace(query, epoch=7), snapshot).reason == "camera epoch 7 has no registration"
 
 
 def test_a_wider_registration_widens_the_answer() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(6), pairs=26)
     used, out = held_out(measurements, 1)
-    snapshot, query = Snapshot.from_context(solved_context(used, model)), query_of(out[0], looks=1, sweeps=False)
+    snapshot, query = solved(used, model).snapshot, query_of(out[0], looks=1, sweeps=False)
     epoch = snapshot.epochs[0]
     wide = replace(snapshot, epochs=(replace(epoch, covariance=9.0 * epoch.covariance),), prepared={})
-    narrow_sigma, wide_sigma = fast_track(query, snapshot).sigma_rad, fast_track(query, wide).sigma_rad
+    narrow_sigma, wide_sigma = track(query, snapshot).sigma_rad, track(query, wide).sigma_rad
     assert narrow_sigma is not None
     assert wide_sigma is not None
     assert wide_sigma > 1.2 * narrow_sigma

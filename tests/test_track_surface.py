@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray
 from fgreg.surface import TissueSurface, fit_surface
-from fgreg.tracking import Snapshot, fast_track
+from fgreg.tracking import track
 from tests import tracking_reference
 from tests.test_tracking import surface_case
+from tests.track_cases import solved_of
 
 
 def some_surface(seed: int, count: int) -> TissueSurface:
@@ -55,12 +57,10 @@ def test_rays_end_where_the_surface_is(count: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_answers_and_sigmas_are_those_of_sampling(seed: int) -> None:
     case = surface_case(seed, heard=False, count=8)
-    context = case.solution.context
-    assert context is not None
-    snapshot = Snapshot.from_context(context)
+    session = solved_of(case.solution, case.model, SolveConfig())
     compared = 0
     for query in case.queries:
-        slow, fast = tracking_reference.track(query, context), fast_track(query, snapshot)
+        slow, fast = tracking_reference.track(query, session), track(query, session.snapshot)
         if slow.stage_rad is None or slow.sigma_rad is None:
             assert fast.reason == slow.reason
             continue

@@ -23,6 +23,7 @@ from fgreg.frames import (
 from fgreg.measurements import Look, MarkerObservation, Track, default_marker_covariance
 from fgreg.models import SessionModel
 from fgreg.surface import fit_surface
+from fgreg.tracking import track
 from tests.forward import Truth, hear, make_measurements
 
 
@@ -88,10 +89,10 @@ def surface_case(seed: int, *, heard: bool, count: int = 4, noise: bool = True) 
 
 def _scores(case: SurfaceCase) -> list[float]:
     out = []
-    for track, bearing in zip(case.solution.tracks, case.bearings, strict=True):
-        if track.stage_rad is not None:
-            assert track.sigma_rad is not None
-            out.append((track.stage_rad - bearing) / track.sigma_rad)
+    for answer, bearing in zip(case.solution.tracks, case.bearings, strict=True):
+        if answer.stage_rad is not None:
+            assert answer.sigma_rad is not None
+            out.append((answer.stage_rad - bearing) / answer.sigma_rad)
     return out
 
 
@@ -122,25 +123,19 @@ def test_a_query_does_not_touch_the_estimate() -> None:
 
 def test_answers_are_device_angles() -> None:
     case = surface_case(3, heard=True)
-    context = case.solution.context
-    assert context is not None
-    from fgreg.tracking import track
-
-    turned = replace(
-        context, model=replace(case.model, stage=replace(case.model.stage, direction=-1, zero_device_rad=0.1))
-    )
-    plain, device = track(case.queries[0], context), track(case.queries[0], turned)
+    snapshot = case.solution.snapshot
+    assert snapshot is not None
+    turned = replace(snapshot, stage=replace(case.model.stage, direction=-1, zero_device_rad=0.1))
+    plain, device = track(case.queries[0], snapshot), track(case.queries[0], turned)
     assert plain.stage_rad is not None
     assert device.stage_rad == pytest.approx(0.1 - plain.stage_rad)
 
 
 def test_an_angle_beyond_the_stages_limits_is_not_given() -> None:
     case = surface_case(3, heard=True)
-    context = case.solution.context
-    assert context is not None
-    from fgreg.tracking import track
-
-    narrow = replace(context, model=replace(case.model, stage=replace(case.model.stage, limits_device_rad=(1.0, 1.1))))
+    snapshot = case.solution.snapshot
+    assert snapshot is not None
+    narrow = replace(snapshot, stage=replace(case.model.stage, limits_device_rad=(1.0, 1.1)))
     answer = track(case.queries[0], narrow)
     assert answer.stage_rad is None
     assert "outside its limits 57 to 63 deg" in answer.reason
@@ -159,11 +154,9 @@ def test_a_beam_that_misses_the_surface_is_not_answered() -> None:
     query = case.queries[0]
     away = query.marker.camera_T_marker.copy()
     away[:3, 3] += [80.0, 0.0, 0.0]
-    from fgreg.tracking import track
-
-    context = case.solution.context
-    assert context is not None
-    answer = track(replace(query, marker=replace(query.marker, camera_T_marker=away)), context)
+    snapshot = case.solution.snapshot
+    assert snapshot is not None
+    answer = track(replace(query, marker=replace(query.marker, camera_T_marker=away)), snapshot)
     assert answer.stage_rad is None
     assert "misses the part of the surface" in answer.reason
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.batch import solve
+from fgreg.batch import Solution, solve
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.measurements import Measurements, Pair, Track
 from fgreg.models import SessionModel
+from fgreg.posterior import Posterior
 from fgreg.surface import TissueSurface
-from fgreg.tracking import EpochSnapshot, Snapshot, TrackContext
+from fgreg.tracking import EpochSnapshot, Snapshot
 from fgreg.tracking.snapshot import SHARED
 
 
@@ -23,11 +24,34 @@ def held_out(measurements: Measurements, count: int) -> tuple[Measurements, list
     return replace(measurements, pairs=kept), [[p for p in measurements.pairs if p.pm == pm] for pm in pms]
 
 
-def solved_context(measurements: Measurements, model: SessionModel, config: SolveConfig | None = None) -> TrackContext:
-    """What queries about the measurements are answered from, on a stage that turns any way."""
-    context = solve(measurements, [], model, config or SolveConfig()).context
-    assert context is not None
-    return replace(context, model=replace(model, stage=replace(model.stage, limits_device_rad=(-4.0, 4.0))))
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """A solved session: the snapshot that queries are answered from, and all epochs' variables for the reference."""
+
+    model: SessionModel
+    config: SolveConfig
+    epochs: tuple[int, ...]
+    posterior: Posterior
+    snapshot: Snapshot
+
+
+def solved_of(solution: Solution, model: SessionModel, config: SolveConfig) -> Solved:
+    """A solution with an estimate."""
+    assert solution.registration is not None
+    assert solution.posterior is not None
+    assert solution.snapshot is not None
+    return Solved(model, config, solution.registration.epochs, solution.posterior, solution.snapshot)
+
+
+def solved(measurements: Measurements, model: SessionModel, config: SolveConfig | None = None) -> Solved:
+    """The measurements solved, on a stage that turns any way; answered whatever the verdict."""
+    config = config or SolveConfig()
+    found = solved_of(solve(measurements, [], model, config), model, config)
+    stage = replace(model.stage, limits_device_rad=(-4.0, 4.0))
+    epochs = tuple(replace(epoch, verdict=Verdict.OK, reason="") for epoch in found.snapshot.epochs)
+    return replace(
+        found, model=replace(model, stage=stage), snapshot=replace(found.snapshot, stage=stage, epochs=epochs)
+    )
 
 
 def query_of(pairs: list[Pair], *, looks: int, sweeps: bool = True) -> Track:

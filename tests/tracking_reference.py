@@ -20,37 +20,39 @@ from fgreg.graph.sites import propagate
 from fgreg.measurements import EpochStart, Measurements, Pair, Track
 from fgreg.registration import pack_session
 from fgreg.surface import GRAZING, LONGEST_MM, REACH_MM, TissueSurface
-from fgreg.tracking import TrackContext
+from tests.track_cases import Solved
 
 SAMPLES = 40_000
 """Of the Gaussian that a query takes the shared variables for."""
 
 
-def track(query: Track, context: TrackContext) -> TrackEstimate:
+def track(query: Track, solved: Solved) -> TrackEstimate:
     """Answer one query; ``stage_rad`` None with a reason where it cannot be answered."""
-    if query.epoch not in context.epochs:
-        return _refused(query, context, f"camera epoch {query.epoch} has no registration")
+    if query.epoch not in solved.epochs:
+        return _refused(query, solved, f"camera epoch {query.epoch} has no registration")
     scan_rad: float
     if query.looks:
-        scan_rad, sigma_rad, lambda_mm = _from_looks(query, context)
+        scan_rad, sigma_rad, lambda_mm = _from_looks(query, solved)
     else:
-        answer = _from_surface(query, context)
+        answer = _from_surface(query, solved)
         if isinstance(answer, str):
-            return _refused(query, context, answer)
+            return _refused(query, solved, answer)
         scan_rad, sigma_rad, lambda_mm = answer
-    device_rad = context.model.stage.device_from_scan(scan_rad)
-    low, high = context.model.stage.limits_device_rad
+    device_rad = solved.model.stage.device_from_scan(scan_rad)
+    low, high = solved.model.stage.limits_device_rad
     turned = [a for a in (device_rad, device_rad - 2 * math.pi, device_rad + 2 * math.pi) if low <= a <= high]
     if turned:
         device_rad = turned[0]
     else:
         reason = f"the stage would have to turn to {math.degrees(device_rad):.1f} deg, outside its limits"
-        return _refused(query, context, f"{reason} {math.degrees(low):.0f} to {math.degrees(high):.0f} deg")
-    return TrackEstimate(query.t, device_rad, sigma_rad, lambda_mm - context.origin_shift_mm, context.causal)
+        return _refused(query, solved, f"{reason} {math.degrees(low):.0f} to {math.degrees(high):.0f} deg")
+    return TrackEstimate(
+        query.t, device_rad, sigma_rad, lambda_mm - solved.snapshot.origin_shift_mm, solved.snapshot.causal
+    )
 
 
-def _refused(query: Track, context: TrackContext, reason: str) -> TrackEstimate:
-    return TrackEstimate(query.t, None, None, None, context.causal, reason)
+def _refused(query: Track, solved: Solved, reason: str) -> TrackEstimate:
+    return TrackEstimate(query.t, None, None, None, solved.snapshot.causal, reason)
 
 
 def _angle(trus_p: FloatArray) -> tuple[float, FloatArray]:
@@ -60,20 +62,20 @@ def _angle(trus_p: FloatArray) -> tuple[float, FloatArray]:
     return math.atan2(y, z), np.array([0.0, z, -y]) / square
 
 
-def _from_looks(query: Track, context: TrackContext) -> tuple[float, float, float]:
+def _from_looks(query: Track, solved: Solved) -> tuple[float, float, float]:
     """The one PM's angle with the session's estimate as prior: (scan angle, sigma, lambda in the chart)."""
-    epoch = context.epochs.index(query.epoch)
-    count = context.state.rotation.shape[1]
+    epoch = solved.epochs.index(query.epoch)
+    count = solved.posterior.mean.rotation.shape[1]
     markers = query.look_markers or (query.marker,) * len(query.looks)
     pairs = tuple(Pair(query.t, 0, epoch, marker, look) for marker, look in zip(markers, query.looks, strict=True))
     once = Measurements((), pairs, tuple(EpochStart(0.0) for _ in range(count)))
-    problem = pack_session(once, context.model, context.config)
-    if problem.columns.size != len(context.covariance):
-        raise ValueError("the context's variables are not those of its configuration")
+    problem = pack_session(once, solved.model, solved.config)
+    if problem.columns.size != len(solved.posterior.covariance):
+        raise ValueError("the session's variables are not those of its configuration")
     # The priors on the shared variables are in the session's estimate already.
-    anchor = Anchor(context.state, np.asarray(np.linalg.inv(context.covariance)))
+    anchor = Anchor(solved.posterior.mean, np.asarray(np.linalg.inv(solved.posterior.covariance)))
     problem = replace(problem, anchor=anchor, prior_information=np.zeros(problem.columns.size))
-    optimum = optimize(problem, context.state)
+    optimum = optimize(problem, solved.posterior.mean)
     _, optimum = propagate(problem, optimum) or (problem, optimum)
     at = optimum.evaluation
     shared = np.linalg.inv(at.hessian[0])
@@ -83,21 +85,21 @@ def _from_looks(query: Track, context: TrackContext) -> tuple[float, float, floa
     return angle, math.sqrt(float(by_point @ covariance @ by_point)), float(at.lambda_mm[0, 0])
 
 
-def _from_surface(query: Track, context: TrackContext) -> tuple[float, float, float] | str:
+def _from_surface(query: Track, solved: Solved) -> tuple[float, float, float] | str:
     """The beam's end on the tissue surface: (scan angle, sigma, lambda in the chart), or why not."""
-    if context.surface is None:
+    if solved.snapshot.surface is None:
         return "no PM is heard and the session's PMs trace no surface yet (at least 5, not in a row)"
-    epoch = context.epochs.index(query.epoch)
-    origin, direction = _beam_in_trus(query, context.state, epoch, np.zeros((1, 6)))
-    met = meet(context.surface, origin[0], direction[0])
+    epoch = solved.epochs.index(query.epoch)
+    origin, direction = _beam_in_trus(query, solved.posterior.mean, epoch, np.zeros((1, 6)))
+    met = meet(solved.snapshot.surface, origin[0], direction[0])
     if met is None:
         return "no PM is heard and the beam misses the part of the surface that the session's PMs trace"
     angle, _ = _angle(met.trus_p)
     rng = np.random.default_rng(0)
-    columns = context.posterior.columns
-    root = np.linalg.cholesky(context.covariance)
+    columns = solved.posterior.columns
+    root = np.linalg.cholesky(solved.posterior.covariance)
     step = rng.standard_normal((SAMPLES, columns.size)) @ root.T
-    state = context.state.take(np.zeros(SAMPLES, dtype=np.int64)).retract(step, columns)
+    state = solved.posterior.mean.take(np.zeros(SAMPLES, dtype=np.int64)).retract(step, columns)
     turn = np.kron(np.eye(2), query.marker.camera_T_marker[:3, :3])
     noise = rng.multivariate_normal(np.zeros(6), turn @ query.marker.covariance @ turn.T, SAMPLES)
     origin, direction = _beam_in_trus(query, state, epoch, noise)

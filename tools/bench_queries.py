@@ -46,10 +46,10 @@ from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
-from fgreg.tracking import Snapshot, fast_track
+from fgreg.tracking import Snapshot, track
 from tests.forward import make_measurements, make_session
 from tests.test_tracking import surface_case
-from tests.track_cases import held_out, query_of, solved_context
+from tests.track_cases import held_out, query_of, solved, solved_of
 
 ALONE_MS, UNDER_MS = {50.0: 0.2, 99.0: 0.5}, {99.0: 2.0}
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
@@ -79,12 +79,12 @@ def alone(repeats: int) -> None:
     print("alone (ms)")
     for name, queries, snapshot in _kinds():
         for query in queries:
-            fast_track(query, snapshot)
+            track(query, snapshot)
         wall, cpu = np.empty(repeats), np.empty(repeats)
         for k in range(repeats):
             query = queries[k % len(queries)]
             start, cpu_start = time.perf_counter(), time.thread_time()
-            fast_track(query, snapshot)
+            track(query, snapshot)
             wall[k], cpu[k] = time.perf_counter() - start, time.thread_time() - cpu_start
         print(line(name, wall, ALONE_MS))
         print(line("    CPU time", cpu, ALONE_MS))
@@ -93,7 +93,7 @@ def alone(repeats: int) -> None:
 def _kinds() -> list[tuple[str, list[Track], Snapshot]]:
     model, measurements, _ = make_measurements(np.random.default_rng(1), pairs=35)
     used, out = held_out(measurements, 10)
-    snapshot = Snapshot.from_context(solved_context(used, model))
+    snapshot = solved(used, model).snapshot
     kinds = [
         ("one look, first hit", [query_of(pairs, looks=1) for pairs in out], snapshot),
         ("one look, window only", [query_of(pairs, looks=1, sweeps=False) for pairs in out], snapshot),
@@ -104,12 +104,11 @@ def _kinds() -> list[tuple[str, list[Track], Snapshot]]:
             np.random.default_rng(2), session=make_session(curve=True), pairs=20, share_marker=share, **options
         )
         used, out = held_out(measurements, 5)
-        snapshot = Snapshot.from_context(solved_context(used, model))
+        snapshot = solved(used, model).snapshot
         kinds.append((f"three looks with amplitudes, {name}", [query_of(pairs, looks=3) for pairs in out], snapshot))
     case = surface_case(1, heard=False, count=10)
-    context = case.solution.context
-    assert context is not None
-    kinds.append(("no look, from the surface", case.queries, Snapshot.from_context(context)))
+    snapshot = solved_of(case.solution, case.model, SolveConfig()).snapshot
+    kinds.append(("no look, from the surface", case.queries, snapshot))
     return kinds
 
 
@@ -129,7 +128,7 @@ def _ask_of(client: Client) -> Ask:
     if client.by_round_trip:
         return QueryClient(client.address).track
     reader = SnapshotReader(client.memory)
-    return lambda query: fast_track(query, reader.snapshot())
+    return lambda query: track(query, reader.snapshot())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,7 @@ from baseline_point_based import register_points
 from cramer_rao_bound import FullTruth, beam_covariance, truth_covariance
 
 from fgreg.answer import answer
-from fgreg.batch import track_context
+from fgreg.batch import track_snapshot
 from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
 from fgreg.evaluation.pair_residual import line_to_arc
@@ -271,8 +271,8 @@ def tracking(job: Job) -> dict[Any, Row]:
     found = register(sim.measurements, sim.model, SETTINGS)
     answered = answer(found, SETTINGS)
     shift = read_laser(answered.registration, sim.model).origin_shift_mm
-    context = track_context(answered.registration, answered.posterior, sim.model, SETTINGS, shift)
-    answers = [track(query, context) for query in sim.tracks]
+    snapshot = track_snapshot(answered.registration, sim.model, SETTINGS, shift)
+    answers = [track(query, snapshot) for query in sim.tracks]
     errors = [
         abs(math.degrees(answer.stage_rad - right))
         for answer, right in zip(answers, sim.track_rad, strict=True)

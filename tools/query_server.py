@@ -2,7 +2,7 @@
 
 Native calls of the estimate's updates hold their interpreter's lock, so a thread beside them waits. A client of this
 server waits for one round trip over a local socket. A camera loop that is a process of its own needs no server: it
-holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.fast_track` itself.
+holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.track` itself.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from query_codec import QueryError, decode_answer, decode_query, encode_answer, 
 from fgreg.estimate import TrackEstimate
 from fgreg.measurements import Track
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
-from fgreg.tracking import fast_track
+from fgreg.tracking import track
 
 START_S = 30.0
 """How long the process may take to start."""
@@ -63,7 +63,7 @@ class QueryClient:
         return self._age_s
 
     def track(self, query: Track) -> TrackEstimate:
-        """The answer to a query, as of :func:`fgreg.tracking.fast_track`.
+        """The answer to a query, as of :func:`fgreg.tracking.track`.
 
         Raises:
             QueryError: the server could not work on it. EOFError, OSError: the server is gone.
@@ -192,7 +192,7 @@ def _answer(connection: Connection[Any, Any], reader: SnapshotReader) -> None:
 def _reply(message: bytes, reader: SnapshotReader) -> bytes:
     try:
         received = reader.read()
-        return encode_answer(fast_track(decode_query(message), received.snapshot), received.age_s)
+        return encode_answer(track(decode_query(message), received.snapshot), received.age_s)
     except (QueryError, NoSnapshotError) as error:
         return encode_error(str(error))
     except Exception as error:  # a defect, or a query that nobody thought of: the next one is to be answered

@@ -47,7 +47,7 @@ from fgreg.session.reading import read_session
 from fgreg.session.safe_yaml import load_yaml
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
-from fgreg.tracking import fast_track
+from fgreg.tracking import track
 from tests.rehearsal import Rehearsal
 
 SAME_SIGMA = 0.05
@@ -107,7 +107,7 @@ class Recording:
 
     def track(self, query: Track) -> TrackEstimate:
         """As the live loop does it."""
-        return fast_track(query, self._snapshots.read().snapshot)
+        return track(query, self._snapshots.read().snapshot)
 
     def add(self, event: Aim | Pair) -> None:
         """As the live loop records it."""

@@ -35,7 +35,7 @@ from fgreg.measurements import Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import target_errors
 from fgreg.registration import SoundSpeedPrior, register
-from fgreg.tracking import TrackContext, track
+from fgreg.tracking import make_snapshot, track
 from fgreg.verdict import sound_speed_condition
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
@@ -103,10 +103,22 @@ def _tracked(pairs: int, seed: int, taken: dict[str, object]) -> Row:
     )
     found = solved(measurements, model)
     state, covariance = found.registration.optimum.state, found.registration.covariance
-    context = TrackContext(model, (0,), state, covariance, found.posterior, None, 0.0)
     there = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
     there = replace(there, edge_rad=np.array([truth.window_edge_rad]))
-    exact = replace(context, state=there, covariance=1e-12 * np.eye(len(covariance)))
+    session, exact = (
+        make_snapshot(
+            model,
+            SolveConfig(),
+            at,
+            spread,
+            found.posterior.columns,
+            (0,),
+            origin_shift_mm=0.0,
+            surface=None,
+            causal=False,
+        )
+        for at, spread in ((state, covariance), (there, 1e-12 * np.eye(len(covariance))))
+    )
     kinds: dict[str, dict[str, object]] = {
         "window look": {"first_hit": False},
         "first hit": {},
@@ -127,7 +139,7 @@ def _tracked(pairs: int, seed: int, taken: dict[str, object]) -> Row:
             mine = [pair for pair in asked.pairs if pair.pm == pm]
             query = Track(0.0, 0, mine[0].marker, tuple(p.look for p in mine), None, tuple(p.marker for p in mine))
             bearing = math.atan2(at.trus_p_pm_mm[pm][1], at.trus_p_pm_mm[pm][2])
-            for name, of in (("session", context), ("truth", exact)):
+            for name, of in (("session", session), ("truth", exact)):
                 reply = track(query, of)
                 if reply.stage_rad is not None and reply.sigma_rad is not None:
                     out.setdefault(f"{kind} {name}", []).append(math.degrees(reply.stage_rad - bearing) ** 2)

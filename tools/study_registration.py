@@ -81,9 +81,8 @@ def collect(report: SolveReport, figures: Figures, limit_mm: float) -> None:
     epoch = estimate.epochs[0]
     if epoch.predicted_tre is not None:
         figures.predicted_mm.append(epoch.predicted_tre.mean_mm)
-    context = report.solution.context
     events = [report.session.events[i] for i in report.recognised.track_events]
-    if context is None:
+    if report.solution.snapshot is None:
         return
     for track, error, event in zip(estimate.tracks, errors.track_rad, events, strict=False):
         if error is not None and track.sigma_rad:

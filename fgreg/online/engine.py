@@ -47,7 +47,7 @@ from fgreg.online.tracking import online_snapshot
 from fgreg.online.updates import is_kept, with_aim, with_move, with_pair
 from fgreg.registration import SoundSpeedPrior
 from fgreg.surface import TissueSurface
-from fgreg.tracking import Snapshot, fast_track
+from fgreg.tracking import Snapshot, track
 from fgreg.verdict import accuracy
 
 NOT_JUDGED = "this camera epoch has not been judged by the full solve yet: take the estimate as preliminary"
@@ -416,7 +416,7 @@ class OnlineRegistration:
     def track(self, query: Track) -> TrackEstimate:
         """Answer a query from the estimate as it is; the graph is not touched."""
         self._adopt_found(self._t)
-        return fast_track(query, self.snapshot())
+        return track(query, self.snapshot())
 
     def snapshot(self) -> Snapshot:
         """All that queries need of the estimate as it is; made once per event, on demand."""

@@ -31,7 +31,7 @@ from fgreg.online.numbers import Numbers, Sink, Source
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.registration import SoundSpeedPrior
-from fgreg.tracking import fast_track
+from fgreg.tracking import track
 from fgreg.workers.worker_process import NICENESS
 
 START_S = 60.0
@@ -145,7 +145,7 @@ class EngineProcess:
         """Answered here, from the snapshot."""
         reader = self.reader()
         try:
-            return fast_track(query, reader.snapshot())
+            return track(query, reader.snapshot())
         except NoSnapshotError:
             return TrackEstimate(query.t, None, None, None, causal=True, reason="nothing is known yet")
         finally:

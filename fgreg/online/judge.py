@@ -83,7 +83,6 @@ def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
     """What carries over of a solve of all measurements up to an event."""
     data = solution.epochs[epoch]
     pose, covariance, registration = _plain(data.trus_T_camera), _plain(data.covariance), solution.registration
-    context = solution.context
     shift = root = optimum_root = None
     if pose is not None and covariance is not None and registration is not None and epoch in registration.epochs:
         place = registration.epochs.index(epoch)
@@ -104,7 +103,7 @@ def judgement_of(solution: Solution, serial: int, epoch: int) -> Judgement:
         shift,
         root,
         optimum_root,
-        None if context is None else context.surface,
+        None if solution.snapshot is None else solution.snapshot.surface,
     )
 
 

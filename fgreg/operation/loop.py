@@ -46,7 +46,7 @@ from fgreg.operation.view import (
     View,
 )
 from fgreg.pairing import Latencies, TimedPose
-from fgreg.tracking import Snapshot, fast_track
+from fgreg.tracking import Snapshot, track
 
 IDLE_S = 0.002
 """Between looks for a frame."""
@@ -254,7 +254,7 @@ class LiveLoop:
             (),
             0.0 if plane is None else plane.scan_rad,
         )
-        return fast_track(query, self._snapshot)
+        return track(query, self._snapshot)
 
     def _view(self, now: float) -> View:
         commands, self._commands = tuple(self._commands), []

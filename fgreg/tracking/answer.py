@@ -25,7 +25,7 @@ from fgreg.tracking.snapshot import Snapshot
 _NOTHING = [0.0] * MARKER
 
 
-def fast_track(query: Track, snapshot: Snapshot) -> TrackEstimate:
+def track(query: Track, snapshot: Snapshot) -> TrackEstimate:
     """Answer one query; ``stage_rad`` None with a reason where it cannot be answered."""
     epoch = snapshot.epoch(query.epoch)
     if epoch is None:

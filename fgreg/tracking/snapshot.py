@@ -21,7 +21,6 @@ from fgreg.models import SensitivityModel, SessionModel, StageModel
 from fgreg.surface import TissueSurface
 
 if TYPE_CHECKING:
-    from fgreg.tracking.context import TrackContext
     from fgreg.tracking.prepared import Prepared
 
 POSE, BEAM, EDGE, BIAS, SPEED, RADIUS, SHARED = 0, 6, 10, 11, 14, 15, 16
@@ -110,37 +109,6 @@ class Snapshot:
             surface=None,
         )
 
-    @classmethod
-    def from_context(
-        cls,
-        context: TrackContext,
-        *,
-        t: float = 0.0,
-        pairs: int = 0,
-        refused: Mapping[int, str] | None = None,
-    ) -> Snapshot:
-        """What a solved session's queries are answered from.
-
-        Args:
-            context: the session's estimate.
-            t: time of its last event. pairs: how many entered.
-            refused: the epochs refused, with the reason (which may be empty).
-        """
-        return make_snapshot(
-            context.model,
-            context.config,
-            context.state,
-            context.covariance,
-            context.posterior.columns,
-            context.epochs,
-            origin_shift_mm=context.origin_shift_mm,
-            surface=context.surface,
-            t=t,
-            pairs=pairs,
-            causal=context.causal,
-            refused=refused,
-        )
-
 
 def _refused_epoch(number: int, reason: str) -> EpochSnapshot:
     nothing = np.zeros((SHARED, SHARED))
@@ -168,9 +136,9 @@ def make_snapshot(
     *,
     origin_shift_mm: float,
     surface: TissueSurface | None,
-    t: float,
-    pairs: int,
     causal: bool,
+    t: float = 0.0,
+    pairs: int = 0,
     refused: Mapping[int, str] | None = None,
 ) -> Snapshot:
     """A snapshot of an estimate.
@@ -180,7 +148,7 @@ def make_snapshot(
         state: one hypothesis; its registrations are those of ``epochs``.
         covariance: (D, D) of the shared variables, laid out by ``columns``.
         epochs: the session's numbers of the epochs with a registration.
-        origin_shift_mm, surface, t, pairs, causal: as in :class:`Snapshot`.
+        origin_shift_mm, surface, causal, t, pairs: as in :class:`Snapshot`.
         refused: further epochs, or some of ``epochs``, of which no query may be answered, and why (may be empty).
     """
     refused = {} if refused is None else refused
