@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binom, chi2
+from scipy.special import bdtrc, chdtrc, chdtri
 
 from fgreg.config import SolveConfig
 from fgreg.estimate import PredictedTre, Verdict, worst_verdict
@@ -133,7 +133,7 @@ def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
             f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it"
         )
         found.append(Condition(Verdict.REFUSED, text))
-    if search.own_beam_cost is not None and search.own_beam_cost < cost - chi2.isf(IMPOSSIBLE_P, 4):
+    if search.own_beam_cost is not None and search.own_beam_cost < cost - chdtri(4, IMPOSSIBLE_P):
         found.append(
             Condition(
                 Verdict.REFUSED,
@@ -172,7 +172,7 @@ def understated_noise(deviant: BoolArray, nis: FloatArray) -> list[Condition]:
     mild = deviant & (nis < MILD_NIS)
     share_of_junk = float(np.mean(deviant & ~mild))
     expected = min(JUNK_P + MILD_JUNK * share_of_junk, 1.0)
-    if float(binom.sf(int(mild.sum()) - 1, len(nis), expected)) >= SUSPICIOUS_P:
+    if float(bdtrc(int(mild.sum()) - 1, len(nis), expected)) >= SUSPICIOUS_P:
         return []
     return [
         Condition(
@@ -285,7 +285,7 @@ def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
     """Residuals against the noise that was stated."""
     if degrees_of_freedom <= 0:
         return []
-    p = float(chi2.sf(cost, degrees_of_freedom))
+    p = float(chdtrc(degrees_of_freedom, cost))
     if p >= SUSPICIOUS_P:
         return []
     return [

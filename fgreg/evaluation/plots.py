@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri, gammaln, xlogy
 
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.evaluation.run import SessionEvaluation
 from fgreg.evaluation.summary import all_tre_mm, pooled_curve
+from fgreg.frames import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,6 +105,11 @@ def curve_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     return figure
 
 
+def _chi_square_density(value: FloatArray, degrees_of_freedom: int) -> FloatArray:
+    half = 0.5 * degrees_of_freedom
+    return np.asarray(np.exp(xlogy(half - 1.0, value) - 0.5 * value - half * np.log(2.0) - gammaln(half)))
+
+
 def held_out_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     """Pair residual and NIS of PMs held out one by one."""
     held = [pm for e in evaluations for solve in (e.leave_one_out or e.k_fold) for pm in solve.held_out]
@@ -113,7 +119,7 @@ def held_out_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     figure = new_figure(6.4, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=bars)
     residual, nis = [pm.pair_residual_mm for pm in held], [pm.nis for pm in held]
-    limit = float(chi2.ppf(0.95, held[0].degrees_of_freedom))
+    limit = float(chdtri(held[0].degrees_of_freedom, 0.05))
     if bars:
         place = np.arange(len(held))
         upper.bar(place, residual, color=ORANGE, width=0.7)
@@ -129,7 +135,7 @@ def held_out_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
         upper.set(xlabel="pair residual, mm", ylabel="PMs")
         lower.hist(nis, bins=40, range=(0, max(12.0, float(np.quantile(nis, 0.99)))), density=True, color=BLUE)
         grid = np.linspace(0, lower.get_xlim()[1], 200)
-        lower.plot(grid, chi2.pdf(grid, held[0].degrees_of_freedom), color=GREY, label="chi square")
+        lower.plot(grid, _chi_square_density(grid, held[0].degrees_of_freedom), color=GREY, label="chi square")
         lower.legend(frameon=False, fontsize=8)
         lower.set(xlabel="NIS", ylabel="density")
     for axes in (upper, lower):

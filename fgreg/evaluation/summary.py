@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from fgreg.evaluation.resolve import HeldOutPm, Resolved
 from fgreg.evaluation.run import SessionEvaluation, SizedSolves
@@ -68,7 +68,7 @@ def prediction_of(solves: Sequence[Resolved]) -> Prediction | None:
     return Prediction(
         pair_residual_mm=residual,
         nis_per_degree=sum(pm.nis for pm in held) / freedom,
-        beyond_95=float(np.mean([pm.nis > chi2.ppf(QUANTILE, pm.degrees_of_freedom) for pm in held])),
+        beyond_95=float(np.mean([pm.nis > chdtri(pm.degrees_of_freedom, 1.0 - QUANTILE) for pm in held])),
         failed=sum(bool(solve.failure) for solve in solves),
     )
 
