@@ -161,8 +161,7 @@ def solve(
 
 def _summary_extras(report: SolveReport) -> Any:
     """What the summary tells besides the estimate."""
-    from fgreg.detection.find import PaFind
-    from fgreg.detection.marker import MarkerFit
+    from fgreg.detection.results import MarkerFit, PaFind
     from fgreg.events import PairEvent
     from fgreg.report import DetectionFigures, SummaryExtras, TruthFigures
 

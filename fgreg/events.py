@@ -35,6 +35,11 @@ class TrusRecord:
     sweep: int = 0
     frame: Path | None = None
 
+    @property
+    def needs_frame(self) -> bool:
+        """Whether x and range are to be found in the frame."""
+        return self.frame is not None and self.x_mm is None
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AimEvent:
@@ -122,6 +127,34 @@ class NoteEvent:
 
 
 Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | RefusedEvent | StageEvent | NoteEvent
+
+
+Shot = AimEvent | PairEvent | TrackEvent
+"""Events with a marker."""
+
+
+def looks_of(event: Event) -> tuple[TrusRecord, ...]:
+    """The looks that an event brings."""
+    if isinstance(event, PairEvent):
+        return (event.trus,)
+    return event.looks if isinstance(event, TrackEvent) else ()
+
+
+def needs_marker_frames(record: MarkerRecord, *, redetect: bool) -> bool:
+    """Whether the marker is to be found in the frames rather than taken from the recorded pose."""
+    return record.left is not None and (record.camera_T_marker is None or redetect)
+
+
+def needs_board(event: Shot) -> bool:
+    """Whether the board is to be found in the frames of an aim, rather than the spot taken as recorded."""
+    return isinstance(event, AimEvent) and event.camera_p_spot_mm is None
+
+
+def needs_frames(event: Event, *, redetect: bool) -> bool:
+    """Whether anything of an event is to be found in its frames."""
+    if isinstance(event, Shot) and (needs_board(event) or needs_marker_frames(event.marker, redetect=redetect)):
+        return True
+    return any(look.needs_frame for look in looks_of(event))
 
 
 def refused_lines(events: Iterable[Event]) -> dict[int, str]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,22 +18,24 @@ from fgreg import __version__
 from fgreg.batch import Solution, solve
 from fgreg.config import SolveConfig
 from fgreg.detection.camera import project
-from fgreg.detection.find import NoSignal, PaFind, pool_sound_speed_ratio
-from fgreg.detection.marker import MarkerFit
+from fgreg.detection.results import MarkerFit, NoSignal, PaFind, pool_sound_speed_ratio
 from fgreg.errors import InputError
 from fgreg.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
-from fgreg.events import AimEvent, Event, PairEvent, TrackEvent
+from fgreg.events import AimEvent, Event, PairEvent, TrackEvent, looks_of
 from fgreg.frames import FloatArray, transform_points
 from fgreg.models import SessionModel
-from fgreg.online.detect import DetectedMove, EpochsFound, find_epochs, renumbered, split_epochs
-from fgreg.recognition import Recognised, load_trus_frame, looks_of, marker_pictures, recognise
+from fgreg.recognition import Recognised, recognise
 from fgreg.registration import SoundSpeedPrior
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import remove_result, write_result
 from fgreg.targets import beam_error, tre_mm
 from fgreg.verdict import Condition
-from fgreg.viewer.recording import NullViewer, ShotKind, Viewer, open_viewer
+from fgreg.viewer.null_viewer import NullViewer, ShotKind, open_viewer
+
+if TYPE_CHECKING:
+    from fgreg.online.detect import DetectedMove, EpochsFound
+    from fgreg.viewer.recording import Viewer
 
 RESULT_FILE = "result.yaml"
 SOUND_SPEED_TOLERANCE = 0.005
@@ -116,21 +119,24 @@ def solve_session(
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
         prior = sound_speed_prior(recognised, config)
-        found = EpochsFound()
+        moves: tuple[DetectedMove, ...] = ()
+        conditions = detection_conditions(recognised, config)
         if request.detect_moves:
+            from fgreg.online.detect import find_epochs  # loads the online engine
+
             found = find_epochs(recognised.measurements, session.model, config, prior)
-        recognised = with_moves(recognised, found)
-        conditions = move_conditions(found)
+            recognised, moves = with_moves(recognised, found), found.moves
+            conditions = [*move_conditions(found), *conditions]
         solution = solve(
             recognised.measurements,
             recognised.tracks,
             session.model,
             config,
-            [*conditions, *detection_conditions(recognised, config)],
+            conditions,
             prior,
         )
         estimate = session_estimate(session, recognised, solution)
-        errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
+        errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
         show(viewer, session, recognised, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -150,6 +156,8 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
 
 def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
     """The session's events with camera moves in place that were found out: epochs of pairs and tracks follow."""
+    from fgreg.online.detect import renumbered, split_epochs
+
     if not found.texts:
         return recognised
     epoch_of = renumbered(recognised.epoch_of, recognised.pair_events, found.moves)
@@ -282,6 +290,8 @@ def show_frames(
     """The frames of one event with what was found in them; ``shot`` is its number among aims, pairs and tracks."""
     if isinstance(viewer, NullViewer):
         return  # spares reading the frames again
+    from fgreg.frame_detection import load_trus_frame, marker_pictures
+
     model = session.model
     kind: ShotKind = "aim" if isinstance(event, AimEvent) else "pair" if isinstance(event, PairEvent) else "track"
     if event.marker.left is not None and model.camera is not None:

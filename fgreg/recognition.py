@@ -1,31 +1,28 @@
 """Recorded events to measurements: frames are looked at, defaults of the noise filled in, epochs and shots numbered.
 
-A shot whose marker or PM is not found is no error: it gets a reason and is left out. Detection runs in threads (OpenCV
-and numpy release the interpreter lock); the corner noise is pooled over the session before any covariance is formed.
+A shot whose marker or PM is not found is no error: it gets a reason and is left out. The corner noise is pooled over
+the session before any covariance is formed.
 """
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from fgreg.detection.board import BoardFit, board_corner, detect_board
-from fgreg.detection.find import NoSignal, PaFind
-from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
 from fgreg.detection.noise import CornerNoise, Misfit, Weighed, pool_corner_noise
-from fgreg.detection.photoacoustic import locate_in_frame
-from fgreg.drivers.frame_files import read_array, read_picture
-from fgreg.errors import InputError
+from fgreg.detection.results import (
+    BoardFit,
+    FrameResults,
+    MarkerFit,
+    NoSignal,
+    NotFound,
+    PaFind,
+    board_corner,
+    marker_covariance,
+)
 from fgreg.events import (
     AimEvent,
     CameraMovedEvent,
@@ -34,6 +31,9 @@ from fgreg.events import (
     PairEvent,
     TrackEvent,
     TrusRecord,
+    looks_of,
+    needs_frames,
+    needs_marker_frames,
     refused_lines,
 )
 from fgreg.frames import FloatArray, as_float_array
@@ -47,12 +47,10 @@ from fgreg.measurements import (
     Track,
     default_marker_covariance,
 )
-from fgreg.models import SessionModel, StereoRig
-from fgreg.session.frames_named import check_camera_frame, check_trus_frame
+from fgreg.models import SessionModel
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
-Image = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,81 +84,11 @@ class Recognised:
     epoch_of: tuple[int, ...]
 
 
-@dataclass(slots=True, eq=False)
-class _Found:
-    markers: dict[int, MarkerFit | NotFound] = field(default_factory=dict)
-    boards: dict[int, BoardFit | NotFound] = field(default_factory=dict)
-    finds: dict[tuple[int, int], PaFind | NoSignal] = field(default_factory=dict)
-
-
-def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Image:
-    """An endoscope frame that an event names.
-
-    Raises:
-        InputError: missing, not a PNG image of the camera's size, or not decodable.
-    """
-    where = f"events.jsonl: line {line}: {key}"
-    check_camera_frame(path, path.name, where, None if rig is None else rig.left.image_size)
-    picture = read_picture(path)
-    if picture is None:
-        raise InputError(where, f"{path.name}, whose pixels cannot be decoded", "a PNG image")
-    return picture
-
-
-def load_trus_frame(path: Path, line: int, key: str, model: SessionModel) -> npt.NDArray[Any]:
-    """A probe frame that an event names.
-
-    Raises:
-        InputError: missing, not an NPY array that this probe can have recorded, or with numbers that are not finite.
-    """
-    where = f"events.jsonl: line {line}: {key}"
-    check_trus_frame(path, path.name, where, model.probe)
-    frame = read_array(path)
-    if frame is None:
-        raise InputError(where, f"{path.name}, which cannot be read", "an NPY array")
-    return frame
-
-
-def needs_marker_frames(record: MarkerRecord, *, redetect: bool) -> bool:
-    """Whether the marker is to be found in the frames rather than taken from the recorded pose."""
-    return record.left is not None and (record.camera_T_marker is None or redetect)
-
-
 def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
     """Equal for the same frames, or the same matrix."""
     if needs_marker_frames(record, redetect=redetect) or record.camera_T_marker is None:
         return record.left, record.right
     return record.camera_T_marker.tobytes()
-
-
-def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Image, Image | None]:
-    """Left and right frame of a shot; the right one only where the rig has a right camera."""
-    if record.left is None:
-        raise AssertionError("no frames to load")
-    left = load_picture(record.left, line, "marker.left", rig)
-    both = record.right is not None and rig.right is not None
-    right = load_picture(record.right, line, "marker.right", rig) if both and record.right is not None else None
-    return left, right
-
-
-@contextmanager
-def refusing(where: str) -> Iterator[None]:
-    """Turns a detector's refusal of a frame into an input error that names the place.
-
-    Raises:
-        InputError: instead of ValueError, OverflowError or LinAlgError.
-    """
-    try:
-        yield
-    except (ValueError, OverflowError, np.linalg.LinAlgError) as error:
-        raise InputError(where, f"a frame that cannot be worked with ({error})", "one as session.yaml says") from error
-
-
-def looks_of(event: Event) -> tuple[TrusRecord, ...]:
-    """The looks that an event brings."""
-    if isinstance(event, PairEvent):
-        return (event.trus,)
-    return event.looks if isinstance(event, TrackEvent) else ()
 
 
 def recognise(
@@ -232,64 +160,24 @@ def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tupl
     return tuple(starts), epoch_of
 
 
-def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progress: Progress | None) -> _Found:
-    found = _Found()
-    rig, marker, board = model.camera, model.marker, model.board
-    jobs: list[Callable[[], None]] = []
+def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progress: Progress | None) -> FrameResults:
+    if not any(needs_frames(event, redetect=redetect) for event in events):
+        return FrameResults()
+    from fgreg.frame_detection import detect_in_frames  # loads OpenCV, which poses and points do without
 
-    def optical(index: int, event: AimEvent | PairEvent | TrackEvent, wants_board: bool) -> None:
-        wants_marker = needs_marker_frames(event.marker, redetect=redetect)
-        if rig is None:
-            raise InputError("session.yaml: camera", "nothing", f"the cameras, for line {event.line} of events.jsonl")
-        if wants_marker and marker is None:
-            raise InputError("session.yaml: marker", "nothing", f"the marker, for line {event.line} of events.jsonl")
-        left, right = marker_pictures(event.marker, event.line, rig)
-        with refusing(f"events.jsonl: line {event.line}: marker"):
-            if wants_marker and marker is not None:
-                found.markers[index] = detect_marker(left, right, rig, marker)
-            if wants_board and board is not None:
-                found.boards[index] = detect_board(left, right, rig, board)
-
-    def acoustic(index: int, number: int, event: PairEvent | TrackEvent, path: Path) -> None:
-        key = "trus.frame" if len(looks_of(event)) == 1 else f"looks[{number}].frame"
-        frame = load_trus_frame(path, event.line, key, model)
-        with refusing(f"events.jsonl: line {event.line}: {key}"):
-            found.finds[index, number] = locate_in_frame(frame, model.probe)
-
-    for index, event in enumerate(events):
-        if isinstance(event, AimEvent | PairEvent | TrackEvent):
-            wants_board = isinstance(event, AimEvent) and event.camera_p_spot_mm is None
-            if wants_board or needs_marker_frames(event.marker, redetect=redetect):
-                jobs.append(lambda i=index, e=event, b=wants_board: optical(i, e, b))  # type: ignore[misc]
-        if isinstance(event, PairEvent | TrackEvent):
-            for number, look in enumerate(looks_of(event)):
-                if look.frame is not None and look.x_mm is None:
-                    jobs.append(lambda i=index, n=number, e=event, p=look.frame: acoustic(i, n, e, p))  # type: ignore[misc]
-    _run(jobs, progress)
-    return found
-
-
-def _run(jobs: Sequence[Callable[[], None]], progress: Progress | None) -> None:
-    """All jobs, in threads; the first error in the events' order is raised."""
-    if not jobs:
-        return
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        futures = [pool.submit(job) for job in jobs]
-        try:
-            for done, future in enumerate(futures, 1):
-                future.result()
-                if progress is not None:
-                    progress(done, len(jobs))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    return detect_in_frames(events, model, redetect=redetect, progress=progress)
 
 
 class _Builder:
     """Collects measurements event by event."""
 
     def __init__(
-        self, model: SessionModel, found: _Found, marker_noise: CornerNoise, board_noise: CornerNoise, redetect: bool
+        self,
+        model: SessionModel,
+        found: FrameResults,
+        marker_noise: CornerNoise,
+        board_noise: CornerNoise,
+        redetect: bool,
     ) -> None:
         self.model, self.found, self.redetect = model, found, redetect
         self.marker_noise, self.board_noise = marker_noise, board_noise
@@ -422,7 +310,7 @@ class EventRecogniser:
 
     def __init__(self, model: SessionModel) -> None:
         nothing = pool_corner_noise(())
-        self._builder = _Builder(model, _Found(), nothing, nothing, redetect=False)
+        self._builder = _Builder(model, FrameResults(), nothing, nothing, redetect=False)
         self._markers: list[Misfit] = []
         self._boards: list[Misfit] = []
         self._before = (0, 0)

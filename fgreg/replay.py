@@ -38,7 +38,8 @@ from fgreg.pipeline import (
 from fgreg.recognition import Recognised, recognise
 from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import write_result
-from fgreg.viewer.recording import Moment, NullViewer, Viewer, open_viewer
+from fgreg.viewer.null_viewer import NullViewer, open_viewer
+from fgreg.viewer.recording import Moment, Viewer
 from fgreg.viewer.spawn import spawn_viewer
 
 Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent

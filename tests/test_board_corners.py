@@ -7,16 +7,9 @@ import contextlib
 import numpy as np
 import pytest
 
-from fgreg.detection.board import (
-    BoardFit,
-    board_corner,
-    board_covariance,
-    detect_board,
-    find_board_corners,
-    order_corners,
-)
-from fgreg.detection.joint import NotFound
+from fgreg.detection.board import detect_board, find_board_corners, order_corners
 from fgreg.detection.noise import pool_corner_noise
+from fgreg.detection.results import BoardFit, NotFound, board_corner, board_covariance
 from fgreg.frames import FloatArray, exp_so3, make_transform, transform_points
 from fgreg.models import BoardModel, CharucoModel, StereoRig
 from fgreg.simulation.render import BoardSurface, PatchSurface

@@ -9,7 +9,9 @@ import numpy.typing as npt
 import pytest
 
 from fgreg.detection.channels import baseband, prepare_channels
-from fgreg.detection.photoacoustic import NoSignal, PaFind, locate_in_frame, locate_in_image
+from fgreg.detection.envelope import locate_in_image
+from fgreg.detection.photoacoustic import locate_in_frame
+from fgreg.detection.results import NoSignal, PaFind
 from fgreg.detection.wavefront import SEARCH_BANDS
 from fgreg.frames import as_float_array
 from fgreg.models import ChannelModel, ImageModel, ProbeModel, SensitivityModel

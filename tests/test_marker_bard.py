@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
+from fgreg.detection.marker import detect_marker
 from fgreg.detection.noise import pool_corner_noise
+from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
 from fgreg.frames import as_float_array, log_so3, make_transform
 from fgreg.models import CameraModel, MarkerModel, StereoRig, TagModel
 

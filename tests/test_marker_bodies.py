@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, detect_marker
+from fgreg.detection.marker import detect_marker
+from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import dictionary_named, find_tags
 from fgreg.frames import FloatArray, as_float_array, exp_so3, make_transform
 from fgreg.models import MarkerModel, StereoRig, TagModel

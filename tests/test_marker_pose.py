@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
+from fgreg.detection.marker import detect_marker
 from fgreg.detection.noise import pool_corner_noise
 from fgreg.detection.pose import CornerSet, common_covariance, corner_residuals, fit_pose
+from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
 from fgreg.frames import FloatArray, exp_so3, make_transform, transform_points
 from fgreg.models import StereoRig
 from tests.marker_scene import (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgreg.detection.find import NoSignal
+from fgreg.detection.results import NoSignal
 from fgreg.drivers.base import PaFrame
 from fgreg.operation.senses import LOCATE_S, MOST_UNDER_WAY, Ears
 from fgreg.operation.view import Heard

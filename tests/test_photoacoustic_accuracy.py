@@ -9,7 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from fgreg.detection.arrival import path_jacobian, path_mm
-from fgreg.detection.photoacoustic import PaFind, locate_in_channels, locate_in_frame
+from fgreg.detection.photoacoustic import locate_in_channels, locate_in_frame
+from fgreg.detection.results import PaFind
 from fgreg.frames import as_float_array
 from fgreg.models import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, quantised, simulate_channels

@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fgreg.detection.photoacoustic import NoSignal, PaFind, locate_in_channels
+from fgreg.detection.photoacoustic import locate_in_channels
+from fgreg.detection.results import NoSignal, PaFind
 from fgreg.frames import as_float_array
 from fgreg.models import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, noise_channels, simulate_channels

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from fgreg.detection.photoacoustic import PaFind, locate_in_channels, pool_sound_speed_ratio
+from fgreg.detection.photoacoustic import locate_in_channels
+from fgreg.detection.results import PaFind, pool_sound_speed_ratio
 from fgreg.frames import as_float_array
 from fgreg.models import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, simulate_channels

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from fgreg.detection.marker import MarkerFit, detect_marker, right_corners
+from fgreg.detection.marker import detect_marker, right_corners
+from fgreg.detection.results import MarkerFit
 from fgreg.drivers.base import StereoFrame
 from fgreg.models import SessionModel
 from fgreg.operation.second_eye import SecondEye

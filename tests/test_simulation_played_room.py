@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from played_room import FRAME_RATE, LOOP_S, Making, PlayedRoom, make_pictures
 
-from fgreg.detection.marker import MarkerFit, detect_marker
+from fgreg.detection.marker import detect_marker
+from fgreg.detection.results import MarkerFit
 from fgreg.frames import log_so3
 from fgreg.simulation.room import RoomConfig, room_config
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.detection.find import PaFind
-from fgreg.detection.marker import MarkerFit, detect_marker
+from fgreg.detection.marker import detect_marker
 from fgreg.detection.photoacoustic import locate_in_frame
+from fgreg.detection.results import MarkerFit, PaFind
 from fgreg.frames import is_rigid
 from fgreg.simulation.room import BUMP_S, Room, room_config
 

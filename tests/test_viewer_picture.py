@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fgreg.viewer.recording import open_viewer
+from fgreg.viewer.null_viewer import open_viewer
 from tests.answers import answer_from_truth
 from tests.forward import make_measurements
 

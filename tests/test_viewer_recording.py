@@ -27,7 +27,8 @@ from fgreg.models import (
     StereoRig,
     TagModel,
 )
-from fgreg.viewer.recording import NullViewer, Viewer, open_viewer
+from fgreg.viewer.null_viewer import NullViewer, open_viewer
+from fgreg.viewer.recording import Viewer
 from tests.answers import REGISTRATION_COVARIANCE, answer_from_truth
 from tests.forward import Truth, make_measurements, make_session
 from tests.recordings import Row, read_recording, transform_of, views
@@ -449,7 +450,7 @@ def test_the_null_viewer_takes_every_call_and_writes_nothing(tmp_path: Path, mon
 
 def test_rerun_is_not_imported_before_a_recording_is_asked_for() -> None:
     code = (
-        "import sys; from fgreg.viewer.recording import open_viewer\n"
+        "import sys; from fgreg.viewer.null_viewer import open_viewer\n"
         "with open_viewer(None, 'x') as v: pass\n"
         "assert 'rerun' not in sys.modules and 'cv2' not in sys.modules"
     )

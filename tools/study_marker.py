@@ -28,10 +28,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fgreg.detection.board import board_corner, board_covariance, detect_board
-from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, detect_marker, marker_covariance
+from fgreg.detection.board import detect_board
+from fgreg.detection.marker import detect_marker
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.detection.results import MarkerFit, NotFound, board_corner, board_covariance, marker_covariance
 from fgreg.frames import (
     FloatArray,
     as_float_array,

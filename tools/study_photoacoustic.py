@@ -25,13 +25,9 @@ import numpy.typing as npt
 
 from fgreg.detection.arrival import fit_wavefront
 from fgreg.detection.channels import prepare_channels
-from fgreg.detection.photoacoustic import (
-    NoSignal,
-    PaFind,
-    locate_in_channels,
-    locate_in_image,
-    pool_sound_speed_ratio,
-)
+from fgreg.detection.envelope import locate_in_image
+from fgreg.detection.photoacoustic import locate_in_channels
+from fgreg.detection.results import NoSignal, PaFind, pool_sound_speed_ratio
 from fgreg.frames import FloatArray, as_float_array
 from fgreg.models import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, noise_channels, simulate_channels, simulate_envelope_image

@@ -10,8 +10,6 @@ Board frame: origin at corner [0, 0], x along the columns, y down the rows, z aw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +17,11 @@ import numpy.typing as npt
 from fgreg.detection.camera import focal_px, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.corners import grey, refine_subpixel
 from fgreg.detection.edges import MIN_CONTRAST, Image
-from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, choose_pose, robust_pose
-from fgreg.detection.noise import CornerNoise, fit_covariance
+from fgreg.detection.joint import VIEW_NAMES, choose_pose, robust_pose
 from fgreg.detection.pose import CornerSet, join
+from fgreg.detection.results import BoardFit, NotFound
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
-from fgreg.frames import BoolArray, FloatArray, IntArray, hat
+from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.models import BoardModel, CameraModel, StereoRig
 
 CORNER_SIGMA_PX = 0.03
@@ -34,42 +32,6 @@ MIN_CORNERS = 6
 SMALL_WIDTH_PX = 640
 HALF_ENOUGH = 0.5
 """Share of the corners that has to be found at half the resolution."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardFit:
-    """A board found: its pose with all that goes with it."""
-
-    pose: RigidFit
-    board: BoardModel
-
-    @property
-    def camera_T_board(self) -> FloatArray:
-        """(4, 4)."""
-        return self.pose.camera_T_body
-
-
-def board_covariance(fit: BoardFit, noise: CornerNoise) -> FloatArray:
-    """(6, 6) covariance of ``camera_T_board`` over the right tangent (rotation rad, translation mm)."""
-    return fit_covariance(fit.pose, noise)
-
-
-def board_corner(fit: BoardFit, column: int, row: int, noise: CornerNoise) -> tuple[FloatArray, FloatArray]:
-    """Where a corner is: (camera_p_mm (3,), covariance (3, 3) along the camera's axes).
-
-    From the pose fitted to all corners, so it is as good as the board is flat, and need not itself be in view.
-
-    Raises:
-        ValueError: the board has no such corner.
-    """
-    board = fit.board
-    if not (0 <= column < board.columns and 0 <= row < board.rows):
-        raise ValueError(f"corner [{column}, {row}], expected [0..{board.columns - 1}, 0..{board.rows - 1}]")
-    board_p = np.array([column, row, 0.0]) * board.square_mm
-    rotation = fit.camera_T_board[:3, :3]
-    jacobian = rotation @ np.hstack([-hat(board_p), np.eye(3)])
-    covariance = jacobian @ board_covariance(fit, noise) @ jacobian.T
-    return rotation @ board_p + fit.camera_T_board[:3, 3], covariance
 
 
 def _find_chessboard(image: Image, board: BoardModel) -> FloatArray | None:

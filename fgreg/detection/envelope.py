@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy import ndimage, optimize
 
 from fgreg.detection.channels import check_frame
-from fgreg.detection.find import NoSignal, PaFind
+from fgreg.detection.results import NoSignal, PaFind
 from fgreg.frames import FloatArray
 from fgreg.models import ImageModel, ProbeModel
 

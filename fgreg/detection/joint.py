@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from fgreg.detection.pose import (
@@ -16,6 +14,7 @@ from fgreg.detection.pose import (
     pose_hypotheses,
     whitener,
 )
+from fgreg.detection.results import NotFound, RigidFit
 from fgreg.frames import FloatArray
 
 VIEW_NAMES = ("left", "right")
@@ -31,44 +30,6 @@ STRAY_PX, STRAY_START_PX = 2.0, 15.0
 AMBIGUITY_CHI2 = 25.0
 """Difference in chi-square at that noise (or at the residuals', where they are larger) below which a pose is ambiguous:
 odds of 2.7e5 to 1."""
-
-
-@dataclass(frozen=True, slots=True)
-class NotFound:
-    """Nothing that can be used; the reason as a plain sentence part."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RigidFit:
-    """A rigid body found in one or two views.
-
-    Attributes:
-        camera_T_body: (4, 4).
-        information: (6, 6) over the right tangent (rotation rad, translation mm), at corner noise scale 1.
-        common_covariance: (6, 6) of the errors that residuals cannot show (method bias, errors common to both views).
-        cost: whitened sum of squared residuals, chi-square of ``dof`` at scale 1.
-        dof: residuals less 6.
-        corners: how many, over all views.
-        views: names of the views used.
-        rms_px: root mean square distance of predicted from observed corners, undistorted pixels.
-        residual_sum_px2: sum of those squared distances.
-        second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
-        left_out: what was seen but not used, with the reason.
-    """
-
-    camera_T_body: FloatArray
-    information: FloatArray
-    common_covariance: FloatArray
-    cost: float
-    dof: int
-    corners: int
-    views: tuple[str, ...]
-    rms_px: float
-    residual_sum_px2: float
-    second_ratio: float
-    left_out: tuple[str, ...]
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:

@@ -15,33 +15,15 @@ import numpy.typing as npt
 from fgreg.detection.camera import focal_px
 from fgreg.detection.corners import grey, square_corners
 from fgreg.detection.edges import Image
-from fgreg.detection.joint import VIEW_NAMES, NotFound, RigidFit, choose_pose, without_strays
-from fgreg.detection.noise import CornerNoise, fit_covariance
+from fgreg.detection.joint import VIEW_NAMES, choose_pose, without_strays
 from fgreg.detection.pose import CornerSet, join
+from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import FoundTag, find_tags, tag_cells
 from fgreg.frames import FloatArray
 from fgreg.models import CameraModel, MarkerModel, StereoRig
 
 LARGE_WIDTH_PX = 1000
 """From this width on a single tag is looked for at half the resolution first."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerFit:
-    """A marker found: its pose with all that goes with it, and the ids of the tags used."""
-
-    pose: RigidFit
-    tags: tuple[int, ...]
-
-    @property
-    def camera_T_marker(self) -> FloatArray:
-        """(4, 4)."""
-        return self.pose.camera_T_body
-
-
-def marker_covariance(fit: MarkerFit, noise: CornerNoise) -> FloatArray:
-    """(6, 6) covariance over the right tangent (rotation rad, translation mm) at the session's corner noise."""
-    return fit_covariance(fit.pose, noise)
 
 
 def _own_tags(found: list[FoundTag], marker: MarkerModel, view: str) -> tuple[list[FoundTag], list[str]]:

@@ -18,14 +18,11 @@ import numpy.typing as npt
 
 from fgreg.detection.arrival import WavefrontFit, fit_wavefront, path_mm
 from fgreg.detection.channels import check_frame, prepare_channels
-from fgreg.detection.envelope import locate_in_image
-from fgreg.detection.find import NoSignal, PaFind, pool_sound_speed_ratio
+from fgreg.detection.results import NoSignal, PaFind
 from fgreg.detection.wavefront import COARSE_RANGE_MM, MAX_TANGENT, RATIOS, SIDELOBES_MM, find_peaks, search_nearby
 from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray
 from fgreg.models import ProbeModel
-
-__all__ = ["NoSignal", "PaFind", "locate_in_channels", "locate_in_frame", "locate_in_image", "pool_sound_speed_ratio"]
 
 FALSE_ALARMS = 2e-4
 """Share of frames of noise in which a source may be found by mistake."""
@@ -128,6 +125,8 @@ def locate_in_frame(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     if probe.channels is not None and (probe.image is None or probe.is_channel_data(frame)):
         return locate_in_channels(data, probe)
     if probe.image is not None:
+        from fgreg.detection.envelope import locate_in_image  # loads scipy.optimize and scipy.ndimage
+
         return locate_in_image(data, probe)
     raise ValueError("the probe has neither channel sampling (probe.channels) nor image geometry (probe.image)")
 

@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 
 import numpy.typing as npt
 
-from fgreg.detection.find import NoSignal, PaFind
 from fgreg.detection.photoacoustic import locate_in_frame
+from fgreg.detection.results import NoSignal, PaFind
 from fgreg.models import ProbeModel
 from fgreg.workers.worker_process import NICENESS
 

@@ -14,9 +14,9 @@ from typing import Protocol
 
 import numpy as np
 
-from fgreg.detection.board import BoardFit, board_corner, detect_board
-from fgreg.detection.joint import NotFound
+from fgreg.detection.board import detect_board
 from fgreg.detection.noise import pool_corner_noise
+from fgreg.detection.results import BoardFit, NotFound, board_corner
 from fgreg.drivers.base import BmodeFrame, Command, DeviceLost, Registration, StereoFrame, host_now
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.find import NoSignal, PaFind
-from fgreg.detection.joint import NotFound
-from fgreg.detection.marker import MarkerFit, ViewCorners, marker_covariance, marker_from_views
+from fgreg.detection.marker import ViewCorners, marker_from_views
 from fgreg.detection.noise import CornerNoise, pool_corner_noise
+from fgreg.detection.results import MarkerFit, NoSignal, NotFound, PaFind, marker_covariance
 from fgreg.detection.view_watch import ViewWatch
 from fgreg.drivers.base import PaFrame, StereoFrame, host_now
 from fgreg.models import SessionModel

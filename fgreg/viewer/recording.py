@@ -1,4 +1,4 @@
-"""The Rerun recording of a session, and its null twin that takes the same calls and does nothing.
+"""The Rerun recording of a session; its null twin is in null_viewer.py.
 
 Entities, all in TRUS millimetres unless a parent's transform says otherwise:
 
@@ -21,7 +21,7 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -36,68 +36,13 @@ from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LivePainter, Moment
 from fgreg.viewer.now import BmodePicture
+from fgreg.viewer.null_viewer import ShotKind
 from fgreg.viewer.pa import pa_picture, texture
 from fgreg.viewer.result import ResultPainter, Truth
 from fgreg.viewer.shapes import Image8
 
 LARGEST_TEXTURE = 160
 """Larger side of a B-mode picture on the image plane, pixels."""
-ShotKind = Literal["aim", "pair", "track"]
-
-
-class NullViewer:
-    """Takes every call of :class:`Viewer` and does nothing, for runs without a recording."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing to close."""
-
-    def session(self, model: SessionModel) -> None:
-        """Nothing is drawn."""
-
-    def shot_images(
-        self,
-        t: float,
-        kind: ShotKind,
-        index: int,
-        left: Image8 | None,
-        right: Image8 | None = None,
-        marker_outlines_px: Iterable[FloatArray] | None = None,
-        corner_px: FloatArray | None = None,
-    ) -> None:
-        """Nothing is drawn."""
-
-    def pa_frame(
-        self,
-        t: float,
-        index: int,
-        frame: npt.NDArray[np.generic],
-        x_mm: float | None,
-        range_mm: float | None,
-        covariance: FloatArray | None,
-        probe: ProbeModel,
-    ) -> None:
-        """Nothing is drawn."""
-
-    def bmode(self, t: float, index: int, picture: BmodePicture | None) -> None:
-        """Nothing is drawn."""
-
-    def moment(self, moment: Moment) -> None:
-        """Nothing is drawn."""
-
-    def result(
-        self,
-        model: SessionModel,
-        measurements: Measurements,
-        estimate: SessionEstimate,
-        truth: Truth | None = None,
-        tracks: Sequence[Track] = (),
-    ) -> None:
-        """Nothing is drawn."""
 
 
 def _is_recording(path: Path) -> bool:
@@ -425,13 +370,4 @@ class Viewer:
         self._live.draw(moment, textured=moment.number in self._textured)
 
 
-def open_viewer(rrd: Path | None, session_name: str, url: str | None = None) -> Viewer | NullViewer:
-    """A viewer that records to ``rrd``, shows in the running viewer at ``url``, or its null twin where both are None.
-
-    Raises:
-        InputError: the folder of ``rrd`` does not exist or cannot be written to, or ``rrd`` is a folder.
-    """
-    return NullViewer() if rrd is None and url is None else Viewer(rrd, session_name, url)
-
-
-__all__ = ["Moment", "NullViewer", "ShotKind", "Truth", "Viewer", "open_viewer"]
+__all__ = ["Moment", "Truth", "Viewer"]

@@ -1,0 +1,186 @@
+"""What a frame can answer: the pose of marker or board, a photoacoustic point, or why there is none.
+
+Apart from the detectors, so that who reads results need not load OpenCV.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fgreg.detection.noise import CornerNoise, fit_covariance
+from fgreg.frames import FloatArray, hat
+from fgreg.models import BoardModel
+
+
+@dataclass(frozen=True, slots=True)
+class NotFound:
+    """Nothing that can be used; the reason as a plain sentence part."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigidFit:
+    """A rigid body found in one or two views.
+
+    Attributes:
+        camera_T_body: (4, 4).
+        information: (6, 6) over the right tangent (rotation rad, translation mm), at corner noise scale 1.
+        common_covariance: (6, 6) of the errors that residuals cannot show (method bias, errors common to both views).
+        cost: whitened sum of squared residuals, chi-square of ``dof`` at scale 1.
+        dof: residuals less 6.
+        corners: how many, over all views.
+        views: names of the views used.
+        rms_px: root mean square distance of predicted from observed corners, undistorted pixels.
+        residual_sum_px2: sum of those squared distances.
+        second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
+        left_out: what was seen but not used, with the reason.
+    """
+
+    camera_T_body: FloatArray
+    information: FloatArray
+    common_covariance: FloatArray
+    cost: float
+    dof: int
+    corners: int
+    views: tuple[str, ...]
+    rms_px: float
+    residual_sum_px2: float
+    second_ratio: float
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerFit:
+    """A marker found: its pose with all that goes with it, and the ids of the tags used."""
+
+    pose: RigidFit
+    tags: tuple[int, ...]
+
+    @property
+    def camera_T_marker(self) -> FloatArray:
+        """(4, 4)."""
+        return self.pose.camera_T_body
+
+
+def marker_covariance(fit: MarkerFit, noise: CornerNoise) -> FloatArray:
+    """(6, 6) covariance over the right tangent (rotation rad, translation mm) at the session's corner noise."""
+    return fit_covariance(fit.pose, noise)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardFit:
+    """A board found: its pose with all that goes with it."""
+
+    pose: RigidFit
+    board: BoardModel
+
+    @property
+    def camera_T_board(self) -> FloatArray:
+        """(4, 4)."""
+        return self.pose.camera_T_body
+
+
+def board_covariance(fit: BoardFit, noise: CornerNoise) -> FloatArray:
+    """(6, 6) covariance of ``camera_T_board`` over the right tangent (rotation rad, translation mm)."""
+    return fit_covariance(fit.pose, noise)
+
+
+def board_corner(fit: BoardFit, column: int, row: int, noise: CornerNoise) -> tuple[FloatArray, FloatArray]:
+    """Where a corner is: (camera_p_mm (3,), covariance (3, 3) along the camera's axes).
+
+    From the pose fitted to all corners, so it is as good as the board is flat, and need not itself be in view.
+
+    Raises:
+        ValueError: the board has no such corner.
+    """
+    board = fit.board
+    if not (0 <= column < board.columns and 0 <= row < board.rows):
+        raise ValueError(f"corner [{column}, {row}], expected [0..{board.columns - 1}, 0..{board.rows - 1}]")
+    board_p = np.array([column, row, 0.0]) * board.square_mm
+    rotation = fit.camera_T_board[:3, :3]
+    jacobian = rotation @ np.hstack([-hat(board_p), np.eye(3)])
+    covariance = jacobian @ board_covariance(fit, noise) @ jacobian.T
+    return rotation @ board_p + fit.camera_T_board[:3, 3], covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PaFind:
+    """One photoacoustic source found in one frame.
+
+    Attributes:
+        x_mm: TRUS x of the source.
+        range_mm: distance from the element row along the image plane, as the *assumed* sound speed has it: assumed
+            speed times the arrival time at the apex of the wavefront. Multiplied by the true ratio of sound speeds
+            (``sound_speed_ratio`` once it is known well enough) it is the true range.
+        covariance: (2, 2) over (x_mm, range_mm), mm^2.
+        amplitude: peak of the wave's envelope at the strongest elements (channel data) or in the image, in the
+            frame's units; comparable within one source only.
+        snr_db: amplitude / sqrt(2) over the standard deviation of the noise, per sample.
+        sound_speed_ratio: true over assumed sound speed as the wavefront's shape alone tells it; None for images,
+            which do not hold the wavefront.
+        sound_speed_ratio_sigma: its standard deviation.
+        elements_used: number of elements that heard the source and entered the fit; None for images.
+        statistic, threshold: the detection statistic (log likelihood ratio) and what it had to exceed.
+    """
+
+    x_mm: float
+    range_mm: float
+    covariance: FloatArray
+    amplitude: float
+    snr_db: float
+    sound_speed_ratio: float | None
+    sound_speed_ratio_sigma: float | None
+    elements_used: int | None
+    statistic: float
+    threshold: float
+
+
+@dataclass(frozen=True, slots=True)
+class NoSignal:
+    """There is no source in the frame; ``reason`` says so with the figure behind it."""
+
+    reason: str
+
+
+def pool_sound_speed_ratio(finds: Iterable[PaFind]) -> tuple[float, float] | None:
+    """Ratio of true to assumed sound speed over many finds, weighted by their variances.
+
+    The sigma is enlarged by the spread of the finds where that is larger than their sigmas explain.
+
+    Args:
+        finds: finds in channel data; those without a ratio are passed over.
+
+    Returns:
+        (ratio, sigma), or None where no find has a ratio. Worth a warning where ``abs(ratio - 1)`` exceeds both 3
+        sigma and 0.005.
+    """
+    pairs = [
+        (find.sound_speed_ratio, find.sound_speed_ratio_sigma**-2)
+        for find in finds
+        if find.sound_speed_ratio is not None and find.sound_speed_ratio_sigma is not None
+    ]
+    if not pairs:
+        return None
+    weight = math.fsum(w for _, w in pairs)
+    ratio = math.fsum(w * value for value, w in pairs) / weight
+    spread = math.fsum(w * (value - ratio) ** 2 for value, w in pairs) / max(len(pairs) - 1, 1)
+    return ratio, math.sqrt(max(1.0, spread) / weight)
+
+
+@dataclass(slots=True, eq=False)
+class FrameResults:
+    """What was found in a session's frames.
+
+    Attributes:
+        markers, boards: by the event's index; of every event whose marker or board is looked for in frames.
+        finds: by (the event's index, number of the look).
+    """
+
+    markers: dict[int, MarkerFit | NotFound] = field(default_factory=dict)
+    boards: dict[int, BoardFit | NotFound] = field(default_factory=dict)
+    finds: dict[tuple[int, int], PaFind | NoSignal] = field(default_factory=dict)
