@@ -116,7 +116,7 @@ def _pid_of(case: Rig, what: str) -> int:
         assert link is not None
         return link.pid
     if what == "locator":
-        pid = case.session.loop.ears.locator._pid
+        pid = case.session.loop.ears.locator.pid
         assert pid is not None
         return pid
     (engine,) = [child for child in multiprocessing.active_children() if child.name == "fgreg-engine"]
@@ -194,7 +194,7 @@ class Trial:
 def trial(case: Rig, fault: Fault, lasts_s: float, *, orders: bool = True, rest_s: float = 2.0) -> Trial:
     """Make a fault where all is well, mend it, and let the session go on: until the next order, and a while more."""
     found, ears = Trial(), case.session.loop.ears
-    case.run(PATIENCE_S, lambda: not case.session.loop.lost and ears.locator._pid is not None)
+    case.run(PATIENCE_S, lambda: not case.session.loop.lost and ears.locator.ready)
     before, began = case.counts(), time.monotonic()
     mend = fault.begin(case, fault.what)
     lost, back = f"{fault.role} lost", f"{fault.role} is back"

@@ -29,7 +29,7 @@ def ears() -> Iterator[Ears]:
     assert isinstance(model, SessionModel), problems
     ears = Ears(model)
     try:
-        turn(ears, lambda: ears.locator._pid is not None)
+        turn(ears, lambda: ears.locator.ready)
         yield ears
     finally:
         ears.close()
@@ -64,7 +64,7 @@ def test_pulses_under_way_when_it_is_killed_are_located_by_the_next(
     ears: Ears, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(senses, "LOCATE_S", 60.0)  # a busy machine takes its time to start another
-    pid = ears.locator._pid
+    pid = ears.locator.pid
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
     for _ in range(3):
@@ -77,28 +77,28 @@ def test_pulses_under_way_when_it_is_killed_are_located_by_the_next(
     assert len(heard) == 3
     assert [one.scan_rad for one in heard] == [0.1, None, None]  # one at a time is looked into: nothing heard
     turn(ears, lambda: not ears.trouble)
-    assert ears.locator._pid not in (None, pid)
+    assert ears.locator.pid not in (None, pid)
 
 
 def test_one_that_ended_while_idle_is_noticed_and_replaced(ears: Ears) -> None:
-    pid = ears.locator._pid
+    pid = ears.locator.pid
     assert pid is not None
     os.kill(pid, signal.SIGKILL)
     turn(ears, lambda: ears.trouble)
-    assert ears.trouble == "it had ended"
+    assert ears.trouble == "it has ended"
     turn(ears, lambda: not ears.trouble)
-    assert ears.locator._pid not in (None, pid)
+    assert ears.locator.pid not in (None, pid)
 
 
 def test_one_that_hangs_is_told_and_trouble_ends_when_it_goes_on(ears: Ears) -> None:
-    pid = ears.locator._pid
+    pid = ears.locator.pid
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
     turn(ears, lambda: ears.trouble)
     assert "has not answered" in ears.trouble
     os.kill(pid, signal.SIGCONT)
     turn(ears, lambda: not ears.trouble)
-    assert ears.locator._pid == pid
+    assert ears.locator.pid == pid
 
 
 def test_a_frame_that_cannot_be_looked_into_is_no_silence(ears: Ears) -> None:

@@ -14,7 +14,7 @@ from fgreg.detection.marker import detect_marker, right_corners
 from fgreg.detection.results import MarkerFit
 from fgreg.drivers.base import StereoFrame
 from fgreg.models import SessionModel
-from fgreg.operation.second_eye import SecondEye
+from fgreg.operation.second_eye import RightViewWorker
 from fgreg.operation.senses import Eyes
 from fgreg.pairing import Stamp
 from fgreg.session.setup import read_setup
@@ -35,43 +35,41 @@ def room() -> tuple[SessionModel, list[Pictures]]:
 
 
 @pytest.fixture
-def eye(room: tuple[SessionModel, list[Pictures]]) -> Iterator[SecondEye]:
+def worker(room: tuple[SessionModel, list[Pictures]]) -> Iterator[RightViewWorker]:
     model = room[0]
     assert model.camera is not None
     assert model.marker is not None
-    found = SecondEye(model.camera, model.marker)
+    found = RightViewWorker(model.camera, model.marker)
     try:
         yield found
     finally:
         found.close()
 
 
-def ready(eye: SecondEye, image: UInt8Image) -> None:
+def ready(worker: RightViewWorker, image: UInt8Image) -> None:
     """Until it has looked at a picture."""
     end = time.monotonic() + 60.0
-    while not eye.look(image):
+    while not worker.look(image):
         assert time.monotonic() < end
         time.sleep(0.02)
 
 
-def seen_of(eye: SecondEye) -> object:
+def seen_of(worker: RightViewWorker) -> object:
     """What it answers, on a machine that may be busy."""
-    found = None
-    end = time.monotonic() + 10.0
-    connection = eye._connection
-    assert connection is not None
-    while found is None and time.monotonic() < end and connection.poll(10.0):
-        found = eye.seen()
-    return found
+    process = worker._worker
+    assert process is not None
+    process.answer_s = 60.0
+    reply = process.fetch(60.0)
+    return None if reply is None else reply[0]
 
 
-def test_it_sees_what_is_seen_here(room: tuple[SessionModel, list[Pictures]], eye: SecondEye) -> None:
+def test_it_sees_what_is_seen_here(room: tuple[SessionModel, list[Pictures]], worker: RightViewWorker) -> None:
     model, pictures = room
     assert model.camera is not None
     assert model.marker is not None
     for _, right in pictures:
-        ready(eye, right)
-        found = seen_of(eye)
+        ready(worker, right)
+        found = seen_of(worker)
         here = right_corners(right, model.camera, model.marker)
         assert found is not None
         assert here.corners is not None
@@ -79,21 +77,25 @@ def test_it_sees_what_is_seen_here(room: tuple[SessionModel, list[Pictures]], ey
         np.testing.assert_array_equal(found.corners.covariance, here.corners.covariance)  # type: ignore[attr-defined]
 
 
-def test_a_picture_without_a_marker_is_no_trouble(room: tuple[SessionModel, list[Pictures]], eye: SecondEye) -> None:
+def test_a_picture_without_a_marker_is_no_trouble(
+    room: tuple[SessionModel, list[Pictures]], worker: RightViewWorker
+) -> None:
     blank = np.full_like(room[1][0][1], 90)
-    ready(eye, blank)
-    found = seen_of(eye)
+    ready(worker, blank)
+    found = seen_of(worker)
     assert found is not None
     assert found.corners is None  # type: ignore[attr-defined]
 
 
-def test_another_size_of_pictures_begins_anew(room: tuple[SessionModel, list[Pictures]], eye: SecondEye) -> None:
+def test_another_size_of_pictures_begins_anew(
+    room: tuple[SessionModel, list[Pictures]], worker: RightViewWorker
+) -> None:
     right = room[1][0][1]
-    ready(eye, right)
-    assert seen_of(eye) is not None
-    assert not eye.look(np.ascontiguousarray(right[::2, ::2]))
-    ready(eye, right)
-    assert seen_of(eye) is not None
+    ready(worker, right)
+    assert seen_of(worker) is not None
+    assert not worker.look(np.ascontiguousarray(right[::2, ::2]))
+    ready(worker, right)
+    assert seen_of(worker) is not None
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
@@ -123,15 +125,16 @@ def test_where_it_ends_or_hangs_frames_are_looked_into_here_and_another_takes_ov
             see()
 
     try:
-        until(lambda: eyes._second._ready)
-        process = eyes._second._process
-        assert process is not None
-        assert process.pid is not None
-        os.kill(process.pid, how)
+        until(lambda: (worker := eyes._second._worker) is not None and worker.ready)
+        worker = eyes._second._worker
+        assert worker is not None
+        pid = worker.pid
+        assert pid is not None
+        os.kill(pid, how)
         see()
         see()
-        until(lambda: eyes._second._ready and eyes._second._process is not process)
+        until(lambda: worker.ready and worker.pid != pid)
         see()
     finally:
         eyes.close()
-    assert eyes._second._process is None
+    assert not worker.alive

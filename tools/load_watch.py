@@ -314,7 +314,7 @@ class Processes:
 
     def _look(self) -> None:
         own, parents = os.getpid(), _parents()
-        locator = self._session.loop.ears.locator._pid
+        locator = self._session.loop.ears.locator.pid
         self._parts = {} if locator is None else {locator: "locator"}
         below = [own]
         for pid in below:
@@ -336,7 +336,7 @@ class Processes:
             if part in words:
                 return name
         if parents.get(pid) == own:
-            return self._parts.get(pid) or ("engine" if pid == min(engines) else "second eye")
+            return self._parts.get(pid) or ("engine" if pid == min(engines) else "right view")
         return "beside the engine"
 
     def figures(self) -> dict[str, Any]:

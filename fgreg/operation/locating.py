@@ -1,111 +1,114 @@
-"""The process that locates sources in the probe's frames; started anew where it has ended or hangs."""
+"""Sources are located in a worker process: the camera's loop goes on, and one that ends or hangs is replaced."""
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
-import signal
-import time
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy.typing as npt
 
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import NoSignal, PaFind
+from fgreg.errors import FgregError
 from fgreg.models import ProbeModel
-from fgreg.workers.worker_process import NICENESS
+from fgreg.workers.worker_process import WorkerProcess
 
-ASK_S = 0.2
-"""It is asked this often whether it is there, also where there is nothing to locate."""
-MUTE_S = 2.0
-"""Without an answer for so long it is told to be gone."""
-HANGS_S = 10.0
-"""And ended after so long, for another to take over."""
-START_S = 30.0
-"""So long it may take for its first answer."""
+ANSWER_S, START_S = 10.0, 30.0
+"""A process that takes longer to answer, or to start, is killed."""
 
 Result = TypeVar("Result")
 
 
-class Locator:
-    """One process at a time.
+@dataclass(slots=True, eq=False)
+class _Job:
+    found: Future[Any]
+    task: tuple[Callable[..., Any], tuple[Any, ...]]
+    again: bool = False
 
-    Attributes:
-        trouble: what is wrong with it; empty where it answers.
+
+class Locator:
+    """One job after another, in their order. For one thread, which calls :meth:`check` often.
+
+    A job whose process ended is done again by the next one, but once only: it may be to blame.
     """
 
     def __init__(self, probe: ProbeModel) -> None:
-        self._probe, self.trouble = probe, ""
-        self._begin()
+        self._probe = probe
+        self._worker: WorkerProcess[Any, Any] = WorkerProcess(
+            _doing, name="fgreg-locator", what="the locating process", answer_s=ANSWER_S, start_s=START_S
+        )
+        self._waiting: deque[_Job] = deque()
+        self._under_way: _Job | None = None
 
-    def _begin(self) -> None:
-        self._pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_stand_back)
-        self._pid: int | None = None
-        self._waits_s = time.monotonic()  # for an answer, since
-        self._asked_s, self._answers = self._waits_s, False
-        self._asked: Future[int] | None = self._pool.submit(os.getpid)  # before any frame: it may have to be ended
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the process; empty where it answers."""
+        return self._worker.trouble
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process; None where there is none."""
+        return self._worker.pid
+
+    @property
+    def ready(self) -> bool:
+        """Whether the process has started."""
+        return self._worker.ready
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job is under way, or waits."""
+        return self._under_way is not None or bool(self._waiting)
 
     def submit(self, data: npt.NDArray[Any]) -> Future[PaFind | NoSignal]:
-        """Have a source located. The future raises BrokenProcessPool where the process ended meanwhile."""
+        """Have a source located. The future raises FgregError where that failed."""
         return self.run(locate_in_frame, data, self._probe)
 
     def run(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
         """Have something else done there; as :meth:`submit`."""
-        try:
-            found = self._pool.submit(work, *arguments)
-        except BrokenProcessPool:
-            self._again("it had ended")
-            found = self._pool.submit(work, *arguments)
-        found.add_done_callback(self._answered)
-        return found
+        job = _Job(Future(), (work, arguments))
+        self._waiting.append(job)
+        self._begin_next()
+        return job.found
 
-    def look_after(self, now_s: float) -> None:
-        """See that it is there. Call it often."""
-        if self._asked is not None and self._asked.done():
-            if self._asked.exception() is not None:
-                self._again("it had ended")
+    def check(self) -> None:
+        """Take in what was found, and see that the process is there."""
+        self._worker.check()
+        job, reply = self._under_way, self._worker.fetch()
+        if job is not None and reply is not None:
+            if self._worker.lost and not job.again:
+                job.again = True
+                self._worker.send(job.task)
                 return
-            self._pid, self._asked = self._asked.result(), None
-            self.trouble = ""
-        if self._asked is None and now_s - self._asked_s > ASK_S:
-            self._asked_s = self._waits_s = now_s
-            try:
-                self._asked = self._pool.submit(os.getpid)
-            except BrokenProcessPool:
-                self._again("it had ended")
-        if self._answers:
-            self.trouble, self._answers = "", False
-        waited = now_s - self._waits_s
-        if self._asked is not None and waited > (START_S if self._pid is None else MUTE_S):
-            self.trouble = self.trouble or f"it has not answered for {waited:.1f} s"
-            if self._pid is not None and waited > HANGS_S:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(self._pid, signal.SIGKILL)  # the pool breaks, and is begun again
-                self._pid = None
+            self._under_way = None
+            if self._worker.failure:
+                job.found.set_exception(FgregError(self._worker.failure))
+            else:
+                job.found.set_result(reply[0])
+        self._begin_next()
 
-    def _answered(self, found: Future[Any]) -> None:
-        """On a thread of the pool's: any answer is a sign of life."""
-        if not found.cancelled() and not isinstance(found.exception(), BrokenProcessPool):
-            self._waits_s, self._answers = max(self._waits_s, time.monotonic()), True
-
-    def _again(self, why: str) -> None:
-        self.trouble = why
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        self._begin()
+    def _begin_next(self) -> None:
+        while self._under_way is None and self._waiting:
+            job = self._waiting.popleft()
+            if job.found.set_running_or_notify_cancel():
+                self._under_way = job
+                self._worker.send(job.task)
 
     def close(self) -> None:
         """End the process."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._worker.close()
 
 
-def _stand_back() -> None:
-    """Frames come first: sources are located in what they leave. Ctrl-C is the main program's business."""
-    os.nice(NICENESS)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _doing() -> Callable[[Any], Any]:
+    return _do
+
+
+def _do(task: tuple[Callable[..., Any], tuple[Any, ...]]) -> Any:
+    work, arguments = task
+    return work(*arguments)
 
 
 __all__ = ["Locator"]

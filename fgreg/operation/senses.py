@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +23,7 @@ from fgreg.detection.view_watch import ViewWatch
 from fgreg.drivers.base import PaFrame, StereoFrame, host_now
 from fgreg.models import SessionModel
 from fgreg.operation.locating import Locator
-from fgreg.operation.second_eye import SecondEye, right_watch
+from fgreg.operation.second_eye import RightViewWorker, right_watch
 from fgreg.operation.view import Heard
 from fgreg.pairing import DeviceClock, PairRefused, PoseHistory, TimedPose
 
@@ -32,10 +31,8 @@ POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled anew after so many markers found, over so many."""
 GIVE_UP_S = 0.5
 """A pulse waits for the poses about it no longer than this."""
-MOST_UNDER_WAY, LOCATE_S = 3, 2.0
-"""Pulses that the locating process has to do at a time, and how long one is waited for."""
-TRIES = 2
-"""A frame during which the locating process ended is given to the next one; not for ever: it may be to blame."""
+LOCATE_S = 2.0
+"""A pulse waits for the locating process no longer than this."""
 UNREAD_S = 2.0
 """So long it is told that a frame could not be looked into."""
 STOOD_RAD = 0.002
@@ -52,7 +49,7 @@ class Eyes:
         rig = self._rig
         self._left = ViewWatch(rig.left, 0, np.eye(4), self._marker)
         self._right = None if rig.right is None else right_watch(rig, self._marker)
-        self._second = SecondEye(rig, self._marker)
+        self._second = RightViewWorker(rig, self._marker)
         self._clock = DeviceClock(latency_s)
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
@@ -87,7 +84,7 @@ class Eyes:
         return marker_from_views(left, right, self._marker)
 
     def close(self) -> None:
-        """End the second eye."""
+        """End the right view's process."""
         self._second.close()
 
 
@@ -99,7 +96,6 @@ class _Waiting:
     data: npt.NDArray[Any] | None
     scan_rad: float | None = None
     located: Future[PaFind | NoSignal] | None = None
-    tries: int = 0
 
     @property
     def under_way(self) -> bool:
@@ -121,7 +117,6 @@ class Ears:
         self._clock = DeviceClock(latency_s)
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
-        self._under_way: list[Future[PaFind | NoSignal]] = []
         self.listening, self.passed_over = True, 0
         self._unread, self._unread_s = "", -np.inf
 
@@ -151,7 +146,7 @@ class Ears:
     def heard(self, now_s: float, poses: PoseHistory) -> tuple[Heard, ...]:
         """The pulses that are complete, in their order."""
         out = []
-        self.locator.look_after(now_s)
+        self.locator.check()
         for pulse in self._waiting:
             self._look_into(pulse, now_s)
             if pulse.located is not None and not pulse.located.done() and now_s - pulse.pulse_s > LOCATE_S:
@@ -176,21 +171,17 @@ class Ears:
             if pulse.scan_rad is None:
                 pulse.data = None
                 return
-        elif not pulse.located.done():
-            return
-        elif not _ended_under(pulse.located) or pulse.tries >= TRIES:
+            if self.locator.busy:  # with a pulse that was passed over
+                self._pass_over(pulse)
+                return
+            pulse.located = self.locator.submit(pulse.data)
+        elif pulse.located.done():
             pulse.data = None
-            return
-        self._under_way = [located for located in self._under_way if not located.done()]
-        if len(self._under_way) >= MOST_UNDER_WAY:
-            self._pass_over(pulse)
-            return
-        pulse.tries += 1
-        pulse.located = self.locator.submit(pulse.data)
-        self._under_way.append(pulse.located)
 
     def _pass_over(self, pulse: _Waiting) -> None:
         """Nobody knows whether anything was heard: then the pulse says nothing of any angle."""
+        if pulse.located is not None:
+            pulse.located.cancel()
         pulse.data = pulse.scan_rad = pulse.located = None
         self.passed_over += 1
 
@@ -228,8 +219,3 @@ class Ears:
     def close(self) -> None:
         """End the process."""
         self.locator.close()
-
-
-def _ended_under(located: Future[PaFind | NoSignal]) -> bool:
-    """Whether the process was gone before it had looked."""
-    return located.cancelled() or isinstance(located.exception(), BrokenProcessPool)
