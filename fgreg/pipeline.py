@@ -31,11 +31,12 @@ from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import remove_result, write_result
 from fgreg.targets import beam_error, tre_mm
 from fgreg.verdict import Condition
-from fgreg.viewer.null_viewer import NullViewer, ShotKind, open_viewer
+from fgreg.viewer.null_viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:
     from fgreg.online.detect import DetectedMove, EpochsFound
     from fgreg.viewer.recording import Viewer
+    from fgreg.viewer.scene import ShotKind
 
 RESULT_FILE = "result.yaml"
 SOUND_SPEED_TOLERANCE = 0.005

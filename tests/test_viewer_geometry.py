@@ -44,10 +44,6 @@ def test_an_arc_keeps_its_range_from_the_element_and_ends_where_the_stage_turns_
     np.testing.assert_allclose(ends, [-9.0, 9.0], atol=1e-9)
 
 
-def test_six_degrees_of_rotation_are_eight_of_arc_at_30_mm_from_a_10_mm_probe() -> None:
-    assert math.degrees(float(scene.arc_from_rotation(math.radians(6.0), 30.0, 10.0))) == pytest.approx(8.0, abs=0.01)
-
-
 def test_ellipsoids_have_the_sigmas_times_the_chi_square_quantile_as_half_sizes() -> None:
     ellipsoid = scene.ellipsoid_95(np.diag([1.0, 4.0, 9.0]))
     np.testing.assert_allclose(sorted(ellipsoid.half_sizes_mm), np.sqrt(7.814728) * np.array([1.0, 2.0, 3.0]))

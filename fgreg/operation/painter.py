@@ -23,8 +23,9 @@ from fgreg.online.estimate import OnlineEstimate
 from fgreg.operation.recorder import Recorded
 from fgreg.operation.status import Status
 from fgreg.viewer.now import Now
-from fgreg.viewer.null_viewer import NullViewer, ShotKind, open_viewer
+from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Moment, Viewer
+from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.spawn import spawn_viewer
 
 LOOK_S = 0.5

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Self
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from fgreg.models import ProbeModel, SessionModel
     from fgreg.viewer.now import BmodePicture
     from fgreg.viewer.recording import Moment, Truth, Viewer
+    from fgreg.viewer.scene import ShotKind
     from fgreg.viewer.shapes import Image8
-
-ShotKind = Literal["aim", "pair", "track"]
 
 
 class NullViewer:

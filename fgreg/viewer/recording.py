@@ -36,9 +36,9 @@ from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LivePainter, Moment
 from fgreg.viewer.now import BmodePicture
-from fgreg.viewer.null_viewer import ShotKind
 from fgreg.viewer.pa import pa_picture, texture
 from fgreg.viewer.result import ResultPainter, Truth
+from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.shapes import Image8
 
 LARGEST_TEXTURE = 160

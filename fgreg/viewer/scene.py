@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from fgreg.estimate import SessionEstimate
 from fgreg.frames import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
 from fgreg.measurements import Look
 from fgreg.models import CameraModel, MarkerModel, ProbeModel
+from fgreg.sensitivity import arc_of_rotation
 
+ShotKind = Literal["aim", "pair", "track"]
 CHI2_95_3 = 7.814728
 """95 % quantile of chi-square with three degrees of freedom."""
 CHI2_95_2 = 5.991465
@@ -27,16 +30,6 @@ ARC_HALF_WIDTHS = 1.5
 def trus_T_plane(scan_rad: float) -> FloatArray:
     """(4, 4) from the turned image plane's frame to TRUS: +z goes to (0, sin t, cos t), a turn of -t about x."""
     return make_transform(exp_so3(np.array([-scan_rad, 0.0, 0.0])), np.zeros(3))
-
-
-def arc_from_rotation(rotation_rad: FloatArray | float, range_mm: float, radius_mm: float) -> FloatArray:
-    """Arc angle delta about the element that a stage rotation from the look's plane corresponds to.
-
-    Inverse of ``rotation = atan2(r sin delta, R + r cos delta)``; by the sine rule
-    ``r sin(delta - rotation) = R sin(rotation)``.
-    """
-    sine = np.clip(radius_mm * np.sin(rotation_rad) / range_mm, -1.0, 1.0)
-    return np.asarray(rotation_rad + np.arcsin(sine))
 
 
 def element_centre_mm(look: Look, probe: ProbeModel) -> FloatArray:
@@ -56,7 +49,7 @@ def arc_strip_mm(look: Look, probe: ProbeModel, points: int = 25) -> FloatArray:
     """(points, 3) the arc of a look over 1.5 half widths of the window to either side of its plane."""
     half = ARC_HALF_WIDTHS * float(probe.sensitivity.half_width_at(look.range_mm))
     rotation = np.linspace(-half, half, points)
-    return arc_point_mm(look, probe, look.scan_rad + arc_from_rotation(rotation, look.range_mm, probe.radius_mm))
+    return arc_point_mm(look, probe, look.scan_rad + arc_of_rotation(rotation, look.range_mm, probe.radius_mm))
 
 
 def array_length_mm(probe: ProbeModel) -> float:
@@ -164,7 +157,7 @@ class Shot:
 
     number: int
     t: float
-    kind: str
+    kind: ShotKind
     position: int
 
 
@@ -173,7 +166,7 @@ def shots_of(estimate: SessionEstimate) -> list[Shot]:
     listed = [(aim.t, 0, position) for position, aim in enumerate(estimate.aims)]
     listed += [(pair.t, 1, position) for position, pair in enumerate(estimate.pairs)]
     listed += [(track.t, 2, position) for position, track in enumerate(estimate.tracks)]
-    kinds = ("aim", "pair", "track")
+    kinds: tuple[ShotKind, ...] = ("aim", "pair", "track")
     return [Shot(number, t, kinds[kind], position) for number, (t, kind, position) in enumerate(sorted(listed))]
 
 
