@@ -14,16 +14,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from fgreg.estimate import PredictedTre
-from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, transform_points
+from fgreg.frames import FloatArray, IntArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
 from fgreg.graph.reduced import evaluate, log_posterior, refine
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.steadiness import logsumexp
 
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
@@ -185,27 +185,45 @@ def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Students:
-    """Mixture of multivariate Student densities of one shape each: centres (K, D), roots (K, D, D), shares (K,)."""
+    """Mixture of multivariate Student densities, grouped by shape: roots (G, D, D), of which each has scales.
+
+    Attributes:
+        centre: (K, D). group: (K,) which root each has. scale: (K,) what multiplies it. share: (K,).
+        root: (G, D, D) lower triangular.
+    """
 
     centre: FloatArray
-    root: FloatArray
+    group: IntArray
+    scale: FloatArray
     share: FloatArray
+    root: FloatArray
 
     def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
         which = rng.choice(len(self.share), count, p=self.share)
         normal = rng.standard_normal((count, self.centre.shape[1]))
-        stretch = np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
-        return np.asarray(self.centre[which] + (self.root[which] @ (normal * stretch[:, None])[..., None])[..., 0])
+        stretch = self.scale[which] * np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
+        out = self.centre[which]
+        for group, root in enumerate(self.root):
+            mine = self.group[which] == group
+            out[mine] += (normal[mine] * stretch[mine, None]) @ root.T
+        return out
 
     def log(self, x: FloatArray) -> FloatArray:
         """(S,) log density up to a constant common to all mixtures."""
         size = x.shape[1]
         out = np.empty((len(self.share), len(x)))
-        for k in range(len(self.share)):
-            whitened = np.linalg.solve(self.root[k], (x - self.centre[k]).T)
-            log = -0.5 * (DEGREES_OF_FREEDOM + size) * np.log1p(np.sum(whitened**2, axis=0) / DEGREES_OF_FREEDOM)
-            out[k] = log - np.log(np.diag(self.root[k])).sum() + np.log(self.share[k])
-        return np.asarray(logsumexp(out, axis=0))
+        for group, root in enumerate(self.root):
+            mine = np.flatnonzero(self.group == group)
+            # About the group's first centre: squares of small numbers only.
+            origin = self.centre[mine[0]]
+            at = np.linalg.solve(root, (x - origin).T)
+            centre = np.linalg.solve(root, (self.centre[mine] - origin).T)
+            square = np.sum(centre**2, axis=0)[:, None] - 2.0 * centre.T @ at + np.sum(at**2, axis=0)
+            square = np.maximum(square, 0.0) / (DEGREES_OF_FREEDOM * self.scale[mine, None] ** 2)
+            log = -0.5 * (DEGREES_OF_FREEDOM + size) * np.log1p(square)
+            volume = np.log(np.diag(root)).sum() + size * np.log(self.scale[mine])
+            out[mine] = log + (np.log(self.share[mine]) - volume)[:, None]
+        return logsumexp(out, axis=0)
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -237,10 +255,13 @@ def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: 
     # Kernels as wide as a density estimate from so many samples would have them.
     width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
     at = x[rng.choice(len(x), KERNELS, p=weight)]
-    centres = np.concatenate([centre[None], centre[None], at])
-    roots = np.concatenate([root[None], WIDE * root[None], np.repeat(width * root[None], KERNELS, axis=0)])
-    share = np.concatenate([SHARES[:2], np.full(KERNELS, SHARES[2] / KERNELS)])
-    return _Students(centres, roots, share)
+    return _Students(
+        centre=np.concatenate([centre[None], centre[None], at]),
+        group=np.zeros(2 + KERNELS, dtype=np.int64),
+        scale=np.concatenate([[1.0, WIDE], np.full(KERNELS, width)]),
+        share=np.concatenate([SHARES[:2], np.full(KERNELS, SHARES[2] / KERNELS)]),
+        root=root[None],
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -306,9 +327,11 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
     ]
     proposals = [
         _Students(
-            np.concatenate(starts),
-            np.stack([_root(mode.covariance) for mode in modes]),
-            np.full(len(modes), 1.0 / len(modes)),
+            centre=np.concatenate(starts),
+            group=np.arange(len(modes)),
+            scale=np.ones(len(modes)),
+            share=np.full(len(modes), 1.0 / len(modes)),
+            root=np.stack([_root(mode.covariance) for mode in modes]),
         )
     ]
     x, log_target = np.zeros((0, columns.size)), np.zeros(0)
