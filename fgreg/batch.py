@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -21,9 +22,10 @@ from fgreg.estimate import (
 )
 from fgreg.frames import FloatArray
 from fgreg.graph.explicit import GraphOptions, build_graph
-from fgreg.graph.explicit_solver import optimize as optimize_graph
-from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
-from fgreg.graph.shared_state import SharedState, make_state, pose_difference
+from fgreg.graph.explicit_solver import newton_step
+from fgreg.graph.explicit_values import PrivateValues, SharedValues, values_at
+from fgreg.graph.reduced_blocks import moved_markers
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre
@@ -207,7 +209,7 @@ def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, c
 
 
 def _agreement(registration: Registration) -> list[Condition]:
-    """The explicit graph, solved from the reduced optimum, has to stay there: two derivations of one answer."""
+    """The explicit graph has to have its optimum where the reduced one is: two derivations of one answer."""
     apart = distance_to_explicit(registration)
     if apart <= AGREEMENT_SIGMA:
         return []
@@ -216,8 +218,12 @@ def _agreement(registration: Registration) -> list[Condition]:
 
 
 def distance_to_explicit(registration: Registration) -> float:
-    """Mahalanobis distance between the reduced optimum's registrations and the explicit graph's (reference)."""
-    state, problem = registration.optimum.state, registration.problem
+    """Mahalanobis distance between the registrations that the explicit graph and the reduced one lead to.
+
+    By the Gauss-Newton step of each from the reduced optimum, where its own is next to nothing; infinite where the
+    explicit graph, the reference, has none.
+    """
+    state, problem, at = registration.optimum.state, registration.problem, registration.optimum.evaluation
     epochs = problem.columns.epochs
     speed = problem.columns.sound_speed
     options = GraphOptions(
@@ -234,12 +240,20 @@ def distance_to_explicit(registration: Registration) -> float:
         marker_bias_mm=state.bias_mm[0],
         sound_speed_ratio=float(state.sound_speed_ratio[0]),
     )
-    found = optimize_graph(explicit, initial_values(explicit, shared))
-    there = read_shared(explicit, found.values, shared)
-    other = make_state(np.stack(there.trus_T_camera)[None], state.marker_T_nominal, problem.radius_mm)
-    step = np.concatenate([pose_difference(state, other, k)[0] for k in range(epochs)])
+    private, bias_mm = at.private, state.bias_mm[0]
+    there = PrivateValues(
+        aim_camera_T_marker=moved_markers(problem.aims, private.aim_error[0], bias_mm),
+        camera_p_spot_mm=problem.aim_spot_mm + private.aim_shift[0],
+        camera_T_marker=moved_markers(problem.beams, private.beam_error[0], bias_mm),
+        trus_p_pm_mm=private.trus_p_pm[0],
+    )
+    step = newton_step(explicit, values_at(explicit, shared, there))
+    if step is None:
+        return math.inf
+    own = -(registration.covariance @ at.gradient[0])[: 6 * epochs]
+    apart = np.concatenate([step.at(key) for key in explicit.keys.trus_T_camera]) - own
     poses = registration.covariance[: 6 * epochs, : 6 * epochs]
-    return float(np.sqrt(step @ np.linalg.solve(poses, step)))
+    return float(np.sqrt(apart @ np.linalg.solve(poses, apart)))
 
 
 def _judge_epochs(

@@ -57,6 +57,16 @@ def _damped_step(
     """The step of the damped normal equations, None where they are singular."""
     damped = gtsam.GaussianFactorGraph()
     damped.push_back(linear)
+    if damping:
+        _add_damping(explicit, damped, damping)
+    try:
+        step = damped.optimize(ordering, gtsam.EliminateQR)
+    except RuntimeError:  # GTSAM's indeterminate linear system
+        return None
+    return step if math.isfinite(step.squaredNorm()) else None
+
+
+def _add_damping(explicit: ExplicitGraph, damped: gtsam.GaussianFactorGraph, damping: float) -> None:
     blocks = {
         variable: (math.sqrt(damping) * np.diag(1.0 / np.array(scale)), np.zeros(len(scale)))
         for variable, scale in _SCALE.items()
@@ -72,11 +82,6 @@ def _damped_step(
         block, zero = blocks[variable]
         for key in own:
             damped.push_back(gtsam.JacobianFactor(key, block, zero, units[variable]))
-    try:
-        step = damped.optimize(ordering, gtsam.EliminateQR)
-    except RuntimeError:  # GTSAM's indeterminate linear system
-        return None
-    return step if math.isfinite(step.squaredNorm()) else None
 
 
 def optimize(
@@ -128,3 +133,12 @@ def optimize(
             if damping > _LARGEST_DAMPING:
                 return GraphOptimum(values, cost, iteration, False)
     return GraphOptimum(values, cost, max_iterations, False)
+
+
+def newton_step(explicit: ExplicitGraph, values: gtsam.Values) -> gtsam.VectorValues | None:
+    """The Gauss-Newton step of all variables from some values: zero at an optimum. None where it is undetermined.
+
+    Raises:
+        FactorError: a factor cannot be computed there.
+    """
+    return _damped_step(explicit, explicit.graph.linearize(values), 0.0, explicit.ordering)

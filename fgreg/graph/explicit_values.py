@@ -7,6 +7,7 @@ chart's origin), along the unit direction.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -127,16 +128,29 @@ def _meeting_point(
     return np.asarray(0.5 * (points[best] + feet[best]))
 
 
-def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Values:
-    """Starting values from a state of the shared variables.
+@dataclass(frozen=True, slots=True, eq=False)
+class PrivateValues:
+    """One state of the private variables: distances and arc angles follow from these and the shared ones.
 
-    Marker poses are at their observations (less the bias), spots at theirs, each PM midway between its beams and arcs
-    (the mean over its looks); distances and arc angles follow from the points.
+    Attributes:
+        aim_camera_T_marker: (A, 4, 4). camera_p_spot_mm: (A, 3).
+        camera_T_marker: (B, 4, 4) of the shots of pairs, in the order of the graph's keys.
+        trus_p_pm_mm: (J, 3), in the order in which the PMs first come.
+    """
+
+    aim_camera_T_marker: FloatArray
+    camera_p_spot_mm: FloatArray
+    camera_T_marker: FloatArray
+    trus_p_pm_mm: FloatArray
+
+
+def values_at(explicit: ExplicitGraph, shared: SharedValues, private: PrivateValues) -> gtsam.Values:
+    """All variables at a state of the shared and private ones.
 
     Raises:
         ValueError: another number of registrations than epochs.
     """
-    keys, session, measurements = explicit.keys, explicit.session, explicit.measurements
+    keys, measurements = explicit.keys, explicit.measurements
     if len(shared.trus_T_camera) != len(keys.trus_T_camera):
         raise ValueError(f"{len(shared.trus_T_camera)} registrations, expected {len(keys.trus_T_camera)}")
     values = gtsam.Values()
@@ -153,39 +167,60 @@ def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Value
         values.insert(keys.sound_speed_ratio, float(shared.sound_speed_ratio))
     marker_p, marker_d = beam_of_chart(shared.marker_laser, explicit.marker_T_nominal)
 
-    def place(key: int, observed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def place(key: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Insert a marker pose; the beam from it, in the camera frame."""
-        rotation, translation = observed[:3, :3], observed[:3, 3] - shared.marker_bias_mm
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, translation
         values.insert(key, gtsam.Pose3(pose))
-        return rotation @ marker_p + translation, rotation @ marker_d
+        return pose[:3, :3] @ marker_p + pose[:3, 3], pose[:3, :3] @ marker_d
 
-    for aim, own in zip(measurements.aims, keys.aims, strict=True):
-        origin, direction = place(own.camera_T_marker, aim.marker.camera_T_marker)
-        values.insertPoint3(own.camera_p_spot, np.array(aim.camera_p_spot_mm))
-        values.insert(own.lam, float(direction @ (aim.camera_p_spot_mm - origin)))
-    beams: list[tuple[FloatArray, FloatArray]] = []
-    for shot in keys.shots:
-        pair = measurements.pairs[shot.pair]
-        origin, direction = place(shot.camera_T_marker, pair.marker.camera_T_marker)
-        trus_T_camera = shared.trus_T_camera[pair.epoch]
-        rotation = trus_T_camera[:3, :3]
-        beams.append((rotation @ origin + trus_T_camera[:3, 3], rotation @ direction))
-    meetings: dict[int, list[FloatArray]] = {}
-    for index, pair in enumerate(measurements.pairs):
-        prior = sensitivity_prior(pair.look, session.probe, session.stage.step_rad)
-        point = _meeting_point(*beams[keys.pair_shot[index]], pair.look, prior, session, shared)
-        meetings.setdefault(pair.pm, []).append(point)
-    points = {keys.trus_p_pm[pm]: np.mean(of_pm, axis=0) for pm, of_pm in meetings.items()}
+    for own, pose, spot in zip(keys.aims, private.aim_camera_T_marker, private.camera_p_spot_mm, strict=True):
+        origin, direction = place(own.camera_T_marker, pose)
+        values.insertPoint3(own.camera_p_spot, np.array(spot))
+        values.insert(own.lam, float(direction @ (spot - origin)))
+    points = dict(zip(keys.trus_p_pm.values(), private.trus_p_pm_mm, strict=True))
     for key, point in points.items():
-        values.insertPoint3(key, point)
-    for shot, (origin, direction) in zip(keys.shots, beams, strict=True):
-        values.insert(shot.lam, float(direction @ (points[shot.trus_p_pm] - origin)))
+        values.insertPoint3(key, np.array(point))
+    for shot, pose in zip(keys.shots, private.camera_T_marker, strict=True):
+        origin, direction = place(shot.camera_T_marker, pose)
+        trus_T_camera = shared.trus_T_camera[measurements.pairs[shot.pair].epoch]
+        camera_p = trus_T_camera[:3, :3].T @ (points[shot.trus_p_pm] - trus_T_camera[:3, 3])
+        values.insert(shot.lam, float(direction @ (camera_p - origin)))
     for index, pair in enumerate(measurements.pairs):
         point = points[keys.trus_p_pm[pair.pm]]
-        values.insert(keys.theta[index], bearing_from_element(point, pair.look, session.probe.radius_mm))
+        values.insert(keys.theta[index], bearing_from_element(point, pair.look, explicit.session.probe.radius_mm))
     return values
+
+
+def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Values:
+    """Starting values from a state of the shared variables.
+
+    Marker poses are at their observations (less the bias), spots at theirs, each PM midway between its beams and arcs
+    (the mean over its looks); distances and arc angles follow from the points.
+
+    Raises:
+        ValueError: another number of registrations than epochs.
+    """
+    keys, session, measurements = explicit.keys, explicit.session, explicit.measurements
+    marker_p, marker_d = beam_of_chart(shared.marker_laser, explicit.marker_T_nominal)
+
+    def unbiased(observed: Iterable[FloatArray]) -> FloatArray:
+        poses = np.array([*observed], dtype=np.float64).reshape(-1, 4, 4)
+        poses[:, :3, 3] -= shared.marker_bias_mm
+        return poses
+
+    markers = unbiased(measurements.pairs[shot.pair].marker.camera_T_marker for shot in keys.shots)
+    meetings: dict[int, list[FloatArray]] = {}
+    for pair, place in zip(measurements.pairs, keys.pair_shot, strict=True):
+        trus_T_marker = shared.trus_T_camera[pair.epoch] @ markers[place]
+        origin, direction = trus_T_marker[:3, :3] @ marker_p + trus_T_marker[:3, 3], trus_T_marker[:3, :3] @ marker_d
+        prior = sensitivity_prior(pair.look, session.probe, session.stage.step_rad)
+        meetings.setdefault(pair.pm, []).append(_meeting_point(origin, direction, pair.look, prior, session, shared))
+    private = PrivateValues(
+        aim_camera_T_marker=unbiased(aim.marker.camera_T_marker for aim in measurements.aims),
+        camera_p_spot_mm=np.array([aim.camera_p_spot_mm for aim in measurements.aims]).reshape(-1, 3),
+        camera_T_marker=markers,
+        trus_p_pm_mm=np.array([np.mean(of_pm, axis=0) for of_pm in meetings.values()]).reshape(-1, 3),
+    )
+    return values_at(explicit, shared, private)
 
 
 def bearing_from_element(trus_p: FloatArray, look: Look, radius_mm: float) -> float:

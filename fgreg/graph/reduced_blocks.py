@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.frames import FloatArray, IntArray, exp_so3, hat
+from fgreg.frames import FloatArray, IntArray, exp_so3, hat, make_transform
 from fgreg.graph.packing import LINE_SIGMA_MM, BeamArrays, PackedProblem
 from fgreg.graph.shared_state import SharedState
 from fgreg.sensitivity import arc_of_rotation
@@ -96,6 +96,16 @@ def sum_by(values: FloatArray, index: IntArray, groups: int) -> FloatArray:
     out = np.zeros((values.shape[0], groups, *values.shape[2:]))
     np.add.at(out.swapaxes(0, 1), index, values.swapaxes(0, 1))
     return out
+
+
+def moved_markers(beams: BeamArrays, error: FloatArray, bias_mm: FloatArray) -> FloatArray:
+    """(n, 4, 4) marker poses at errors (w, n) (n, 6) of their observations, one hypothesis, less the bias (3,).
+
+    The marker moves by Exp of a twist about its observed origin: t + n + w x n / 2 to second order.
+    """
+    turn, shift = error[:, :3], error[:, 3:]
+    translation = beams.translation_mm + shift + 0.5 * np.cross(turn, shift) - bias_mm
+    return make_transform(exp_so3(turn) @ beams.rotation, translation)
 
 
 def line_block(
