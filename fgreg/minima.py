@@ -34,6 +34,8 @@ from fgreg.robust import (
 
 SEARCH_PAIRS = 40
 """The search for minima looks at no more pairs than this, spread over the session; all are used from there on."""
+SEARCH_TOLERANCE = 1e-4
+"""Newton decrement (chi square) at which a search stops: the joint solve goes on from the best."""
 SAME_MINIMUM_MM = 1.5
 """Minima whose registrations move no target by more than this are one."""
 BEAM_CHI2 = 30.0
@@ -218,12 +220,19 @@ def search_epoch(
         return EpochSearch((), None)
     subset = replace(measurements, pairs=_search_subset(pairs), epochs=measurements.epochs[:1])
     problem = pack(subset, model)
-    found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
+    found = optimize(problem, _starts(problem, frames, model), tolerance=SEARCH_TOLERANCE, keep_within=keep_within)
     minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
     if len(problem.pms) > MIN_KEPT_PMS and not _is_clean(problem, found):
         return _search_among_junk(subset, problem, model, frames, minima, keep_within)
     mirrored_problem = _mirrored(problem)
-    mirrored = optimize(mirrored_problem, _starts(mirrored_problem, frames, model), keep_within=keep_within)
+    # How much worse it fits does not matter where it does by far.
+    mirrored = optimize(
+        mirrored_problem,
+        _starts(mirrored_problem, frames, model),
+        tolerance=SEARCH_TOLERANCE,
+        keep_within=keep_within,
+        best_cost=minima[0].cost,
+    )
     cost = mirrored.evaluation.cost
     return EpochSearch(
         minima,
@@ -272,7 +281,7 @@ def _search_among_junk(
     fitting = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm in names))
     reduced = pack(fitting, model)
     states = [robust.state, *plain, _starts(reduced, frames, model)]
-    found = optimize(reduced, stack_states(states), keep_within=keep_within)
+    found = optimize(reduced, stack_states(states), tolerance=SEARCH_TOLERANCE, keep_within=keep_within)
     all_minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
     base, level = float(robust.cost[order[0]]), all_minima[0].cost
     # Another set of shots that fit each other as well as these do is as good an answer.

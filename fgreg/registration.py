@@ -321,7 +321,7 @@ def _solve_jointly(
     whole = packed(measurements)
     everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
     if clean and aim_kept.all():
-        optimum = optimize(whole, start, tolerance=1e-9)
+        optimum = optimize(whole, start, tolerance=1e-7)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
         beyond = deviant(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
@@ -346,7 +346,7 @@ def _solve_jointly(
         kept = _enough(whole, judged.pm_kept, judged.aim_kept)
     chosen = _keep(measurements, whole.pms, *kept)
     problem = packed(chosen)
-    optimum = optimize(problem, judged.state, tolerance=1e-9)
+    optimum = optimize(problem, judged.state, tolerance=1e-7)
     found = innovations_at(whole, optimum.state, *kept)
     deviants = deviant(whole, found, kept[0])
     private = initial_private(whole, optimum.state)

@@ -16,6 +16,10 @@ WEIGHT_FLOOR = 1e-12
 """Curvature lent to shared variables that nothing observes (a registration without pairs): they stay where they are."""
 
 
+CREEPING = 10.0
+"""At most so many times what one step promised is what all the steps after it may still gain."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimum:
     """Result of :func:`optimize`: S hypotheses, each at its own local minimum, with its evaluation there."""
@@ -32,8 +36,9 @@ def optimize(
     private: PrivateState | None = None,
     *,
     max_iterations: int = 60,
-    tolerance: float = 1e-8,
+    tolerance: float = 1e-6,
     keep_within: float | None = None,
+    best_cost: float = np.inf,
 ) -> Optimum:
     """Levenberg-Marquardt on the shared variables, all hypotheses side by side.
 
@@ -42,13 +47,16 @@ def optimize(
         state: S starts.
         private: where to linearise the private variables first; from the arcs where None.
         max_iterations: of the outer loop.
-        tolerance: a hypothesis has converged when the Newton decrement (in chi square) falls below this.
+        tolerance: a hypothesis has converged when the Newton decrement (in chi square) falls below this; the default is
+            a thousandth of a standard deviation.
         keep_within: stop early on hypotheses whose cost exceeds the best converged one by more than this.
+        best_cost: a cost that is known to be reached otherwise: hypotheses that will not come to within ``keep_within``
+            of it are left where they are.
     """
     if private is None:
         private = initial_private(problem, state)
-    for _ in range(3):
-        _, private = refine(problem, state, private)
+        for _ in range(3):
+            _, private = refine(problem, state, private)
     current = evaluate(problem, state, private)
     count = state.count
     damping = np.full(count, 1e-4)
@@ -76,8 +84,11 @@ def optimize(
             current = _merge_evaluation(current, trial, index, good)
         damping[index] = np.clip(np.where(good, damping[index] * 0.1, damping[index] * 8.0), 1e-9, 1e12)
         active[index[(good & (decrement < tolerance)) | (damping[index] > 1e9)]] = False
-        if keep_within is not None and not active.all():
-            active &= current.cost <= current.cost[~active].min() + keep_within
+        if keep_within is not None:
+            if not active.all():
+                active &= current.cost <= current.cost[~active].min() + keep_within
+            hopeless = current.cost[index] - CREEPING * np.maximum(decrement, 0.0) > best_cost + keep_within
+            active[index[good & hopeless]] = False
         if not active.any():
             break
     return Optimum(state, current, ~active, iteration)

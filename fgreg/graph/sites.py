@@ -82,7 +82,7 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
         private = at.private
     if not settled:
         return None
-    return problem, optimize(problem, state, private, tolerance=1e-9)
+    return problem, optimize(problem, state, private, tolerance=1e-7)
 
 
 def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[SharedState, Evaluation] | None:
