@@ -167,7 +167,7 @@ def _ended(pid: int, latest: float) -> bool:
 
 
 def test_a_server_of_no_memory_does_not_start() -> None:
-    with pytest.raises(RuntimeError, match="has not started"):
+    with pytest.raises(RuntimeError, match="has ended"):
         QueryServer("fgreg-none")
 
 

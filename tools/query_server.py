@@ -8,16 +8,16 @@ holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fg
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
-import os
+import math
 import secrets
 import shutil
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Client, Connection, Listener, wait
-from multiprocessing.context import SpawnProcess
+from multiprocessing import AuthenticationError
+from multiprocessing.connection import Client, Connection, Listener
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -28,6 +28,7 @@ from fgreg.estimate import TrackEstimate
 from fgreg.measurements import Track
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.tracking import track
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 START_S = 30.0
 """How long the process may take to start."""
@@ -103,35 +104,31 @@ class QueryServer:
     def __init__(self, name: str) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="fgreg-"))  # of mode 0700
         self.address = QueryAddress(str(self._folder / "queries"), secrets.token_bytes(_KEY_BYTES))
-        context = multiprocessing.get_context("spawn")
-        self._control, theirs = context.Pipe()
-        self._process: SpawnProcess = context.Process(
-            target=_serve, args=(name, self.address.path, self.address.key, theirs), name="fgreg-queries", daemon=True
+        self._worker: WorkerProcess[None, None] = WorkerProcess(
+            _serving,
+            name,
+            self.address,
+            name="fgreg-queries",
+            what="the query process",
+            niceness=0,
+            start_s=START_S,
+            restart=False,
         )
-        try:
-            self._process.start()
-            theirs.close()
-            if not self._control.poll(START_S):
-                raise RuntimeError(f"the query process has not started within {START_S:.0f} s")
-            try:
-                said = self._control.recv_bytes().decode()
-            except EOFError:
-                said = "it ended at once"
-            if said:
-                raise RuntimeError(f"the query process has not started: {said}")
-        except BaseException:
+        self._worker.send(None)  # answered when it has started
+        self._worker.fetch(math.inf)
+        if self._worker.failure:
             self.close()
-            raise
+            raise RuntimeError(f"no queries can be answered: {self._worker.failure}")
 
     @property
     def pid(self) -> int | None:
         """Of the process."""
-        return self._process.pid
+        return self._worker.pid
 
     @property
     def alive(self) -> bool:
         """Whether the process runs."""
-        return self._process.is_alive()
+        return self._worker.alive
 
     def client(self) -> QueryClient:
         """A new client in this process; others make theirs of ``address``."""
@@ -139,12 +136,7 @@ class QueryServer:
 
     def close(self) -> None:
         """End the process; clients find their connection closed."""
-        self._control.close()  # which it takes for the signal to end
-        if self._process.pid is not None:
-            self._process.join(5.0)
-            if self._process.is_alive():
-                self._process.kill()
-                self._process.join()
+        self._worker.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def __enter__(self) -> QueryServer:
@@ -156,27 +148,21 @@ class QueryServer:
         self.close()
 
 
-def _serve(name: str, path: str, key: bytes, control: Connection[Any, Any]) -> None:
-    """The process: one thread a client, which holds a reader of its own."""
-    try:
-        reader = SnapshotReader(name)
-        listener = Listener(path, family="AF_UNIX", backlog=16, authkey=key)
-    except (OSError, ValueError) as error:
-        control.send_bytes(str(error).encode())
-        return
-    threading.Thread(target=_accept, args=(listener, reader), daemon=True).start()
-    control.send_bytes(b"")
-    parent = multiprocessing.parent_process()
-    wait([control] if parent is None else [control, parent.sentinel])
-    shutil.rmtree(Path(path).parent, ignore_errors=True)
-    os._exit(0)  # clients' threads may be in the middle of waiting; there is nothing to save
+@contextlib.contextmanager
+def _serving(name: str, address: QueryAddress) -> Iterator[Work[None, None]]:
+    """In the process, one thread a client, which holds a reader of its own. Nothing is left to do for the worker."""
+    reader = SnapshotReader(name)
+    with Listener(address.path, family="AF_UNIX", backlog=16, authkey=address.key) as listener:
+        threading.Thread(target=_accept, args=(listener, reader), daemon=True).start()
+        yield lambda _: None
+    shutil.rmtree(Path(address.path).parent, ignore_errors=True)
 
 
 def _accept(listener: Listener, reader: SnapshotReader) -> None:
     while True:
         try:
             connection = listener.accept()
-        except (OSError, EOFError, multiprocessing.AuthenticationError):
+        except (OSError, EOFError, AuthenticationError):
             time.sleep(0.01)  # one that left in the middle of it, or has no key; or no more connections are to be had
             continue
         threading.Thread(target=_answer, args=(connection, reader.clone()), daemon=True).start()

@@ -23,7 +23,7 @@ from fgreg.models import SessionModel
 from fgreg.posterior import pose_tangent
 from fgreg.registration import SoundSpeedPrior
 from fgreg.surface import TissueSurface
-from fgreg.workers.worker_process import WorkerProcess
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 JUDGED_AT = (*range(1, 9), 10, 12, 15, 20, 25, 30, 40, 60, 80)
 """Pairs of an epoch at which it is judged; from there on whenever they have doubled."""
@@ -204,9 +204,7 @@ def _judged(case: Case, model: SessionModel, config: SolveConfig, sound_speed: S
     return judge(case, model, config, sound_speed)[0]
 
 
-def _judging(
-    model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None
-) -> Callable[[Case], Judgement]:
+def _judging(model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> Work[Case, Judgement]:
     return partial(_judged, model=model, config=config, sound_speed=sound_speed)
 
 

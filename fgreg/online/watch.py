@@ -7,7 +7,6 @@ pairs from the move on are given to the new epoch anyhow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
@@ -20,7 +19,7 @@ from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
 from fgreg.online.early import EarlyCase, early_test
 from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test, tested_last
 from fgreg.registration import SoundSpeedPrior
-from fgreg.workers.worker_process import WorkerProcess
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 Found = MoveFound | ReturnFound
 
@@ -112,7 +111,7 @@ class InlineWatch:
 
 def _testing(
     model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: WatchSettings
-) -> Callable[[Case], Found | None]:
+) -> Work[Case, Found | None]:
     return partial(tested, model=model, config=config, prior=prior, settings=settings)
 
 

@@ -14,7 +14,7 @@ from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import NoSignal, PaFind
 from fgreg.errors import FgregError
 from fgreg.models import ProbeModel
-from fgreg.workers.worker_process import WorkerProcess
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S, START_S = 10.0, 30.0
 """A process that takes longer to answer, or to start, is killed."""
@@ -102,7 +102,7 @@ class Locator:
         self._worker.close()
 
 
-def _doing() -> Callable[[Any], Any]:
+def _doing() -> Work[Any, Any]:
     return _do
 
 

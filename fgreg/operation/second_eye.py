@@ -7,7 +7,6 @@ Pictures go there through shared memory: one of 1920 x 1080 pixels in colour tak
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from multiprocessing.sharedctypes import RawArray
 from typing import Any
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from fgreg.detection.marker import ViewCorners
 from fgreg.detection.view_watch import ViewWatch
 from fgreg.models import MarkerModel, StereoRig
-from fgreg.workers.worker_process import WorkerProcess
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S = 0.3
 """An answer that takes longer does not come: a busy machine takes a third of that."""
@@ -85,7 +84,7 @@ def right_watch(rig: StereoRig, marker: MarkerModel) -> ViewWatch:
     return ViewWatch(rig.right, 1, rig.right_T_left, marker)
 
 
-def _looking(picture: Any, rig: StereoRig, marker: MarkerModel) -> Callable[[Shape], ViewCorners]:
+def _looking(picture: Any, rig: StereoRig, marker: MarkerModel) -> Work[Shape, ViewCorners]:
     """The process's work. What it raises at a picture the caller meets as well, and says so."""
     return partial(_look, picture, right_watch(rig, marker))
 

@@ -34,6 +34,7 @@ IDLE_S = 0.1
 
 Request = TypeVar("Request")
 Answer = TypeVar("Answer")
+Work = Callable[[Request], Answer]
 Kind = Literal["ready", "ping", "request", "failed", "broken"]
 """Of a message. To the process: ping, request. From it: the same in answer, ready to work, a request that failed, and
 why it ends. The message None ends it."""
@@ -64,7 +65,7 @@ class WorkerProcess(Generic[Request, Answer]):
 
     def __init__(
         self,
-        make: Callable[..., Callable[[Request], Answer] | AbstractContextManager[Callable[[Request], Answer]]],
+        make: Callable[..., Work[Request, Answer] | AbstractContextManager[Work[Request, Answer]]],
         *arguments: Any,
         name: str,
         what: str,
@@ -305,4 +306,4 @@ def _answer(connection: Connection[Any, Any], work: Any) -> None:
         connection.send(answer)
 
 
-__all__ = ["WorkerProcess"]
+__all__ = ["Work", "WorkerProcess"]
