@@ -81,12 +81,15 @@ def public_names(package: Path) -> tuple[str, ...]:
 
 def measure(checkout: Path) -> Structure:
     """Count a checkout; none of its code is run."""
+    loaded = sys.modules.pop(ROOT, None)  # it would be counted in place of the checkout's
     sys.path.insert(0, str(checkout.resolve()))
     importlib.invalidate_caches()
     try:
         graph = grimp.build_graph(ROOT, cache_dir=None)
     finally:
         del sys.path[0]
+        if loaded is not None:
+            sys.modules[ROOT] = loaded
     files: Arrows = {}
     for module in graph.modules:
         files[module] = graph.find_modules_directly_imported_by(module)
