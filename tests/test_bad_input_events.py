@@ -19,6 +19,7 @@ ASYMMETRIC = [[1.0, 0.5], [0.4, 1.0]]
 INDEFINITE = [[1.0, 1.1], [1.1, 1.0]]
 SINGULAR = [[1.0, 1.0], [1.0, 1.0]]
 HUGE = [[1e-300, 1e99], [1e99, 1e-300]]
+POSE_COVARIANCE = session_files.diagonal(1, 1, 1, 1, 1, 1)
 ZERO_VARIANCE = session_files.diagonal(1, 1, 1, 1, 1, 0)
 
 CASES: list[tuple[str, Any, str, str, str]] = [
@@ -43,7 +44,8 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("3.marker.camera_T_marker", MIRRORED, "line 4: marker.camera_T_marker", "det R -1", "a rigid transform"),
     ("3.marker.camera_T_marker.0.3", None, "line 4: marker.camera_T_marker", "null in row 0", "4 lists of 4"),
     ("3.marker.camera_T_marker.0.3", 2001, "line 4: marker.camera_T_marker", "2006.71 mm", "at most 2000 mm"),
-    ("3.marker.camera_T_marker", ABSENT, "line 4: marker.covariance", "without camera_T_marker", "both or none"),
+    ("3.marker.camera_T_marker", ABSENT, "line 4: marker", "neither camera_T_marker nor left", "the frames"),
+    ("4.marker.covariance", POSE_COVARIANCE, "line 5: marker.covariance", "without camera_T_marker", "both or none"),
     ("3.marker.covariance", ZERO_VARIANCE, "line 4: marker.covariance", "the variance 0", "positive definite"),
     ("3.marker.covariance.2.2", -1, "line 4: marker.covariance", "the variance -1", "positive definite"),
     ("3.marker.covariance.2.2", 1e30, "line 4: marker.covariance", "standard deviations from", "positive definite"),

@@ -53,7 +53,12 @@ def pose(rng: np.random.Generator) -> MarkerRecord:
 
 def pair(rng: np.random.Generator, t: float, pm: int = 0) -> PairEvent:
     look = TrusRecord(
-        rng.normal() * 20, rng.normal() * 9, 20 + rng.random() * 20, np.diag(rng.random(2) + 0.01), 0.7, -1
+        rng.normal() * 20,
+        rng.normal() * 9,
+        20 + rng.random() * 20,
+        covariance=np.diag(rng.random(2) + 0.01),
+        amplitude=0.7,
+        sweep=-1,
     )
     return PairEvent(t, 0, pm, pose(rng), look)
 
@@ -69,8 +74,8 @@ def every_kind(rng: np.random.Generator, folder: Path) -> list[Event]:
         AimEvent(0.3, 0, both, corner=(8, 5)),
         pair(rng, 0.4, 3),
         PairEvent(0.4, 0, 4, replace(pose(rng), left=frames / "a.png"), raw),
-        TrackEvent(0.5, 0, both, (heard,)),
-        TrackEvent(0.6, 0, pose(rng), (heard, raw, heard)),
+        TrackEvent(0.5, 0, both, heard),
+        TrackEvent(0.6, 0, pose(rng), several=(heard, raw, heard)),
         TrackEvent(0.7, 0, pose(rng), scan_deg=0.1),
         CameraMovedEvent(0.8, 0),
         CameraMovedEvent(0.9, 0, moved.camera_T_marker, moved.covariance),
@@ -126,7 +131,6 @@ BAD: list[tuple[str, Callable[[PairEvent], Event]]] = [
     ("pm", lambda event: replace(event, pm=-1)),
     ("not rigid", lambda event: replace(event, marker=MarkerRecord(np.diag([1.0, 2.0, 1.0, 1.0])))),
     ("covariance", lambda event: replace(event, marker=replace(event.marker, covariance=-np.eye(6)))),
-    ("marker: found neither", lambda event: replace(event, marker=MarkerRecord())),
     ("outside|inside", lambda event: replace(event, marker=MarkerRecord(left=Path("/etc/passwd")))),
     ("no such file", lambda event: replace(event, marker=MarkerRecord(left=Path("frames/none.png")))),
     ("at most 1000000", lambda _event: NoteEvent(6.0, 0, "x" * 1_000_001)),

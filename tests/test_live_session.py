@@ -156,7 +156,7 @@ def test_an_event_that_no_session_may_hold_is_recorded_as_refused(pose_session: 
         replace(pair, t=-1e11),
         replace(pair, pm=-1, t=1e11),  # must not carry the session's clock away
         replace(pair, marker=MarkerRecord(left=Path("/etc/passwd"))),
-        replace(pair, marker=MarkerRecord(covariance=np.zeros((300, 300)))),
+        replace(pair, marker=MarkerRecord(np.eye(4), np.zeros((300, 300)))),
     ]
     with LiveSession.open(folder, make_engine=BatchEngine) as live:
         live.add(aim)

@@ -12,7 +12,7 @@ from fgreg.errors import InputError, one_line
 from fgreg.frames import FloatArray
 from fgreg.models import CameraModel, StereoRig
 from fgreg.session.event_document import event_line
-from fgreg.session.event_log import read_line
+from fgreg.session.event_log import frames_of, read_line
 from fgreg.session.frames_named import FrameUse, check_frames
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE, check_session
 from fgreg.session.safe_yaml import load_yaml, read_bounded
@@ -95,13 +95,14 @@ def _lines(drafts: list[Draft], folder: Path, setup: Setup) -> tuple[list[bytes]
     for draft in drafts:
         line = event_line(draft.document, draft.where)
         read = read_line(line, len(out) + 2, EVENTS_FILE, folder.resolve(), setup, last)
-        if read.problems:
+        if read.event is None:
             problem = read.problems[0]
             raise InputError(_place(draft, problem), problem.found, problem.expected)
         last = (draft.t, len(out) + 2)
         out.append(line)
         size = None if setup.camera is None else setup.camera.left.image_size
-        fresh = [use for use in read.frames if use.path not in uses]
+        uses_here = frames_of(read.event, EVENTS_FILE, folder.resolve())
+        fresh = [use for use in uses_here if use.path not in uses]
         if wrong := check_frames(fresh, setup.probe, size):
             raise InputError(_place(draft, wrong[0]), wrong[0].found, wrong[0].expected)
         uses |= {use.path: use for use in fresh}

@@ -35,13 +35,13 @@ from fgreg.operation.rooms import HEARING_THRESHOLD, room_truth
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.operation.status import Devices
 from fgreg.pairing import Latencies
-from fgreg.session.event_log import SCAN_DEG
 from fgreg.session.reading import SETUP_FILE
 from fgreg.session.safe_yaml import load_yaml, parse_yaml, read_bounded
-from fgreg.session.schema import Fields, Place, shown
+from fgreg.session.schema import Bounds, Fields, Place, shown
 from fgreg.session.setup import read_setup
 
 _MAX_BYTES = 1_000_000
+SCAN_DEG = Bounds(-180.0, 180.0, unit="deg")
 _TOP = ("format", "session", "calibration", "room", *(role.value for role in Role), "settings")
 
 

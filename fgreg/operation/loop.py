@@ -353,7 +353,7 @@ class LiveLoop:
         if look.scan_rad is None:
             raise AssertionError("a look that cannot be paired")
         device = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
-        trus = TrusRecord(device, look.x_mm, look.range_mm, look.covariance, look.amplitude, 0)
+        trus = TrusRecord(device, look.x_mm, look.range_mm, covariance=look.covariance, amplitude=look.amplitude)
         marker = MarkerRecord(pose.parent_T_child, pose.covariance)
         self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))
 

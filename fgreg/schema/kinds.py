@@ -271,13 +271,9 @@ class IntegerPair(Kind):
     what: str
 
     def read(self, value: object, _folder: Path | None = None, /) -> tuple[int, int]:
-        if not isinstance(value, list):
+        whole = isinstance(value, list) and len(value) == 2 and all(type(entry) is int for entry in value)
+        if not (isinstance(value, list) and whole and self.low <= min(value) and max(value) <= self.high):
             raise FieldError.of(shown(value), self.expected)
-        if len(value) != 2:
-            raise FieldError.of(f"{len(value)} entries", self.expected)
-        for i, entry in enumerate(value):
-            if type(entry) is not int or not self.low <= entry <= self.high:
-                raise FieldError.of(shown(entry), f"an integer from {self.low} to {self.high}", i)
         return value[0], value[1]
 
     def write(self, value: Any, _folder: Path | None = None, /) -> list[int]:

@@ -92,13 +92,20 @@ class Record(Kind):
     def read(self, value: object, folder: Path | None = None, /, **given: object) -> Any:
         """The object; ``given`` are the fields that are not in the file."""
         values = self.values(value, folder)
+        problems: list[Problem] = []
+        made = None
         try:
-            return self.cls(**values, **given)
+            made = self.cls(**values, **given)
         except FieldError as error:
-            raise FieldError(error.problems, values) from None
+            problems += error.problems
         except ValueError as error:
-            wrong = Problem((), f"values that do not fit together ({error})", "values that do")
-            raise FieldError([wrong], values) from None
+            problems.append(Problem((), f"values that do not fit together ({error})", "values that do"))
+        if isinstance(value, Mapping):
+            for field in self._related:
+                problems += self._relations(field, value)
+        if problems:
+            raise FieldError(problems, values)
+        return made
 
     def values(self, value: object, folder: Path | None = None, /) -> dict[str, Any]:
         """The values of the keys that are there, by attribute. Raises FieldError with all that is wrong."""
@@ -111,8 +118,7 @@ class Record(Kind):
         for name, constant in self.constants.items():
             found = value.get(name)
             if found != constant and name not in misspelt:
-                found = shown(found) if name in value else "nothing"
-                problems.append(Problem((name,), found, f"one of {constant}" if name in value else constant))
+                problems.append(Problem((name,), shown(found) if name in value else "nothing", constant))
         for field in self.fields:
             name = field.name
             if name not in value:
@@ -134,8 +140,6 @@ class Record(Kind):
                     out.update(read)
                 else:
                     out[field.attribute] = read
-        for field in self._related:
-            problems += self._relations(field, value)
         if problems:
             raise FieldError(problems, out)
         return out
@@ -175,8 +179,8 @@ class Record(Kind):
             elif not (field.key.brief and np.array_equal(entry, field.default)):
                 try:
                     out[field.name] = field.kind.write(entry, folder)
-                except ValueError as error:
-                    raise ValueError(f"{field.name}: {error}") from None
+                except FieldError as error:
+                    raise FieldError(error.below(field.name)) from None
         return out
 
     @property
@@ -233,6 +237,45 @@ class Section(Record):
     @property
     def name(self) -> str:
         return f"{self.cls.__name__}.{self._name}"
+
+
+class Tagged(Kind):
+    """A mapping of one of several kinds; the key ``tag`` says which.
+
+    Attributes:
+        tag: the key.
+        records: of each value of it.
+    """
+
+    def __init__(self, tag: str, classes: Mapping[str, type]) -> None:
+        self.tag = tag
+        self.records = {name: record(cls, (tag, name)) for name, cls in classes.items()}
+        self.names = {cls: name for name, cls in classes.items()}
+        self._tag = Text(self.expected, tuple(self.records))
+
+    def read(self, value: object, folder: Path | None = None, /, **given: object) -> Any:
+        """As :meth:`Record.read`."""
+        if not isinstance(value, Mapping):
+            raise FieldError.of(shown(value), f"a mapping with {self.tag}")
+        name = value.get(self.tag)
+        if not isinstance(name, str) or name not in self.records:
+            if self.tag not in value:
+                raise FieldError.of("nothing", self.expected, self.tag)
+            try:
+                self._tag.read(name)
+            except FieldError as error:
+                raise FieldError(error.below(self.tag)) from None
+        return self.records[str(name)].read(value, folder, **given)
+
+    def write(self, value: Any, folder: Path | None = None, /) -> dict[str, Any]:
+        return self.records[self.names[type(value)]].write(value, folder)
+
+    @property
+    def expected(self) -> str:
+        return f"one of {', '.join(self.records)}"
+
+    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"oneOf": [entry.json_schema(definitions) for entry in self.records.values()]}
 
 
 @functools.cache

@@ -13,36 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from fgreg.errors import InputError
-from fgreg.events import (
-    AimEvent,
-    CameraMovedEvent,
-    Event,
-    MarkerRecord,
-    NoteEvent,
-    PairEvent,
-    RefusedEvent,
-    StageEvent,
-    TrackEvent,
-    TrusRecord,
-)
-from fgreg.frames import FloatArray
+from fgreg.events import EVENTS, Event
+from fgreg.schema.problems import FieldError, path_text
 
 Document = dict[str, Any]
-
-_TYPES: dict[type[Event], str] = {
-    AimEvent: "aim",
-    PairEvent: "pair",
-    TrackEvent: "track",
-    CameraMovedEvent: "camera_moved",
-    RefusedEvent: "refused",
-    StageEvent: "stage",
-    NoteEvent: "note",
-}
 
 
 def type_of(event: Event) -> str:
     """The event's ``type``, as the file has it."""
-    return _TYPES[type(event)]
+    return EVENTS.names[type(event)]
 
 
 def event_document(event: Event, folder: Path) -> Document:
@@ -55,45 +34,11 @@ def event_document(event: Event, folder: Path) -> Document:
     Raises:
         InputError: a frame outside the folder.
     """
-    document: Document = {"type": type_of(event), "t": _number(event.t)}
-    match event:
-        case AimEvent():
-            document["marker"] = _marker(event.marker, folder)
-            _put(document, "camera_p_spot_mm", event.camera_p_spot_mm)
-            _put(document, "covariance", event.covariance)
-            if event.corner is not None:
-                document["corner"] = [int(entry) for entry in event.corner]
-        case PairEvent():
-            document["pm"] = int(event.pm)
-            document["marker"] = _marker(event.marker, folder)
-            document["trus"] = _trus(event.trus, folder)
-        case TrackEvent():
-            document["marker"] = _marker(event.marker, folder)
-            looks = [_trus(look, folder) for look in event.looks]
-            if len(looks) == 1:
-                document["trus"] = looks[0]
-            elif looks:
-                document["looks"] = looks
-            if event.scan_deg is not None:
-                document["scan_deg"] = _number(event.scan_deg)
-        case CameraMovedEvent():
-            _put(document, "camera_new_T_camera_old", event.camera_new_T_camera_old)
-            _put(document, "covariance", event.covariance)
-            if event.detected:
-                document["detected"] = True
-            if event.since_t is not None:
-                document["since_t"] = _number(event.since_t)
-        case RefusedEvent():
-            document |= {"event": event.event, "reason": event.reason}
-        case StageEvent():
-            document["command"] = event.command
-            if event.scan_deg is not None:
-                document["scan_deg"] = _number(event.scan_deg)
-            if event.reason:
-                document["reason"] = event.reason
-        case NoteEvent():
-            document["text"] = event.text
-    return document
+    try:
+        return EVENTS.write(event, folder)
+    except FieldError as error:
+        problem = error.problems[0]
+        raise InputError(path_text(problem.path), problem.found, problem.expected) from None
 
 
 def event_line(document: Document, place: str) -> bytes:
@@ -133,50 +78,3 @@ def _not_finite(value: object, path: str = "") -> tuple[str, str] | None:
     elif isinstance(value, list | tuple):
         entries = [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
     return next((found for at, entry in entries if (found := _not_finite(entry, at)) is not None), None)
-
-
-def _number(value: float) -> float | int:
-    # Whole numbers that are given as such stay so; numpy's scalars become Python's.
-    return value if type(value) is int else float(value)
-
-
-def _put(document: Document, key: str, array: FloatArray | None) -> None:
-    if array is not None:
-        document[key] = array.tolist()
-
-
-def _marker(record: MarkerRecord, folder: Path) -> Document:
-    document: Document = {}
-    _put(document, "camera_T_marker", record.camera_T_marker)
-    _put(document, "covariance", record.covariance)
-    for key, path in (("left", record.left), ("right", record.right)):
-        if path is not None:
-            document[key] = frame_name(path, folder, f"marker.{key}")
-    return document
-
-
-def _trus(record: TrusRecord, folder: Path) -> Document:
-    document: Document = {"scan_deg": _number(record.scan_deg)}
-    for key, value in (("x_mm", record.x_mm), ("range_mm", record.range_mm)):
-        if value is not None:
-            document[key] = _number(value)
-    if record.frame is not None:
-        document["frame"] = frame_name(record.frame, folder, "trus.frame")
-    _put(document, "covariance", record.covariance)
-    if record.amplitude is not None:
-        document["amplitude"] = _number(record.amplitude)
-    if record.sweep:
-        document["sweep"] = int(record.sweep)
-    return document
-
-
-def frame_name(path: Path, folder: Path, where: str) -> str:
-    """A frame's name as events have it: relative to the session's folder, with forward slashes.
-
-    Raises:
-        InputError: the path is not inside the folder.
-    """
-    try:
-        return path.relative_to(folder).as_posix() if path.is_absolute() else path.as_posix()
-    except ValueError:
-        raise InputError(where, str(path), f"a file inside the session's folder, {folder}") from None

@@ -1,4 +1,4 @@
-"""``events.jsonl``: what happened, one JSON object per line. Angles stay the device's, in degrees."""
+"""``events.jsonl``: what happened, one JSON object per line, described by fgreg.events."""
 
 from __future__ import annotations
 
@@ -9,57 +9,32 @@ from pathlib import Path
 from typing import IO
 
 from fgreg.errors import InputError, one_line
-from fgreg.events import (
-    AimEvent,
-    CameraMovedEvent,
-    Event,
-    MarkerRecord,
-    NoteEvent,
-    PairEvent,
-    RefusedEvent,
-    StageEvent,
-    TrackEvent,
-    TrusRecord,
-)
-from fgreg.frames import FloatArray
-from fgreg.session.frames_named import FrameKind, FrameUse, locate_frame
+from fgreg.events import EVENTS, AimEvent, Event, MarkerRecord, PairEvent, RefusedEvent, TrackEvent, TrusRecord
+from fgreg.schema.files import FrameKind
+from fgreg.schema.kinds import SECONDS
+from fgreg.schema.problems import FieldError, Problem, input_error, path_text, shown
+from fgreg.session.frames_named import FrameUse
 from fgreg.session.safe_yaml import open_file
-from fgreg.session.schema import NOT_NEGATIVE, Bounds, Fields, Place, shown
 from fgreg.session.setup import Setup
 
 MAX_LINE_BYTES = 1_000_000
 _MAX_INTEGER_DIGITS = 30
-_SECONDS = Bounds(unit="s")
-SCAN_DEG = Bounds(-180.0, 180.0, unit="deg")
-RANGE_MM = Bounds(0.0, 300.0, above=True, unit="mm")
-LATERAL_MM = Bounds(-200.0, 200.0, unit="mm")
-COORDINATE_MM = Bounds(-2000, 2000, unit="mm")
-
-_FIELDS = {
-    "aim": ("marker", "camera_p_spot_mm", "covariance", "corner"),
-    "pair": ("pm", "marker", "trus"),
-    "track": ("marker", "trus", "looks", "scan_deg"),
-    "camera_moved": ("camera_new_T_camera_old", "covariance", "detected", "since_t"),
-    "refused": ("event", "reason"),
-    "stage": ("command", "scan_deg", "reason"),
-    "note": ("text",),
-}
-_MARKER = ("camera_T_marker", "covariance", "left", "right")
-_TRUS = ("scan_deg", "x_mm", "range_mm", "covariance", "amplitude", "sweep", "frame")
-_TRUS_WAYS = "x_mm and range_mm, or frame"
 
 
 @dataclass(slots=True)
 class EventLog:
-    """What an ``events.jsonl`` holds: the events that are right, warnings, and the frames that any event names."""
+    """What an ``events.jsonl`` holds: the events that are right, and warnings."""
 
     events: list[Event] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    frames: list[FrameUse] = field(default_factory=list)
 
 
 class _RefusedJsonError(ValueError):
     """Well-formed, but not allowed here: a key twice, a number that is none."""
+
+
+class _CutShortError(ValueError):
+    """A last line without its line break that is no JSON."""
 
 
 def read_events(path: Path, file: str, folder: Path, setup: Setup | None, problems: list[InputError]) -> EventLog:
@@ -80,51 +55,125 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
     last: tuple[float, int] | None = None
     with stream:
         for number, line in _lines(stream, file, problems):
-            place = Place(file, line=number, line_first=True)
-            value = _parse(line, place, problems, log)
-            if value is None:
+            try:
+                read = read_line(line, number, file, folder, setup, last)
+            except _CutShortError:
+                log.warnings.append(f"{file}: line {number}: cut short, dropped")
                 continue
-            reader = _EventReader(value, place, folder, setup, log, problems)
-            t = reader.time(last)
-            if t is not None:
-                last = (t, number)
-            event = reader.event(t, number)
-            if event is not None:
-                log.events.append(event)
+            problems += read.problems
+            if read.t is not None:
+                last = (read.t, number)
+            if read.event is not None:
+                log.events.append(read.event)
     return log
 
 
 @dataclass(frozen=True, slots=True)
 class LineRead:
-    """One line by itself: its event, the frames that it names, and what is wrong with it (then there is no event)."""
+    """One line by itself: its event, its time where it has one, and what is wrong with it (then there is no event)."""
 
     event: Event | None
-    frames: tuple[FrameUse, ...]
+    t: float | None
     problems: tuple[InputError, ...]
 
 
 def read_line(
     line: bytes, number: int, file: str, folder: Path, setup: Setup | None, last: tuple[float, int] | None
 ) -> LineRead:
-    """Reads one whole line as :func:`read_events` does.
+    """Reads one line.
 
     Args:
         line: with its line break.
         number: of the line, from 1.
-        file, folder, setup: as there.
+        file, folder, setup: as of :func:`read_events`.
         last: time and line of the event before, None for the first.
     """
-    log, problems = EventLog(), list[InputError]()
-    place = Place(file, line=number, line_first=True)
-    if len(line) > MAX_LINE_BYTES:
-        problems.append(InputError(str(place), f"{len(line)} bytes", f"at most {MAX_LINE_BYTES}"))
-        return LineRead(None, (), tuple(problems))
-    event = None
-    value = _parse(line, place, problems, log)
-    if value is not None:
-        reader = _EventReader(value, place, folder, setup, log, problems)
-        event = reader.event(reader.time(last), number)
-    return LineRead(None if problems else event, tuple(log.frames), tuple(problems))
+    event: Event | None = None
+    t: float | None = None
+    problems: list[Problem] = []
+    try:
+        document = _parse(line)
+        t, problems = _time(document, last)
+        event = EVENTS.read(document, folder, line=number)
+        problems += _misfits(event, setup)
+    except FieldError as error:
+        problems += error.problems
+    errors = tuple(input_error(problem, file, line=number) for problem in dict.fromkeys(problems))
+    return LineRead(None if errors else event, t, errors)
+
+
+def _time(document: Mapping[str, object], last: tuple[float, int] | None) -> tuple[float | None, list[Problem]]:
+    """The time of an event, None where it has none, and what is wrong with it."""
+    if "t" not in document:
+        return None, []  # missed with the other keys
+    try:
+        t = SECONDS.read(document["t"])
+    except FieldError as error:
+        return None, error.below("t")
+    if last is not None and t < last[0]:
+        return t, [Problem(("t",), f"{t:.17g}", f"at least {last[0]:.17g}, the time on line {last[1]}")]
+    return t, []
+
+
+def frames_of(event: Event, file: str, folder: Path) -> Iterator[FrameUse]:
+    """The frames that an event names."""
+    for path, record in _records(event):
+        uses = (
+            (("left", record.left, FrameKind.CAMERA), ("right", record.right, FrameKind.CAMERA))
+            if isinstance(record, MarkerRecord)
+            else (("frame", record.frame, FrameKind.TRUS),)
+        )
+        for key, frame, kind in uses:
+            if frame is not None:
+                where = f"{file}: line {event.line}: {path_text((*path, key))}"
+                yield FrameUse(frame, frame.relative_to(folder).as_posix(), kind, where)
+
+
+def _records(event: Event) -> Iterator[tuple[tuple[str | int, ...], MarkerRecord | TrusRecord]]:
+    """The marker and the looks of an event, with their places."""
+    if isinstance(event, AimEvent | PairEvent | TrackEvent):
+        yield ("marker",), event.marker
+    if isinstance(event, PairEvent | TrackEvent) and event.trus is not None:
+        yield ("trus",), event.trus
+    if isinstance(event, TrackEvent):
+        for i, look in enumerate(event.several):
+            yield ("looks", i), look
+
+
+def _misfits(event: Event, setup: Setup | None) -> Iterator[Problem]:
+    """What an event says that its session, or its place in the file, does not allow."""
+    if isinstance(event, RefusedEvent):
+        line = event.refused_line
+        if line is not None and not 0 < line < event.line:
+            yield Problem(("event",), f"line {line}", "an earlier line of this file")
+    if setup is None:
+        return
+    corner = event.corner if isinstance(event, AimEvent) else None
+    for path, record in _records(event):
+        if isinstance(record, MarkerRecord):
+            if record.left is not None and (corner is not None or record.camera_T_marker is None):
+                yield from _lacks_camera(record, path, setup)
+        elif record.frame is not None and not setup.present & {"probe.channels", "probe.image"}:
+            found = "a frame, but neither probe.channels nor probe.image in session.yaml"
+            yield Problem((*path, "frame"), found, "one of them there, to read the frame by")
+    if corner is not None:
+        board = setup.board
+        if "board" not in setup.present:
+            yield Problem(("corner",), "it without a board in session.yaml", "board: {columns, rows, square_mm}")
+        elif board is not None and not (corner[0] < board.columns and corner[1] < board.rows):
+            expected = f"[column, row] of a board with {board.columns} columns and {board.rows} rows, counted from 0"
+            yield Problem(("corner",), shown(list(corner)), expected)
+
+
+def _lacks_camera(marker: MarkerRecord, path: tuple[str | int, ...], setup: Setup) -> Iterator[Problem]:
+    if "camera" not in setup.present:
+        found = "a frame, but no camera in session.yaml"
+        yield Problem((*path, "left"), found, "camera there, or camera_T_marker here")
+    elif marker.right is not None and "camera.right" not in setup.present:
+        yield Problem((*path, "right"), "a frame, but no camera.right in session.yaml", "camera.right there")
+    if marker.camera_T_marker is None and "marker" not in setup.present:
+        found = "a frame, but no marker in session.yaml"
+        yield Problem((*path, "left"), found, "marker there, or camera_T_marker here")
 
 
 def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator[tuple[int, bytes]]:
@@ -148,9 +197,10 @@ def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator
         yield number, line
 
 
-def _parse(line: bytes, place: Place, problems: list[InputError], log: EventLog) -> Mapping[str, object] | None:
-    """The object on a line; None where it is bad (reported) or a last line cut short (a warning)."""
-    whole = line.endswith(b"\n")
+def _parse(line: bytes) -> Mapping[str, object]:
+    """The object on a line. Raises FieldError where it is bad, _CutShortError where a last line was cut short."""
+    if len(line) > MAX_LINE_BYTES:
+        raise FieldError.of(f"{len(line)} bytes", f"at most {MAX_LINE_BYTES}")
     expected = "one JSON object"
     try:
         value = json.loads(
@@ -164,9 +214,8 @@ def _parse(line: bytes, place: Place, problems: list[InputError], log: EventLog)
     except RecursionError:
         found = "nesting too deep"
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        if not whole:
-            log.warnings.append(f"{place}: cut short, dropped")
-            return None
+        if not line.endswith(b"\n"):
+            raise _CutShortError from None
         if isinstance(error, UnicodeDecodeError):
             found, expected = "bytes that are not UTF-8", "UTF-8 text"
         elif not line.strip():
@@ -177,8 +226,7 @@ def _parse(line: bytes, place: Place, problems: list[InputError], log: EventLog)
         if isinstance(value, dict):
             return value
         found = shown(value)
-    problems.append(InputError(str(place), found, expected))
-    return None
+    raise FieldError.of(found, expected)
 
 
 def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
@@ -197,249 +245,3 @@ def _refuse_constant(name: str) -> float:
 def _integer(digits: str) -> int | float:
     # Python refuses to convert thousands of digits; no field here needs more than a double holds.
     return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)
-
-
-class _EventReader:
-    """Reads one line's object."""
-
-    def __init__(
-        self,
-        value: Mapping[str, object],
-        place: Place,
-        folder: Path,
-        setup: Setup | None,
-        log: EventLog,
-        problems: list[InputError],
-    ) -> None:
-        kind = value.get("type")
-        self._kind = kind if isinstance(kind, str) and kind in _FIELDS else None
-        # Of an event of unknown type only type and time can be judged.
-        known = _FIELDS[self._kind] if self._kind is not None else tuple(value)
-        self._fields = Fields(value, ("type", "t", *known), place, problems)
-        self._folder = folder
-        self._setup = setup
-        self._log = log
-
-    def time(self, last: tuple[float, int] | None) -> float | None:
-        """``t``, or None with the problem reported; ``last`` is the time and line of the event before."""
-        before = len(self._fields.problems)
-        t = self._fields.number("t", _SECONDS)
-        if len(self._fields.problems) > before:
-            return None
-        if last is not None and t < last[0]:
-            self._fields.fail("t", f"{t:.17g}", f"at least {last[0]:.17g}, the time on line {last[1]}")
-        return t
-
-    def event(self, t: float | None, line: int) -> Event | None:
-        self._fields.text("type", f"one of {', '.join(_FIELDS)}", allowed=tuple(_FIELDS))
-        time = 0.0 if t is None else t
-        match self._kind:
-            case "aim":
-                return self._aim(time, line)
-            case "pair":
-                return self._pair(time, line)
-            case "track":
-                return self._track(time, line)
-            case "camera_moved":
-                return self._camera_moved(time, line)
-            case "refused":
-                return self._refused(time, line)
-            case "stage":
-                return self._stage(time, line)
-            case "note":
-                return self._note(time, line)
-            case _:
-                return None
-
-    def _aim(self, t: float, line: int) -> AimEvent | None:
-        fields = self._fields
-        marker = self._marker(fields, board="corner" if fields.has("corner") else None)
-        spot_mm = covariance = corner = None
-        if fields.has("corner") == fields.has("camera_p_spot_mm"):
-            found = "both" if fields.has("corner") else "neither"
-            fields.fail("", found, "camera_p_spot_mm or corner")
-        if fields.has("camera_p_spot_mm"):
-            spot_mm = fields.numbers("camera_p_spot_mm", 3, COORDINATE_MM)
-        if fields.has("covariance"):
-            covariance = fields.covariance("covariance", 3)
-            if not fields.has("camera_p_spot_mm"):
-                fields.fail("covariance", "it without camera_p_spot_mm", "both or none")
-        if fields.has("corner"):
-            corner = self._corner()
-
-        def make() -> AimEvent:
-            if marker is None:
-                raise AssertionError("a part is missing without a problem")
-            return AimEvent(t, line, marker, spot_mm, covariance, corner)
-
-        return fields.build(make)
-
-    def _corner(self) -> tuple[int, int] | None:
-        """[column, row] of an inner corner of the session's board."""
-        fields = self._fields
-        value = fields.raw("corner")
-        setup = self._setup
-        if setup is not None and "board" not in setup.present:
-            fields.fail("corner", "it without a board in session.yaml", "board: {columns, rows, square_mm}")
-        if not isinstance(value, list) or len(value) != 2 or any(type(v) is not int or v < 0 for v in value):
-            fields.fail("corner", shown(value), "[column, row], two integers >= 0")
-            return None
-        board = None if setup is None else setup.board
-        if board is not None and not (value[0] < board.columns and value[1] < board.rows):
-            expected = f"[column, row] of a board with {board.columns} columns and {board.rows} rows, counted from 0"
-            fields.fail("corner", shown(value), expected)
-        return value[0], value[1]
-
-    def _pair(self, t: float, line: int) -> PairEvent | None:
-        fields = self._fields
-        pm = fields.integer("pm", 0, 2**31 - 1)
-        marker = self._marker(fields)
-        trus = self._trus(fields.child("trus", _TRUS))
-
-        def make() -> PairEvent:
-            if marker is None or trus is None:
-                raise AssertionError("a part is missing without a problem")
-            return PairEvent(t, line, pm, marker, trus)
-
-        return fields.build(make)
-
-    def _track(self, t: float, line: int) -> TrackEvent | None:
-        fields = self._fields
-        marker = self._marker(fields)
-        looks: list[TrusRecord | None] = []
-        if fields.has("trus"):
-            looks.append(self._trus(fields.child("trus", _TRUS)))
-        if fields.has("looks"):
-            looks.extend(self._trus(look) for look in fields.children("looks", _TRUS))
-        scan_deg = fields.number("scan_deg", SCAN_DEG) if fields.has("scan_deg") else None
-        if fields.has("trus") and fields.has("looks"):
-            fields.fail("looks", "it together with trus", "one of the two")
-        if not (fields.has("trus") or fields.has("looks") or fields.has("scan_deg")):
-            fields.fail("", "none of trus, looks, scan_deg", "one of them")
-
-        def make() -> TrackEvent:
-            if marker is None:
-                raise AssertionError("a part is missing without a problem")
-            return TrackEvent(t, line, marker, tuple(look for look in looks if look is not None), scan_deg)
-
-        return fields.build(make)
-
-    def _camera_moved(self, t: float, line: int) -> CameraMovedEvent | None:
-        fields = self._fields
-        transform: FloatArray | None = None
-        covariance: FloatArray | None = None
-        since_t: float | None = None
-        if fields.has("camera_new_T_camera_old"):
-            transform = fields.transform("camera_new_T_camera_old")
-        if fields.has("covariance"):
-            covariance = fields.covariance("covariance", 6)
-            if not fields.has("camera_new_T_camera_old"):
-                fields.fail("covariance", "it without camera_new_T_camera_old", "both or none")
-        detected = fields.boolean("detected", default=False)
-        if fields.has("since_t"):
-            since_t = fields.number("since_t", _SECONDS)
-            if not fields.raw("detected"):
-                fields.fail("since_t", "it without detected: true", "both or none")
-            elif since_t > t:
-                fields.fail("since_t", shown(since_t), f"at most t, {t:.17g}")
-        return fields.build(lambda: CameraMovedEvent(t, line, transform, covariance, detected, since_t))
-
-    def _refused(self, t: float, line: int) -> RefusedEvent | None:
-        fields = self._fields
-        if not fields.has("event"):
-            fields.fail("event", "nothing", "the event that was not taken in")
-        reason, value = fields.text("reason"), fields.raw("event")
-        found = RefusedEvent(t, line, value, reason)
-        if (of_line := found.refused_line) is not None and not 0 < of_line < line:
-            fields.fail("event", f"line {of_line}", "an earlier line of this file")
-        return fields.build(lambda: found)
-
-    def _stage(self, t: float, line: int) -> StageEvent | None:
-        fields = self._fields
-        command = fields.text("command")
-        scan_deg = fields.number("scan_deg", SCAN_DEG) if fields.has("scan_deg") else None
-        reason = fields.text("reason") if fields.has("reason") else ""
-        return fields.build(lambda: StageEvent(t, line, command, scan_deg, reason))
-
-    def _note(self, t: float, line: int) -> NoteEvent | None:
-        text = self._fields.text("text")
-        return self._fields.build(lambda: NoteEvent(t, line, text))
-
-    def _marker(self, event: Fields, board: str | None = None) -> MarkerRecord | None:
-        """``marker``; ``board`` names the key that asks for a board in the same frames, pose or not."""
-        fields = event.child("marker", _MARKER)
-        if fields is None:
-            return None
-        pose = covariance = left = right = None
-        if fields.has("camera_T_marker"):
-            pose = fields.transform("camera_T_marker")
-        if fields.has("covariance"):
-            covariance = fields.covariance("covariance", 6)
-            if not fields.has("camera_T_marker"):
-                fields.fail("covariance", "it without camera_T_marker", "both or none")
-        if fields.has("left"):
-            left = self._frame(fields, "left", FrameKind.CAMERA)
-        if fields.has("right"):
-            right = self._frame(fields, "right", FrameKind.CAMERA)
-            if not fields.has("left"):
-                fields.fail("left", "nothing", "a frame of the left camera too")
-        if not any(fields.has(key) for key in ("camera_T_marker", "left", "right")):
-            fields.fail("", "neither camera_T_marker nor left", "the marker's pose or the frames to get it from")
-        if board is not None and not fields.has("left"):
-            event.fail(board, "it without frames", "marker.left, the frame in which to find the board")
-        if fields.has("left") and (board is not None or not fields.has("camera_T_marker")):
-            self._need_camera(fields, find_marker=not fields.has("camera_T_marker"))
-        return fields.build(lambda: MarkerRecord(pose, covariance, left, right))
-
-    def _need_camera(self, fields: Fields, find_marker: bool) -> None:
-        if self._setup is None:
-            return
-        present = self._setup.present
-        if "camera" not in present:
-            fields.fail("left", "a frame, but no camera in session.yaml", "camera there, or camera_T_marker here")
-        elif fields.has("right") and "camera.right" not in present:
-            fields.fail("right", "a frame, but no camera.right in session.yaml", "camera.right there")
-        if find_marker and "marker" not in present:
-            fields.fail("left", "a frame, but no marker in session.yaml", "marker there, or camera_T_marker here")
-
-    def _trus(self, fields: Fields | None) -> TrusRecord | None:
-        if fields is None:
-            return None
-        scan_deg = fields.number("scan_deg", SCAN_DEG)
-        x_mm = range_mm = covariance = amplitude = frame = None
-        if fields.has("frame"):
-            frame = self._frame(fields, "frame", FrameKind.TRUS)
-            if fields.has("x_mm") or fields.has("range_mm"):
-                fields.fail("frame", "it together with x_mm or range_mm", _TRUS_WAYS)
-            present = None if self._setup is None else self._setup.present
-            if present is not None and not present & {"probe.channels", "probe.image"}:
-                expected = "one of them there, to read the frame by"
-                fields.fail("frame", "a frame, but neither probe.channels nor probe.image in session.yaml", expected)
-        if fields.has("x_mm") or not fields.has("frame"):
-            x_mm = fields.number("x_mm", LATERAL_MM)
-        if fields.has("range_mm") or not fields.has("frame"):
-            range_mm = fields.number("range_mm", RANGE_MM)
-        if fields.has("covariance"):
-            covariance = fields.covariance("covariance", 2)
-            if fields.has("frame"):
-                fields.fail("covariance", "it together with frame", "it with x_mm and range_mm only")
-        if fields.has("amplitude"):
-            amplitude = fields.number("amplitude", NOT_NEGATIVE)
-        sweep = fields.choice("sweep", (0, 1, -1), default=0)
-        return fields.build(
-            lambda: TrusRecord(scan_deg, x_mm, range_mm, covariance, amplitude, sweep, frame),
-        )
-
-    def _frame(self, fields: Fields, key: str, kind: FrameKind) -> Path | None:
-        before = len(fields.problems)
-        name = fields.text(key, "the name of a frame")
-        if len(fields.problems) > before:
-            return None
-        where = str(fields.at(key))
-        try:
-            path = locate_frame(self._folder, name, where)
-        except InputError as error:
-            fields.problems.append(error)
-            return None
-        self._log.frames.append(FrameUse(path, name, kind, where))
-        return path

@@ -1,4 +1,4 @@
-"""Raw frames that events name: where they may lie, and whether they are what they should be, from headers alone."""
+"""Raw frames that events name: whether they are what they should be, from headers alone."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import struct
 import warnings
 import zlib
 from dataclasses import dataclass
-from enum import Enum
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import IO
 
 import numpy as np
@@ -17,56 +16,22 @@ from numpy.lib import format as npy_format
 
 from fgreg.errors import InputError
 from fgreg.models import ProbeModel
+from fgreg.schema.files import FrameKind
+from fgreg.schema.problems import shown
 from fgreg.session.safe_yaml import open_file
-from fgreg.session.schema import shown
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_MAX_NAME = 1024
 _MAX_BYTES = 2_000_000_000
-_FRAME_NAME = "a relative name of a file inside the session's folder"
-
-
-class FrameKind(Enum):
-    """What a frame is used for."""
-
-    CAMERA = "camera"
-    TRUS = "trus"
 
 
 @dataclass(frozen=True, slots=True)
 class FrameUse:
-    """A frame that an event names: resolved path, name as written, use, and the place of the name."""
+    """A frame that an event names: resolved path, name in the folder, use, and the place of the name."""
 
     path: Path
     name: str
     kind: FrameKind
     where: str
-
-
-def locate_frame(folder: Path, name: str, where: str) -> Path:
-    """The resolved path of a frame, which need not exist but has to lie inside the session's folder.
-
-    Args:
-        folder: the session's folder, resolved.
-        name: as the event has it.
-        where: the place of the name, for messages.
-
-    Raises:
-        InputError: absolute, with ``..``, with control characters, or leading out of the folder by a symbolic link.
-    """
-    if not name.isprintable() or len(name) > _MAX_NAME:
-        raise InputError(where, shown(name), _FRAME_NAME)
-    windows = PureWindowsPath(name)
-    if PurePosixPath(name).is_absolute() or windows.drive or windows.root or ".." in windows.parts:
-        raise InputError(where, shown(name), _FRAME_NAME)
-    try:
-        path = (folder / name).resolve()
-        inside = path.is_relative_to(folder) and path != folder
-    except (OSError, RuntimeError, ValueError):  # loops of links, names the file system cannot have
-        inside = False
-    if not inside:
-        raise InputError(where, f"{shown(name)}, which leads out of the folder", _FRAME_NAME)
-    return path
 
 
 def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int, int] | None) -> None:

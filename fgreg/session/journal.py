@@ -20,10 +20,12 @@ from typing import Self
 from fgreg.errors import InputError, JournalError
 from fgreg.events import Event
 from fgreg.models import SessionModel
+from fgreg.schema.files import FrameKind, FrameName
+from fgreg.schema.problems import FieldError, input_error
 from fgreg.session.append_file import AppendFile, sync_path
-from fgreg.session.event_document import event_document, event_line, frame_name, type_of
-from fgreg.session.event_log import read_line
-from fgreg.session.frames_named import check_frames, locate_frame
+from fgreg.session.event_document import event_document, event_line, type_of
+from fgreg.session.event_log import frames_of, read_line
+from fgreg.session.frames_named import check_frames
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE, Session, read_session
 from fgreg.session.safe_yaml import load_yaml
 from fgreg.session.setup import Setup, read_setup
@@ -129,16 +131,14 @@ class Journal:
             place = f"{type_of(event)} event"
             line = event_line(event_document(event, self.folder), place)
             read = read_line(line, number, place, self.folder, self._setup, self._last)
-            problems = [*read.problems]
-            if not problems:
-                camera, probe = self._setup.camera, self._setup.probe
-                size = None if camera is None else camera.left.image_size
-                problems = check_frames(list(read.frames), probe, size)
-            if problems:
-                raise problems[0]
             if read.event is None:
-                raise AssertionError("no event and no problem")
-            self._sync_frames({use.path for use in read.frames})
+                raise read.problems[0]
+            frames = [*frames_of(read.event, place, self.folder)]
+            camera, probe = self._setup.camera, self._setup.probe
+            size = None if camera is None else camera.left.image_size
+            if problems := check_frames(frames, probe, size):
+                raise problems[0]
+            self._sync_frames({use.path for use in frames})
             offset = self._file.append(line, durable=durable)
             self._last = (read.event.t, number)
             return Appended(offset, read.event)
@@ -157,9 +157,13 @@ class Journal:
             InputError: a name that leads out of the folder, or of a file that is there: frames are never written over.
             JournalError: the disk refuses; no file is left.
         """
-        path = locate_frame(self.folder, name, "frame")
+        try:
+            path = FrameName(FrameKind.CAMERA).read(name, self.folder)
+        except FieldError as error:
+            raise input_error(error.problems[0], "frame") from None
         if os.path.lexists(path):
-            raise InputError(f"frame {frame_name(path, self.folder, 'frame')}", "a file of this name", "a new name")
+            name = path.relative_to(self.folder).as_posix()
+            raise InputError(f"frame {name}", "a file of this name", "a new name")
         part = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
         try:
             made = not path.parent.is_dir()

@@ -8,25 +8,23 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from fgreg.errors import InputError
 from fgreg.events import Event, PairEvent, TrackEvent
 from fgreg.models import SessionModel
-from fgreg.session.event_log import COORDINATE_MM, SCAN_DEG, EventLog, read_events
+from fgreg.schema.problems import FieldError, input_error
+from fgreg.session.event_log import EventLog, frames_of, read_events
 from fgreg.session.frames_named import check_frames
-from fgreg.session.ground_truth import GroundTruth, TrackTruth
+from fgreg.session.ground_truth import GROUND_TRUTH, GroundTruth
 from fgreg.session.safe_yaml import load_yaml
-from fgreg.session.schema import Bounds, Fields, Place, read_numbers, read_transform, shown
 from fgreg.session.setup import Setup, read_setup
 
 SETUP_FILE = "session.yaml"
 EVENTS_FILE = "events.jsonl"
 TRUTH_FILE = "ground_truth.yaml"
 
-_PM = re.compile(r"0|[1-9][0-9]{0,9}")
 _TRUTH_BYTES = 64_000_000
 _TRUTH_NODES = 2_000_000
 
@@ -77,7 +75,8 @@ def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
         problems.append(error)
     camera = None if setup is None else setup.camera
     probe = None if setup is None else setup.probe
-    problems.extend(check_frames(log.frames, probe, None if camera is None else camera.left.image_size))
+    frames = [use for event in log.events for use in frames_of(event, EVENTS_FILE, folder.resolve())]
+    problems.extend(check_frames(frames, probe, None if camera is None else camera.left.image_size))
     return problems, _warnings(setup, log)
 
 
@@ -140,28 +139,9 @@ def _read_truth(folder: Path, problems: list[InputError]) -> GroundTruth | None:
     if not os.path.lexists(path):
         return None
     data = load_yaml(path, TRUTH_FILE, max_bytes=_TRUTH_BYTES, max_nodes=_TRUTH_NODES)
-    top = Fields(data, ("trus_T_camera", "marker_T_laser", "pms", "tracks"), Place(TRUTH_FILE), problems)
-    trus_T_camera = []
-    if top.has("trus_T_camera"):
-        entries = top.items("trus_T_camera", "a list of 4x4 transforms, one for each epoch")
-        trus_T_camera = [read_transform(entry, place, problems) for entry, place in entries]
-    marker_T_laser = top.transform("marker_T_laser") if top.has("marker_T_laser") else None
-    pms = {}
-    if top.has("pms") and (table := top.child("pms", _keys(top.raw("pms")))) is not None:
-        for key in _keys(top.raw("pms")):
-            if key.startswith("x_"):
-                continue
-            if not _PM.fullmatch(key):
-                table.fail(key, f"the PM {shown(key)}", "its number, an integer >= 0")
-                continue
-            pms[int(key)] = read_numbers(table.raw(key), table.at(key), problems, 3, COORDINATE_MM)
-    tracks = []
-    if top.has("tracks"):
-        for track in top.children("tracks", ("t", "stage_deg"), empty=True):
-            t = track.number("t", Bounds(unit="s"))
-            tracks.append(TrackTruth(t, math.radians(track.number("stage_deg", SCAN_DEG))))
-    return top.build(lambda: GroundTruth(tuple(trus_T_camera), marker_T_laser, pms, tuple(tracks)))
-
-
-def _keys(value: object) -> tuple[str, ...]:
-    return tuple(value) if isinstance(value, dict) else ()
+    try:
+        truth: GroundTruth = GROUND_TRUTH.read(data)
+    except FieldError as error:
+        problems += [input_error(problem, TRUTH_FILE, data) for problem in error.problems]
+        return None
+    return truth

@@ -1,0 +1,63 @@
+"""Values of a document that name files: frames inside the session's folder, and files of any place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from fgreg.schema.kinds import JsonSchema, Kind
+from fgreg.schema.problems import FieldError, shown
+
+_MAX_NAME = 1024
+_FRAME_NAME = "a relative name of a file inside the session's folder"
+
+
+class FrameKind(Enum):
+    """What a frame is used for."""
+
+    CAMERA = "camera"
+    TRUS = "trus"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameName(Kind):
+    """The name of a raw frame, relative to the session's folder; its resolved path inside.
+
+    The file need not exist, but has to lie inside the folder: names that are absolute, have ``..`` or control
+    characters, or lead out by a symbolic link are refused. The folder that is passed has to be resolved.
+    """
+
+    use: FrameKind
+
+    def read(self, value: object, folder: Path | None = None, /) -> Path:
+        if not isinstance(value, str) or not value:
+            raise FieldError.of(shown(value), self.expected)
+        windows = PureWindowsPath(value)
+        outside = PurePosixPath(value).is_absolute() or windows.drive or windows.root or ".." in windows.parts
+        if outside or not value.isprintable() or len(value) > _MAX_NAME:
+            raise FieldError.of(shown(value), _FRAME_NAME)
+        if folder is None:
+            raise AssertionError("frames are relative to a folder")
+        try:
+            path = (folder / value).resolve()
+            inside = path.is_relative_to(folder) and path != folder
+        except (OSError, RuntimeError, ValueError):  # loops of links, names the file system cannot have
+            inside = False
+        if not inside:
+            raise FieldError.of(f"{shown(value)}, which leads out of the folder", _FRAME_NAME)
+        return path
+
+    def write(self, value: Path, folder: Path | None = None, /) -> str:
+        """With forward slashes. Raises FieldError where the path is not inside the folder."""
+        try:
+            return value.relative_to(folder or "").as_posix() if value.is_absolute() else value.as_posix()
+        except ValueError:
+            raise FieldError.of(str(value), f"a file inside the session's folder, {folder}") from None
+
+    @property
+    def expected(self) -> str:
+        return "the name of a frame"
+
+    def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"type": "string", "minLength": 1, "maxLength": _MAX_NAME}
