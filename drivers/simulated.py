@@ -11,13 +11,13 @@ import math
 import os
 import shutil
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -33,6 +33,7 @@ from fgreg.drivers.base import (
     StereoFrame,
     host_now,
 )
+from fgreg.drivers.simulated_room import simulated
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
@@ -41,6 +42,7 @@ from fgreg.models import StageModel
 from fgreg.motion.device import MAX_CALL_S, StageLost, StageStatus
 from fgreg.pairing import Stamp
 from fgreg.simulation.room import BUMP_EVERY_S
+from fgreg.workers.worker_process import Work, WorkerProcess
 
 AGAIN_S = 0.2
 """Between attempts to connect."""
@@ -61,7 +63,7 @@ class RoomProcess:
 
     Args:
         seed, width_px, aims, bump_every_s: of the room (fgreg.simulation.room).
-        program: what to start in its place that speaks as it does: words after the interpreter's.
+        run: another room to run in its place, given the path of the socket.
 
     Attributes:
         path: of the socket that its devices are reached by.
@@ -77,20 +79,19 @@ class RoomProcess:
         aims: int = 10,
         bump_every_s: float = BUMP_EVERY_S,
         *,
-        program: Sequence[str] = ("-m", "fgreg.drivers.simulated_room"),
+        run: Callable[[Path], AbstractContextManager[Work[tuple[str, str], None]]] | None = None,
     ) -> None:
+        run = run or partial(simulated, seed=seed, width_px=width_px, aims=aims, bump_every_s=bump_every_s)
         self._folder = Path(tempfile.mkdtemp(prefix="fgreg-room-"))  # of mode 0700
         self.path = self._folder / "socket"
-        words = [sys.executable, *program, "--socket", os.fspath(self.path)]
-        words += ["--seed", str(seed), "--width", str(width_px), "--aims", str(aims)]
-        words += ["--bump-every-s", str(bump_every_s)]
-        self._child = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, text=True
+        self._worker: WorkerProcess[tuple[str, str], None] = WorkerProcess(
+            run, self.path, name="fgreg-room", what="the simulated room", niceness=0, end_s=3.0, restart=False
         )
-        said = "" if self._child.stdout is None else self._child.stdout.readline()
-        if said.strip() != "ready":
+        try:
+            self.fault("camera", "")
+        except FgregError:
             self.close()
-            raise FgregError("the simulated room did not start")
+            raise
 
     def __enter__(self) -> RoomProcess:
         return self
@@ -102,29 +103,16 @@ class RoomProcess:
         """Break one of its devices, or mend it with an empty word (fgreg.drivers.simulated_room.FAULTS).
 
         Raises:
-            FgregError: there is no such device or fault.
+            FgregError: there is no such device or fault, or no room any more.
         """
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-            try:
-                connection.connect(os.fspath(self.path))
-                send(connection, {"role": "control"})
-                send(connection, {"device": device, "fault": what})
-                receive(connection)
-            except (OSError, WireClosed):
-                raise FgregError(f"the simulated room has no {device} that could be {what!r}") from None
+        self._worker.send((device, what))
+        self._worker.fetch(math.inf)
+        if self._worker.failure:
+            raise FgregError(self._worker.failure)
 
     def close(self) -> None:
         """End it."""
-        if self._child.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._child.stdin.close()
-        try:
-            self._child.wait(3.0)
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            self._child.wait()
-        if self._child.stdout is not None:
-            self._child.stdout.close()
+        self._worker.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 

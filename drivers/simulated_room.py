@@ -1,34 +1,31 @@
-"""The simulated operating room as a process of its own: the devices that drivers in fgreg.drivers.simulated connect to.
-
-    python -m fgreg.drivers.simulated_room --socket /run/user/1000/room/socket --seed 1
+"""The simulated operating room, a process of its own: the devices that drivers in fgreg.drivers.simulated connect to.
 
 Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe``, ``scanner`` (B-mode pictures)
 and ``motion`` (the holder of the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon,
-who says what he does and can be asked to go on. No devices are ``control``, which breaks devices and mends them
-(``{"device": "camera", "fault": "frozen"}``, :data:`FAULTS`), and ``truth``, which answers how things truly were, for
-whoever judges a recorded session. Camera and probe stamp with clocks of their own. The process ends with the one that
-started it (its standard input closes), or on SIGTERM.
+who says what he does and can be asked to go on. No device is ``truth``, which answers how things truly were, for
+whoever judges a recorded session. Camera and probe stamp with clocks of their own. The process is a worker of whoever
+started it, for whom it breaks devices and mends them (:data:`FAULTS`).
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
 import math
 import os
 import queue
-import signal
 import socket
-import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
-from fgreg.simulation.room import BUMP_EVERY_S, Room, RoomConfig, room_config
+from fgreg.simulation.room import Room, room_config
+from fgreg.workers.worker_process import Work
 
 CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
 """What the devices' clocks read when the room begins."""
@@ -159,9 +156,6 @@ class RoomServer:
             connection.close()
             return
         role = header.get("role")
-        if role == "control":
-            self._control(connection)
-            return
         if self._faults.get(str(role)) == "gone":
             connection.close()
             return
@@ -202,15 +196,6 @@ class RoomServer:
             connection.close()
         with self._lock:
             self._stages.remove(connection)
-
-    def _control(self, connection: socket.socket) -> None:
-        """Somebody breaks devices and mends them; each order is answered once it is carried out."""
-        with contextlib.suppress(WireClosed, KeyError, ValueError):
-            while True:
-                header, _ = receive(connection)
-                self.fault(header["device"], header["fault"])
-                send(connection, {"done": True})
-        connection.close()
 
     def _tell_truth(self, connection: socket.socket) -> None:
         """As :meth:`Room.truth_at`, all times on the host's clock."""
@@ -337,35 +322,20 @@ class RoomServer:
             client.put(words)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """The process."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
-    parser.add_argument("--socket", type=Path, required=True, help="where the drivers connect")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--width", type=int, default=640, help="of the camera's images, px")
-    parser.add_argument("--aims", type=int, default=10, help="calibration shots before the surgeon turns to the tissue")
-    parser.add_argument(
-        "--bump-every-s", type=float, default=BUMP_EVERY_S, help="mean time between camera moves; inf: none"
-    )
-    given = parser.parse_args(arguments)
-    config: RoomConfig = room_config(given.seed, given.width, aims=given.aims, bump_every_s=given.bump_every_s)
-    serve(RoomServer(Room(config), given.socket))
-
-
-def serve(server: RoomServer) -> None:
-    """Say that it is ready and run it, until SIGTERM comes or the program that started this one is gone."""
-    signal.signal(signal.SIGTERM, lambda *_: server.stop())
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the program that started it ends it
-
-    def watch() -> None:
-        sys.stdin.buffer.read()
+@contextlib.contextmanager
+def serving(server: RoomServer) -> Iterator[Work[tuple[str, str], None]]:
+    """Run a room. The work is to break a device, or to mend it: :meth:`RoomServer.fault` with the request."""
+    thread = threading.Thread(target=server.run, name="room")
+    thread.start()
+    try:
+        yield lambda fault: server.fault(*fault)
+    finally:
         server.stop()
-
-    threading.Thread(target=watch, daemon=True).start()
-    sys.stdout.write("ready\n")
-    sys.stdout.flush()
-    server.run()
+        thread.join()
 
 
-if __name__ == "__main__":
-    main()
+def simulated(
+    path: Path, seed: int, width_px: int, aims: int, bump_every_s: float
+) -> AbstractContextManager[Work[tuple[str, str], None]]:
+    """Run a room (fgreg.simulation.room) whose devices are reached by the Unix socket at ``path``."""
+    return serving(RoomServer(Room(room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s)), path))

@@ -20,10 +20,12 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from load_player import playing
 from load_watch import GROWS_FROM_MIN, Made, Processes, Watch
 from played_room import FRAME_RATE, Making, make_pictures
 
@@ -37,6 +39,8 @@ from fgreg.session.reading import read_session
 from fgreg.simulation.room import room_config
 from fgreg.workers.threads import NAMES
 
+STAY_S = 12.0
+"""The surgeon stays at a spot for so long, while the stage follows."""
 P50_MS, P99_MS = 40.0, 100.0
 RECORDER_WAITS, PULSES_WAIT = 12, 30
 """Events of some spots; pulses of the time that one is waited for (fgreg.operation.senses)."""
@@ -47,16 +51,14 @@ GROWTH_MB = 20.0
 def measure(options: argparse.Namespace, making: Making, folder: Path) -> dict[str, Any]:
     """One session; what was seen."""
     figures_file = folder / "player.json"
-    program = [str(Path(__file__).with_name("load_player.py")), "--pictures", str(making.path)]
-    program += ["--figures", str(figures_file), "--spots", str(making.spots), "--laps", str(making.laps)]
-    program += ["--frame-rate", str(options.frame_rate)]
+    play = partial(playing, making=making, frame_rate=options.frame_rate, stay_s=STAY_S, figures=figures_file)
     session_folder = folder / "session"
     with ExitStack() as stack:
-        room = stack.enter_context(RoomProcess(options.seed, options.width, options.aims, program=program))
+        room = stack.enter_context(RoomProcess(run=play))
         painter = stack.enter_context(painted(options.rrd, "load", live=False, say=print))
         with running(room_setup(room.path, making.config), session_folder, None, painter.taken) as session:
             painter.session(session.model)
-            processes, watch = Processes(session), Watch(session)
+            processes, watch = Processes(), Watch(session)
             until = time.monotonic() + options.seconds
 
             def on_status(status: Any) -> None:
@@ -115,7 +117,7 @@ def verdicts(found: dict[str, Any]) -> dict[str, bool]:
         f"no process grows by more than {GROWTH_MB:g} MB after minute {GROWS_FROM_MIN}": all(
             process["growth_mb"] <= GROWTH_MB
             for name, process in found["processes"].items()
-            if "growth_mb" in process and not name.startswith("player")  # which maps more and more of its file
+            if "growth_mb" in process and not name.startswith("room")  # which maps more and more of its file
         ),
         "no queue grows": all(
             queues["recorder"] <= RECORDER_WAITS and queues["pulses"] <= PULSES_WAIT

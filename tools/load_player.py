@@ -1,19 +1,17 @@
-"""The process that plays a simulated room for tools/load_live.py: pictures from a file, all else as in the room.
-
-It takes the options that fgreg.drivers.simulated_room takes. At its end it writes what it did to the file --figures.
-"""
+"""What plays a simulated room for tools/load_live.py: pictures from a file, all else as in the room."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from played_room import FRAME_RATE, Making, PlayedRoom
+from played_room import Making, PlayedRoom
 
-from fgreg.drivers.simulated_room import RoomServer, serve
-from fgreg.simulation.room import room_config
+from fgreg.drivers.simulated_room import RoomServer, serving
+from fgreg.workers.worker_process import Work
 
 
 class Player(RoomServer):
@@ -36,32 +34,28 @@ class Player(RoomServer):
         super()._pulse(t_s, index)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--socket", type=Path, required=True)
-    parser.add_argument("--pictures", type=Path, required=True, help="made by tools/load_live.py")
-    parser.add_argument("--figures", type=Path, required=True, help="written at the end")
-    parser.add_argument("--frame-rate", type=float, default=FRAME_RATE, help="a whole part of that of the pictures")
-    parser.add_argument("--stay-s", type=float, default=12.0, help="at a spot, while the stage follows")
-    for name in ("--seed", "--width", "--aims", "--spots", "--laps"):
-        parser.add_argument(name, type=int, required=True)
-    parser.add_argument("--bump-every-s", type=float, help="not used: bumps come where the list has them")
-    given = parser.parse_args()
-    making = Making(room_config(given.seed, given.width, aims=given.aims), given.spots, given.laps, given.pictures)
+@contextmanager
+def playing(
+    path: Path, making: Making, frame_rate: float, stay_s: float, figures: Path
+) -> Iterator[Work[tuple[str, str], None]]:
+    """Play a room whose devices are reached by the socket at ``path``; at the end, write what it did to ``figures``.
+
+    Args:
+        making: of the room, its pictures made before.
+        frame_rate: a whole part of that of the pictures.
+        stay_s: at a spot, while the stage follows.
+    """
     room = making.room()
     room.show(making.file(room, "r"))
-    server = Player(room, given.socket, given.frame_rate, given.stay_s)
+    server = Player(room, path, frame_rate, stay_s)
     began = time.monotonic(), time.process_time()
-    serve(server)
+    with serving(server) as work:
+        yield work
     lasted, used = time.monotonic() - began[0], time.process_time() - began[1]
-    figures = {
+    found = {
         "start_s": server.start_s,
         "made": server.made,
         "bumps": len(room.moved_s),
         "processor_share": used / lasted,
     }
-    given.figures.write_text(json.dumps(figures), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    figures.write_text(json.dumps(found), encoding="utf-8")

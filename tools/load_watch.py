@@ -289,8 +289,8 @@ class _Process:
 class Processes:
     """This process and all that it has started, looked at once a minute."""
 
-    def __init__(self, session: Running) -> None:
-        self._session, self._began_s = session, time.monotonic()
+    def __init__(self) -> None:
+        self._began_s = time.monotonic()
         self._found: dict[int, _Process] = {}
         self._next_s = self._began_s + 60.0
         self._first_used: dict[int, float] = {}
@@ -314,30 +314,12 @@ class Processes:
 
     def _look(self) -> None:
         own, parents = os.getpid(), _parents()
-        locator = self._session.loop.ears.locator.pid
-        self._parts = {} if locator is None else {locator: "locator"}
         below = [own]
         for pid in below:
             below += [child for child, parent in sorted(parents.items()) if parent == pid]
-        engines = [pid for pid in below if parents.get(pid) == own and "spawn_main" in _words(pid)]
         for pid in below:
-            if pid not in self._found:
-                self._found[pid] = _Process(self._name(pid, own, parents, engines), _started(pid))
-
-    def _name(self, pid: int, own: int, parents: dict[int, int], engines: list[int]) -> str:
-        words = _words(pid)
-        if pid == own:
-            return "main"
-        for part, name in (
-            ("load_player", "player"),
-            ("fgreg.motion.watchdog", "watchdog"),
-            ("resource_tracker", TRACKER),
-        ):
-            if part in words:
-                return name
-        if parents.get(pid) == own:
-            return self._parts.get(pid) or ("engine" if pid == min(engines) else "right view")
-        return "beside the engine"
+            name = "main" if pid == own else _name(pid)
+            self._found.setdefault(pid, _Process(name, _started(pid))).name = name
 
     def figures(self) -> dict[str, Any]:
         """By process: memory at each minute and at the end, its growth since all is in use, share of a processor."""
@@ -392,8 +374,14 @@ def _rss_mb(pid: int) -> float:
     return int(fields[21]) * resource.getpagesize() / 1e6 if fields else 0.0
 
 
-def _words(pid: int) -> str:
+def _name(pid: int) -> str:
+    """Workers have theirs; the others are known by the module that they run."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
+        words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
+        shown = Path(f"/proc/{pid}/comm").read_text(encoding="utf-8").strip()
     except OSError:
-        return ""
+        return "ended"
+    for part, name in (("fgreg.motion.watchdog", "watchdog"), ("resource_tracker", TRACKER)):
+        if part in words:
+            return name
+    return shown.removeprefix("fgreg-")

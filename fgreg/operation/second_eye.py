@@ -63,7 +63,7 @@ class RightViewWorker:
             self._picture,
             self._rig,
             self._marker,
-            name="fgreg-right-view",
+            name="fgreg-rightview",
             what="the right view's process",
             niceness=0,
             answer_s=ANSWER_S,

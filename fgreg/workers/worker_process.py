@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
+from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
@@ -51,7 +52,7 @@ class WorkerProcess(Generic[Request, Answer]):
         make: called in the child with ``arguments`` at each start; a function of a module. Returns the work: a function
             of a request, or a context manager that gives one and is left when the worker is closed. If the work has a
             method ``idle``, that is called every 0.1 s while no request comes.
-        name: of the process. what: it is, in messages, e.g. ``the full solve's process``.
+        name: of the process; top shows its first 15 letters. what: it is, in messages: ``the full solve's process``.
         niceness: added to the owner's.
         start_s, answer_s, end_s: longest start, answer and end; then the process is killed.
         restart: start another process where one has ended; without it every request fails from then on.
@@ -274,7 +275,11 @@ def _serve(
     connection: Connection[Any, Any], niceness: int, make: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> None:
     """The child, until the owner closes the connection, or ends."""
+    import multiprocessing
+
     os.nice(niceness)
+    with suppress(OSError):  # where top and ps have the name from
+        Path("/proc/self/comm").write_text(multiprocessing.current_process().name)
     try:
         made = make(*arguments)
         context = made if isinstance(made, AbstractContextManager) else nullcontext(made)
