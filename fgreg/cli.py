@@ -7,6 +7,7 @@ that needs them.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from fgreg.pipeline import SolveReport
 
 EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+GARBAGE_THRESHOLD = 50_000
+"""New objects between two looks for garbage: imports leave none, and 700 would cost a short command a twentieth."""
 
 app = typer.Typer(
     name="fgreg",
@@ -52,6 +55,7 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, a
 
 def main() -> None:
     """Entry point: known errors become one line and exit status 2."""
+    gc.set_threshold(GARBAGE_THRESHOLD)
     try:
         status = app(standalone_mode=False)
     except FgregError as error:
@@ -143,20 +147,27 @@ def solve(
     """
     from fgreg.estimate import Verdict
     from fgreg.pipeline import SolveRequest, solve_session
-    from fgreg.report import print_summary, summary_dict
 
     config = solve_config(limit_mm, estimate)
     with _progress(quiet or as_json) as progress:
         report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves), config, progress)
+    if as_json or not quiet:
+        _show(report, as_json)
+    if report.estimate.verdict is Verdict.REFUSED:
+        raise typer.Exit(EXIT_REFUSED)
+
+
+def _show(report: SolveReport, as_json: bool) -> None:
+    """The summary of a solve, with what the reader warned of."""
+    from fgreg.report import print_summary, summary_dict
+
     extras = _summary_extras(report)
     if as_json:
         typer.echo(json.dumps(summary_dict(report.session.model, report.estimate, extras), indent=2))
-    elif not quiet:
+    else:
         for warning in report.session.warnings:
             sys.stderr.write(f"fgreg: warning: {warning}\n")
         print_summary(report.session.model, report.estimate, extras)
-    if report.estimate.verdict is Verdict.REFUSED:
-        raise typer.Exit(EXIT_REFUSED)
 
 
 def _summary_extras(report: SolveReport) -> Any:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 
 from fgreg.frames import FloatArray, right_from_parent_covariance
 from fgreg.models import NoiseModel
@@ -130,12 +129,15 @@ def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) ->
 
 
 def usable_covariance(covariance: FloatArray, floor: Sequence[float]) -> FloatArray:
-    """The covariance, with the floor's squares added where a direction of it is below the floor."""
+    """Covariances (..., n, n), with the floor's squares (n,) added to those with a direction below the floor."""
     least = _squares(tuple(floor))
-    # Less the floor it has a Cholesky factor: a fraction of the time that its eigenvalues take.
-    if dpotrf(covariance - least, lower=1)[1] == 0:
-        return covariance
-    return np.asarray(covariance + least)
+    try:
+        # Less the floor it has a Cholesky factor: a fraction of the time that its eigenvalues take.
+        np.linalg.cholesky(covariance - least)
+    except np.linalg.LinAlgError:
+        below = np.linalg.eigvalsh(covariance - least)[..., :1, None] <= 0.0
+        return np.where(below, covariance + least, covariance)
+    return covariance
 
 
 @lru_cache

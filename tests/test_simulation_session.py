@@ -15,7 +15,9 @@ import pytest
 import fgreg.simulation
 from fgreg.frames import FloatArray, log_so3
 from fgreg.models import NoiseModel, SensitivityModel, StageModel
-from fgreg.simulation import PRESETS, SimulatedSession, SimulationConfig, Sweep, simulate
+from fgreg.simulation.config import SimulationConfig, Sweep
+from fgreg.simulation.presets import PRESETS
+from fgreg.simulation.simulate import SimulatedSession, simulate
 
 R = 10.0
 STEP = 2.0

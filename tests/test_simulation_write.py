@@ -13,8 +13,9 @@ import yaml
 
 from fgreg.errors import InputError
 from fgreg.models import MarkerModel, TagModel
-from fgreg.simulation import PRESETS, simulate, write_session
-from fgreg.simulation.write import encoded
+from fgreg.simulation.presets import PRESETS
+from fgreg.simulation.simulate import simulate
+from fgreg.simulation.write import encoded, write_session
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "sessions"
 SMALL = replace(PRESETS["raw-small"], aims=1, pairs=1, tracks_heard=1, tracks_silent=0)

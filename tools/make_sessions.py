@@ -16,7 +16,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from fgreg.simulation import PRESETS, simulate, write_session
+from fgreg.simulation.presets import PRESETS
+from fgreg.simulation.simulate import simulate
+from fgreg.simulation.write import write_session
 
 SEEDS = {"phantom": 1, "paper": 1}
 LIMIT_MB = 45.0

@@ -121,7 +121,7 @@ def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
     if not markers:
         return BeamArrays(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)))
     transforms = np.stack([marker.camera_T_marker for marker in markers])
-    covariance = np.stack([usable_covariance(marker.covariance, POSE_FLOOR) for marker in markers])
+    covariance = usable_covariance(np.stack([marker.covariance for marker in markers]), POSE_FLOOR)
     rotation = np.ascontiguousarray(transforms[:, :3, :3])
     return BeamArrays(rotation, transforms[:, :3, 3].copy(), parent_from_right_covariance(rotation, covariance))
 
@@ -179,7 +179,7 @@ def pack(
     weight = np.zeros((len(looks), 3, 3))
     if looks:
         weight[:, :2, :2] = np.linalg.inv(
-            np.stack([usable_covariance(look.covariance, (FLOOR_MM,) * 2) for look in looks])
+            usable_covariance(np.stack([look.covariance for look in looks]), (FLOOR_MM,) * 2)
         )
         weight[:, 2, 2] = priors.sigma_rad**-2
 
@@ -211,9 +211,9 @@ def pack(
         ),
         aims=_beam_arrays([aim.marker for aim in aims]),
         aim_spot_mm=np.array([aim.camera_p_spot_mm for aim in aims], dtype=np.float64).reshape(-1, 3),
-        aim_spot_covariance=np.array(
-            [usable_covariance(aim.covariance, (FLOOR_MM,) * 3) for aim in aims], dtype=np.float64
-        ).reshape(-1, 3, 3),
+        aim_spot_covariance=usable_covariance(
+            np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3), (FLOOR_MM,) * 3
+        ),
         links=_links(measurements.epochs),
         radius_mm=model.probe.radius_mm,
         prior_information=prior_information,

@@ -1,0 +1,69 @@
+"""Which modules a command loads: what it does not use, it must not wait for."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SLOW = ("cv2", "rerun", "matplotlib", "scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.ndimage")
+"""Libraries that take 50 ms and more, and that few commands use."""
+SOLVER = ("scipy", "gtsam", "poselib", "fgreg.registration", "fgreg.graph", "fgreg.factors")
+OTHER_COMMANDS = ("fgreg.online", "fgreg.live", "fgreg.simulation", "fgreg.evaluation", "fgreg.convert")
+DETECTORS = ("cv2", "scipy.fft", "fgreg.drivers", "fgreg.detection.marker", "fgreg.detection.photoacoustic")
+DRAWING = ("rerun", "fgreg.viewer.recording", "fgreg.viewer.shapes")
+PROCESSES = ("multiprocessing", "concurrent.futures.process")
+
+FORBIDDEN: dict[str, tuple[str, ...]] = {
+    "--help": ("numpy", "pydantic", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
+    "solve --help": ("numpy", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
+    "check POSES": ("rich", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "solve POSES": (*SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "solve POSES --quiet": ("rich", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "solve FRAMES": (*SLOW[1:], *OTHER_COMMANDS, *DRAWING, *PROCESSES),
+    "replay POSES": (*SLOW, *DETECTORS, "fgreg.simulation", "fgreg.evaluation", "fgreg.convert"),
+    "evaluate POSES --jobs 1 --folds 0 --subsets 0 --no-leave-one-out": (
+        *SLOW,
+        *DETECTORS,
+        *DRAWING,
+        "fgreg.online",
+        "fgreg.simulation",
+    ),
+    "simulate OUT --preset first-hit": (*SLOW[1:], *SOLVER, *DRAWING, *PROCESSES, "fgreg.online", "fgreg.evaluation"),
+}
+"""Command, and modules that it must not have loaded when it ends."""
+
+PROGRAM = """
+import sys
+from fgreg.cli import main
+try:
+    main()
+finally:
+    print(*sys.modules, sep=chr(10), file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("command", FORBIDDEN)
+def test_a_command_loads_nothing_that_it_does_not_use(
+    command: str, pose_session: Path, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    places = {"POSES": str(pose_session), "OUT": str(tmp_path / "out")}
+    if "FRAMES" in command:
+        places["FRAMES"] = str(request.getfixturevalue("raw_session"))
+    words = [places.get(word, word) for word in command.split()]
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *words], check=False, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode in (0, 1), done.stderr
+    loaded = set(done.stderr.splitlines())
+    assert "fgreg.cli" in loaded
+    assert sorted(loaded & set(FORBIDDEN[command])) == []
+
+
+def test_what_is_forbidden_exists() -> None:
+    """A module that was renamed would be forbidden to no effect."""
+    names = {name for names in FORBIDDEN.values() for name in names}
+    assert sorted(name for name in names if importlib.util.find_spec(name) is None) == []
