@@ -94,7 +94,7 @@ class Number(Kind):
         return math.radians(number) if self.degrees else number
 
     def write(self, value: Any, _folder: Path | None = None, /) -> float | int | None:
-        """What is not finite is written as null where figures are rounded, so that a result can be without them."""
+        """Where figures are rounded, one that is not finite is written as null."""
         if self.degrees:
             value = math.degrees(value)
         if self.decimals is not None:
@@ -113,6 +113,17 @@ class Number(Kind):
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
         low = "exclusiveMinimum" if self.above else "minimum"
         return {"type": "number", low: self.low, "maximum": self.high}
+
+
+@dataclass(frozen=True, slots=True)
+class Figure(Number):
+    """A number that may be infinite: ``null`` in the file."""
+
+    def read(self, value: object, _folder: Path | None = None, /) -> float:
+        return math.inf if value is None else Number.read(self, value)
+
+    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"anyOf": [Number.json_schema(self, definitions), {"type": "null"}]}
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,9 +253,11 @@ class Numbers(Kind):
         return as_float_array(np.radians(value) if self.each.degrees else value)
 
     def write(self, value: Any, _folder: Path | None = None, /) -> list[Any]:
-        if type(value) is not np.ndarray:
-            return [self.each.write(entry) for entry in value]
-        return [self.each.write(entry) for entry in value.tolist()]
+        entries = value.tolist() if type(value) is np.ndarray else value
+        written = [self.each.write(entry) for entry in entries]
+        if None in written:
+            raise FieldError.of("an entry that is not finite", "finite numbers")
+        return written
 
     @property
     def expected(self) -> str:
@@ -333,12 +346,12 @@ class Transform(Matrix):
         return as_rigid(matrix)
 
     def write(self, value: Any, _folder: Path | None = None, /) -> list[list[float]]:
-        """Raises ValueError where rounding is asked for and the matrix is not rigid or finite."""
+        """Raises FieldError where rounding is asked for and the matrix is not rigid or finite."""
         if self.decimals is None:
             return Matrix.write(self, value)
         _require_finite(value)
         if (problem := transform_problem(value)) is not None:
-            raise ValueError(problem[0])
+            raise FieldError.of(*problem)
         rotation, translation = self.decimals
         places = (rotation, rotation, rotation, translation)
         rows = as_rigid(value).tolist()
@@ -370,7 +383,7 @@ class Covariance(Matrix):
         return as_float_array(0.5 * (matrix + matrix.T))
 
     def write(self, value: Any, _folder: Path | None = None, /) -> list[list[float]]:
-        """Raises ValueError where rounding is asked for and an entry is not finite."""
+        """Raises FieldError where rounding is asked for and an entry is not finite."""
         if self.digits is None:
             return Matrix.write(self, value)
         _require_finite(value)
@@ -512,7 +525,7 @@ def _not_a_matrix(value: object, size: int) -> str | None:
 
 def _require_finite(array: FloatArray) -> None:
     if not np.isfinite(array).all():
-        raise ValueError("an entry is not finite")
+        raise FieldError.of("an entry that is not finite", "finite numbers")
 
 
 def transform_problem(matrix: FloatArray, max_translation_mm: float = math.inf) -> tuple[str, str] | None:

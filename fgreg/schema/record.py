@@ -58,6 +58,13 @@ class Key:
 
 
 @dataclass(frozen=True, slots=True)
+class NotStored:
+    """Of a field that is not in the file: what it reads as."""
+
+    value: object
+
+
+@dataclass(frozen=True, slots=True)
 class Field:
     """A key of a mapping: its name there, the attribute that it becomes, and whether it has to be there."""
 
@@ -87,7 +94,7 @@ class Record(Kind):
         self._known = frozenset(self.names)
         self._required = tuple(field for field in self.fields if field.required)
         self._related = tuple(field for field in self.fields if field.key.requires or field.key.required_if)
-        self._by_name = {field.name: field for field in self.fields}
+        self._not_stored = {} if fields else dict(_not_stored(cls))
 
     def read(self, value: object, folder: Path | None = None, /, **given: object) -> Any:
         """The object; ``given`` are the fields that are not in the file."""
@@ -95,7 +102,7 @@ class Record(Kind):
         problems: list[Problem] = []
         made = None
         try:
-            made = self.cls(**values, **given)
+            made = self.cls(**values, **self._not_stored, **given)
         except FieldError as error:
             problems += error.problems
         except ValueError as error:
@@ -319,6 +326,11 @@ def _fields(cls: type) -> Iterator[Field]:
             parts = tuple(sections[entry])
             entry = Field(entry, "", Section(cls, entry, parts), False, None, Key(""))
         yield entry
+
+
+def _not_stored(cls: type) -> Iterator[tuple[str, object]]:
+    for name, hint in typing.get_type_hints(cls, include_extras=True).items():
+        yield from ((name, entry.value) for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, NotStored))
 
 
 def kind_of(hint: Any) -> Kind:
