@@ -1,3 +1,3 @@
 """fgreg: factor-graph registration of a stereo endoscope to a rotating TRUS probe."""
 
-__version__ = "0.1.0"
+from fgreg.version import __version__ as __version__

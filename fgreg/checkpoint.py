@@ -17,7 +17,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fgreg import __version__
 from fgreg.config import SolveConfig
 from fgreg.detection.noise import Misfit
 from fgreg.errors import FgregError
@@ -37,6 +36,7 @@ from fgreg.session.checkpoint_file import (
     write_checkpoint,
 )
 from fgreg.session.reading import EVENTS_FILE, SETUP_FILE
+from fgreg.version import __version__
 
 INT64 = 2**63
 

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from fgreg import __version__
 from fgreg.cli_convert import add_convert
 from fgreg.cli_devices import add_devices
 from fgreg.cli_evaluate import add_commands
@@ -26,6 +25,7 @@ from fgreg.cli_live import add_live
 from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
 from fgreg.errors import FgregError, InputError
+from fgreg.version import __version__
 
 if TYPE_CHECKING:
     from fgreg.pipeline import SolveReport

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgreg import __version__
 from fgreg.batch import Solution, solve
 from fgreg.config import SolveConfig
 from fgreg.detection.camera import project
@@ -31,6 +30,7 @@ from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import remove_result, write_result
 from fgreg.targets import beam_error, tre_mm
 from fgreg.verdict import Condition
+from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:

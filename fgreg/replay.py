@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg import __version__
 from fgreg.batch import solve
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused, InputError
@@ -38,6 +37,7 @@ from fgreg.pipeline import (
 from fgreg.recognition import Recognised, recognise
 from fgreg.session.reading import Session, read_ground_truth, read_session
 from fgreg.session.results import write_result
+from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Moment, Viewer
 from fgreg.viewer.spawn import spawn_viewer

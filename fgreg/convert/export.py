@@ -23,11 +23,11 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from fgreg import __version__
 from fgreg.errors import InputError, one_line
 from fgreg.estimate import SessionEstimate, Verdict
 from fgreg.frames import FloatArray, inverse
 from fgreg.quaternions import quaternion_from_rotation
+from fgreg.version import __version__
 
 JSON_FORMAT = "fgreg-transform/1"
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
