@@ -309,9 +309,9 @@ class TagModel:
 
     id: Annotated[int, Key("in the dictionary", Integer(0, max(DICTIONARY_SIZES.values()) - 1))]
     size_mm: Annotated[float, Key("outer edge of the black border", POSITIVE_MM)]
-    marker_T_tag: Annotated[FloatArray, Key("where it sits on the marker body", Transform(), default="identity")] = (
-        field(default_factory=lambda: as_float_array(np.eye(4)))
-    )
+    marker_T_tag: Annotated[
+        FloatArray, Key("where it sits on the marker body", Transform(), default="identity", brief=True)
+    ] = field(default_factory=lambda: as_float_array(np.eye(4)))
 
     def __post_init__(self) -> None:
         _positive(size_mm=self.size_mm)

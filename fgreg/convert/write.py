@@ -9,8 +9,8 @@ from pathlib import Path
 from fgreg.convert.drafts import Draft, Imported
 from fgreg.convert.files import whole_folder
 from fgreg.errors import InputError, one_line
-from fgreg.frames import FloatArray
-from fgreg.models import CameraModel, StereoRig
+from fgreg.models import STEREO_RIG, StereoRig
+from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.event_document import event_line
 from fgreg.session.event_log import frames_of, read_line
 from fgreg.session.frames_named import FrameUse, check_frames
@@ -117,26 +117,5 @@ def _place(draft: Draft, problem: InputError) -> str:
 
 def camera_yaml(rig: StereoRig) -> str:
     """The ``camera`` section of a ``session.yaml``."""
-    width, height = rig.left.image_size
-    lines = ["camera:", f"  image_size: [{width}, {height}]", f"  left: {_camera(rig.left)}"]
-    if rig.right is not None and rig.right_T_left is not None:
-        lines += [f"  right: {_camera(rig.right)}", f"  right_T_left: {_matrix(rig.right_T_left)}"]
-    return "\n".join(lines) + "\n"
-
-
-def _camera(model: CameraModel) -> str:
-    return f"{{matrix: {_matrix(model.matrix)}, distortion: {_row(model.distortion)}}}"
-
-
-def _matrix(values: FloatArray) -> str:
-    return "[" + ", ".join(_row(row) for row in values) + "]"
-
-
-def _row(values: FloatArray) -> str:
-    return "[" + ", ".join(_number(float(value)) for value in values) + "]"
-
-
-def _number(value: float) -> str:
-    # YAML 1.1 takes 1e-05 for a text.
-    text = repr(value)
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+    section = STEREO_RIG.write(rig)
+    return "".join(["camera:\n", *(f"  {key}: {one_line_yaml(value)}\n" for key, value in section.items())])

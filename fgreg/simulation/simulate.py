@@ -9,15 +9,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.events import (
+    EVENTS,
+    AimEvent,
+    CameraMovedEvent,
+    Event,
+    MarkerRecord,
+    PairEvent,
+    TrackEvent,
+    TrusRecord,
+)
 from fgreg.frames import BoolArray, FloatArray, IntArray, exp_so3, inverse, make_transform
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig
-from fgreg.simulation.documents import degrees, rows, session_document
+from fgreg.simulation.documents import degrees, round_array, rows, session_document
 from fgreg.simulation.pictures import LookPicture, ShotPicture
 from fgreg.simulation.scene import AimShots, Scene, Shots, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
@@ -188,52 +199,61 @@ class _Recorder:
             heard.half_width_rad,
         )
 
-    def _observed(self, shots: Shots) -> list[Document]:
-        """Marker entries with a pose each: [Exp(w) R, t + n + bias], w and n along the camera's axes."""
+    def _observed(self, shots: Shots) -> list[MarkerRecord | None]:
+        """A marker pose each: [Exp(w) R, t + n + bias], w and n along the camera's axes. None: frames are recorded."""
         if self.config.frames:
-            return [{} for _ in shots.lambda_mm]
+            return [None for _ in shots.lambda_mm]
         noise, n = self.config.noise, shots.lambda_mm.size
         w = self.marker_rng.standard_normal((n, 3)) * noise.marker_rotation_rad
         shift = self.marker_rng.standard_normal((n, 3)) * noise.marker_translation_mm + self.scene.marker_bias_mm
         turned = exp_so3(w) @ shots.camera_T_marker[:, :3, :3]
         poses = make_transform(turned, shots.camera_T_marker[:, :3, 3] + shift)
-        return [{"camera_T_marker": matrix} for matrix in rows(poses)]
+        return [MarkerRecord(pose) for pose in round_array(poses)]
 
     def _aims(self, aims: AimShots) -> None:
         markers = self._observed(aims.shots)
-        spots = rows(aims.camera_p_spot_mm)
+        spots = round_array(aims.camera_p_spot_mm)
         for i, marker in enumerate(markers):
-            if self.config.frames:
-                pose = aims.shots.camera_T_marker[i]
+            pose = aims.shots.camera_T_marker[i]
+            if marker is None:
                 marker = self._pictures(f"aim-{i:02d}", pose, aims.shots.spot_mm[i], aims.camera_T_board[i], None)
-                event = {"type": "aim", "t": self._now(), "marker": marker, "corner": aims.corner[i].tolist()}
+                column, row = aims.corner[i].tolist()
+                event = AimEvent(self._now(), 0, marker, corner=(column, row))
             else:
-                event = {"type": "aim", "t": self._now(), "marker": marker, "camera_p_spot_mm": spots[i]}
-            self._add(event, aims.shots.camera_T_marker[i])
+                event = AimEvent(self._now(), 0, marker, spots[i])
+            self._add(event, pose)
 
-    def _pair(self, i: int, epoch: int, pms: Shots, markers: list[Document], looks: _Looks) -> None:
+    def _pair(self, i: int, epoch: int, pms: Shots, markers: list[MarkerRecord | None], looks: _Looks) -> None:
         name = f"pm-{i:02d}"
         marker = self._pm_marker(name, i, epoch, pms, markers)
         for k in range(looks.scan_deg.shape[1]):
             trus = self._look(name if k == 0 else f"{name}-look-{k}", looks, i, k)
-            event = {"type": "pair", "t": self._now(), "pm": i, "marker": marker, "trus": trus}
-            self._add(event, pms.camera_T_marker[i])
+            self._add(PairEvent(self._now(), 0, i, marker, trus), pms.camera_T_marker[i])
 
     def _track(
-        self, j: int, epoch: int, tracks: Shots, markers: list[Document], looks: _Looks | None, idle_deg: float
+        self,
+        j: int,
+        epoch: int,
+        tracks: Shots,
+        markers: list[MarkerRecord | None],
+        looks: _Looks | None,
+        idle_deg: float,
     ) -> None:
-        name = f"track-{j:02d}"
-        event = {"type": "track", "t": self._now(), "marker": self._pm_marker(name, j, epoch, tracks, markers)}
+        name, t = f"track-{j:02d}", self._now()
+        marker = self._pm_marker(name, j, epoch, tracks, markers)
         if looks is None:
-            event["scan_deg"] = round(idle_deg, 4)
+            event = TrackEvent(t, 0, marker, scan_deg=round(idle_deg, 4))
         else:
-            heard = [self._look(f"{name}-look-{k}", looks, j, k) for k in range(looks.scan_deg.shape[1])]
-            event |= {"trus": heard[0]} if len(heard) == 1 else {"looks": heard}
+            heard = tuple(self._look(f"{name}-look-{k}", looks, j, k) for k in range(looks.scan_deg.shape[1]))
+            event = TrackEvent(t, 0, marker, heard[0] if len(heard) == 1 else None, heard if len(heard) > 1 else ())
         self._add(event, tracks.camera_T_marker[j])
 
-    def _pm_marker(self, name: str, i: int, epoch: int, shots: Shots, markers: list[Document]) -> Document:
-        if not self.config.frames:
-            return markers[i]
+    def _pm_marker(
+        self, name: str, i: int, epoch: int, shots: Shots, markers: list[MarkerRecord | None]
+    ) -> MarkerRecord:
+        observed = markers[i]
+        if observed is not None:
+            return observed
         camera_T_trus = inverse(self.scene.trus_T_camera[epoch])
         spot = camera_T_trus[:3, :3] @ shots.spot_mm[i] + camera_T_trus[:3, 3]
         return self._pictures(name, shots.camera_T_marker[i], spot, None, camera_T_trus)
@@ -245,7 +265,7 @@ class _Recorder:
         camera_p_spot_mm: FloatArray,
         camera_T_board: FloatArray | None,
         camera_T_trus: FloatArray | None,
-    ) -> Document:
+    ) -> MarkerRecord:
         picture = ShotPicture(
             camera_T_marker,
             camera_T_marker @ self.scene.marker_T_laser,
@@ -256,13 +276,13 @@ class _Recorder:
             camera_T_trus,
         )
         sides = ["left"] if self.config.camera.right is None else ["left", "right"]
-        marker = {side: f"frames/{name}-{side}.png" for side in sides}
-        for side, frame in marker.items():
+        names = {side: f"frames/{name}-{side}.png" for side in sides}
+        for side, frame in names.items():
             self.frames[frame] = partial(picture.render, self.config, side == "right")
-        return marker
+        return MarkerRecord(**{side: Path(frame) for side, frame in names.items()})
 
-    def _look(self, name: str, looks: _Looks, i: int, k: int) -> Document:
-        trus: Document = {"scan_deg": round(float(looks.scan_deg[i, k]), 4)}
+    def _look(self, name: str, looks: _Looks, i: int, k: int) -> TrusRecord:
+        scan_deg, sweep = round(float(looks.scan_deg[i, k]), 4), int(looks.sweep[i, k])
         if self.config.frames:
             picture = LookPicture(
                 looks.source_mm[i, k],
@@ -270,26 +290,27 @@ class _Recorder:
                 float(looks.half_width_rad[i, k]),
                 (self.seed, len(self.frames), 2),
             )
-            trus["frame"] = f"frames/{name}.npy"
-            self.frames[trus["frame"]] = partial(picture.record, self.config)
-        else:
-            trus["x_mm"] = round(float(looks.x_mm[i, k]), 5)
-            trus["range_mm"] = round(float(looks.range_mm[i, k]), 5)
-            if self.config.amplitudes:
-                trus["amplitude"] = round(float(looks.amplitude[i, k]), 5)
-        if looks.sweep[i, k] != 0:
-            trus["sweep"] = int(looks.sweep[i, k])
-        return trus
+            frame = f"frames/{name}.npy"
+            self.frames[frame] = partial(picture.record, self.config)
+            return TrusRecord(scan_deg, frame=Path(frame), sweep=sweep)
+        return TrusRecord(
+            scan_deg,
+            round(float(looks.x_mm[i, k]), 5),
+            round(float(looks.range_mm[i, k]), 5),
+            amplitude=round(float(looks.amplitude[i, k]), 5) if self.config.amplitudes else None,
+            sweep=sweep,
+        )
 
     def _camera_moved(self, move: FloatArray) -> None:
-        event: Document = {"type": "camera_moved", "t": self._now()}
-        if self.config.camera_move_known:
-            sigma = np.repeat(self.config.camera_move_sigma, 3)
-            xi = sigma * self.misc_rng.standard_normal(6)
-            # Right perturbation; for errors this small Expmap's translation is xi's to second order.
-            event["camera_new_T_camera_old"] = rows(move @ make_transform(exp_so3(xi[:3]), xi[3:]))
-            event["covariance"] = np.diag(sigma**2).tolist()
-        self._add(event, None)
+        t = self._now()
+        if not self.config.camera_move_known:
+            self._add(CameraMovedEvent(t, 0), None)
+            return
+        sigma = np.repeat(self.config.camera_move_sigma, 3)
+        xi = sigma * self.misc_rng.standard_normal(6)
+        # Right perturbation; for errors this small Expmap's translation is xi's to second order.
+        known = round_array(move @ make_transform(exp_so3(xi[:3]), xi[3:]))
+        self._add(CameraMovedEvent(t, 0, known, np.diag(sigma**2)), None)
 
     def _rough_laser(self) -> FloatArray:
         error = self.misc_rng.standard_normal(6) * np.repeat([np.radians(3.0), 2.0], 3)
@@ -299,10 +320,10 @@ class _Recorder:
         self.time_s += 2.0 + 3.0 * float(self.misc_rng.random())
         return round(self.time_s, 2)
 
-    def _add(self, event: Document, camera_T_marker: FloatArray | None) -> None:
+    def _add(self, event: Event, camera_T_marker: FloatArray | None) -> None:
         if camera_T_marker is not None:
             self.true_markers[len(self.events)] = camera_T_marker
-        self.events.append(event)
+        self.events.append(EVENTS.write(event))
 
 
 def _part(shots: Shots, which: slice) -> Shots:
