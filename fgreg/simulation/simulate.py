@@ -275,11 +275,12 @@ class _Recorder:
             camera_T_board,
             camera_T_trus,
         )
-        sides = ["left"] if self.config.camera.right is None else ["left", "right"]
-        names = {side: f"frames/{name}-{side}.png" for side in sides}
-        for side, frame in names.items():
-            self.frames[frame] = partial(picture.render, self.config, side == "right")
-        return MarkerRecord(**{side: Path(frame) for side, frame in names.items()})
+        frames = {side: Path(f"frames/{name}-{side}.png") for side in ("left", "right")}
+        if self.config.camera.right is None:
+            del frames["right"]
+        for side, frame in frames.items():
+            self.frames[frame.as_posix()] = partial(picture.render, self.config, side == "right")
+        return MarkerRecord(left=frames["left"], right=frames.get("right"))
 
     def _look(self, name: str, looks: _Looks, i: int, k: int) -> TrusRecord:
         scan_deg, sweep = round(float(looks.scan_deg[i, k]), 4), int(looks.sweep[i, k])
