@@ -18,12 +18,12 @@ from fgreg.graph.reduced import Evaluation, evaluate
 from fgreg.graph.reduced_blocks import look_block, times
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState
-from fgreg.graph.windows import LEAST_PRECISION, NODES, REACH, WEIGHTS
+from fgreg.graph.windows import LEAST_PRECISION
 from fgreg.sensitivity import interval_moments, log_interval
 
 ROUNDS = 30
 SETTLED = 0.02
-"""Sites have settled when no look's rotation moves by more than this share of its own standard deviation."""
+"""Sites have settled when no rotation, nor its standard deviation, moves by more than this share of the latter."""
 DAMPING = 0.8
 """Share of a site's change that is made at once."""
 FARTHEST_SIGMA = 100.0
@@ -51,38 +51,57 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
         problem: with shapes, and the Gaussian priors as first sites.
         optimum: of that problem, one hypothesis.
     """
-    shapes = problem.shapes
-    if shapes is None or not len(problem.look_pm):
+    if problem.shapes is None:
         return None
-    state, private = optimum.state, optimum.evaluation.private
+    settled = settle(problem, optimum.state, optimum.evaluation)
+    if settled is None:
+        return None
+    problem, state, at = settled
+    return problem, optimize(problem, state, at.private, tolerance=1e-7)
+
+
+def settle(
+    problem: PackedProblem,
+    state: SharedState,
+    at: Evaluation,
+    *,
+    settled: float = SETTLED,
+    damping: float = DAMPING,
+) -> tuple[PackedProblem, SharedState, Evaluation] | None:
+    """Sites for the windows' shapes, and where they settled: near their optimum; None where they do not settle.
+
+    Args:
+        problem: with the Gaussian priors as first sites, which stay where it has no shapes.
+        state: to start from, one hypothesis. at: the problem there.
+        settled, damping: in place of ``SETTLED`` and ``DAMPING``.
+    """
+    if not len(problem.look_pm):
+        return None
     precision = problem.looks.weight[:, 2, 2].copy()
     centre = problem.looks.centre_rad.copy()
-    at = optimum.evaluation
-    before = np.full(len(precision), np.inf)
-    settled = False
+    before, sigma_before = np.full((2, len(precision)), np.inf)
     for _ in range(ROUNDS):
         covariance = inverse_hessian(at.hessian[0])
         if covariance is None:
             return None
         mean, variance = _look_marginals(problem, state, at, covariance)
-        settled = bool((np.abs(mean - before) < SETTLED * np.sqrt(variance)).all())
-        if settled:
-            break
-        before = mean
-        new_centre, new_precision = _new_sites(problem, shapes, mean, variance, centre, precision)
-        pull = (1.0 - DAMPING) * precision * centre + DAMPING * new_precision * new_centre
-        precision = (1.0 - DAMPING) * precision + DAMPING * new_precision
-        centre = pull / precision
-        problem = with_sites(problem, centre, precision)
+        sigma = np.sqrt(variance)
+        if (np.maximum(np.abs(mean - before), np.abs(sigma - sigma_before)) < settled * sigma).all():
+            return problem, state, at
+        before, sigma_before = mean, sigma
+        if problem.shapes is not None:
+            new_centre, new_precision = _new_sites(problem, problem.shapes, mean, variance, centre, precision)
+            pull = (1.0 - damping) * precision * centre + damping * new_precision * new_centre
+            precision = (1.0 - damping) * precision + damping * new_precision
+            centre = pull / precision
+            problem = with_sites(problem, centre, precision)
+            at = evaluate(problem, state, at.private)
         # One Gauss-Newton step with the sites as they are now; they are refitted before the next.
-        stepped = _step(problem, state, evaluate(problem, state, private))
+        stepped = _step(problem, state, at)
         if stepped is None:
             return None
         state, at = stepped
-        private = at.private
-    if not settled:
-        return None
-    return problem, optimize(problem, state, private, tolerance=1e-7)
+    return None
 
 
 def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[SharedState, Evaluation] | None:
@@ -148,16 +167,10 @@ def _new_sites(
     slope, curvature = interval_moments(low, high, np.sqrt(soft**2 + 1.0 / q))
     for pm, look in enumerate(shapes.amplitude_look):
         if look >= 0:
-            sigma, around = 1.0 / np.sqrt(q[look]), cavity[look]
-            begin = max(-REACH * sigma, low[look] - REACH * soft[look])
-            end = min(REACH * sigma, high[look] + REACH * soft[look])
-            if end <= begin:
-                continue
-            d = 0.5 * (begin + end) + 0.5 * (end - begin) * NODES
+            d = shapes.plane_rad[pm] - problem.looks.scan_rad[look] - cavity[look]
             log = log_interval(low[look] - d, high[look] - d, soft[look]) - 0.5 * q[look] * d * d
-            plane = around + d + problem.looks.scan_rad[look]
-            log = log + np.interp(plane, shapes.plane_rad[pm], shapes.amplitude_log[pm])
-            weight = np.exp(log - log.max()) * WEIGHTS
+            log = log + shapes.amplitude_log[pm]
+            weight = np.exp(log - log.max())
             weight = weight / weight.sum()
             first = float(weight @ d)
             second = float(weight @ (d - first) ** 2)
