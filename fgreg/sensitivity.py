@@ -22,7 +22,7 @@ from scipy.special import log_ndtr
 
 from fgreg.frames import FloatArray
 from fgreg.measurements import Look
-from fgreg.models import ProbeModel, SensitivityModel
+from fgreg.models import SensitivityModel
 
 _Angles = npt.ArrayLike
 
@@ -112,20 +112,20 @@ def window_priors(
     )
 
 
-def sensitivity_priors(looks: Sequence[Look], probe: ProbeModel, step_rad: float) -> SensitivityPriors:
+def sensitivity_priors(looks: Sequence[Look], sensitivity: SensitivityModel, step_rad: float) -> SensitivityPriors:
     """The priors of n looks, arrays (n,); see :func:`window_priors`."""
     return window_priors(
         [look.range_mm for look in looks],
         [look.sweep for look in looks],
         [look.scan_sigma_rad for look in looks],
-        probe.sensitivity,
+        sensitivity,
         step_rad,
     )
 
 
-def sensitivity_prior(look: Look, probe: ProbeModel, step_rad: float) -> SensitivityPrior:
+def sensitivity_prior(look: Look, sensitivity: SensitivityModel, step_rad: float) -> SensitivityPrior:
     """The prior of one look; see :func:`window_priors`."""
-    priors = sensitivity_priors([look], probe, step_rad)
+    priors = sensitivity_priors([look], sensitivity, step_rad)
     return SensitivityPrior(float(priors.centre_rad[0]), float(priors.edge_gain[0]), float(priors.sigma_rad[0]))
 
 
@@ -150,10 +150,10 @@ class WindowShapes:
     soft_rad: FloatArray
 
 
-def window_shapes(looks: Sequence[Look], probe: ProbeModel, step_rad: float) -> WindowShapes:
+def window_shapes(looks: Sequence[Look], sensitivity: SensitivityModel, step_rad: float) -> WindowShapes:
     """The intervals of n looks; the cases are those of :func:`window_priors`."""
     s = np.array([look.sweep for look in looks], dtype=np.float64)
-    w = probe.sensitivity.half_width_at(np.array([look.range_mm for look in looks], dtype=np.float64))
+    w = sensitivity.half_width_at(np.array([look.range_mm for look in looks], dtype=np.float64))
     informed = (s != 0.0) & (step_rad < 2.0 * w)
     near = w - step_rad
     return WindowShapes(
@@ -222,24 +222,18 @@ def amplitude_curve(sensitivity: SensitivityModel) -> AmplitudeCurve | None:
     return AmplitudeCurve(rotations, log, np.asarray(np.gradient(log, rotations)))
 
 
-def amplitude_table(
-    looks: Sequence[Look],
-    sensitivity: SensitivityModel,
-    amplitude_sigma: float,
-    curve: AmplitudeCurve | None = None,
-) -> AmplitudeTable:
+def amplitude_table(looks: Sequence[Look], sensitivity: SensitivityModel, amplitude_sigma: float) -> AmplitudeTable:
     """What the amplitudes of the looks at one PM say about its plane angle, its unknown peak eliminated.
 
     ``log amplitude = log peak + log curve(rotation) + noise``: at a plane angle each look gives one estimate of the
     peak, and with a flat prior on its logarithm what counts is how far they scatter about their weighted mean. The
-    stage reading's noise adds by the curve's slope. Needs two looks with amplitudes and a curve; ``curve``: the
-    sensitivity's, where it is at hand.
+    stage reading's noise adds by the curve's slope. Needs two looks with amplitudes and a curve.
     """
     scan = np.array([look.scan_rad for look in looks])
     heard = [(look.scan_rad, look.scan_sigma_rad, look.amplitude) for look in looks if look.amplitude]
     reach = float(sensitivity.half_width_rad.max()) + TABLE_MARGIN_RAD
     plane = np.linspace(scan.min() - reach, scan.max() + reach, TABLE_SIZE)
-    curve = amplitude_curve(sensitivity) if curve is None else curve
+    curve = amplitude_curve(sensitivity)
     if len(heard) < 2 or curve is None:
         return AmplitudeTable(plane, np.zeros(TABLE_SIZE), False)
     at, at_sigma, amplitude = np.array(heard, dtype=np.float64).T[:, :, None]

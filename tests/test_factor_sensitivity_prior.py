@@ -73,7 +73,7 @@ def test_zero_at_truth(first_hit: bool, ratio: float) -> None:
     )
     for index, pair in enumerate(measurements.pairs):
         look = pair.look
-        prior = sensitivity_prior(look, session.probe, session.stage.step_rad)
+        prior = sensitivity_prior(look, session.probe.sensitivity, session.stage.step_rad)
         theta = truth.theta_rad[index]
         error, _ = residual(theta, 0.0, ratio, look.scan_rad, look.range_mm, 10.0, prior.centre_rad, prior.edge_gain)
         assert abs(error[0]) < 1e-13
@@ -93,7 +93,7 @@ def test_error_is_wrapped() -> None:
 def test_window_only_does_not_depend_on_the_edge() -> None:
     _, measurements, _ = make_measurements(np.random.default_rng(33), aims=0, pairs=1, first_hit=False)
     look = measurements.pairs[0].look
-    prior = sensitivity_prior(look, make_session().probe, 2.0 * DEG)
+    prior = sensitivity_prior(look, make_session().probe.sensitivity, 2.0 * DEG)
     values = gtsam.Values()
     values.insert(THETA, look.scan_rad + 0.02)
     values.insert(EDGE, 0.01)

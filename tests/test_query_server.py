@@ -70,7 +70,7 @@ def test_a_newer_snapshot_is_answered_from_at_once(running: _Running) -> None:
             epoch = replace(
                 running.snapshot.epochs[0], verdict=running.snapshot.epochs[0].verdict.REFUSED, reason=reason
             )
-            running.shared.publish(replace(running.snapshot, epochs=(epoch,), prepared={}))
+            running.shared.publish(replace(running.snapshot, epochs=(epoch,)))
             assert client.track(query).reason.endswith(f"is refused: {reason}")
         running.shared.publish(running.snapshot)
         assert client.track(query).stage_rad is not None

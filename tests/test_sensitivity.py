@@ -73,40 +73,40 @@ def test_first_hit_is_five_degrees_ahead_not_zero() -> None:
     # design.md: 6 deg and 2 deg steps, 5 +- 0.6 deg, not 0 +- 3.5.
     probe = make_session().probe
     for sweep in (1, -1):
-        prior = sensitivity_prior(look(30.0, sweep, 0.0), probe, 2.0 * DEG)
+        prior = sensitivity_prior(look(30.0, sweep, 0.0), probe.sensitivity, 2.0 * DEG)
         assert math.degrees(prior.centre_rad) == pytest.approx(5.0 * sweep)
         assert math.degrees(prior.sigma_rad) == pytest.approx(2.0 / math.sqrt(12.0))
         assert prior.edge_gain == sweep
-    window = sensitivity_prior(look(30.0, 0, 0.0), probe, 2.0 * DEG)
+    window = sensitivity_prior(look(30.0, 0, 0.0), probe.sensitivity, 2.0 * DEG)
     assert (window.centre_rad, window.edge_gain) == (0.0, 0.0)
     assert math.degrees(window.sigma_rad) == pytest.approx(6.0 / math.sqrt(3.0))
 
 
 def test_stage_noise_adds_in_square() -> None:
-    prior = sensitivity_prior(look(30.0, 1, 0.3), make_session().probe, 2.0 * DEG)
+    prior = sensitivity_prior(look(30.0, 1, 0.3), make_session().probe.sensitivity, 2.0 * DEG)
     assert math.degrees(prior.sigma_rad) == pytest.approx(math.hypot(2.0 / math.sqrt(12.0), 0.3))
 
 
 def test_half_width_is_taken_at_the_looks_depth() -> None:
     probe = make_session(half_width_deg=(5.0, 6.0, 9.0)).probe
     ranges = [10.0, 25.0, 30.0, 40.0, 90.0]
-    priors = sensitivity_priors([look(r, 1) for r in ranges], probe, 2.0 * DEG)
+    priors = sensitivity_priors([look(r, 1) for r in ranges], probe.sensitivity, 2.0 * DEG)
     np.testing.assert_allclose(np.degrees(priors.centre_rad), [4.0, 4.5, 5.0, 7.0, 8.0])
 
 
 def test_a_step_wider_than_the_window_tells_no_more_than_the_window() -> None:
     probe = make_session().probe
-    wide = sensitivity_prior(look(30.0, 1), probe, 15.0 * DEG)
-    window = sensitivity_prior(look(30.0, 0), probe, 15.0 * DEG)
+    wide = sensitivity_prior(look(30.0, 1), probe.sensitivity, 15.0 * DEG)
+    window = sensitivity_prior(look(30.0, 0), probe.sensitivity, 15.0 * DEG)
     assert wide == window
 
 
 def test_arrays_and_single_looks_agree() -> None:
     session, measurements, _ = make_measurements(np.random.default_rng(44), aims=0, pairs=9)
     looks = [pair.look for pair in measurements.pairs]
-    many = sensitivity_priors(looks, session.probe, session.stage.step_rad)
+    many = sensitivity_priors(looks, session.probe.sensitivity, session.stage.step_rad)
     for index, one in enumerate(looks):
-        single = sensitivity_prior(one, session.probe, session.stage.step_rad)
+        single = sensitivity_prior(one, session.probe.sensitivity, session.stage.step_rad)
         assert single.centre_rad == many.centre_rad[index]
         assert single.edge_gain == many.edge_gain[index]
         assert single.sigma_rad == many.sigma_rad[index]
@@ -164,14 +164,23 @@ def test_moments_are_derivatives_of_the_probability(mean: float) -> None:
     assert curvature == pytest.approx(-(log(1e-3) - 2.0 * log(0.0) + log(-1e-3)) / 1e-6, rel=1e-4)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_moments_far_out_stay_finite(sign: float) -> None:
+    low, high = sorted((sign * 500.0, sign * 501.0))
+    slope, curvature = interval_moments(low, high, 1.0)
+    # Nearly all of what is left sits at the nearer end: the mean is pulled there.
+    assert slope == pytest.approx(sign * 500.0, rel=1e-4)
+    assert -1e-4 <= curvature <= 1.0 + 1e-4
+
+
 def test_intervals_are_those_of_the_sweeps() -> None:
     probe = make_session().probe
-    shapes = window_shapes([look(30.0, 1), look(30.0, -1), look(30.0, 0)], probe, 2.0 * DEG)
+    shapes = window_shapes([look(30.0, 1), look(30.0, -1), look(30.0, 0)], probe.sensitivity, 2.0 * DEG)
     np.testing.assert_allclose(np.degrees(shapes.low_rad), [4.0, -6.0, -6.0])
     np.testing.assert_allclose(np.degrees(shapes.high_rad), [6.0, -4.0, 6.0])
     np.testing.assert_array_equal(shapes.low_gain, [1.0, -1.0, -1.0])
     np.testing.assert_array_equal(shapes.high_gain, [1.0, -1.0, 1.0])
-    wide = window_shapes([look(30.0, 1)], probe, 13.0 * DEG)
+    wide = window_shapes([look(30.0, 1)], probe.sensitivity, 13.0 * DEG)
     assert (wide.low_gain[0], wide.high_gain[0]) == (-1.0, 1.0)
 
 

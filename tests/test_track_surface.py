@@ -40,15 +40,15 @@ def test_rays_end_where_the_surface_is(count: int) -> None:
     surface = some_surface(count, count)
     met = missed = torn = 0
     for trus_p, trus_d in _rays(count, 60):
-        slow, fast = tracking_reference.meet(surface, trus_p, trus_d), surface.meet(trus_p, trus_d)
-        if slow is None or fast is None:
-            missed += slow is None and fast is None
-            torn += (slow is None) != (fast is None)
+        expected, found = tracking_reference.meet(surface, trus_p, trus_d), surface.meet(trus_p, trus_d)
+        if expected is None or found is None:
+            missed += expected is None and found is None
+            torn += (expected is None) != (found is None)
             continue
         met += 1
-        assert fast.distance_mm == pytest.approx(slow.distance_mm, abs=0.01 + 0.01 * slow.sigma_mm)
-        np.testing.assert_allclose(fast.normal, slow.normal, atol=2e-3)
-        assert fast.sigma_mm == pytest.approx(slow.sigma_mm, rel=0.02, abs=0.03)
+        assert found.distance_mm == pytest.approx(expected.distance_mm, abs=0.01 + 0.01 * expected.sigma_mm)
+        np.testing.assert_allclose(found.normal, expected.normal, atol=2e-3)
+        assert found.sigma_mm == pytest.approx(expected.sigma_mm, rel=0.02, abs=0.03)
     assert met > 15
     assert missed > 2
     assert torn <= 2  # rays at the very limit of what counts as known
@@ -60,12 +60,12 @@ def test_answers_and_sigmas_are_those_of_sampling(seed: int) -> None:
     session = solved_of(case.solution, case.model, SolveConfig())
     compared = 0
     for query in case.queries:
-        slow, fast = tracking_reference.track(query, session), track(query, session.snapshot)
-        if slow.stage_rad is None or slow.sigma_rad is None:
-            assert fast.reason == slow.reason
+        expected, found = tracking_reference.track(query, session), track(query, session.snapshot)
+        if expected.stage_rad is None or expected.sigma_rad is None:
+            assert found.reason == expected.reason
             continue
-        assert fast.stage_rad is not None
-        assert abs(fast.stage_rad - slow.stage_rad) < 0.02 * slow.sigma_rad
-        assert fast.sigma_rad == pytest.approx(slow.sigma_rad, rel=0.02)
+        assert found.stage_rad is not None
+        assert abs(found.stage_rad - expected.stage_rad) < 0.02 * expected.sigma_rad
+        assert found.sigma_rad == pytest.approx(expected.sigma_rad, rel=0.02)
         compared += 1
     assert compared >= 6

@@ -72,7 +72,7 @@ def marked_snapshot(base: Snapshot, value: int) -> Snapshot:
         surface = replace(
             surface, residual=np.full_like(surface.residual, number), place=np.full_like(surface.place, number)
         )
-    return replace(base, t=number, pairs=value, epochs=(epoch,), beam=np.full(4, number), surface=surface, prepared={})
+    return replace(base, t=number, pairs=value, epochs=(epoch,), beam=np.full(4, number), surface=surface)
 
 
 def is_whole(snapshot: Snapshot) -> bool:
@@ -97,7 +97,6 @@ def plain_snapshot(model: SessionModel, surface: TissueSurface | None = None) ->
         bias_mm=np.zeros(3),
         sound_speed_ratio=1.0,
         radius_mm=model.probe.radius_mm,
-        edge_variance=1e-5,
         sensitivity=model.probe.sensitivity,
         stage=model.stage,
         amplitude_sigma=0.05,

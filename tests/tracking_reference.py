@@ -1,7 +1,8 @@
-"""Answers to tracking queries by the machinery of the session's own solve: slow, and what the fast ones are held to.
+"""Answers to tracking queries, slow: what those of fgreg.tracking are held to.
 
-A PM that is heard goes through the reduced problem as a session of one PM, the estimate as its prior; the end on the
-tissue surface is spread by sampling, on a fine grid of the Gaussian process itself.
+A PM that is heard goes through the reduced problem with all epochs' variables, to the last digit; or, of a session
+that is solved again with the PM in it, has the angle that it has there. The end on the tissue surface is spread by many
+samples, on a fine grid of the Gaussian process itself.
 """
 
 from __future__ import annotations
@@ -11,15 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.config import SolveConfig
 from fgreg.estimate import TrackEstimate
 from fgreg.frames import FloatArray, exp_so3
-from fgreg.graph.packing import Anchor
-from fgreg.graph.reduced_solver import optimize
-from fgreg.graph.shared_state import SharedState
-from fgreg.graph.sites import propagate
+from fgreg.graph.packing import Anchor, PackedProblem
+from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.graph.sites import propagate, settle
 from fgreg.measurements import EpochStart, Measurements, Pair, Track
+from fgreg.models import SessionModel
 from fgreg.registration import pack_session
 from fgreg.surface import GRAZING, LONGEST_MM, REACH_MM, TissueSurface
+from tests.forward import Truth
 from tests.track_cases import Solved
 
 SAMPLES = 40_000
@@ -76,13 +80,47 @@ def _from_looks(query: Track, solved: Solved) -> tuple[float, float, float]:
     anchor = Anchor(solved.posterior.mean, np.asarray(np.linalg.inv(solved.posterior.covariance)))
     problem = replace(problem, anchor=anchor, prior_information=np.zeros(problem.columns.size))
     optimum = optimize(problem, solved.posterior.mean)
-    _, optimum = propagate(problem, optimum) or (problem, optimum)
+    settled = settle(problem, optimum.state, optimum.evaluation, settled=1e-4)
+    if settled is not None:
+        problem, state, at = settled
+        optimum = optimize(problem, state, at.private, tolerance=1e-9)
     at = optimum.evaluation
     shared = np.linalg.inv(at.hessian[0])
     gain = at.point_gain[0, 0]
     covariance = at.point_covariance[0, 0] + gain @ shared @ gain.T
     angle, by_point = _angle(at.private.trus_p_pm[0, 0])
     return angle, math.sqrt(float(by_point @ covariance @ by_point)), float(at.lambda_mm[0, 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionOptimum:
+    """A session's optimum with its windows' sites, and the covariance (D, D) of the shared variables there."""
+
+    problem: PackedProblem
+    optimum: Optimum
+    covariance: FloatArray
+
+    @property
+    def state(self) -> SharedState:
+        return self.optimum.state
+
+    def plane_angle(self, pm: int) -> tuple[float, float]:
+        """A PM's plane angle and its sigma, rad."""
+        k, at = self.problem.pms.index(pm), self.optimum.evaluation
+        gain = at.point_gain[0, k]
+        covariance = at.point_covariance[0, k] + gain @ self.covariance @ gain.T
+        angle, by_point = _angle(at.private.trus_p_pm[0, k])
+        return angle, math.sqrt(float(by_point @ covariance @ by_point))
+
+
+def optimum_of(measurements: Measurements, model: SessionModel, truth: Truth) -> SessionOptimum:
+    """The optimum that is found from the truth."""
+    problem = pack_session(measurements, model, SolveConfig())
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    found = propagate(problem, optimize(problem, start))
+    assert found is not None
+    problem, optimum = found
+    return SessionOptimum(problem, optimum, np.asarray(np.linalg.inv(optimum.evaluation.hessian[0])))
 
 
 def _from_surface(query: Track, solved: Solved) -> tuple[float, float, float] | str:

@@ -229,7 +229,7 @@ def build_graph(
         nominal = session.initial_marker_T_laser if session.initial_marker_T_laser is not None else np.eye(4)
     probe, noise = session.probe, session.noise
     looks = [pair.look for pair in measurements.pairs]
-    priors = sensitivity_priors(looks, probe, session.stage.step_rad)
+    priors = sensitivity_priors(looks, probe.sensitivity, session.stage.step_rad)
     edge_sigma = probe.sensitivity.edge_sigma_rad
     keys = _make_keys(
         measurements,

@@ -212,7 +212,7 @@ def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Value
     for pair, place in zip(measurements.pairs, keys.pair_shot, strict=True):
         trus_T_marker = shared.trus_T_camera[pair.epoch] @ markers[place]
         origin, direction = trus_T_marker[:3, :3] @ marker_p + trus_T_marker[:3, 3], trus_T_marker[:3, :3] @ marker_d
-        prior = sensitivity_prior(pair.look, session.probe, session.stage.step_rad)
+        prior = sensitivity_prior(pair.look, session.probe.sensitivity, session.stage.step_rad)
         meetings.setdefault(pair.pm, []).append(_meeting_point(origin, direction, pair.look, prior, session, shared))
     private = PrivateValues(
         aim_camera_T_marker=unbiased(aim.marker.camera_T_marker for aim in measurements.aims),

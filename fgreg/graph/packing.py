@@ -24,7 +24,7 @@ from fgreg.measurements import (
     Pair,
     usable_covariance,
 )
-from fgreg.models import SessionModel
+from fgreg.models import SensitivityModel, SessionModel
 from fgreg.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
 
 LINE_SIGMA_MM = 1e-3
@@ -160,13 +160,55 @@ def pack(
         shapes: keep the windows' own shape, and the amplitudes, for the posterior beside the Gaussian priors.
         amplitude_sigma: relative noise of amplitudes.
     """
-    pairs = measurements.pairs
+    probe = model.probe
     columns = make_columns(
         len(measurements.epochs),
         bias=model.noise.marker_bias_mm > 0,
         sound_speed=sound_speed_sigma is not None,
         radius=radius_sigma_mm is not None,
     )
+    prior_information = np.zeros(columns.size)
+    prior_information[columns.edge] = max(probe.sensitivity.edge_sigma_rad, 1e-9) ** -2
+    if columns.bias is not None:
+        prior_information[columns.bias : columns.bias + 3] = model.noise.marker_bias_mm**-2
+    if columns.sound_speed is not None and sound_speed_sigma is not None:
+        prior_information[columns.sound_speed] = sound_speed_sigma**-2
+    if columns.radius is not None and radius_sigma_mm is not None:
+        prior_information[columns.radius] = radius_sigma_mm**-2
+    aims = measurements.aims
+    alone = pack_pairs(
+        measurements.pairs,
+        columns,
+        probe.sensitivity,
+        radius_mm=probe.radius_mm,
+        step_rad=model.stage.step_rad,
+        shapes=shapes,
+        amplitude_sigma=amplitude_sigma,
+    )
+    return replace(
+        alone,
+        aims=_beam_arrays([aim.marker for aim in aims]),
+        aim_spot_mm=np.array([aim.camera_p_spot_mm for aim in aims], dtype=np.float64).reshape(-1, 3),
+        aim_spot_covariance=usable_covariance(
+            np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3), (FLOOR_MM,) * 3
+        ),
+        links=_links(measurements.epochs),
+        prior_information=prior_information,
+        sound_speed_mean=sound_speed_mean,
+    )
+
+
+def pack_pairs(
+    pairs: Sequence[Pair],
+    columns: Columns,
+    sensitivity: SensitivityModel,
+    *,
+    radius_mm: float,
+    step_rad: float,
+    shapes: bool,
+    amplitude_sigma: float,
+) -> PackedProblem:
+    """Pairs alone: no aims, no links, no priors (arguments as of :func:`pack`; ``step_rad``: the sweeps' increment)."""
     pms = tuple(dict.fromkeys(pair.pm for pair in pairs))
     pm_index = {pm: index for index, pm in enumerate(pms)}
     first_of_beam: dict[tuple[int, int], Pair] = {}
@@ -175,24 +217,13 @@ def pack(
     beam_pairs = tuple(first_of_beam.values())
     beam_index = {key: index for index, key in enumerate(first_of_beam)}
     looks = [pair.look for pair in pairs]
-    priors = sensitivity_priors(looks, model.probe, model.stage.step_rad)
+    priors = sensitivity_priors(looks, sensitivity, step_rad)
     weight = np.zeros((len(looks), 3, 3))
     if looks:
         weight[:, :2, :2] = np.linalg.inv(
             usable_covariance(np.stack([look.covariance for look in looks]), (FLOOR_MM,) * 2)
         )
         weight[:, 2, 2] = priors.sigma_rad**-2
-
-    prior_information = np.zeros(columns.size)
-    prior_information[columns.edge] = max(model.probe.sensitivity.edge_sigma_rad, 1e-9) ** -2
-    if columns.bias is not None:
-        prior_information[columns.bias : columns.bias + 3] = model.noise.marker_bias_mm**-2
-    if columns.sound_speed is not None and sound_speed_sigma is not None:
-        prior_information[columns.sound_speed] = sound_speed_sigma**-2
-    if columns.radius is not None and radius_sigma_mm is not None:
-        prior_information[columns.radius] = radius_sigma_mm**-2
-
-    aims = measurements.aims
     return PackedProblem(
         columns=columns,
         pms=pms,
@@ -209,21 +240,22 @@ def pack(
             centre_rad=priors.centre_rad,
             edge_gain=priors.edge_gain,
         ),
-        aims=_beam_arrays([aim.marker for aim in aims]),
-        aim_spot_mm=np.array([aim.camera_p_spot_mm for aim in aims], dtype=np.float64).reshape(-1, 3),
-        aim_spot_covariance=usable_covariance(
-            np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3), (FLOOR_MM,) * 3
-        ),
-        links=_links(measurements.epochs),
-        radius_mm=model.probe.radius_mm,
-        prior_information=prior_information,
-        shapes=_rotation_shapes(pairs, pm_index, model, amplitude_sigma) if shapes else None,
-        sound_speed_mean=sound_speed_mean,
+        aims=_beam_arrays([]),
+        aim_spot_mm=np.zeros((0, 3)),
+        aim_spot_covariance=np.zeros((0, 3, 3)),
+        links=(),
+        radius_mm=radius_mm,
+        prior_information=np.zeros(columns.size),
+        shapes=_rotation_shapes(pairs, pm_index, sensitivity, step_rad, amplitude_sigma) if shapes else None,
     )
 
 
 def _rotation_shapes(
-    pairs: Sequence[Pair], pm_index: dict[int, int], model: SessionModel, amplitude_sigma: float
+    pairs: Sequence[Pair],
+    pm_index: dict[int, int],
+    sensitivity: SensitivityModel,
+    step_rad: float,
+    amplitude_sigma: float,
 ) -> RotationShapes:
     looks = [pair.look for pair in pairs]
     plane, log, look_of = [], [], []
@@ -232,14 +264,14 @@ def _rotation_shapes(
         of_pm.setdefault(pair.pm, []).append(i)
     for pm in pm_index:
         mine = of_pm[pm]
-        table = amplitude_table([looks[i] for i in mine], model.probe.sensitivity, amplitude_sigma)
+        table = amplitude_table([looks[i] for i in mine], sensitivity, amplitude_sigma)
         plane.append(table.plane_rad)
         log.append(table.log_likelihood)
         # Best a look that knows only the window: its interval does not hang on the window's edge.
         free = [i for i in mine if looks[i].sweep == 0] or mine
         look_of.append(free[0] if table.used else -1)
     return RotationShapes(
-        window_shapes(looks, model.probe, model.stage.step_rad),
+        window_shapes(looks, sensitivity, step_rad),
         np.array(plane).reshape(len(pm_index), -1),
         np.array(log).reshape(len(pm_index), -1),
         np.array(look_of, dtype=np.int64),

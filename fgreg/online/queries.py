@@ -77,7 +77,6 @@ class Layout:
                 ("bias_mm", "f8", (3,)),
                 ("sound_speed_ratio", "f8"),
                 ("radius_mm", "f8"),
-                ("edge_variance", "f8"),
                 ("places", "i8"),
                 ("axes", "f8", (3, 3)),
                 ("centre", "f8", (3,)),
@@ -99,7 +98,7 @@ def layout_of(sensitivity: SensitivityModel, epochs: int = EPOCHS_KEPT) -> Layou
 
 
 _SURFACE = ("axes", "centre", "trend", "trend_covariance", "relief_mm", "inflation")
-_SCALARS = ("t", "pairs", "origin_shift_mm", "edge_rad", "sound_speed_ratio", "radius_mm", "edge_variance")
+_SCALARS = ("t", "pairs", "origin_shift_mm", "edge_rad", "sound_speed_ratio", "radius_mm")
 _ARRAYS = ("marker_T_nominal", "beam", "bias_mm")
 
 
@@ -201,7 +200,6 @@ class SnapshotDecoder:
             bias_mm=record["bias_mm"],
             sound_speed_ratio=float(record["sound_speed_ratio"]),
             radius_mm=float(record["radius_mm"]),
-            edge_variance=float(record["edge_variance"]),
             sensitivity=sensitivity,
             stage=stage,
             amplitude_sigma=float(session["amplitude_sigma"]),

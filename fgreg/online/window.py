@@ -186,7 +186,7 @@ Windows = tuple[list[float], list[float], list[float]]
 
 def windows_of(pairs: Sequence[Pair], model: SessionModel) -> Windows:
     """Centre, gain of the edge, and sigma of each look's rotation."""
-    priors = sensitivity_priors([pair.look for pair in pairs], model.probe, model.stage.step_rad)
+    priors = sensitivity_priors([pair.look for pair in pairs], model.probe.sensitivity, model.stage.step_rad)
     return priors.centre_rad.tolist(), priors.edge_gain.tolist(), priors.sigma_rad.tolist()
 
 

@@ -7,25 +7,21 @@ its epoch with what all epochs share: 16 variables in a fixed order, with zero v
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.frames import FloatArray, IntArray
-from fgreg.graph.columns import Columns
+from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import SharedState
 from fgreg.models import SensitivityModel, SessionModel, StageModel
 from fgreg.surface import TissueSurface
 
-if TYPE_CHECKING:
-    from fgreg.tracking.prepared import Prepared
-
-POSE, BEAM, EDGE, BIAS, SPEED, RADIUS, SHARED = 0, 6, 10, 11, 14, 15, 16
-"""Where the shared variables of one epoch sit: registration 6 (rotation rad, translation mm; right tangent), beam chart
-4, window edge 1 (rad), marker bias 3 (mm), sound speed ratio 1, probe radius 1 (mm); how many they are."""
+EDGE, BIAS, SPEED, RADIUS, SHARED = 10, 11, 14, 15, 16
+"""Where window edge (rad), marker bias (3, mm), sound speed ratio and probe radius (mm) sit in the covariance of one
+epoch, and its size; the order is that of fgreg.graph.columns, with a place for each optional variable."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +48,6 @@ class Snapshot:
         epochs: those with a registration, and those refused.
         marker_T_nominal: (4, 4) of the beam chart. beam: (4,). origin_shift_mm: lambda of the laser frame's origin.
         edge_rad, bias_mm (3,), sound_speed_ratio, radius_mm: as in :class:`fgreg.graph.shared_state.SharedState`.
-        edge_variance: of the window's edge given all other shared variables, rad^2.
         sensitivity, stage: of the session. amplitude_sigma, window_shape: of its configuration.
         surface: where the PMs trace one.
         oldest: epochs of lower numbers are not kept any more.
@@ -69,15 +64,12 @@ class Snapshot:
     bias_mm: FloatArray
     sound_speed_ratio: float
     radius_mm: float
-    edge_variance: float
     sensitivity: SensitivityModel
     stage: StageModel
     amplitude_sigma: float
     window_shape: bool
     surface: TissueSurface | None
     oldest: int = 0
-    prepared: dict[int, Prepared] = field(default_factory=dict, repr=False)
-    """What queries of an epoch have in common, kept from the first one."""
 
     def epoch(self, number: int) -> EpochSnapshot | None:
         """The epoch of that number."""
@@ -85,6 +77,24 @@ class Snapshot:
             if epoch.number == number:
                 return epoch
         return None
+
+    def shared(self, epoch: EpochSnapshot) -> tuple[SharedState, Columns, FloatArray]:
+        """An epoch's shared variables: values (one hypothesis), columns and covariance (D, D) of those estimated."""
+        estimated = np.diag(epoch.covariance) > 0.0
+        columns = make_columns(
+            1, bias=bool(estimated[BIAS]), sound_speed=bool(estimated[SPEED]), radius=bool(estimated[RADIUS])
+        )
+        state = SharedState(
+            rotation=epoch.rotation[None, None],
+            translation_mm=epoch.translation_mm[None, None],
+            marker_T_nominal=self.marker_T_nominal[None],
+            beam=self.beam[None],
+            edge_rad=np.array([self.edge_rad]),
+            bias_mm=self.bias_mm[None],
+            sound_speed_ratio=np.array([self.sound_speed_ratio]),
+            radius_mm=np.array([self.radius_mm]),
+        )
+        return state, columns, epoch.covariance[np.ix_(estimated, estimated)]
 
     @classmethod
     def without_registration(cls, model: SessionModel, config: SolveConfig, refused: Mapping[int, str]) -> Snapshot:
@@ -101,7 +111,6 @@ class Snapshot:
             bias_mm=np.zeros(3),
             sound_speed_ratio=1.0,
             radius_mm=model.probe.radius_mm,
-            edge_variance=model.probe.sensitivity.edge_sigma_rad**2,
             sensitivity=model.probe.sensitivity,
             stage=model.stage,
             amplitude_sigma=config.amplitude_sigma,
@@ -173,7 +182,6 @@ def make_snapshot(
         bias_mm=state.bias_mm[0].copy(),
         sound_speed_ratio=float(state.sound_speed_ratio[0]),
         radius_mm=float(state.radius_mm[0]),
-        edge_variance=1.0 / float(np.linalg.inv(covariance)[columns.edge, columns.edge]),
         sensitivity=model.probe.sensitivity,
         stage=model.stage,
         amplitude_sigma=config.amplitude_sigma,
