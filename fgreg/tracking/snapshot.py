@@ -124,7 +124,7 @@ def _refused_epoch(number: int, reason: str) -> EpochSnapshot:
     return EpochSnapshot(number, Verdict.REFUSED, np.eye(3), np.zeros(3), nothing, reason)
 
 
-def epoch_columns(columns: Columns, place: int) -> tuple[IntArray, IntArray]:
+def _epoch_columns(columns: Columns, place: int) -> tuple[IntArray, IntArray]:
     """Columns of the whole covariance that concern an epoch, and where they go among the ``SHARED``."""
     whole = [*range(6 * place, 6 * place + 6), *range(columns.beam, columns.beam + 4), columns.edge]
     mine = [*range(EDGE + 1)]
@@ -163,7 +163,7 @@ def make_snapshot(
     refused = {} if refused is None else refused
     found = []
     for place, number in enumerate(epochs):
-        whole, mine = epoch_columns(columns, place)
+        whole, mine = _epoch_columns(columns, place)
         block = np.zeros((SHARED, SHARED))
         block[np.ix_(mine, mine)] = covariance[np.ix_(whole, whole)]
         verdict = Verdict.REFUSED if number in refused else Verdict.OK
