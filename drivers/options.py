@@ -1,147 +1,52 @@
-"""What a driver can be told in a configuration: its keys, with type, unit, default, bounds and a line of help."""
+"""What each driver can be told in a configuration: its keys, with type, unit, default, bounds and a line of help."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any
 
-from fgreg.errors import InputError, one_line
-from fgreg.session.schema import ANY, Bounds, Fields, shown
+from fgreg.errors import InputError
+from fgreg.frames import FloatArray
+from fgreg.motion.limits import LIMITS
+from fgreg.schema.files import ExistingPath, exists
+from fgreg.schema.kinds import Integer, JsonSchema, Kind, Number, Text, Transform
+from fgreg.schema.problems import FieldError, shown
+from fgreg.schema.record import Key
 
-REQUIRED: Final = object()
-"""The default of a key that has none."""
+NAME_BYTES = 20
+IGTL_PORT, SINK_PORT, BK_PORT = 18944, 18945, 7915
 
 _VIDEO_DEVICE = re.compile(r"/dev/video[0-9]+")
 _STREAM = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://.+")
-_SOURCE = "a video device (0, /dev/video0), a stream (rtsp://...), a video file, or a folder of pictures"
-
-
-class Kind(StrEnum):
-    """Of a value."""
-
-    NUMBER = "number"
-    INTEGER = "integer"
-    TRUTH = "true or false"
-    TEXT = "text"
-    CHOICE = "choice"
-    FILE = "path"
-    VIDEO = "video"
-    TRANSFORM = "4 x 4 matrix"
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
-    """One key.
+class VideoSource(Kind):
+    """A video input; files are relative to the configuration's folder."""
 
-    Attributes:
-        name: as written; carries the unit where there is one.
-        kind: of its value.
-        help: one line.
-        default: as written; None where absence has a meaning of its own, ``REQUIRED`` where it has to be there.
-        bounds: of numbers; of integers, too.
-        choices: of a choice.
-        example: what an example shows where there is no default.
-        check: raises InputError for a text that cannot be one.
-        nullable: ``null`` may be written; it may, too, where it is the default.
-    """
+    takes_text = True
 
-    name: str
-    kind: Kind
-    help: str
-    default: Any = REQUIRED
-    bounds: Bounds = ANY
-    choices: tuple[str, ...] = ()
-    example: str = ""
-    check: Callable[[str], object] | None = None
-    nullable: bool = False
+    def read(self, value: object, folder: Path | None = None, /) -> str:
+        if type(value) is int and 0 <= value <= 999:
+            return str(value)
+        if not isinstance(value, str) or not value:
+            raise FieldError.of(shown(value), self.expected)
+        if value.isdecimal() or _VIDEO_DEVICE.fullmatch(value) or _STREAM.fullmatch(value):
+            return value
+        path = (folder or Path()) / value
+        if not (exists(path) or ("*" in path.name and _matches(path))):
+            raise FieldError.of(shown(value), f"{self.expected}; paths are relative to this file's folder")
+        return str(path)
 
-    def read(self, fields: Fields, folder: Path) -> Any:
-        """Its value; what is wrong is reported to ``fields``. Paths are relative to ``folder``."""
-        if not fields.has(self.name) and self.default is not REQUIRED:
-            return self.default
-        if (self.nullable or self.default is None) and fields.has(self.name) and fields.raw(self.name) is None:
-            return None
-        value = self._value(fields, folder)
-        if self.check is not None and isinstance(value, str) and value:
-            try:
-                self.check(value)
-            except InputError as error:
-                fields.fail(self.name, error.found, error.expected)
-        return value
+    @property
+    def expected(self) -> str:
+        return "a video device (0, /dev/video0), a stream (rtsp://...), a video file, or a folder of pictures"
 
-    def _value(self, fields: Fields, folder: Path) -> Any:
-        match self.kind:
-            case Kind.NUMBER:
-                return fields.number(self.name, self.bounds)
-            case Kind.INTEGER:
-                return fields.integer(self.name, round(self.bounds.low), round(self.bounds.high))
-            case Kind.TRUTH:
-                return fields.boolean(self.name)
-            case Kind.TEXT:
-                return fields.text(self.name, self.help)
-            case Kind.CHOICE:
-                return fields.text(self.name, "one of " + ", ".join(self.choices), allowed=self.choices)
-            case Kind.FILE:
-                return read_path(fields, self.name, folder)
-            case Kind.VIDEO:
-                return _video(fields, self.name, folder)
-            case Kind.TRANSFORM:
-                return fields.transform(self.name)
-
-    def line(self) -> str:
-        """As in an example: ``name: value  # help; default``."""
-        if self.default is REQUIRED or (self.default is None and self.example):
-            value = self.example
-        else:
-            value = written(self.default)
-        notes = [self.help]
-        if self.choices:
-            notes.append(", ".join(self.choices))
-        if self.kind is Kind.NUMBER and self.bounds != ANY:
-            notes.append(str(self.bounds))
-        if self.default is None and self.example:
-            notes.append("may be absent")
-        return f"{self.name}: {value}  # {'; '.join(notes)}"
-
-
-def written(value: object) -> str:
-    """A default as YAML has it."""
-    if value is None:
-        return "null"
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def read_path(fields: Fields, key: str, folder: Path) -> Path:
-    """An existing file or folder that a key names, relative to ``folder``; what is wrong is reported."""
-    text = fields.text(key, "a path")
-    path = folder / text
-    if text and not _there(path):
-        fields.fail(key, f"nothing at {one_line(str(path), 200)}", "a path, relative to this file's folder")
-    return path
-
-
-def _video(fields: Fields, key: str, folder: Path) -> str:
-    value = fields.raw(key)
-    if type(value) is int and 0 <= value <= 999:
-        return str(value)
-    text = fields.text(key, _SOURCE)
-    if not text or text.isdecimal() or _VIDEO_DEVICE.fullmatch(text) or _STREAM.fullmatch(text):
-        return text
-    path = folder / text
-    if not (_there(path) or ("*" in path.name and _matches(path))):
-        fields.fail(key, shown(value), f"{_SOURCE}; paths are relative to this file's folder")
-    return str(path)
-
-
-def _there(path: Path) -> bool:
-    try:
-        return path.exists()
-    except (OSError, ValueError):  # a name that no file system takes
-        return False
+    def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"anyOf": [{"type": "integer", "minimum": 0, "maximum": 999}, {"type": "string", "minLength": 1}]}
 
 
 def _matches(path: Path) -> bool:
@@ -151,6 +56,226 @@ def _matches(path: Path) -> bool:
         return False
 
 
-def read_keys(keys: tuple[Key, ...], fields: Fields, folder: Path) -> Mapping[str, Any]:
-    """All of them, as the factory's keyword arguments; what is wrong is reported to ``fields``."""
-    return {key.name: key.read(fields, folder) for key in keys}
+def _check_device(text: str) -> None:
+    """Raises InputError where OpenIGTLink would cut it."""
+    from fgreg.drivers.igtl_messages import check_name
+
+    check_name(text)
+
+
+def _check_host(text: str) -> None:
+    """Raises InputError for what cannot be a host."""
+    from fgreg.drivers.tcp_link import Endpoint
+
+    Endpoint(text, 1)
+
+
+def _check_fourcc(text: str) -> None:
+    """Raises InputError for what is no FOURCC."""
+    if len(text) != 4 or not text.isascii():
+        raise InputError("fourcc", repr(text), "four characters such as MJPG")
+
+
+_PORT = Integer(1, 65535)
+_HOST = Text("a host name or an IP address", check=_check_host)
+_DEVICE = Text(f"a name of at most {NAME_BYTES} characters", check=_check_device)
+
+
+def _named(help_text: str) -> Key:
+    return Key(f"{help_text}, at most {NAME_BYTES} characters", _DEVICE)
+
+
+_RATE = Number(0.0, 1000.0, above=True)
+_SECONDS = Number(0.0, 60.0, above=True, unit="s")
+_GAP = Number(0.0, 1.0, above=True, unit="s")
+_MM = Number(-500.0, 500.0, unit="mm")
+_RECORDING = ExistingPath()
+
+Silent = Annotated[float | None, Key("silent for so long, it counts as lost; null: never", _SECONDS, null=True)]
+Flip = Annotated[bool, Key("its columns run against TRUS x")]
+Limits = Annotated[Mapping[str, Any] | None, Key("besides those of session.yaml", LIMITS)]
+
+
+@dataclass(frozen=True, slots=True)
+class NoOptions:
+    """A driver without keys."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndoscopeOptions:
+    """One or two video inputs."""
+
+    left: Annotated[
+        str,
+        Key("device number or path, stream, video file, folder of pictures", VideoSource(), example="/dev/video0"),
+    ]
+    right: Annotated[
+        str | None, Key("the right input, where there are two", VideoSource(), null=True, example="/dev/video1")
+    ] = None
+    layout: Annotated[
+        str | None,
+        Key(
+            "separate with two inputs, else mono",
+            Text(allowed=("mono", "separate", "side-by-side", "top-bottom")),
+            null=True,
+            example="separate",
+        ),
+    ] = None
+    swap: Annotated[bool, Key("left and right are the other way round in each frame")] = False
+    fields: Annotated[str, Key("of interlaced frames", Text(allowed=("whole", "top", "bottom", "both")))] = "whole"
+    width: Annotated[int | None, Key("asked of a device, px", Integer(16, 8192), null=True, example="1280")] = None
+    height: Annotated[int | None, Key("asked of a device, px", Integer(16, 8192), null=True, example="720")] = None
+    fps: Annotated[float | None, Key("asked of a device; a folder's pace", _RATE, null=True, example="30")] = None
+    fourcc: Annotated[
+        str | None,
+        Key(
+            "kind of pixels asked of a device", Text("four characters", check=_check_fourcc), null=True, example="MJPG"
+        ),
+    ] = None
+    loop: Annotated[bool, Key("files and folders begin again at their end")] = False
+    delay_s: Annotated[float, Key("from the exposure to the device's time stamp", Number(-1.0, 1.0, unit="s"))] = 0.0
+    max_gap_s: Annotated[float, Key("most time between left and right", _GAP)] = 0.017
+    by_arrival: Annotated[bool, Key("match two inputs by their times of arrival")] = False
+    silence_s: Annotated[float, Key("silent for so long, it counts as lost", _SECONDS)] = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingOptions:
+    """A ROS 2 recording that is played."""
+
+    path: Annotated[Path, Key("rosbag2 folder, .mcap or .db3", _RECORDING, example="recording.mcap")]
+    speed: Annotated[float, Key("how many times as fast as it was recorded", Number(0.0, 100.0, above=True))] = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedCameraOptions(RecordingOptions):
+    """Its images."""
+
+    left: Annotated[
+        str | None, Key("topic of the left images; found by its name", null=True, example="/rig/left/image_raw")
+    ] = None
+    right: Annotated[
+        str | None, Key("topic of the right images; found by its name", null=True, example="/rig/right/image_raw")
+    ] = None
+    max_gap_s: Annotated[float, Key("most time between left and right", _GAP)] = 0.017
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RecordedMotionOptions(RecordingOptions):
+    """Poses of the endoscope's holder."""
+
+    topic: Annotated[
+        str | None, Key("of the holder's poses; found by its name", null=True, example="/ECM/measured_cp")
+    ] = None
+    tip_T_camera: Annotated[
+        FloatArray | None, Key("where the camera is on what the poses are of, mm", Transform(), null=True)
+    ] = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThorlabsOptions:
+    """PRM1Z8 on a KDC101 or TDC001."""
+
+    port: Annotated[
+        str | None, Key("serial port; the only cube that is plugged in", null=True, example="/dev/ttyUSB0")
+    ] = None
+    acceleration_deg_s2: Annotated[float, Key("of every motion", Number(0.0, 100.0, above=True, unit="deg/s^2"))] = 20.0
+    limits: Limits = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandInOptions:
+    """A simulated stage beside real devices."""
+
+    device_deg: Annotated[float, Key("where it stands at first", Number(-180.0, 180.0, unit="deg"))] = 0.0
+    homed: Annotated[bool, Key("it knows its zero position at first")] = False
+    max_speed_deg_s: Annotated[float, Key("of the motor", Number(0.0, 100.0, above=True, unit="deg/s"))] = 25.0
+    acceleration_deg_s2: Annotated[float, Key("of the motor", Number(0.0, 1000.0, above=True, unit="deg/s^2"))] = 25.0
+    limits: Limits = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoomStageOptions:
+    """The stage of the simulated room."""
+
+    limits: Limits = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Connection:
+    """A peer that speaks OpenIGTLink."""
+
+    host: Annotated[str, Key("the other side's; with listen: where to listen", _HOST)] = "127.0.0.1"
+    port: Annotated[int, Key("TCP port", _PORT)] = IGTL_PORT
+    listen: Annotated[bool, Key("wait for the other side to connect")] = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IgtlProbeOptions(Connection):
+    """Images, one for each laser pulse."""
+
+    device: Annotated[str, _named("of the pulses' images")] = "Image_Probe"
+    transposed: Annotated[bool, Key("its rows are what session.yaml has as columns")] = False
+    silent_s: Silent = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IgtlMotionOptions(Connection):
+    """Transforms of the endoscope's holder."""
+
+    device: Annotated[str, _named("of the holder's transforms")] = "CameraToBase"
+    inverted: Annotated[bool, Key("the matrix maps base to camera")] = False
+    silent_s: Silent = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IgtlBmodeOptions(Connection):
+    """B-mode images."""
+
+    device: Annotated[str, _named("of the images")] = "Image_Reference"
+    depth_mm: Annotated[float, Key("of the first row's centre, below the array's face", _MM)] = 0.0
+    x_mm: Annotated[
+        float | None,
+        Key("TRUS x of the leftmost pixel shown; absent: not shown in the plane", _MM, null=True, example="-19"),
+    ] = None
+    flip: Flip = False
+    silent_s: Silent = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BkOptions:
+    """A BK scanner's OEM interface."""
+
+    host: Annotated[
+        str,
+        Key(
+            "name or address of the scanner",
+            Text("name or address of the scanner", check=_check_host),
+            example="192.168.1.10",
+        ),
+    ]
+    port: Annotated[int, Key("of its OEM interface", _PORT)] = BK_PORT
+    rate_hz: Annotated[int, Key("pictures asked for, a second", Integer(1, 100))] = 20
+    flip: Flip = False
+    silent_s: Silent = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IgtlSinkOptions(Connection):
+    """Who takes the registration."""
+
+    port: Annotated[int, Key("TCP port", _PORT)] = SINK_PORT
+    listen: Annotated[bool, Key("wait for the other side to connect")] = True
+    registration: Annotated[str, _named("of the registration")] = "CameraToTrus"
+    plane: Annotated[str, _named("of the image plane")] = "PlaneToTrus"
+    status: Annotated[str, _named("of the state")] = "RegistrationStatus"
+    verdict: Annotated[str, _named("of the verdict")] = "RegistrationVerdict"
+    header_version: Annotated[int, Key("1 for receivers of OpenIGTLink 1 and 2", Integer(1, 2))] = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IgtlOperatorOptions(Connection):
+    """Texts of a foot switch, or of a button in 3D Slicer."""
+
+    device: Annotated[str, _named("of its words")] = "Operator"
+    answers: Annotated[str, _named("of what it is told")] = "OperatorTold"

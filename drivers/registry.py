@@ -1,4 +1,4 @@
-"""The drivers that a configuration can name, by role: keys, factory, and the extra that their library comes with.
+"""The drivers that a configuration can name, by role: options, factory, and the extra that their library comes with.
 
 A driver's module is imported when it is opened, not before: nothing here needs a device library.
 """
@@ -13,12 +13,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
 
-from fgreg.drivers.options import Key, Kind
-from fgreg.errors import InputError, MissingExtraError
-from fgreg.session.schema import Bounds
-
-NAME_BYTES = 20
-IGTL_PORT, SINK_PORT, BK_PORT = 18944, 18945, 7915
+from fgreg.drivers import options
+from fgreg.errors import InputError, MissingExtraError, one_line
+from fgreg.schema.kinds import JsonSchema, Kind, Text
+from fgreg.schema.problems import FieldError, Problem, nearest, shown
+from fgreg.schema.record import Record, record
 
 
 class Role(StrEnum):
@@ -70,20 +69,20 @@ class DriverEntry:
     Attributes:
         role, name: what a configuration calls it.
         help: one line.
-        keys: that it takes.
-        factory: ``package.module:function``, called with Surroundings and the keys; of a stage, as
+        options: class of its keys (fgreg.drivers.options).
+        factory: ``package.module:function``, called with Surroundings and the options; of a stage, as
             ``fgreg.motion.watchdog`` calls it.
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
-        check: ``package.module:function``, called with the keys: raises InputError, opens no device.
-        ask: ``package.module:function``, called with Surroundings and the keys: says what is there, or raises; of
+        check: ``package.module:function``, called with the options: raises InputError, ValueError, opens no device.
+        ask: ``package.module:function``, called with Surroundings and the options: says what is there, or raises; of
             devices that are not to be opened only to see whether they answer.
     """
 
     role: Role
     name: str
     help: str
-    keys: tuple[Key, ...]
+    options: type
     factory: str
     extra: str | None = None
     room: bool = False
@@ -95,16 +94,21 @@ class DriverEntry:
         if self.extra is not None and not installed(self.extra):
             raise MissingExtraError(distribution(self.extra), self.extra)
 
-    def checked(self, options: Mapping[str, Any]) -> None:
-        """Raises InputError, MissingExtraError, ValueError where these options, right each by itself, cannot be."""
+    @property
+    def record(self) -> Record:
+        """Of a mapping that names it."""
+        return record(self.options, ("driver", self.name))
+
+    def checked(self, chosen: Any) -> None:
+        """Raises InputError, MissingExtraError, ValueError where options, right each by itself, cannot be."""
         self.require()
         if self.check is not None:
-            load(self.check)(**options)
+            load(self.check)(chosen)
 
-    def open(self, around: Surroundings, options: Mapping[str, Any]) -> Any:
+    def open(self, around: Surroundings, chosen: Any) -> Any:
         """The device; not for stages, which the watchdog opens. Raises what its driver raises."""
         self.require()
-        return load(self.factory)(around, **options)
+        return load(self.factory)(around, chosen)
 
 
 def installed(extra: str) -> bool:
@@ -127,136 +131,12 @@ def load(dotted: str) -> Callable[..., Any]:
     return cast("Callable[..., Any]", getattr(importlib.import_module(module), name))
 
 
-def device_name(text: str) -> None:
-    """Raises InputError where OpenIGTLink would cut it."""
-    from fgreg.drivers.igtl_messages import check_name
-
-    check_name(text)
-
-
-def host_name(text: str) -> None:
-    """Raises InputError for what cannot be a host."""
-    from fgreg.drivers.tcp_link import Endpoint
-
-    Endpoint(text, 1)
-
-
-def four_characters(text: str) -> None:
-    """Raises InputError for what is no FOURCC."""
-    if len(text) != 4 or not text.isascii():
-        raise InputError("fourcc", repr(text), "four characters such as MJPG")
-
-
-def _address(port: int, listen: bool = False) -> tuple[Key, ...]:
-    return (
-        Key("host", Kind.TEXT, "the other side's; with listen: where to listen", "127.0.0.1", check=host_name),
-        Key("port", Kind.INTEGER, "TCP port", port, Bounds(1, 65535)),
-        Key("listen", Kind.TRUTH, "wait for the other side to connect", listen),
-    )
-
-
-def _device(help_text: str, default: str, name: str = "device") -> Key:
-    return Key(name, Kind.TEXT, f"{help_text}, at most {NAME_BYTES} characters", default, check=device_name)
-
-
-_SECONDS = Bounds(0.0, 60.0, above=True, unit="s")
-_SILENT = Key(
-    "silent_s", Kind.NUMBER, "silent for so long, it counts as lost; null: never", 0.8, _SECONDS, nullable=True
-)
-_SPEED = Key("speed", Kind.NUMBER, "how many times as fast as it was recorded", 1.0, Bounds(0.0, 100.0, above=True))
-_RECORDING = Key("path", Kind.FILE, "rosbag2 folder, .mcap or .db3", example="recording.mcap")
-_LAYOUTS = ("mono", "separate", "side-by-side", "top-bottom")
-_DEG_S = Bounds(0.0, 100.0, above=True, unit="deg/s")
-
-_ENDOSCOPE = (
-    Key("left", Kind.VIDEO, "device number or path, stream, video file, folder of pictures", example="/dev/video0"),
-    Key("right", Kind.VIDEO, "the right input, where there are two", None, example="/dev/video1"),
-    Key("layout", Kind.CHOICE, "separate with two inputs, else mono", None, choices=_LAYOUTS, example="separate"),
-    Key("swap", Kind.TRUTH, "left and right are the other way round in each frame", False),
-    Key("fields", Kind.CHOICE, "of interlaced frames", "whole", choices=("whole", "top", "bottom", "both")),
-    Key("width", Kind.INTEGER, "asked of a device, px", None, Bounds(16, 8192), example="1280"),
-    Key("height", Kind.INTEGER, "asked of a device, px", None, Bounds(16, 8192), example="720"),
-    Key("fps", Kind.NUMBER, "asked of a device; a folder's pace", None, Bounds(0.0, 1000.0, above=True), example="30"),
-    Key("fourcc", Kind.TEXT, "kind of pixels asked of a device", None, example="MJPG", check=four_characters),
-    Key("loop", Kind.TRUTH, "files and folders begin again at their end", False),
-    Key("delay_s", Kind.NUMBER, "from the exposure to the device's time stamp", 0.0, Bounds(-1.0, 1.0, unit="s")),
-    Key("max_gap_s", Kind.NUMBER, "most time between left and right", 0.017, Bounds(0.0, 1.0, above=True, unit="s")),
-    Key("by_arrival", Kind.TRUTH, "match two inputs by their times of arrival", False),
-    Key("silence_s", Kind.NUMBER, "silent for so long, it counts as lost", 0.7, _SECONDS),
-)
-_RECORDED_CAMERA = (
-    _RECORDING,
-    Key("left", Kind.TEXT, "topic of the left images; found by its name", None, example="/rig/left/image_raw"),
-    Key("right", Kind.TEXT, "topic of the right images; found by its name", None, example="/rig/right/image_raw"),
-    Key("max_gap_s", Kind.NUMBER, "most time between left and right", 0.017, Bounds(0.0, 1.0, above=True, unit="s")),
-    _SPEED,
-)
-_RECORDED_MOTION = (
-    _RECORDING,
-    Key("topic", Kind.TEXT, "of the holder's poses; found by its name", None, example="/ECM/measured_cp"),
-    Key("tip_T_camera", Kind.TRANSFORM, "where the camera is on what the poses are of, mm", None),
-    _SPEED,
-)
-_THORLABS = (
-    Key("port", Kind.TEXT, "serial port; the only cube that is plugged in", None, example="/dev/ttyUSB0"),
-    Key("acceleration_deg_s2", Kind.NUMBER, "of every motion", 20.0, Bounds(0.0, 100.0, above=True, unit="deg/s^2")),
-)
-_STAND_IN = (
-    Key("device_deg", Kind.NUMBER, "where it stands at first", 0.0, Bounds(-180.0, 180.0, unit="deg")),
-    Key("homed", Kind.TRUTH, "it knows its zero position at first", False),
-    Key("max_speed_deg_s", Kind.NUMBER, "of the motor", 25.0, _DEG_S),
-    Key("acceleration_deg_s2", Kind.NUMBER, "of the motor", 25.0, Bounds(0.0, 1000.0, above=True, unit="deg/s^2")),
-)
-_PULSES = (
-    _device("of the pulses' images", "Image_Probe"),
-    Key("transposed", Kind.TRUTH, "its rows are what session.yaml has as columns", False),
-    _SILENT,
-)
-_HOLDER = (
-    _device("of the holder's transforms", "CameraToBase"),
-    Key("inverted", Kind.TRUTH, "the matrix maps base to camera", False),
-    _SILENT,
-)
-_NAMES = (
-    _device("of the registration", "CameraToTrus", name="registration"),
-    _device("of the image plane", "PlaneToTrus", name="plane"),
-    _device("of the state", "RegistrationStatus", name="status"),
-    _device("of the verdict", "RegistrationVerdict", name="verdict"),
-    Key("header_version", Kind.INTEGER, "1 for receivers of OpenIGTLink 1 and 2", 2, Bounds(1, 2)),
-)
-_SPOKEN = (
-    _device("of its words", "Operator"),
-    _device("of what it is told", "OperatorTold", name="answers"),
-)
-_FLIP = Key("flip", Kind.TRUTH, "its columns run against TRUS x", False)
-_MM = Bounds(-500.0, 500.0, unit="mm")
-_PICTURES = (
-    _device("of the images", "Image_Reference"),
-    Key("depth_mm", Kind.NUMBER, "of the first row's centre, below the array's face", 0.0, _MM),
-    Key(
-        "x_mm",
-        Kind.NUMBER,
-        "TRUS x of the leftmost pixel shown; absent: not shown in the plane",
-        None,
-        _MM,
-        example="-19",
-    ),
-    _FLIP,
-    _SILENT,
-)
-_SCANNER = (
-    Key("host", Kind.TEXT, "name or address of the scanner", example="192.168.1.10", check=host_name),
-    Key("port", Kind.INTEGER, "of its OEM interface", BK_PORT, Bounds(1, 65535)),
-    Key("rate_hz", Kind.INTEGER, "pictures asked for, a second", 20, Bounds(1, 100)),
-    _FLIP,
-    _SILENT,
-)
-
 _HERE = "fgreg.drivers.factories"
 
 
 def _simulated(role: Role, help_text: str, factory: str, ask: str | None = None) -> DriverEntry:
-    return DriverEntry(role, "simulated", help_text, (), factory, room=True, ask=ask)
+    keys = options.RoomStageOptions if role is Role.STAGE else options.NoOptions
+    return DriverEntry(role, "simulated", help_text, keys, factory, room=True, ask=ask)
 
 
 ENTRIES: tuple[DriverEntry, ...] = (
@@ -264,7 +144,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.CAMERA,
         "endoscope",
         "one or two video inputs",
-        _ENDOSCOPE,
+        options.EndoscopeOptions,
         f"{_HERE}:endoscope",
         check=f"{_HERE}:check_endoscope",
     ),
@@ -272,7 +152,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.CAMERA,
         "recorded",
         "images of a ROS 2 recording",
-        _RECORDED_CAMERA,
+        options.RecordedCameraOptions,
         f"{_HERE}:recorded_camera",
         "ros",
         check=f"{_HERE}:check_recorded_camera",
@@ -282,7 +162,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.PHOTOACOUSTIC,
         "igtl",
         "images of PLUS or a scanner over OpenIGTLink, one for each laser pulse",
-        (*_address(IGTL_PORT), *_PULSES),
+        options.IgtlProbeOptions,
         f"{_HERE}:igtl_photoacoustic",
         "igtl",
     ),
@@ -291,7 +171,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.STAGE,
         "thorlabs",
         "PRM1Z8 on a KDC101 or TDC001",
-        _THORLABS,
+        options.ThorlabsOptions,
         "fgreg.drivers.thorlabs_stage:open_stage",
         "stage",
         ask=f"{_HERE}:ask_thorlabs",
@@ -301,7 +181,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.STAGE,
         "stand-in",
         "a simulated stage beside real devices, for rehearsals: nothing turns",
-        _STAND_IN,
+        options.StandInOptions,
         "fgreg.drivers.simulated_stage:open_stage",
         ask=f"{_HERE}:ask_stand_in",
     ),
@@ -309,7 +189,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.MOTION,
         "igtl",
         "transforms of the endoscope's holder over OpenIGTLink",
-        (*_address(IGTL_PORT), *_HOLDER),
+        options.IgtlMotionOptions,
         f"{_HERE}:igtl_motion",
         "igtl",
     ),
@@ -317,7 +197,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.MOTION,
         "recorded",
         "poses of a ROS 2 recording",
-        _RECORDED_MOTION,
+        options.RecordedMotionOptions,
         f"{_HERE}:recorded_motion",
         "ros",
         check=f"{_HERE}:check_recorded_motion",
@@ -327,17 +207,17 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.BMODE,
         "igtl",
         "B-mode images over OpenIGTLink",
-        (*_address(IGTL_PORT), *_PICTURES),
+        options.IgtlBmodeOptions,
         f"{_HERE}:igtl_bmode",
         "igtl",
     ),
-    DriverEntry(Role.BMODE, "bk", "a BK scanner over its OEM interface", _SCANNER, f"{_HERE}:bk_bmode"),
+    DriverEntry(Role.BMODE, "bk", "a BK scanner over its OEM interface", options.BkOptions, f"{_HERE}:bk_bmode"),
     _simulated(Role.BMODE, "of the simulated room", f"{_HERE}:simulated_scanner"),
     DriverEntry(
         Role.SINKS,
         "igtl",
         "3D Slicer, PLUS: takes the registration over OpenIGTLink",
-        (*_address(SINK_PORT, listen=True), *_NAMES),
+        options.IgtlSinkOptions,
         f"{_HERE}:igtl_sink",
         "igtl",
     ),
@@ -345,7 +225,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.OPERATOR,
         "keyboard",
         "whoever sits at the terminal",
-        (),
+        options.NoOptions,
         f"{_HERE}:keyboard",
         ask=f"{_HERE}:ask_keyboard",
     ),
@@ -353,7 +233,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         Role.OPERATOR,
         "igtl",
         "texts over OpenIGTLink: a foot switch, a button in 3D Slicer",
-        (*_address(IGTL_PORT), *_SPOKEN),
+        options.IgtlOperatorOptions,
         f"{_HERE}:igtl_operator",
         "igtl",
     ),
@@ -365,3 +245,53 @@ ENTRIES: tuple[DriverEntry, ...] = (
 def drivers_of(role: Role) -> Mapping[str, DriverEntry]:
     """By name."""
     return {entry.name: entry for entry in ENTRIES if entry.role is role}
+
+
+@dataclass(frozen=True, slots=True)
+class DriverChoice(Kind):
+    """A mapping that names one of a role's drivers, with its options: the entry and the options, both checked."""
+
+    role: Role
+
+    def read(self, value: object, folder: Path | None = None, /) -> tuple[DriverEntry, Any]:
+        """Raises FieldError, MissingExtraError."""
+        entries = drivers_of(self.role)
+        if not isinstance(value, Mapping):
+            raise FieldError.of(shown(value), self.expected)
+        if "driver" not in value:
+            for key in value:
+                if nearest(key, ["driver"]):
+                    raise FieldError.of("an unknown key", "a known one (did you mean driver?)", key)
+            raise FieldError.of("nothing", f"one of {', '.join(entries)}", "driver")
+        try:
+            entry = entries[Text(allowed=tuple(entries)).read(value["driver"])]
+        except FieldError as error:
+            raise FieldError(error.below("driver")) from None
+        entry.require()
+        others = {name for other in entries.values() for name in other.record.names} - {*entry.record.names}
+        names = ", ".join(name for name in entry.record.names if name not in ("driver", "limits"))
+        takes = f"one of {entry.name}'s: {names}" if names else f"{entry.name} alone"
+        problems = [Problem((key,), "a key of another driver", takes) for key in value if key in others]
+        own = {key: entry for key, entry in value.items() if key not in others} if problems else value
+        try:
+            chosen = entry.record.read(own, folder)
+            if not problems:
+                entry.checked(chosen)
+        except FieldError as error:
+            problems += error.problems
+        except ValueError as error:
+            found = f"values that do not fit together ({one_line(str(error), 200)})"
+            problems.append(Problem((), found, "values that do"))
+        except InputError as error:
+            problems.append(Problem((), f"{error.found} ({error.where})", error.expected))
+        if problems:
+            raise FieldError(problems)
+        return entry, chosen
+
+    @property
+    def expected(self) -> str:
+        names = dict.fromkeys(name for entry in drivers_of(self.role).values() for name in entry.record.names)
+        return f"a mapping with {', '.join(names)}"
+
+    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"oneOf": [entry.record.json_schema(definitions) for entry in drivers_of(self.role).values()]}

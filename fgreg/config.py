@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from fgreg.schema.kinds import Number
+from fgreg.schema.record import Key
 
 
 @dataclass(frozen=True, slots=True)
 class SolveConfig:
-    """Settings of the estimate and of its verdict.
+    """Settings of the estimate and of its verdict, which is refused beyond twice ``limit_mm``.
 
     Attributes:
-        limit_mm: predicted 95 % error at the worst target up to which a registration is ``ok``; beyond twice this it
-            is refused.
         second_minimum_chi2: two minima whose costs differ by less cannot be told apart (99 % of chi square, 2 dof).
         min_pairs: below, the registration counts as open unless the session gives an initial one.
         refuse_beam_spread_rad, warn_beam_spread_rad: root mean square angle of the beams about their mean direction.
@@ -30,7 +32,13 @@ class SolveConfig:
         seed: of those draws.
     """
 
-    limit_mm: float = 3.0
+    limit_mm: Annotated[
+        float,
+        Key(
+            "predicted 95 % error at the worst target up to which the verdict is ok",
+            Number(0.0, 100.0, above=True, unit="mm"),
+        ),
+    ] = 3.0
     second_minimum_chi2: float = 9.2
     min_pairs: int = 6
     refuse_beam_spread_rad: float = math.radians(2.0)

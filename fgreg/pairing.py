@@ -14,15 +14,19 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from fgreg.frames import FloatArray, exp_so3, hat, log_so3, make_transform
+from fgreg.schema.kinds import Number
+from fgreg.schema.record import Key
 
 MAX_GAP_S = 0.1
 """Poses farther apart than this do not say where the marker was between them (three frames at 30 frames/s)."""
 UNSTEADY_MM_S2, UNSTEADY_RAD_S2 = 300.0, 3.0
 """Accelerations (sigma) of a hand-held fibre between two poses: a tremor of 0.1 mm and 1 mrad at 9 Hz."""
+_LATENCY = Number(0.0, 1.0, unit="s")
 CLOCK_MEMORY = 256
 """Stamps over which a device's clock is compared with the host's."""
 
@@ -74,9 +78,9 @@ class Latencies:
     grabber holds a picture for some frames, a scanner's packet comes after its pulse. Together they decide where the
     marker was at a pulse."""
 
-    camera_s: float = 0.0
-    pulse_s: float = 0.0
-    holder_s: float = 0.0
+    camera_s: Annotated[float, Key("from exposure to arrival, at best", _LATENCY, name="camera_latency_s")] = 0.0
+    pulse_s: Annotated[float, Key("from laser pulse to arrival, at best", _LATENCY, name="pulse_latency_s")] = 0.0
+    holder_s: Annotated[float, Key("the same of motion's samples", _LATENCY, name="holder_latency_s")] = 0.0
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) and value >= 0 for value in (self.camera_s, self.pulse_s, self.holder_s)):

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 from contextlib import ExitStack
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,12 @@ import numpy as np
 import pytest
 import yaml
 
+from fgreg.drivers.options import RecordedMotionOptions
 from fgreg.drivers.registry import ENTRIES, Role, Surroundings, load
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.motion.limits import MotionLimits
 from fgreg.operation.config import LiveConfig, read_config
-from fgreg.operation.config_keys import example_config
+from fgreg.operation.config_keys import RoomOptions, example_config, example_line
 from fgreg.operation.holder import HolderSettings
 from fgreg.pairing import Latencies
 from fgreg.session.safe_yaml import parse_yaml
@@ -80,13 +82,13 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("photoacoustic.device", "ImageOfTheProbeInUse1", "photoacoustic.device", "'ImageOfTheProbeInUse1'", "1 to 20"),
     ("photoacoustic.silent_s", 0, "photoacoustic.silent_s", "0", "> 0"),
     ("stage.driver", "PRM1Z8", "stage.driver", "'PRM1Z8'", "one of thorlabs, simulated, stand-in"),
-    ("stage.limits", [1], "stage.limits", "[1]", "a mapping with home_speed_deg_s"),
+    ("stage.limits", [1], "stage.limits", "[1]", "a mapping with sweep_deg"),
     ("stage.limits.home_speed_deg_s", 31, "stage.limits.home_speed_deg_s", "31", "<= 30 deg/s"),
     ("stage.limits.home_speed_deg_s", 0, "stage.limits.home_speed_deg_s", "0", "> 0"),
     ("stage.limits.marker_age_s", 0.5, "stage.limits.marker_age_s", "0.5", "<= 0.2 s"),
     ("stage.limits.sweep_deg", [30, -40], "stage.limits.sweep_deg", "[30.0, -40.0]", "the lower end"),
     ("stage.limits.sweep_deg", [-40, 130], "stage.limits", "leaves the stage's limits", "session.yaml"),
-    ("stage.limits.heartbeat_s", 5, "stage.limits.heartbeat_s", "an unknown key", "one of home_speed"),
+    ("stage.limits.heartbeat_s", 5, "stage.limits.heartbeat_s", "an unknown key", "one of sweep_deg, home_speed"),
     ("stage.homed", True, "stage.homed", "a key of another driver", "one of thorlabs's: port"),
     ("motion.device", "", "motion.device", "''", "at most 20 characters"),
     ("motion.silent_s", False, "motion.silent_s", "false", "> 0"),
@@ -135,11 +137,11 @@ def test_one_mistake_is_one_line_with_its_place(
 def test_the_file_that_the_mistakes_are_made_in_is_read_as_it_says(tmp_path: Path) -> None:
     config = read_config(live_configs.write(tmp_path))
     assert config.setup == (tmp_path / "session.yaml").read_text()
-    left, right = (config.devices[Role.CAMERA][0].options[key] for key in ("left", "right"))
+    left, right = (getattr(config.devices[Role.CAMERA][0].options, key) for key in ("left", "right"))
     assert (left, right) == ("/dev/video90", "91")
-    assert config.devices[Role.MOTION][0].options["silent_s"] is None
-    assert config.devices[Role.PHOTOACOUSTIC][0].options["silent_s"] == 0.8
-    assert [sink.options["port"] for sink in config.devices[Role.SINKS]] == [18945, 18946]
+    assert config.devices[Role.MOTION][0].options.silent_s is None
+    assert config.devices[Role.PHOTOACOUSTIC][0].options.silent_s == 0.8
+    assert [sink.options.port for sink in config.devices[Role.SINKS]] == [18945, 18946]
     assert [one.entry.name for one in config.devices[Role.OPERATOR]] == ["keyboard", "igtl"]
     assert (config.settings.hearing_threshold, config.settings.aims, config.solve.limit_mm) == (12.5, 6, 2.0)
     limits = MotionLimits.of_session(config.model.stage, **config.stage_limits)
@@ -234,7 +236,7 @@ def test_paths_are_relative_to_the_file_and_a_session_may_be_a_folder(tmp_path: 
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "1.png").write_bytes(session_files.png(640, 480))
     config = read_config(file)
-    assert config.devices[Role.CAMERA][0].options["left"] == str(tmp_path / "pictures/*.png")
+    assert config.devices[Role.CAMERA][0].options.left == str(tmp_path / "pictures/*.png")
     assert config.model.name == "phantom-01"
 
 
@@ -308,7 +310,7 @@ def test_a_mistake_in_the_calibration_is_one_line(
 def test_the_simulated_room_brings_its_own_set_up(tmp_path: Path) -> None:
     config = read_config(live_configs.write(tmp_path, live_configs.room()))
     assert config.warnings == ()
-    assert config.room == {"seed": 3, "bump_every_s": BUMP_EVERY_S, "width": 320}
+    assert config.room == RoomOptions(3, BUMP_EVERY_S, 320)
     assert config.model.camera is not None
     assert config.model.camera.left.image_size[0] == 320
     assert config.settings.aims == 3
@@ -363,8 +365,12 @@ def test_the_example_reads_back_and_its_commented_defaults_are_the_defaults(tmp_
     spelled = read_config(live_configs.write(tmp_path, "\n".join(whole)))
     assert sum(a != b for a, b in zip(whole, text.splitlines(), strict=True)) > 25
     for role, chosen in example.devices.items():
-        assert [dict(one.options) for one in spelled.devices[role]] == [dict(one.options) for one in chosen]
-    assert (spelled.settings, spelled.stage_limits) == (example.settings, example.stage_limits)
+        ours, theirs = ([asdict(one.options) for one in several] for several in (spelled.devices[role], chosen))
+        for options in (*ours, *theirs):
+            options.pop("limits", None)
+        assert ours == theirs
+    first, second = (MotionLimits.of_session(one.model.stage, **one.stage_limits) for one in (spelled, example))
+    assert (spelled.settings, first) == (example.settings, second)
     assert (spelled.solve, spelled.warnings) == (example.solve, ())
 
 
@@ -373,8 +379,8 @@ def test_the_example_has_every_driver_and_every_key() -> None:
     blocks = [line.strip("# ").split("  #")[0] for line in text.splitlines()]
     for entry in ENTRIES:
         assert any(line.removeprefix("- ") == f"driver: {entry.name}" for line in blocks)
-        for key in entry.keys:
-            assert any(line.startswith(f"{key.name}: ") for line in blocks), (entry.name, key.name)
+        for key in entry.record.fields:
+            assert any(line.startswith(f"{key.name}:") for line in blocks), (entry.name, key.name)
     assert max(len(line) for line in text.splitlines()) <= 140
 
 
@@ -382,8 +388,8 @@ def test_the_example_has_every_driver_and_every_key() -> None:
 def test_every_driver_of_the_example_is_one_that_can_be_named_and_has_its_factory(entry: Any) -> None:
     for dotted in (entry.factory, entry.check, entry.ask):
         assert dotted is None or callable(load(dotted))
-    document = "\n".join(key.line() for key in entry.keys)
-    assert set(yaml.safe_load(document) or {}) == {key.name for key in entry.keys}
+    keys = [key for key in entry.record.fields if key.name != "limits"]
+    assert set(yaml.safe_load("\n".join(map(example_line, keys))) or {}) == {key.name for key in keys}
 
 
 def opened(config: LiveConfig, stack: ExitStack) -> Any:
@@ -436,14 +442,14 @@ def test_devices_that_play_one_recording_share_its_time(tmp_path: Path) -> None:
     bags.write_bag(path, [("/ECM/measured_cp", t / 10, bags.pose_stamped(t / 10, (0.0, 0.0, 0.1))) for t in range(5)])
     around = Surroundings(lambda _: None)
     entry = next(entry for entry in ENTRIES if (entry.role, entry.name) == (Role.MOTION, "recorded"))
-    options = {key.name: key.default for key in entry.keys} | {"path": path}
+    options = RecordedMotionOptions(path=path)
     entry.checked(options)
     devices = [entry.open(around, options) for _ in range(2)]
     assert len(around.paces) == 1
     for device in devices:
         device.close()
     with pytest.raises(InputError, match="no such topic"):
-        entry.checked(options | {"topic": "/other"})
+        entry.checked(replace(options, topic="/other"))
 
 
 def test_the_readme_shows_a_config_that_reads(tmp_path: Path) -> None:

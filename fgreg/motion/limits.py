@@ -6,10 +6,15 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from fgreg.models import StageModel
 from fgreg.motion.device import MAX_CALL_S
+from fgreg.schema.kinds import SCAN_DEG, Number, NumberTuple, in_radians
+from fgreg.schema.problems import FieldError, shown
+from fgreg.schema.record import Key, Section, record
+
+_SPEED = Number(0.0, 30.0, above=True, unit="deg/s", degrees=True)
 
 
 class MotionKind(StrEnum):
@@ -32,17 +37,12 @@ class MotionLimits:
 
     Attributes:
         stage: direction, zero, and the limits that no motion may leave (device angles).
-        sweep_rad: lowest and highest plane angle of a search.
-        home_speed, search_speed, track_speed: highest speeds.
         home_travel_rad: homing is stopped after this much travel. Until the zero position is found nobody knows where
             the stage stands; where it stood inside its limits, homing takes no more than their span.
-        track_sigma_rad: largest standard deviation of a tracking answer that may be followed.
-        marker_age_s: oldest marker that a tracking motion may rest on, from its exposure.
         heartbeat_s: the main program has to be heard from at least this often, or the stage stops.
         command_age_s: a command that was on its way for longer is refused: it comes from before a stall.
         status_age_s: the stage has to be heard from at least this often while it moves.
         clock_gap_s: the watchdog looks at its clock far more often than this; a longer gap means it did not run.
-        request_s: an operator's request ends by itself after this.
         tolerance_rad: of positions: reading, settling, overshoot.
         deceleration: least of a stage that is told to stop or to turn about, rad/s^2.
         overspeed: factor above the commanded speed that is taken for a fault.
@@ -51,18 +51,42 @@ class MotionLimits:
     """
 
     stage: StageModel
-    sweep_rad: tuple[float, float]
-    home_speed: float = math.radians(10.0)
-    search_speed: float = math.radians(10.0)
-    track_speed: float = math.radians(10.0)
+    sweep_rad: Annotated[
+        tuple[float, float],
+        Key(
+            "plane angles that a search may use",
+            NumberTuple(2, in_radians(SCAN_DEG)),
+            default="all that session.yaml allows",
+            example="[-60, 60]",
+        ),
+    ]
+    home_speed: Annotated[float, Key("highest speed to the zero position", _SPEED, name="home_speed_deg_s")] = (
+        math.radians(10.0)
+    )
+    search_speed: Annotated[float, Key("highest speed of a search", _SPEED, name="search_speed_deg_s")] = math.radians(
+        10.0
+    )
+    track_speed: Annotated[float, Key("highest speed after the beam", _SPEED, name="track_speed_deg_s")] = math.radians(
+        10.0
+    )
     home_travel_rad: float | None = None
-    track_sigma_rad: float = math.radians(2.0)
-    marker_age_s: float = 0.2
+    track_sigma_rad: Annotated[
+        float,
+        Key(
+            "largest standard deviation of an answer that is followed",
+            Number(0.0, 10.0, above=True, unit="deg", degrees=True),
+        ),
+    ] = math.radians(2.0)
+    marker_age_s: Annotated[
+        float, Key("oldest marker that is followed, from its exposure", Number(0.0, 0.2, above=True, unit="s"))
+    ] = 0.2
     heartbeat_s: float = 0.25
     command_age_s: float = 0.2
     status_age_s: float = 0.3
     clock_gap_s: float = 0.5
-    request_s: float = 600.0
+    request_s: Annotated[float, Key("an operator's request ends by itself after", Number(1.0, 3600.0, unit="s"))] = (
+        600.0
+    )
     tolerance_rad: float = math.radians(0.5)
     deceleration: float = math.radians(20.0)
     overspeed: float = 1.25
@@ -82,7 +106,8 @@ class MotionLimits:
             raise ValueError(f"overspeed is {self.overspeed}, expected a factor in (1, 2]")
         low, high = self.sweep_rad
         if not low < high:
-            raise ValueError(f"the sweep range is {low} to {high} rad, expected an increasing range")
+            found = shown([round(math.degrees(angle), 9) for angle in (low, high)])
+            raise FieldError.of(found, "the lower end, then the upper one", "sweep_deg")
         if not (self.inside(low) and self.inside(high)):
             raise ValueError(
                 f"the sweep range {math.degrees(low):.1f} to {math.degrees(high):.1f} deg leaves the stage's limits"
@@ -147,3 +172,7 @@ class MotionLimits:
         low, high = stage.pop("limits_device_rad")
         sweep_low, sweep_high = fields.pop("sweep_rad")
         return cls(StageModel(limits_device_rad=(low, high), **stage), (sweep_low, sweep_high), **fields)
+
+
+LIMITS = Section(MotionLimits, "limits", record(MotionLimits).fields)
+"""``limits`` of a stage in a configuration: reads to what :meth:`MotionLimits.of_session` takes."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 from fgreg.drivers.base import Command, Said
 from fgreg.estimate import Verdict
@@ -33,6 +34,8 @@ from fgreg.operation.view import (
     Tell,
     View,
 )
+from fgreg.schema.kinds import Integer, Number
+from fgreg.schema.record import Key
 from fgreg.search.hearing import HearingModel
 from fgreg.search.planner import Found, NotFound, Prediction, SearchPlanner, Turn
 
@@ -68,21 +71,21 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ConductorSettings:
-    """What is wanted.
+    """What is wanted. The operator can end the calibration earlier."""
 
-    Attributes:
-        aims: calibration shots before PMs are searched; the operator can end them earlier.
-        pms: PMs of an epoch after which the stage begins to follow, if the verdict is ok then, or after
-            ``most_pms`` where it is a warning.
-        hearing_threshold: least amplitude that counts as heard, in the unit of the source's amplitudes.
-        follow: whether the stage follows the beam at all.
-    """
-
-    aims: int = 8
-    pms: int = 8
-    most_pms: int = 15
-    hearing_threshold: float = 0.0
-    follow: bool = True
+    aims: Annotated[int, Key("calibration shots", Integer(0, 1000))] = 8
+    pms: Annotated[int, Key("PMs of an epoch after which the stage may follow", Integer(1, 1000))] = 8
+    most_pms: Annotated[int, Key("the same where the verdict is a warning", Integer(1, 1000))] = 15
+    hearing_threshold: Annotated[
+        float,
+        Key(
+            "least amplitude that counts as heard, in the source's unit",
+            Number(0.0, 1e12, above=True),
+            required=True,
+            example="20.0",
+        ),
+    ] = 0.0
+    follow: Annotated[bool, Key("whether the stage follows the beam at all")] = True
 
     def __post_init__(self) -> None:
         if self.aims < 0 or not 1 <= self.pms <= self.most_pms:

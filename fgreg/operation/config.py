@@ -7,42 +7,33 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fgreg.config import SolveConfig
 from fgreg.convert.write import camera_yaml
 from fgreg.drivers.base import Operator
-from fgreg.drivers.options import read_keys, read_path
+from fgreg.drivers.options import Connection, EndoscopeOptions, NoOptions
 from fgreg.drivers.registry import DriverEntry, Role, Surroundings, drivers_of
-from fgreg.errors import InputError, one_line
+from fgreg.errors import InputError
 from fgreg.models import SessionModel, StereoRig
 from fgreg.motion.limits import MotionLimits
 from fgreg.operation.conductor import ConductorSettings
-from fgreg.operation.config_keys import (
-    CALIBRATION_KEYS,
-    LIMIT_KEYS,
-    LIVE_FORMAT,
-    ROOM_KEYS,
-    SETTING_KEYS,
-    THRESHOLD,
-)
+from fgreg.operation.config_keys import LIVE, CalibrationOptions, LiveDocument, RoomOptions
 from fgreg.operation.holder import HolderSettings
 from fgreg.operation.rooms import HEARING_THRESHOLD, room_truth
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.operation.status import Devices
 from fgreg.pairing import Latencies
+from fgreg.schema.problems import FieldError, input_error, nearest, place_text
 from fgreg.session.reading import SETUP_FILE
 from fgreg.session.safe_yaml import load_yaml, parse_yaml, read_bounded
-from fgreg.session.schema import Bounds, Fields, Place, shown
 from fgreg.session.setup import read_setup
 
 _MAX_BYTES = 1_000_000
-SCAN_DEG = Bounds(-180.0, 180.0, unit="deg")
-_TOP = ("format", "session", "calibration", "room", *(role.value for role in Role), "settings")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +41,7 @@ class Chosen:
     """A driver with its options, both checked; ``where`` names the place in the file."""
 
     entry: DriverEntry
-    options: Mapping[str, Any]
+    options: Any
     where: str
 
     def open(self, around: Surroundings) -> Any:
@@ -77,7 +68,7 @@ class LiveConfig:
     model: SessionModel
     devices: Mapping[Role, tuple[Chosen, ...]]
     stage_limits: Mapping[str, Any]
-    room: Mapping[str, Any] | None
+    room: RoomOptions | None
     rectified: Any
     settings: ConductorSettings
     holder: HolderSettings
@@ -91,7 +82,7 @@ class LiveConfig:
         if self.room is not None:
             from fgreg.drivers.simulated import RoomProcess
 
-            process = RoomProcess(self.room["seed"], self.room["width"], self.settings.aims, self.room["bump_every_s"])
+            process = RoomProcess(self.room.seed, self.room.width, self.settings.aims, self.room.bump_every_s)
             room = stack.enter_context(process).path
         board = self.model.board
         return Surroundings(say, None if board is None else (board.columns, board.rows), self.rectified, room)
@@ -138,9 +129,10 @@ class LiveConfig:
         chosen = self.devices.get(Role.STAGE)
         if chosen is None:
             return None
-        options = {"path": os.fspath(around.room)} if chosen[0].entry.room and around.room else chosen[0].options
+        own = {key: value for key, value in asdict(chosen[0].options).items() if key != "limits"}
+        options = {"path": os.fspath(around.room)} if chosen[0].entry.room and around.room else own
         limits = dict(self.stage_limits)
-        if (acceleration := chosen[0].options.get("acceleration_deg_s2")) is not None:
+        if (acceleration := own.get("acceleration_deg_s2")) is not None:
             limits["deceleration"] = math.radians(acceleration)  # what a driver is told to use is what it brakes with
         return StageSetup(chosen[0].entry.factory, options, limits)
 
@@ -163,43 +155,34 @@ def read_config(path: Path) -> LiveConfig:
         InputError: the first problem, with file, key and line.
         MissingExtraError: a driver's library is not installed.
     """
-    problems: list[InputError] = []
-    reader = _Reader(path, problems)
-    found = reader.read()
-    if problems:
-        raise problems[0]
-    if found is None:
-        raise AssertionError("no configuration and no problem")
-    return found
+    data = load_yaml(path, path.name, max_bytes=_MAX_BYTES)
+    try:
+        return _Reader(path, data).read()
+    except FieldError as error:
+        raise input_error(error.problems[0], path.name, data) from None
 
 
 @dataclass(slots=True, eq=False)
 class _Reader:
-    """Reads one file; what is wrong goes to ``problems``."""
+    """Puts together what one file says; its methods raise FieldError, InputError."""
 
     path: Path
-    problems: list[InputError]
+    data: Mapping[str, object]
     warnings: list[str] = field(default_factory=list)
 
-    def read(self) -> LiveConfig | None:
-        label, folder = self.path.name, self.path.parent
-        top = Fields(load_yaml(self.path, label, max_bytes=_MAX_BYTES), _TOP, Place(label), self.problems)
-        top.text("format", LIVE_FORMAT, allowed=(LIVE_FORMAT,))
-        devices = _devices(top, folder)
-        room = self._room(top, devices)
-        settings = _settings(top, room is not None)
-        limits = _limits(top)
-        if self.problems or settings is None:
-            return None
-        conductor = settings.conductor
-        setup, label, rectified = self._session(top, folder, devices, room, conductor.aims)
+    def read(self) -> LiveConfig:
+        simulated = _uses_room(self.data)
+        document: LiveDocument = LIVE.read(_with_room(self.data) if simulated else self.data, self.path.parent)
+        devices = self._devices(document)
+        room = self._room(document, devices)
+        settings = document.settings
+        setup, label, rectified = self._session(document, devices, room)
         model = self._model(setup, label)
-        if model is None:
-            return None
-        _check_model(top, model, devices, conductor.aims)
-        if Role.STAGE in devices:
-            _check_limits(top, model, limits)
-        _check_ports(top, devices)
+        _check_model(model, devices, settings.conductor.aims)
+        limits = (document.stage[1].limits if document.stage else None) or {}
+        if document.stage:
+            _check_limits(model, limits)
+        _check_ports(devices)
         self.warnings += _open_to_all(devices)
         return LiveConfig(
             self.path,
@@ -209,256 +192,182 @@ class _Reader:
             limits,
             room,
             rectified,
-            conductor,
+            settings.conductor,
             settings.holder,
             settings.latencies,
             settings.solve,
             tuple(self.warnings),
         )
 
-    def _room(self, top: Fields, devices: Mapping[Role, tuple[Chosen, ...]]) -> Mapping[str, Any] | None:
+    def _devices(self, document: LiveDocument) -> dict[Role, tuple[Chosen, ...]]:
+        """What is chosen for each role; the operator is at the keyboard where none is."""
+        found: dict[Role, tuple[Chosen, ...]] = {}
+        for role in Role:
+            chosen = getattr(document, role)
+            several = chosen if role in (Role.SINKS, Role.OPERATOR) else () if chosen is None else (chosen,)
+            listed = isinstance(self.data.get(role), list)
+            places = [
+                place_text((role, i) if listed else (role,), self.path.name, self.data) for i in range(len(several))
+            ]
+            if several:
+                found[role] = tuple(
+                    Chosen(entry, options, place) for (entry, options), place in zip(several, places, strict=True)
+                )
+        if Role.OPERATOR not in found:
+            keyboard = drivers_of(Role.OPERATOR)["keyboard"]
+            found[Role.OPERATOR] = (Chosen(keyboard, NoOptions(), place_text((Role.OPERATOR,), self.path.name)),)
+        return found
+
+    def _room(self, document: LiveDocument, devices: Mapping[Role, tuple[Chosen, ...]]) -> RoomOptions | None:
         """The room's options; its camera, probe and stage go together, since they see and hear the same things."""
         simulated = [role for role, chosen in devices.items() if any(one.entry.room for one in chosen)]
         world = [role for role in (Role.CAMERA, Role.PHOTOACOUSTIC, Role.STAGE) if role in devices]
         for role in world:
             if simulated and role not in simulated:
                 found = f"{devices[role][0].entry.name}, and {simulated[0]} of the simulated room"
-                top.fail(role, found, "camera, photoacoustic and stage all simulated, or none")
+                raise FieldError.of(found, "camera, photoacoustic and stage all simulated, or none", role)
         if not simulated:
-            if top.has("room"):
-                top.fail("room", "a room of which no device is used", "drivers called simulated")
+            if document.room is not None:
+                raise FieldError.of("a room of which no device is used", "drivers called simulated", "room")
             return None
         for key in ("session", "calibration"):
-            if top.has(key):
-                top.fail(key, "it, and the simulated room", "one of the two: the room brings a set-up of its own")
+            if key in self.data:
+                expected = "one of the two: the room brings a set-up of its own"
+                raise FieldError.of("it, and the simulated room", expected, key)
         if Role.OPERATOR not in simulated:
             self.warnings.append(
                 f"{self.path.name}: without a simulated operator nobody tells the room's surgeon to go on"
             )
-        if not top.has("room"):
-            return {key.name: key.default for key in ROOM_KEYS}
-        inner = top.child("room", [key.name for key in ROOM_KEYS])
-        return None if inner is None else read_keys(ROOM_KEYS, inner, self.path.parent)
+        return document.room or RoomOptions()
 
-    def _model(self, setup: str, label: str) -> SessionModel | None:
-        found = read_setup(parse_yaml(setup, label), label, "session", self.problems)
+    def _model(self, setup: str, label: str) -> SessionModel:
+        problems: list[InputError] = []
+        found = read_setup(parse_yaml(setup, label), label, "session", problems)
         self.warnings += found.warnings
-        return found.model if not self.problems else None
+        if found.model is None:
+            raise problems[0]
+        return found.model
 
     def _session(
-        self,
-        top: Fields,
-        folder: Path,
-        devices: Mapping[Role, tuple[Chosen, ...]],
-        room: Mapping[str, Any] | None,
-        aims: int,
+        self, document: LiveDocument, devices: Mapping[Role, tuple[Chosen, ...]], room: RoomOptions | None
     ) -> tuple[str, str, Any]:
-        """Text of the ``session.yaml``, what messages call it, the rectification of the pictures. Raises InputError."""
+        """Text of the ``session.yaml``, what messages call it, the rectification of the pictures."""
         if room is not None:
             from fgreg.simulation.documents import session_document
             from fgreg.simulation.room import room_config
 
-            config = room_config(room["seed"], room["width"], aims=aims, bump_every_s=room["bump_every_s"])
+            aims = document.settings.conductor.aims
+            config = room_config(room.seed, room.width, aims=aims, bump_every_s=room.bump_every_s)
             return setup_text(session_document(config.scene)), "the simulated room", None
-        path = read_path(top, "session", folder)
-        if top.problems:
-            raise top.problems[0]
+        path = document.session
+        if path is None:
+            raise FieldError.of("nothing", "a path", "session")
         file = path / SETUP_FILE if path.is_dir() else path
-        label = str(Path(str(top.raw("session"))) / SETUP_FILE) if path.is_dir() else str(top.raw("session"))
+        name = str(self.data["session"])
+        label = str(Path(name) / SETUP_FILE) if path.is_dir() else name
         data = load_yaml(file, label)
         text = read_bounded(file, label, 4_000_000).decode("utf-8-sig")
-        if not top.has("calibration"):
+        if document.calibration is None:
             return text, label, None
         if "camera" in data:
-            raise InputError(str(top.at("calibration")), "it, and a camera in the session.yaml", "one of the two")
-        rig, rectified = self._calibration(top, folder, devices)
+            raise FieldError.of("it, and a camera in the session.yaml", "one of the two", "calibration")
+        rig, rectified = self._calibration(document.calibration, devices[Role.CAMERA][0])
         return text.rstrip("\n") + "\n" + camera_yaml(rig), label, rectified
 
-    def _calibration(
-        self, top: Fields, folder: Path, devices: Mapping[Role, tuple[Chosen, ...]]
-    ) -> tuple[StereoRig, Any]:
-        """The rig of the pictures as the loop sees them. Raises InputError."""
+    def _calibration(self, options: CalibrationOptions, camera: Chosen) -> tuple[StereoRig, Any]:
+        """The rig of the pictures as the loop sees them."""
         from fgreg.drivers.calibration_files import read_calibration
         from fgreg.drivers.interlaced import Fields as Interlaced
         from fgreg.drivers.interlaced import field_rig
         from fgreg.drivers.rectification import rectification
 
-        inner = top.child("calibration", [key.name for key in CALIBRATION_KEYS])
-        values = {} if inner is None else read_keys(CALIBRATION_KEYS, inner, folder)
-        if top.problems:
-            raise top.problems[0]
-        files = [file for file in (values["left"], values["right"]) if file is not None]
-        pictures = values["pictures"]
-        read = read_calibration(files, unit=values["unit"], rectified=pictures == "rectified")
+        files = [file for file in (options.left, options.right) if file is not None]
+        read = read_calibration(files, unit=options.unit, rectified=options.pictures == "rectified")
         rig = read.rig
         self.warnings += read.warnings
-        camera = devices[Role.CAMERA][0]
-        if not values["of_fields"]:
-            rig = field_rig(rig, Interlaced(camera.options.get("fields", "whole")))
-        if pictures != "rectify":
+        if not options.of_fields:
+            whole = not isinstance(camera.options, EndoscopeOptions)
+            rig = field_rig(rig, Interlaced.WHOLE if whole else Interlaced(camera.options.fields))
+        if options.pictures != "rectify":
             return rig, None
         if camera.entry.name != "endoscope":
-            place = str(top.at("calibration").key("pictures"))
-            raise InputError(place, f"rectify with the driver {camera.entry.name}", "rectify with endoscope only")
+            found = f"rectify with the driver {camera.entry.name}"
+            raise FieldError.of(found, "rectify with endoscope only", "calibration", "pictures")
         made = rectification(rig)
         return made.rig, made
 
 
-def _devices(top: Fields, folder: Path) -> dict[Role, tuple[Chosen, ...]]:
-    found: dict[Role, tuple[Chosen, ...]] = {}
+def _raw_choices(data: Mapping[str, object]) -> Iterator[object]:
     for role in Role:
-        if role is Role.OPERATOR and not top.has(role):
-            keyboard = drivers_of(role)["keyboard"]
-            found[role] = (Chosen(keyboard, {}, str(top.at(role))),)
-            continue
-        if role in (Role.CAMERA, Role.PHOTOACOUSTIC) or top.has(role):
-            several = role is Role.SINKS or (role is Role.OPERATOR and isinstance(top.raw(role), list))
-            known = _known_keys(role)
-            entries = top.children(role, known) if several else [top.child(role, known)]
-            chosen = tuple(one for fields in entries if fields is not None and (one := _chosen(role, fields, folder)))
-            if chosen:
-                found[role] = chosen
-    return found
+        chosen = data.get(role)
+        yield from chosen if isinstance(chosen, list) else [chosen]
 
 
-def _known_keys(role: Role) -> list[str]:
-    """Of all of a role's drivers: those of another driver are told as such, by :func:`_chosen`."""
-    names = dict.fromkeys(key.name for entry in drivers_of(role).values() for key in entry.keys)
-    return ["driver", *names, *(["limits"] if role is Role.STAGE else [])]
+def _uses_room(data: Mapping[str, object]) -> bool:
+    """Whether any device is one of the simulated room."""
+    return any(isinstance(one, Mapping) and one.get("driver") == "simulated" for one in _raw_choices(data))
 
 
-def _chosen(role: Role, fields: Fields, folder: Path) -> Chosen | None:
-    entries = drivers_of(role)
-    name = fields.text("driver", "one of " + ", ".join(entries), allowed=tuple(entries))
-    if name not in entries:
-        return None
-    entry = entries[name]
-    own = {"driver", *(key.name for key in entry.keys), *(["limits"] if role is Role.STAGE else [])}
-    for key in _known_keys(role):
-        if fields.has(key) and key not in own:
-            takes = ", ".join(key.name for key in entry.keys) or "no keys"
-            fields.fail(key, "a key of another driver", f"one of {name}'s: {takes}" if entry.keys else f"{name} alone")
-    options = read_keys(entry.keys, fields, folder)
-    entry.require()
-    if fields.ok:
-        try:
-            entry.checked(options)
-        except ValueError as error:
-            fields.fail("", f"values that do not fit together ({one_line(str(error), 200)})", "values that do")
-        except InputError as error:
-            fields.fail("", f"{error.found} ({error.where})", error.expected)
-    return Chosen(entry, options, str(fields.place)) if fields.ok else None
+def _with_room(data: Mapping[str, object]) -> Mapping[str, object]:
+    """A configuration in which what the room brings has its default."""
+    settings = data.get("settings", {})
+    misspelt = "settings" not in data and any(nearest(key, ["settings"]) for key in data)
+    if misspelt or not isinstance(settings, Mapping):
+        return data
+    return {**data, "settings": {"hearing_threshold": HEARING_THRESHOLD, **settings}}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Settings:
-    """All that ``settings`` says."""
-
-    conductor: ConductorSettings
-    holder: HolderSettings = field(default_factory=HolderSettings)
-    latencies: Latencies = field(default_factory=Latencies)
-    solve: SolveConfig = field(default_factory=SolveConfig)
-
-
-def _settings(top: Fields, simulated: bool) -> _Settings | None:
-    known = [*(key.name for key in SETTING_KEYS), THRESHOLD.name]
-    inner = top.child("settings", known) if top.has("settings") or not simulated else None
-    if inner is None:
-        return _Settings(ConductorSettings(hearing_threshold=HEARING_THRESHOLD)) if simulated else None
-    values = dict(read_keys(SETTING_KEYS, inner, Path()))
-    if inner.has(THRESHOLD.name) or not simulated:
-        values[THRESHOLD.name] = THRESHOLD.read(inner, Path())
-    else:
-        values[THRESHOLD.name] = HEARING_THRESHOLD
-    return inner.build(
-        lambda: _Settings(
-            holder=HolderSettings(
-                values.pop("holder_sigma_mm"),
-                math.radians(values.pop("holder_sigma_deg")),
-                values.pop("holder_least_mm"),
-            ),
-            latencies=Latencies(
-                values.pop("camera_latency_s"), values.pop("pulse_latency_s"), values.pop("holder_latency_s")
-            ),
-            solve=SolveConfig(limit_mm=values.pop("limit_mm")),
-            conductor=ConductorSettings(**values),
-        )
-    )
-
-
-def _limits(top: Fields) -> dict[str, Any]:
-    """As MotionLimits.of_session takes them."""
-    stage = top.raw(Role.STAGE)
-    if not (isinstance(stage, Mapping) and "limits" in stage):
-        return _in_radians({key.name: key.default for key in LIMIT_KEYS})
-    known = [*(key.name for key in LIMIT_KEYS), "sweep_deg"]
-    outer = Fields(stage, tuple(stage), top.at(Role.STAGE), top.problems)
-    inner = outer.child("limits", known)
-    if inner is None:
-        return {}
-    values = _in_radians(read_keys(LIMIT_KEYS, inner, Path()))
-    if inner.has("sweep_deg"):
-        low, high = inner.numbers("sweep_deg", 2, SCAN_DEG)
-        if inner.ok and not low < high:
-            inner.fail("sweep_deg", shown([float(low), float(high)]), "the lower end, then the upper one")
-        values["sweep_rad"] = (math.radians(low), math.radians(high))
-    return values
-
-
-def _in_radians(values: Mapping[str, Any]) -> dict[str, Any]:
-    out = {}
-    for name, value in values.items():
-        if name.endswith("_speed_deg_s"):
-            out[name.removesuffix("_deg_s")] = math.radians(value)
-        elif name.endswith("_deg"):
-            out[name.removesuffix("_deg") + "_rad"] = math.radians(value)
-        else:
-            out[name] = value
-    return out
-
-
-def _check_limits(top: Fields, model: SessionModel, limits: Mapping[str, Any]) -> None:
+def _check_limits(model: SessionModel, limits: Mapping[str, Any]) -> None:
     try:
         MotionLimits.of_session(model.stage, **limits)
+    except FieldError as error:
+        raise FieldError(error.below(Role.STAGE, "limits")) from None
     except ValueError as error:
-        inner = f"{Role.STAGE}.limits" if "sweep" in str(error) else Role.STAGE
-        top.fail(inner, str(error), "limits inside those of session.yaml (stage.limits_deg)")
+        place = (Role.STAGE, "limits") if "sweep" in str(error) else (Role.STAGE,)
+        raise FieldError.of(str(error), "limits inside those of session.yaml (stage.limits_deg)", *place) from None
 
 
-def _check_model(top: Fields, model: SessionModel, devices: Mapping[Role, tuple[Chosen, ...]], aims: int) -> None:
+def _check_model(model: SessionModel, devices: Mapping[Role, tuple[Chosen, ...]], aims: int) -> None:
     """Whether the session.yaml has what a live session needs."""
     needs = {"camera": model.camera, "marker": model.marker}
     for name, part in needs.items():
         if part is None:
             more = ", or calibration files here" if name == "camera" else ""
-            top.fail("session", f"a session.yaml without {name}", f"one with {name}{more}")
+            raise FieldError.of(f"a session.yaml without {name}", f"one with {name}{more}", "session")
     if aims > 0 and model.board is None:
-        top.fail("session", "a session.yaml without board", f"one with board for {aims} aims, or settings.aims: 0")
+        expected = f"one with board for {aims} aims, or settings.aims: 0"
+        raise FieldError.of("a session.yaml without board", expected, "session")
     if model.probe.channels is None and model.probe.image is None:
-        top.fail("session", "a session.yaml without probe.channels and probe.image", "one of them")
+        raise FieldError.of("a session.yaml without probe.channels and probe.image", "one of them", "session")
     options = devices[Role.CAMERA][0].options
-    layout = options.get("layout") or ("separate" if options.get("right") else "mono")
-    if model.camera is not None and model.camera.right is None and "layout" in options and layout != "mono":
-        top.fail(Role.CAMERA, f"the layout {layout} where one camera is calibrated", "a calibration of both cameras")
+    if isinstance(options, EndoscopeOptions) and model.camera is not None and model.camera.right is None:
+        layout = options.layout or ("separate" if options.right else "mono")
+        if layout != "mono":
+            found = f"the layout {layout} where one camera is calibrated"
+            raise FieldError.of(found, "a calibration of both cameras", Role.CAMERA)
 
 
-def _check_ports(top: Fields, devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
+def _connections(devices: Mapping[Role, tuple[Chosen, ...]]) -> Iterator[tuple[str, Connection]]:
+    """Devices that wait for the other side to connect, with their places."""
+    for chosen in (one for several in devices.values() for one in several):
+        if isinstance(chosen.options, Connection) and chosen.options.listen:
+            yield chosen.where, chosen.options
+
+
+def _check_ports(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
     """Two devices cannot listen at one port."""
     taken: dict[int, str] = {}
-    for chosen in (one for several in devices.values() for one in several):
-        if chosen.options.get("listen"):
-            port = chosen.options["port"]
-            if port in taken:
-                top.problems.append(InputError(chosen.where, f"port {port} again", f"a port besides {taken[port]}'s"))
-            taken[port] = chosen.where
+    for where, options in _connections(devices):
+        if options.port in taken:
+            raise InputError(where, f"port {options.port} again", f"a port besides {taken[options.port]}'s")
+        taken[options.port] = where
 
 
 def _open_to_all(devices: Mapping[Role, tuple[Chosen, ...]]) -> list[str]:
     out = []
-    for chosen in (one for several in devices.values() for one in several):
-        host = str(chosen.options.get("host", ""))
-        if chosen.options.get("listen") and not (host.startswith("127.") or host in ("localhost", "::1")):
-            out.append(f"{chosen.where}: listens at {host}: other machines can connect, and no password is asked")
+    for where, options in _connections(devices):
+        if not (options.host.startswith("127.") or options.host in ("localhost", "::1")):
+            out.append(f"{where}: listens at {options.host}: other machines can connect, and no password is asked")
     return out
 
 

@@ -1,74 +1,132 @@
-"""The keys of a CONFIG.yaml that are no driver's, and a commented example of all keys."""
+"""What a CONFIG.yaml of a live session may say, and a commented example of all of it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
 
-from fgreg.drivers.options import REQUIRED, Key, Kind
-from fgreg.drivers.registry import DriverEntry, Role, drivers_of
-from fgreg.session.schema import ANY, Bounds
+from fgreg.config import SolveConfig
+from fgreg.drivers.registry import DriverChoice, DriverEntry, Role, drivers_of
+from fgreg.motion.limits import LIMITS
+from fgreg.operation.conductor import ConductorSettings
+from fgreg.operation.holder import HolderSettings
+from fgreg.pairing import Latencies
+from fgreg.schema.files import ExistingPath
+from fgreg.schema.kinds import Integer, JsonSchema, Kind, ListOf, Number, Text
+from fgreg.schema.record import Field, Inline, Key, record
+from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.simulation.room import BUMP_EVERY_S
 
 LIVE_FORMAT = "fgreg-live/1"
-_DEG_S = Bounds(0.0, 30.0, above=True, unit="deg/s")
+Choice = tuple[DriverEntry, Any]
 
-ROOM_KEYS = (
-    Key("seed", Kind.INTEGER, "of everything random in it", 1, Bounds(0, 2**31 - 1)),
-    Key("bump_every_s", Kind.NUMBER, "mean time between moves of the camera", BUMP_EVERY_S, Bounds(1.0, 1e9, unit="s")),
-    Key("width", Kind.INTEGER, "of its camera's images, px", 640, Bounds(160, 1920)),
-)
-CALIBRATION_KEYS = (
-    Key("left", Kind.FILE, "ROS camera_info, OpenCV FileStorage or Kalibr camchain", example="calibration.yaml"),
-    Key("right", Kind.FILE, "the right camera's, or OpenCV's extrinsics", None, example="right.yaml"),
-    Key("unit", Kind.CHOICE, "of its lengths; m for ROS and Kalibr, mm for OpenCV", None, ANY, ("m", "mm"), "m"),
-    Key(
-        "pictures",
-        Kind.CHOICE,
-        "rectified: they come rectified with it; rectify: do that here",
-        "raw",
-        choices=("raw", "rectified", "rectify"),
-    ),
-    Key("of_fields", Kind.TRUTH, "it is that of the single fields of interlaced frames", False),
-)
-LIMIT_KEYS = (
-    Key("home_speed_deg_s", Kind.NUMBER, "highest speed to the zero position", 10.0, _DEG_S),
-    Key("search_speed_deg_s", Kind.NUMBER, "highest speed of a search", 10.0, _DEG_S),
-    Key("track_speed_deg_s", Kind.NUMBER, "highest speed after the beam", 10.0, _DEG_S),
-    Key("track_sigma_deg", Kind.NUMBER, "least certain answer that is followed", 2.0, Bounds(0.0, 10.0, True, "deg")),
-    Key("marker_age_s", Kind.NUMBER, "oldest marker that is followed", 0.2, Bounds(0.0, 0.2, True, "s")),
-    Key("request_s", Kind.NUMBER, "an operator's request ends after", 600.0, Bounds(1.0, 3600.0, unit="s")),
-)
-"""Besides these: ``sweep_deg``, and what session.yaml says of the stage."""
-SETTING_KEYS = (
-    Key("aims", Kind.INTEGER, "calibration shots", 8, Bounds(0, 1000)),
-    Key("pms", Kind.INTEGER, "PMs after which the stage may follow", 8, Bounds(1, 1000)),
-    Key("most_pms", Kind.INTEGER, "the same where the verdict is a warning", 15, Bounds(1, 1000)),
-    Key("follow", Kind.TRUTH, "whether the stage follows the beam at all", True),
-    Key("holder_sigma_mm", Kind.NUMBER, "of a move, by motion's account", 2.0, Bounds(0.0, 100.0, True, "mm")),
-    Key("holder_sigma_deg", Kind.NUMBER, "the same, of its rotation", 1.0, Bounds(0.0, 30.0, True, "deg")),
-    Key("holder_least_mm", Kind.NUMBER, "a smaller shift of the view is none", 1.0, Bounds(0.0, 10.0, True, "mm")),
-    Key("camera_latency_s", Kind.NUMBER, "from exposure to arrival, at best", 0.0, Bounds(0.0, 1.0, unit="s")),
-    Key("pulse_latency_s", Kind.NUMBER, "from laser pulse to arrival, at best", 0.0, Bounds(0.0, 1.0, unit="s")),
-    Key("holder_latency_s", Kind.NUMBER, "the same of motion's samples", 0.0, Bounds(0.0, 1.0, unit="s")),
-    Key("limit_mm", Kind.NUMBER, "predicted error up to which the verdict is ok", 3.0, Bounds(0.0, 100.0, True, "mm")),
-)
-THRESHOLD = Key(
-    "hearing_threshold",
-    Kind.NUMBER,
-    "least amplitude that counts as heard, in the source's unit",
-    bounds=Bounds(0.0, 1e12, above=True),
-    example="20.0",
-)
 
-_ROLES = {
-    Role.CAMERA: "The endoscope.",
-    Role.PHOTOACOUSTIC: "What the probe hears, once for each laser pulse.",
-    Role.STAGE: "The stage that turns the probe; without it nothing turns.",
-    Role.MOTION: "What the endoscope's holder knows of its motion.",
-    Role.BMODE: "Pictures of a scanner, to show with the rest.",
-    Role.SINKS: "Who is told the registration; any number.",
-    Role.OPERATOR: "Who says what is to be done; a list where there are several.",
-}
+@dataclass(frozen=True, slots=True)
+class RoomOptions:
+    """The simulated room."""
+
+    seed: Annotated[int, Key("of everything random in it", Integer(0, 2**31 - 1))] = 1
+    bump_every_s: Annotated[float, Key("mean time between moves of the camera", Number(1.0, 1e9, unit="s"))] = (
+        BUMP_EVERY_S
+    )
+    width: Annotated[int, Key("of its camera's images, px", Integer(160, 1920))] = 640
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """Files with the endoscope's calibration."""
+
+    left: Annotated[
+        Path, Key("ROS camera_info, OpenCV FileStorage or Kalibr camchain", ExistingPath(), example="calibration.yaml")
+    ]
+    right: Annotated[
+        Path | None,
+        Key("the right camera's, or OpenCV's extrinsics", ExistingPath(), null=True, example="right.yaml"),
+    ] = None
+    unit: Annotated[
+        str | None,
+        Key("of its lengths; m for ROS and Kalibr, mm for OpenCV", Text(allowed=("m", "mm")), null=True, example="m"),
+    ] = None
+    pictures: Annotated[
+        str,
+        Key(
+            "rectified: they come rectified with it; rectify: do that here",
+            Text(allowed=("raw", "rectified", "rectify")),
+        ),
+    ] = "raw"
+    of_fields: Annotated[bool, Key("it is that of the single fields of interlaced frames")] = False
+
+
+@dataclass(frozen=True, slots=True)
+class LiveSettings:
+    """``settings``: of the workflow, the endoscope's holder, the devices, the estimate."""
+
+    conductor: Annotated[ConductorSettings, Inline()]
+    holder: Annotated[HolderSettings, Inline()] = field(default_factory=HolderSettings)
+    latencies: Annotated[Latencies, Inline()] = field(default_factory=Latencies)
+    solve: Annotated[SolveConfig, Inline()] = field(default_factory=SolveConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class OneOrMore(Kind):
+    """One value, or a list of them; a tuple inside."""
+
+    each: Kind
+
+    def read(self, value: object, folder: Path | None = None, /) -> tuple[Any, ...]:
+        if isinstance(value, list):
+            return ListOf(self.each).read(value, folder)
+        return (self.each.read(value, folder),)
+
+    @property
+    def expected(self) -> str:
+        return self.each.expected
+
+    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"anyOf": [self.each.json_schema(definitions), ListOf(self.each).json_schema(definitions)]}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LiveDocument:
+    """A CONFIG.yaml: a driver with its options for each role."""
+
+    session: Annotated[
+        Path | None,
+        Key("how things are set up; copied into the new session's folder", ExistingPath(), example="session.yaml"),
+    ] = None
+    calibration: Annotated[CalibrationOptions | None, Key("of the endoscope, where session.yaml has no camera")] = None
+    room: Annotated[
+        RoomOptions | None,
+        Key("the simulated room: camera, photoacoustic and stage have the driver simulated; no session then"),
+    ] = None
+    camera: Annotated[Choice, Key("The endoscope.", DriverChoice(Role.CAMERA))]
+    photoacoustic: Annotated[
+        Choice, Key("What the probe hears, once for each laser pulse.", DriverChoice(Role.PHOTOACOUSTIC))
+    ]
+    stage: Annotated[
+        Choice | None, Key("The stage that turns the probe; without it nothing turns.", DriverChoice(Role.STAGE))
+    ] = None
+    motion: Annotated[
+        Choice | None, Key("What the endoscope's holder knows of its motion.", DriverChoice(Role.MOTION))
+    ] = None
+    bmode: Annotated[Choice | None, Key("Pictures of a scanner, to show with the rest.", DriverChoice(Role.BMODE))] = (
+        None
+    )
+    sinks: Annotated[
+        tuple[Choice, ...], Key("Who is told the registration; any number.", ListOf(DriverChoice(Role.SINKS)))
+    ] = ()
+    operator: Annotated[
+        tuple[Choice, ...],
+        Key("Who says what is to be done; a list where there are several.", OneOrMore(DriverChoice(Role.OPERATOR))),
+    ] = ()
+    settings: Annotated[LiveSettings, Key("Of the session.")]
+
+
+LIVE = record(LiveDocument, ("format", LIVE_FORMAT))
+"""``CONFIG.yaml``."""
+
 _ABSENT = (Role.MOTION, Role.BMODE)
 """Not in the example but as comments."""
 
@@ -79,27 +137,26 @@ def example_config() -> str:
 
 
 def _lines() -> Iterator[str]:
+    top = {entry.name: entry for entry in LIVE.fields}
     yield "# Devices of a live session: fgreg live CONFIG.yaml; fgreg devices CONFIG.yaml asks each of them."
     yield "# Paths are relative to this file's folder. What is commented out is the default, or an alternative."
     yield f"format: {LIVE_FORMAT}"
-    yield "session: session.yaml  # how things are set up; copied into the new session's folder"
-    yield ""
-    yield "# calibration:  # of the endoscope, where session.yaml has no camera"
-    yield from (f"#   {key.line()}" for key in CALIBRATION_KEYS)
-    yield ""
-    yield "# room:  # the simulated room: camera, photoacoustic and stage have the driver simulated; no session then"
-    yield from (f"#   {key.line()}" for key in ROOM_KEYS)
-    for role, text in _ROLES.items():
+    yield example_line(top["session"]).removesuffix("; may be absent")
+    for name, cls in (("calibration", CalibrationOptions), ("room", RoomOptions)):
         yield ""
-        yield f"# {text}"
+        yield f"# {name}:  # {top[name].key.help}"
+        yield from (f"#   {example_line(entry)}" for entry in record(cls).fields)
+    for role in Role:
+        yield ""
+        yield f"# {top[role].key.help}"
         first, *others = drivers_of(role).values()
         yield from _entry(role, first, commented=role in _ABSENT)
         for other in others:
             yield from _entry(role, other, commented=True)
     yield ""
     yield "settings:"
-    yield f"  {THRESHOLD.line()}"
-    yield from (f"  # {key.line()}" for key in SETTING_KEYS)
+    for entry in record(LiveSettings).fields:
+        yield f"  {'' if entry.required else '# '}{example_line(entry)}"
 
 
 def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
@@ -107,14 +164,35 @@ def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
     extra = f"; pip install 'fgreg[{entry.extra}]'" if entry.extra else ""
     dash, indent = ("- ", "    ") if role is Role.SINKS else ("", "  ")
     lines = [f"{role}:", f"  {dash}driver: {entry.name}  # {entry.help}{extra}"]
-    for key in entry.keys:
-        shown = key.default is REQUIRED or (role is Role.CAMERA and key.name == "right" and not commented)
-        lines.append(f"{indent}{'' if shown else '# '}{key.line()}")
-    if role is Role.STAGE and not commented:
-        lines.append("  limits:  # besides those of session.yaml")
-        lines.append("    # sweep_deg: [-60, 60]  # plane angles that a search may use; all that session.yaml allows")
-        first, *rest = LIMIT_KEYS
-        lines.append(f"    {first.line()}")
-        lines += [f"    # {key.line()}" for key in rest]
+    for key in entry.record.fields:
+        if key.kind is LIMITS:
+            if not commented:
+                lines.append(f"{indent}limits:  # {key.key.help}")
+                lines += [
+                    f"{indent}  {'' if n == 1 else '# '}{example_line(limit)}" for n, limit in enumerate(LIMITS.fields)
+                ]
+            continue
+        given = key.required or (role is Role.CAMERA and key.name == "right" and not commented)
+        lines.append(f"{indent}{'' if given else '# '}{example_line(key)}")
     for line in lines:
         yield f"# {line}" if commented else line
+
+
+def example_line(entry: Field) -> str:
+    """As in an example: ``name: value  # help; default``."""
+    key, kind = entry.key, entry.kind
+    absent = entry.default is MISSING or entry.default is None
+    if key.example and (absent or entry.required):
+        value = key.example
+    else:
+        value = entry.default if isinstance(entry.default, str) else one_line_yaml(kind.write(entry.default))
+    notes = [key.help]
+    if isinstance(kind, Text) and kind.allowed:
+        notes.append(", ".join(kind.allowed))
+    if isinstance(kind, Number) and kind.expected != Number().expected:
+        notes.append(kind.expected)
+    if key.default:
+        notes.append(key.default)
+    elif entry.default is None and key.example:
+        notes.append("may be absent")
+    return f"{entry.name}: {value}  # {'; '.join(notes)}"

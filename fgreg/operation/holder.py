@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from fgreg.drivers.base import MotionSample
 from fgreg.frames import FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform, transform_points
 from fgreg.pairing import DeviceClock
+from fgreg.schema.kinds import Number
+from fgreg.schema.record import Key
 
 REST_S = 0.4
 """At rest means for so long."""
@@ -28,16 +31,24 @@ SEEN_MM = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0], [40.0, 0.0, 100.0], [0.0
 
 @dataclass(frozen=True, slots=True)
 class HolderSettings:
-    """How far the holder is to be believed.
+    """How far the holder is to be believed; sigmas of each axis."""
 
-    Attributes:
-        sigma_mm, sigma_rad: of a whole move as it tells it, each axis.
-        least_mm: a camera that has shifted what it sees by more than this has moved.
-    """
-
-    sigma_mm: float = 2.0
-    sigma_rad: float = math.radians(1.0)
-    least_mm: float = 1.0
+    sigma_mm: Annotated[
+        float,
+        Key("of a move, by motion's account", Number(0.0, 100.0, above=True, unit="mm"), name="holder_sigma_mm"),
+    ] = 2.0
+    sigma_rad: Annotated[
+        float,
+        Key(
+            "the same, of its rotation",
+            Number(0.0, 30.0, above=True, unit="deg", degrees=True),
+            name="holder_sigma_deg",
+        ),
+    ] = math.radians(1.0)
+    least_mm: Annotated[
+        float,
+        Key("a smaller shift of the view is none", Number(0.0, 10.0, above=True, unit="mm"), name="holder_least_mm"),
+    ] = 1.0
 
     def __post_init__(self) -> None:
         for name in ("sigma_mm", "sigma_rad", "least_mm"):

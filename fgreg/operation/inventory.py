@@ -7,18 +7,15 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from fgreg.drivers.base import BmodeFrame, DeviceLost, PaFrame, Stamp, StereoFrame
 from fgreg.drivers.factories import endoscope
-from fgreg.drivers.options import read_keys
-from fgreg.drivers.registry import EXTRAS, Role, Surroundings, distribution, drivers_of, installed, load
+from fgreg.drivers.options import Connection, EndoscopeOptions
+from fgreg.drivers.registry import EXTRAS, Role, Surroundings, distribution, installed, load
 from fgreg.errors import FgregError, MissingExtraError, one_line
 from fgreg.models import SessionModel
 from fgreg.operation.config import Chosen, LiveConfig
-from fgreg.session.safe_yaml import parse_yaml
-from fgreg.session.schema import Fields, Place
 
 LISTEN_S = 2.0
 ENOUGH, ENOUGH_S = 20, 1.0
@@ -67,11 +64,8 @@ def video(listen_s: float = LISTEN_S) -> Iterator[Answer]:
         if listen_s == 0:
             yield Answer("video", "", path, True, label)
             continue
-        source = parse_yaml(f"left: {path}", "video")
-        keys = drivers_of(Role.CAMERA)["endoscope"].keys
-        options = read_keys(keys, Fields(source, tuple(source), Place("video"), []), Path())
         with ExitStack() as stack:
-            device = endoscope(_alone(), **options)
+            device = endoscope(_alone(), EndoscopeOptions(left=path))
             stack.callback(device.close)
             found = _listened(device, None, listen_s)
         yield Answer("video", "", path, found.answers, f"{label}: {found.says}" if label else found.says)
@@ -120,12 +114,14 @@ def _asked(
     name = _name(chosen)
     try:
         if chosen.entry.ask is not None:
-            return name, _Heard(True, load(chosen.entry.ask)(around, **chosen.options))
+            return name, _Heard(True, load(chosen.entry.ask)(around, chosen.options))
         device = chosen.open(around)
         try:
             name = device.name
             if role in (Role.SINKS, Role.OPERATOR):
-                return name, _connected(device, bool(chosen.options.get("listen")), listen_s)
+                return name, _connected(
+                    device, isinstance(chosen.options, Connection) and chosen.options.listen, listen_s
+                )
             return name, _listened(device, model, listen_s)
         finally:
             device.close()
@@ -135,8 +131,8 @@ def _asked(
 
 def _name(chosen: Chosen) -> str:
     """What a device is called before it is opened."""
-    options = chosen.options
-    return str(options.get("port") or options.get("left") or options.get("path") or chosen.entry.help)
+    known = (getattr(chosen.options, name, None) for name in ("port", "left", "path"))
+    return str(next((value for value in known if value), chosen.entry.help))
 
 
 def _connected(device: Any, listens: bool, listen_s: float) -> _Heard:

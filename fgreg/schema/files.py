@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from fgreg.errors import one_line
 from fgreg.schema.kinds import JsonSchema, Kind
 from fgreg.schema.problems import FieldError, shown
 
@@ -61,3 +62,37 @@ class FrameName(Kind):
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
         return {"type": "string", "minLength": 1, "maxLength": _MAX_NAME}
+
+
+@dataclass(frozen=True, slots=True)
+class ExistingPath(Kind):
+    """A file or folder that is there, relative to the document's folder."""
+
+    takes_text = True
+
+    def read(self, value: object, folder: Path | None = None, /) -> Path:
+        if not isinstance(value, str) or not value:
+            raise FieldError.of(shown(value), self.expected)
+        path = (folder or Path()) / value
+        if not exists(path):
+            found = f"nothing at {one_line(str(path), 200)}"
+            raise FieldError.of(found, "a path, relative to this file's folder")
+        return path
+
+    def write(self, value: Path, _folder: Path | None = None, /) -> str:
+        return str(value)
+
+    @property
+    def expected(self) -> str:
+        return "a path"
+
+    def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"type": "string", "minLength": 1}
+
+
+def exists(path: Path) -> bool:
+    """Whether something is at a path; False for names that no file system takes."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.errors import InputError
 from fgreg.frames import RIGID_TOLERANCE, FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
 from fgreg.schema.problems import FieldError, Problem, nearest, shown
 
@@ -216,12 +217,15 @@ class Text(Kind):
 
     def read(self, value: object, _folder: Path | None = None, /) -> str:
         if not isinstance(value, str) or not value:
-            raise FieldError.of(shown(value), self.what)
+            raise FieldError.of(shown(value), self.expected)
         if self.allowed and value not in self.allowed:
             meant = nearest(value, self.allowed)
             raise FieldError.of(shown(value), self.expected + (f" (did you mean {meant}?)" if meant else ""))
         if self.check is not None:
-            self.check(value)
+            try:
+                self.check(value)
+            except InputError as error:
+                raise FieldError.of(error.found, error.expected) from None
         return value if self.enum is None else self.enum(value)
 
     def write(self, value: Any, _folder: Path | None = None, /) -> str:

@@ -63,21 +63,26 @@ def path_text(path: Path) -> str:
     return text
 
 
-def input_error(problem: Problem, file: str, root: object = None, line: int | None = None) -> InputError:
-    """A problem as an error that names the place: ``session.yaml: probe.pitch_mm (line 7)``.
+def place_text(path: Path, file: str, root: object = None, line: int | None = None) -> str:
+    """A place as messages have it: ``session.yaml: probe.pitch_mm (line 7)``.
 
     Args:
-        problem: its path begins at the top of the document.
+        path: from the top of the document.
         file: how messages name the file.
-        root: the document, whose mappings and lists know their lines (fgreg.schema.yaml_loader).
+        root: the document, whose mappings and lists know their lines (fgreg.session.safe_yaml).
         line: of a file with one document per line, which line; shown first.
     """
-    where = path_text(problem.path)
+    where = path_text(path)
     if line is not None:
         where = f"line {line}: {where}" if where else f"line {line}"
-    elif where and (at := _line_of(root, problem.path)) is not None:
+    elif where and (at := _line_of(root, path)) is not None:
         where += f" (line {at})"
-    return InputError(f"{file}: {where}" if where else file, problem.found, problem.expected)
+    return f"{file}: {where}" if where else file
+
+
+def input_error(problem: Problem, file: str, root: object = None, line: int | None = None) -> InputError:
+    """A problem as an error that names the place as :func:`place_text` does."""
+    return InputError(place_text(problem.path, file, root, line), problem.found, problem.expected)
 
 
 def _line_of(node: object, path: Path) -> int | None:

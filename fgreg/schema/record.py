@@ -64,9 +64,14 @@ class NotStored:
     value: object
 
 
+class Inline:
+    """Of a field whose own keys stand in the same mapping: an object made of some of the mapping's keys."""
+
+
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A key of a mapping: its name there, the attribute that it becomes, and whether it has to be there."""
+    """A key of a mapping: its name there, the attribute that it becomes (of ``part``, where that is an object made of
+    some of the mapping's keys), and whether it has to be there."""
 
     name: str
     attribute: str
@@ -74,6 +79,7 @@ class Field:
     required: bool
     default: Any
     key: Key
+    part: str = ""
 
 
 class Record(Kind):
@@ -94,6 +100,7 @@ class Record(Kind):
         self._known = frozenset(self.names)
         self._required = tuple(field for field in self.fields if field.required)
         self._related = tuple(field for field in self.fields if field.key.requires or field.key.required_if)
+        self._parts = {} if fields else dict(_parts(cls))
         self._not_stored = {} if fields else dict(_not_stored(cls))
 
     def read(self, value: object, folder: Path | None = None, /, **given: object) -> Any:
@@ -102,17 +109,25 @@ class Record(Kind):
         problems: list[Problem] = []
         made = None
         try:
-            made = self.cls(**values, **self._not_stored, **given)
+            parts = {name: part.make(values.pop(name, {})) for name, part in self._parts.items()}
+            made = self.make({**values, **parts, **self._not_stored, **given})
         except FieldError as error:
             problems += error.problems
-        except ValueError as error:
-            problems.append(Problem((), f"values that do not fit together ({error})", "values that do"))
         if isinstance(value, Mapping):
             for field in self._related:
                 problems += self._relations(field, value)
         if problems:
             raise FieldError(problems, values)
         return made
+
+    def make(self, values: Mapping[str, Any]) -> Any:
+        """The object of values by attribute. Raises FieldError where they do not fit together."""
+        try:
+            return self.cls(**values)
+        except FieldError:
+            raise
+        except ValueError as error:
+            raise FieldError.of(f"values that do not fit together ({error})", "values that do") from None
 
     def values(self, value: object, folder: Path | None = None, /) -> dict[str, Any]:
         """The values of the keys that are there, by attribute. Raises FieldError with all that is wrong."""
@@ -133,18 +148,17 @@ class Record(Kind):
                     problems.append(Problem((name,), "nothing", field.kind.expected))
                 continue
             entry = value[name]
-            if entry is None and field.key.null:
-                out[field.attribute] = None
-                continue
             if texts and field.kind.takes_text:
                 entry = texts.get(name, entry)
             try:
-                read = field.kind.read(entry, folder)
+                read = None if entry is None and field.key.null else field.kind.read(entry, folder)
             except FieldError as error:
                 problems += error.below(name)
             else:
-                if type(field.kind) is Section:
-                    out.update(read)
+                if not field.attribute:
+                    out.update(read or {})
+                elif field.part:
+                    out.setdefault(field.part, {})[field.attribute] = read
                 else:
                     out[field.attribute] = read
         if problems:
@@ -174,11 +188,11 @@ class Record(Kind):
     def write(self, value: Any, folder: Path | None = None, /) -> dict[str, Any]:
         out: dict[str, Any] = dict(self.constants)
         for field in self.fields:
-            if type(field.kind) is Section:
+            if not field.attribute and isinstance(field.kind, Section):
                 if section := field.kind.write(value, folder):
                     out[field.name] = section
                 continue
-            entry = getattr(value, field.attribute)
+            entry = getattr(getattr(value, field.part) if field.part else value, field.attribute)
             condition = field.key.required_if
             if entry is None:
                 if field.key.null and (condition is None or self._holds(condition, out)):
@@ -298,7 +312,11 @@ def _fields(cls: type) -> Iterator[Field]:
     order: list[Field | str] = []
     for field in dataclasses.fields(cls):
         hint = hints[field.name]
-        key = next((entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Key)), None)
+        metadata = getattr(hint, "__metadata__", ())
+        if any(isinstance(entry, Inline) for entry in metadata):
+            order += [dataclasses.replace(entry, part=field.name) for entry in record(hint.__origin__).fields]
+            continue
+        key = next((entry for entry in metadata if isinstance(entry, Key)), None)
         if key is None:
             continue
         kind = key.kind or kind_of(hint.__origin__)
@@ -326,6 +344,12 @@ def _fields(cls: type) -> Iterator[Field]:
             parts = tuple(sections[entry])
             entry = Field(entry, "", Section(cls, entry, parts), False, None, Key(""))
         yield entry
+
+
+def _parts(cls: type) -> Iterator[tuple[str, Record]]:
+    for name, hint in typing.get_type_hints(cls, include_extras=True).items():
+        if any(isinstance(entry, Inline) for entry in getattr(hint, "__metadata__", ())):
+            yield name, record(hint.__origin__)
 
 
 def _not_stored(cls: type) -> Iterator[tuple[str, object]]:
