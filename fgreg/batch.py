@@ -26,12 +26,12 @@ from fgreg.graph.explicit_solver import newton_step
 from fgreg.graph.explicit_values import PrivateValues, SharedValues, values_at
 from fgreg.graph.reduced_blocks import moved_markers
 from fgreg.graph.shared_state import SharedState
+from fgreg.graph.split_points import logsumexp, odds_in_epoch
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
 from fgreg.registration import Registration, SoundSpeedPrior, register
-from fgreg.steadiness import logsumexp, odds_in_epoch
 from fgreg.surface import fit_surface
 from fgreg.tracking import Snapshot, make_snapshot, track
 from fgreg.verdict import (
@@ -122,7 +122,7 @@ def solve(
         *sampling(posterior.effective),
         *_variable_conditions(centred, sound_speed_prior, config),
     ]
-    steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
+    steady = {k: _move_odds(registration, place) for place, k in enumerate(registration.epochs)}
     epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common, steady)
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
@@ -332,8 +332,8 @@ def _epoch_conditions(
     return found
 
 
-def _steadiness(registration: Registration, place: int) -> list[Condition]:
-    """Whether the PMs kept of one epoch fit one registration, before and after as well."""
+def _move_odds(registration: Registration, place: int) -> list[Condition]:
+    """Whether the inliers of one epoch fit one registration, before and after every split point."""
     pms, log = odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
     if not len(log):
         return []

@@ -23,7 +23,7 @@ from fgreg.graph.reduced import evaluate, log_posterior, refine
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import SharedState, step_between
-from fgreg.steadiness import logsumexp
+from fgreg.graph.split_points import logsumexp
 
 DEGREES_OF_FREEDOM = 6.0
 """Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""

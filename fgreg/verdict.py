@@ -12,10 +12,10 @@ from scipy.special import bdtrc, chdtrc, chdtri
 from fgreg.config import SolveConfig
 from fgreg.estimate import PredictedTre, Verdict, worst_verdict
 from fgreg.frames import BoolArray, FloatArray, hat, inverse, transform_points
+from fgreg.graph.split_points import ALARM
 from fgreg.measurements import Pair
 from fgreg.registration import EpochSearch, Registration
 from fgreg.robust import JUNK_P
-from fgreg.steadiness import ALARM
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
@@ -200,11 +200,11 @@ def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names:
 
 
 def unsteady(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
-    """Odds of a camera move among ``pms`` PMs (fgreg.steadiness), likeliest between two: no registration is of both.
+    """Odds of a camera move among ``pms`` PMs (fgreg.graph.split_points), likeliest between two.
 
-    What they are registered to then lies anywhere between, and the predicted error does not know. Among few PMs neither
-    side of a move tells it well, so it counts where a move somewhere among them is about as likely as none; among many
-    the wrong ones are left out, or found by --detect-moves.
+    No registration is of both sides: what they are registered to lies anywhere between, and the predicted error does
+    not know. Among few PMs neither side of a move tells it well, so it counts where a move somewhere among them is
+    about as likely as none; among many the wrong ones are left out, or found by --detect-moves.
     """
     few, alarm = pms <= FEW_PMS, log_odds > ALARM
     somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1)

@@ -1,5 +1,6 @@
-"""Moves that nobody tells before an epoch's seventh PM: refused or doubted while pairs of both sides are mixed, then
-found, and never taken for one registration.
+"""Unreported moves before an epoch's seventh PM.
+
+Refused or doubted while pairs of both sides are mixed, then found, and never taken for one registration.
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ import numpy as np
 import pytest
 
 from fgreg.batch import solve
-from fgreg.camera_moves.bayes_filter import MoveSettings
+from fgreg.camera_moves.detector import CameraMove, find_camera_move
 from fgreg.config import SolveConfig
 from fgreg.estimate import Verdict
 from fgreg.frames import exp_so3, make_transform
+from fgreg.graph.split_points import ALARM, GATE, logsumexp, odds_in_epoch
 from fgreg.measurements import Measurements
 from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.detect import events_in_order, find_moves, split_epochs
-from fgreg.online.early import EarlyCase, early_test
 from fgreg.registration import register
-from fgreg.steadiness import ALARM, DOUBT, logsumexp, odds_in_epoch
 from fgreg.targets import tre_mm
 from fgreg.verdict import ABOUT_EVEN, FEW_PMS, unsteady
+from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
 from tests.online_streams import untold_move
 
@@ -86,35 +87,44 @@ def test_steady_sessions_raise_no_alarm_and_hardly_a_doubt() -> None:
         assert len(log) == len(pms) - 1
         scores.append(float(logsumexp(log)))
     assert max(scores) < ALARM
-    assert sorted(scores)[4] < DOUBT
+    assert sorted(scores)[4] < GATE
 
 
-def _case(measurements: Measurements, early: int) -> EarlyCase:
-    pairs = tuple((replace(pair, pm=n),) for n, pair in enumerate(measurements.pairs))
-    return EarlyCase(pairs, tuple(range(len(pairs))), early, measurements.aims)
+@pytest.mark.parametrize(("seed", "before"), [(3, 4), (1, 5), (2, 2)])
+def test_early_moves_are_found_by_the_many_pms_after_them(seed: int, before: int) -> None:
+    model, measurements, _ = moved_session(seed, BUMP, before, 12)
+    found = find_camera_move(move_case(measurements, model), model, SolveConfig())
+    assert isinstance(found, CameraMove)
+    assert abs(found.first - before) <= 1
+    assert found.score >= found.log_bayes > ALARM
 
 
-def test_the_first_pms_are_judged_by_the_last_ones() -> None:
-    model, measurements, _, _ = _ran(4)
-    tested = early_test(_case(measurements, 6), model, SolveConfig(), None, MoveSettings())
-    assert tested is not None
-    assert tested.test.alarm
-    assert tested.places == (6, 5, 4, 3, 2, 1)
-    assert tested.places[tested.test.since] == 4
+@pytest.mark.parametrize("split", [4, 12])
+def test_a_move_reads_the_same_in_either_direction_of_time(split: int) -> None:
+    model, measurements, _ = moved_session(3, BUMP, split, 16 - split)
+    case = move_case(measurements, model)
+    back = replace(case, pms=case.pms[::-1], places=tuple(range(16)), inlier=case.inlier[::-1])
+    forward, backward = (find_camera_move(of, model, SolveConfig()) for of in (case, back))
+    assert isinstance(forward, CameraMove)
+    assert isinstance(backward, CameraMove)
+    assert backward.first == 16 - forward.first
+    assert backward.score == pytest.approx(forward.score, abs=1e-6)
 
 
-def test_last_pms_that_are_of_both_sides_judge_nobody() -> None:
-    model, measurements, _, _ = _ran(4)
-    mixed = replace(measurements, pairs=measurements.pairs[:9])
-    assert early_test(_case(mixed, 2), model, SolveConfig(), None, MoveSettings()) is None
+def test_as_few_pms_on_both_sides_as_no_registration_takes_are_not_tested() -> None:
+    model, measurements, _ = moved_session(3, BUMP, 5, 5)
+    assert find_camera_move(move_case(measurements, model), model, SolveConfig()) is None
 
 
-def test_a_steady_epoch_s_first_pms_fit_its_last_ones() -> None:
+def test_without_an_estimate_there_is_nothing_to_test() -> None:
+    model, measurements, _ = moved_session(3, BUMP, 4, 12)
+    case = replace(move_case(measurements, model), state=None, known=None)
+    assert find_camera_move(case, model, SolveConfig()) is None
+
+
+def test_a_steady_epoch_is_left_alone_by_screening() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(41), pairs=14)
-    tested = early_test(_case(measurements, 6), model, SolveConfig(), None, MoveSettings())
-    assert tested is not None
-    assert not tested.test.alarm
-    assert tested.test.score < DOUBT
+    assert find_camera_move(move_case(measurements, model), model, SolveConfig()) is None
 
 
 @pytest.mark.parametrize(

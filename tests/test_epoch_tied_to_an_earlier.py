@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from fgreg.batch import distance_to_explicit
+from fgreg.camera_moves.loop_closure import back_to
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, inverse, make_transform
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
-from fgreg.online.back import back_to
 from fgreg.online.detect import events_in_order, find_epochs, split_epochs
 from fgreg.online.tie import with_motion
 from fgreg.registration import register

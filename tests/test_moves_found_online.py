@@ -15,12 +15,11 @@ from fgreg.estimate import Verdict
 from fgreg.frames import FloatArray, exp_so3, make_transform
 from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
-from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags, evidence
+from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags
 from fgreg.online import engine as engine_module
 from fgreg.online import guard as guard_module
 from fgreg.online import watch as watch_module
 from fgreg.online.detect import events_in_order, find_moves, split_epochs
-from fgreg.online.evidence import MoveCase
 from fgreg.online.numbers import Sink, Source
 from fgreg.targets import tre_mm
 from tests.forward import Truth, make_measurements
@@ -99,23 +98,6 @@ def test_another_kind_of_watch_is_refused() -> None:
         OnlineRegistration(model, watch="often")  # type: ignore[arg-type]
 
 
-def test_a_steady_stream_raises_no_alarm_and_mostly_needs_no_proper_test(monkeypatch: pytest.MonkeyPatch) -> None:
-    cases: list[MoveCase] = []
-    proper = evidence.proper_test
-
-    def counted(case: MoveCase, *rest: object) -> object:
-        cases.append(case)
-        return proper(case, *rest)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(watch_module, "proper_test", counted)
-    model, measurements, _ = make_measurements(np.random.default_rng(31), pairs=60)
-    engine = OnlineRegistration(model, judge=None)
-    for _, event in events_in_order(measurements):
-        engine.add(event)
-    assert engine.moves == ()
-    assert len(cases) < 20
-
-
 def test_pairs_set_aside_as_junk_before_the_alarm_come_back_with_it() -> None:
     model, measurements, _ = untold_move(4, make_transform(np.eye(3), np.array([0.0, 14.0, 0.0])), 10, BEFORE)
     engine = OnlineRegistration(model, judge=None)
@@ -183,7 +165,7 @@ def test_a_test_that_fails_is_told_and_the_estimate_goes_on(monkeypatch: pytest.
     def fails(*_: object) -> None:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(watch_module, "proper_test", fails)
+    monkeypatch.setattr(watch_module, "find_camera_move", fails)
     engine = OnlineRegistration(model, judge=None)
     for _, event in events_in_order(measurements):
         engine.add(event)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 from fgreg.camera_moves.static_tags import (
     TagFrame,
@@ -13,13 +12,11 @@ from fgreg.camera_moves.static_tags import (
     TagSettings,
     TagWatch,
     average_tags,
-    log_bayes_of_motion,
     restart_watch,
     tag_motion,
     watch_tags,
 )
 from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform
-from fgreg.steadiness import default_scales
 
 SIGMA = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.8])
 COVARIANCE = np.diag(SIGMA**2)
@@ -143,21 +140,6 @@ def test_a_slow_creep_is_found_against_the_epochs_start() -> None:
         watch, check = watch_tags(watch, _frame(rng, _moved(tags, creep)), SETTINGS)
         alarm = alarm or check.alarm
     assert alarm
-
-
-def test_a_measured_motion_is_evidence_for_or_against_a_move() -> None:
-    tags = _tags(np.random.default_rng(9))
-    still = tag_motion(_exact(tags), _exact(tags))
-    gone = tag_motion(_exact(tags), _exact(_moved(tags, _motion())))
-    assert still is not None
-    assert gone is not None
-    assert log_bayes_of_motion(still, default_scales()) < 0.0 < log_bayes_of_motion(gone, default_scales())
-
-
-@pytest.mark.parametrize("change", [{"windows": ()}, {"steady_share": 1.5}, {"p": 0.0}, {"reference_frames": 0}])
-def test_settings_that_cannot_be_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="have to be"):
-        TagSettings(**change)  # type: ignore[arg-type]
 
 
 def test_the_threshold_is_the_chi_square_of_its_probability() -> None:

@@ -1,57 +1,54 @@
 """The test for unreported camera moves: over all split points of the current epoch, and for a loop closure.
 
-1. Screening: the closed form of :mod:`fgreg.steadiness` over all split points, outliers included. Where their sum stays
-   below :data:`GATE` the epoch is steady, and that is nearly always.
-2. Full test: the Gaussian-sum filter of :mod:`fgreg.camera_moves.bayes_filter` over the split points that screening
-   leaves. Of each split point the side with more PMs is known first, and those of the other side come one by one:
-   forward in time where it is late, backward where it is early. A move is as likely either way round, its prior has
-   zero mean.
-3. Loop closure: the same filter, about an earlier epoch's registration, with the one split point before the first PM.
+A split point is the first PM after a move. Three steps, of which nearly always only the first is taken:
 
-The score is the log of the sum of the Bayes factors of all split points (Shiryaev, 1963; Roberts, 1966).
+1. Screening, in closed form, over all split points (fgreg.graph.split_points). Outliers take part, since what has
+   happened since a move looks like them. Where the sum of the Bayes factors stays below its gate the epoch is steady.
+2. The full test, by a Gaussian sum filter (fgreg.camera_moves.bayes_filter), over the split points that screening
+   picks. Of each the side with more PMs is known first, and the PMs of the other side follow one by one: forward in
+   time for late moves, backward for early ones. A move is as likely either way round, and its prior has zero mean.
+3. Loop closure: the same filter about an earlier epoch's registration (fgreg.camera_moves.loop_closure).
+
+The score is the log of the sum of the Bayes factors over all split points (Shiryaev, 1963; Roberts, 1966). While
+nothing happens that sum, less the number of PMs, is a martingale: if the model holds, a threshold A on it is passed at
+most once in A PMs on average.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from fgreg.camera_moves.bayes_filter import MoveSettings, check_for_move, relinearisation
-from fgreg.camera_moves.loop_closure import default_return_settings, fits_again, which_epoch
-from fgreg.camera_moves.whitened import (
-    PRIVATE_ROUNDS,
-    Gaussian,
-    gaussian_of,
-    linearise,
-    pivot_scale,
-    pose_columns,
+from fgreg.camera_moves.bayes_filter import MoveSettings, move_evidence, relinearisation
+from fgreg.camera_moves.loop_closure import (
+    CANDIDATES,
+    MIN_LOOKS,
+    MOST_LOOKS,
+    LoopClosureSettings,
+    log_bayes_of_same_place,
 )
+from fgreg.camera_moves.whitened import POSE, gaussian_of, linearise, settled_private
 from fgreg.config import SolveConfig
-from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Contributions, contributions, refine
-from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced import Contributions, contributions
 from fgreg.graph.shared_state import SharedState
+from fgreg.graph.split_points import GATE, log_move_odds, logsumexp
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.registration import SoundSpeedPrior, pack_session, register
+from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import pm_limits
-from fgreg.steadiness import default_scales, log_move_odds, logsumexp
 
 if TYPE_CHECKING:
     from fgreg.online.shared import Quadratic
 
-MIN_BASE = 6
-"""PMs that a registration takes: fewer on both sides of a split point leave nothing that could have moved."""
-GATE = 2.5
-"""Log score by the screening from which the full test is made."""
-MOST_LOOKS = 30
-"""Pairs of an epoch up to which a loop may be closed: by then it knows its registration as well by itself."""
+MIN_KNOWN = 6
+"""PMs that a registration takes: with fewer on either side of a split point there is nothing that could have moved."""
 MARGIN, MOST_SPLITS = 6.0, 24
-"""Split points go to the full test within so much of the best one's log Bayes factor, at most so many."""
+"""The full test takes split points within so much of the best one's log Bayes factor, at most so many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +67,7 @@ class MoveCase:
             None where that is None.
         aims: calibration shots.
         earlier: earlier epochs that a loop may be closed to: registration when each ended, and what was known of it.
+            Empty where the motion since is known.
     """
 
     epoch: int
@@ -107,217 +105,150 @@ class LoopClosure:
     log_bayes: float
 
 
+Pms = Sequence[tuple[Pair, ...]]
+
+
+class Pack(Protocol):
+    """PMs as an epoch of their own, numbered in their order; ``shapes``: with their windows as they are."""
+
+    def __call__(self, pms: Pms, *, shapes: bool) -> PackedProblem: ...
+
+
 def find_camera_move(
     case: MoveCase,
     model: SessionModel,
     config: SolveConfig,
     sound_speed_prior: SoundSpeedPrior | None = None,
     settings: MoveSettings | None = None,
+    closure: LoopClosureSettings | None = None,
 ) -> CameraMove | LoopClosure | None:
     """Whether the camera has moved in the current epoch, or is back where an earlier epoch had it.
 
     Args:
         case: the current epoch.
         model, config, sound_speed_prior: of the session.
-        settings: priors and threshold of a move.
+        settings: priors and threshold of a move. closure: of a loop closure.
     """
-    of = (model, config, sound_speed_prior)
     settings = settings or MoveSettings()
-    if case.state is None or case.known is None:
-        move = _without_estimate(case, *of, settings)
-    else:
-        move = _among_all(case, case.state, case.known, *of, settings)
-    return move or _loop_closure(case, *of)
+    gaussian = replace(config, window_shape=False)
+
+    def packed(pms: Pms, *, shapes: bool) -> PackedProblem:
+        pairs = tuple(replace(pair, pm=number, epoch=0) for number, looks in enumerate(pms) for pair in looks)
+        alone = Measurements((), pairs, (EpochStart(0.0),))
+        return pack_session(alone, model, config if shapes else gaussian, sound_speed_prior)
+
+    move = _camera_move(case, packed, settings)
+    return move or _loop_closure(case, packed, closure or LoopClosureSettings())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Evidence:
-    """Log Bayes factors (C,) of moves at split points (C,), each the index of the first PM after."""
-
-    split: IntArray
-    log_bayes: FloatArray
-
-
-def _found(case: MoveCase, parts: list[_Evidence], settings: MoveSettings) -> CameraMove | None:
-    split = np.concatenate([np.zeros(0, dtype=np.int64), *(part.split for part in parts)])
-    log_bayes = np.concatenate([np.zeros(0), *(part.log_bayes for part in parts)])
-    if not len(split):
+def _camera_move(case: MoveCase, packed: Pack, settings: MoveSettings) -> CameraMove | None:
+    """Screening, and the full test where that asks for it."""
+    count, known = len(case.pms), case.known
+    if known is None or count <= MIN_KNOWN:
         return None
-    score, best = float(logsumexp(log_bayes)), int(np.argmax(log_bayes))
-    if score <= settings.threshold:
-        return None
-    return CameraMove(case.epoch, case.places[split[best]], float(log_bayes[best]), score)
-
-
-def _packed(
-    pms: tuple[tuple[Pair, ...], ...], model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None
-) -> PackedProblem:
-    pairs = tuple(replace(pair, pm=number, epoch=0) for number, looks in enumerate(pms) for pair in looks)
-    return pack_session(Measurements((), pairs, (EpochStart(0.0),)), model, config, prior)
-
-
-# --- where there is an estimate of all PMs ----------------------------------------------------------------------------
-
-
-def _among_all(
-    case: MoveCase,
-    state: SharedState,
-    known: Quadratic,
-    model: SessionModel,
-    config: SolveConfig,
-    prior: SoundSpeedPrior | None,
-    settings: MoveSettings,
-) -> CameraMove | None:
-    if len(case.pms) <= MIN_BASE:
-        return None
-    problem = _packed(case.pms, model, config, prior)
-    private = initial_private(problem, state)
-    for _ in range(PRIVATE_ROUNDS):
-        _, private = refine(problem, state, private)
-    parts = contributions(problem, state, private).pm
+    problem = packed(case.pms, shapes=False)
+    parts = contributions(problem, known.state, settled_private(problem, known.state)).pm
     screened = screening(parts, case.inlier, known, pm_limits(problem))
     if logsumexp(screened) < GATE:
         return None
-    count = len(case.pms)
-    split = 1 + np.argsort(-screened)[:MOST_SPLITS]
-    split = np.sort(split[screened[split - 1] > screened.max() - MARGIN])
-    late = split >= count - split
-    found = []
-    for chosen, backward in ((split[late], False), (split[~late], True)):
-        chosen = chosen[(count - chosen if backward else chosen) >= MIN_BASE]
-        if len(chosen):
-            evidence = _full_test(case, problem, state, known, parts, chosen, settings, backward=backward)
-            if evidence is not None:
-                found.append(evidence)
-    return _found(case, found, settings)
+    before = np.arange(1, count)
+    testable = np.maximum(before, count - before) >= MIN_KNOWN
+    if not testable[np.argmax(screened)]:
+        return None  # what speaks for that split point would be taken for another one
+    likeliest = np.argsort(-screened)[:MOST_SPLITS]
+    splits = np.sort(before[likeliest[testable[likeliest] & (screened[likeliest] > screened.max() - MARGIN)]])
+    late = 2 * splits >= count
+    forward = _full_test(case, known, parts, splits[late], packed, settings)
+    backward = _full_test(case, known, parts, splits[~late], packed, settings, backward=True)
+    log_bayes = np.concatenate([backward, forward])
+    score, best = float(logsumexp(log_bayes)), int(np.argmax(log_bayes))
+    if score <= settings.threshold:
+        return None
+    return CameraMove(case.epoch, case.places[splits[best]], float(log_bayes[best]), score)
 
 
 def screening(parts: Contributions, inlier: BoolArray, known: Quadratic, limit: FloatArray) -> FloatArray:
     """(n - 1,) log Bayes factor of a move before each PM but the first, in closed form.
 
-    Outliers count as well, with the weight that leaves them at their limit (Huber): what has happened since a move
-    looks like them.
+    Outliers take part with the weight that leaves them at their limit (Huber's).
 
     Args:
-        parts: of one hypothesis, about the estimate.
-        inlier: (n,). known: what all else says there. limit: (n,) chi square beyond which a PM is an outlier.
+        parts: what the n PMs add, one hypothesis, at the estimate.
+        inlier: (n,) which count in it.
+        known: what all else says, about it.
+        limit: (n,) chi square beyond which a PM is an outlier.
     """
-    cost, gradient, hessian = parts.cost[0], parts.gradient[0], parts.hessian[0]
-    weight = np.where(inlier, 1.0, np.minimum(limit / np.maximum(cost, 1e-12), 1.0))
-    gradient, hessian = weight[:, None] * gradient, weight[:, None, None] * hessian
-    size = gradient.shape[1]
+    weight = np.where(inlier, 1.0, np.minimum(limit / np.maximum(parts.cost[0], 1e-12), 1.0))
+    gradient, hessian = weight[:, None] * parts.gradient[0], weight[:, None, None] * parts.hessian[0]
     total = known.hessian + hessian.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-30))
-    covariance = np.linalg.inv(total * scale * scale[:, None] + 1e-12 * np.eye(size)) * scale * scale[:, None]
+    covariance = np.linalg.inv(total * scale * scale[:, None] + 1e-12 * np.eye(len(scale))) * scale * scale[:, None]
     step = -covariance @ (known.gradient + gradient.sum(axis=0))
-    pull = -(gradient + hessian @ step)
-    return log_move_odds(hessian, pull, np.asarray(covariance), default_scales(), pose_columns(0))[1:]
+    return log_move_odds(gradient + hessian @ step, hessian, np.asarray(covariance), POSE)
 
 
 def _full_test(
     case: MoveCase,
-    problem: PackedProblem,
-    state: SharedState,
     known: Quadratic,
     parts: Contributions,
-    split: IntArray,
+    splits: IntArray,
+    packed: Pack,
     settings: MoveSettings,
     *,
-    backward: bool,
-) -> _Evidence | None:
-    """The filter over split points (C,), the PMs of one side known first."""
+    backward: bool = False,
+) -> FloatArray:
+    """(C,) log Bayes factors of moves at split points (C,), increasing, by the filter.
+
+    The PMs before all of them are known first, or (``backward``) those after. They are linearised about the estimate of
+    all PMs. Where they leave the registration open nothing speaks for a move.
+    """
+    if not len(splits):
+        return np.zeros(0)
     count = len(case.pms)
     order = np.arange(count)[::-1] if backward else np.arange(count)
-    at = np.sort(count - split if backward else split)
-    base, stream = order[: at[0]], order[at[0] :]
-    counts = case.inlier[base]
-    if counts.sum() < MIN_BASE:
-        counts = np.ones(len(base), dtype=bool)
-    hessian, gradient = (known.hessian, known.gradient) if not backward else _without_pose(known)
-    hessian = hessian + parts.hessian[0, base[counts]].sum(axis=0)
-    gradient = gradient + parts.gradient[0, base[counts]].sum(axis=0)
-    before = gaussian_of(hessian, gradient, pivot_scale(problem.columns))
+    at = count - splits[::-1] if backward else splits
+    first, following = order[: at[0]], order[at[0] :]
+    inlier = case.inlier[first]
+    counting = first[inlier] if inlier.sum() >= MIN_KNOWN else first
+    known = _without_pose(known) if backward else known
+    stream = packed([case.pms[i] for i in following], shapes=True)
+    before = gaussian_of(
+        known.hessian + parts.hessian[0, counting].sum(axis=0),
+        known.gradient + parts.gradient[0, counting].sum(axis=0),
+        stream.columns,
+    )
     if before is None:
-        return None
-    terms = linearise(problem, state).take(stream)
-    again = relinearisation(problem, state)
-    test = check_for_move(
-        before,
-        terms,
-        settings.learned(case.inlier[base]),
-        pose=pose_columns(0),
-        relinearise=lambda steps: again(steps).take(stream),
-    )
-    log_bayes = test.log_bayes[at - at[0]]
-    return _Evidence(order[at] + 1, log_bayes) if backward else _Evidence(order[at], log_bayes)
+        return np.full(len(splits), -np.inf)
+    terms, again = linearise(stream, known.state), relinearisation(stream, known.state)
+    log_bayes = move_evidence(before, terms, at - at[0], settings.learned(inlier), again).log_bayes
+    return log_bayes[::-1] if backward else log_bayes
 
 
-def _without_pose(known: Quadratic) -> tuple[FloatArray, FloatArray]:
-    """Hessian and gradient with the registration eliminated: a prior of it holds for the first PMs only."""
-    pose, size = pose_columns(0), len(known.gradient)
-    rest = np.r_[0 : pose.start, pose.stop : size]
+def _without_pose(known: Quadratic) -> Quadratic:
+    """With the registration eliminated: what was known of it holds for the first PMs only."""
+    size = len(known.gradient)
+    rest = np.r_[0 : POSE.start, POSE.stop : size]
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    own = np.linalg.pinv(known.hessian[pose, pose], hermitian=True)
-    across = known.hessian[rest, pose] @ own
-    hessian[np.ix_(rest, rest)] = known.hessian[np.ix_(rest, rest)] - across @ known.hessian[pose, rest]
-    gradient[rest] = known.gradient[rest] - across @ known.gradient[pose]
-    return hessian, gradient
+    gain = known.hessian[rest, POSE] @ np.linalg.pinv(known.hessian[POSE, POSE], hermitian=True)
+    hessian[np.ix_(rest, rest)] = known.hessian[np.ix_(rest, rest)] - gain @ known.hessian[POSE, rest]
+    gradient[rest] = known.gradient[rest] - gain @ known.gradient[POSE]
+    return replace(known, hessian=hessian, gradient=gradient)
 
 
-# --- where there is none ----------------------------------------------------------------------------------------------
-
-
-def _without_estimate(
-    case: MoveCase, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: MoveSettings
-) -> CameraMove | None:
-    """The first PMs judged by a registration of the last ones, from no guess."""
-    count = len(case.pms)
-    early = min(count - MIN_BASE - 1, MIN_BASE)
-    if early < 1:
-        return None
-    base = tuple(replace(pair, pm=n, epoch=0) for n, pm in enumerate(case.pms[early:]) for pair in pm)
-    try:
-        found = register(Measurements(case.aims, base, (EpochStart(0.0),)), model, config, prior)
-    except EstimationError:
-        return None
-    if found.ambiguous:
-        return None
-    problem, state = _packed(case.pms[:early][::-1], model, config, prior), found.optimum.state
-    test = check_for_move(
-        Gaussian(np.zeros(problem.columns.size), found.covariance),
-        linearise(problem, state),
-        settings.learned(found.shots.pm_kept),
-        pose=pose_columns(0),
-        relinearise=relinearisation(problem, state),
-    )
-    return _found(case, [_Evidence(np.arange(early, 0, -1), test.log_bayes)], settings)
-
-
-# --- loop closure -----------------------------------------------------------------------------------------------------
-
-
-def _loop_closure(
-    case: MoveCase, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None
-) -> LoopClosure | None:
+def _loop_closure(case: MoveCase, packed: Pack, settings: LoopClosureSettings) -> LoopClosure | None:
     """The earlier epoch whose registration fits the current epoch's PMs best, if one does."""
-    settings = default_return_settings()
-    if not (case.earlier and settings.least_pairs <= sum(map(len, case.pms)) <= MOST_LOOKS):
+    if not case.earlier or not MIN_LOOKS <= sum(map(len, case.pms)) <= MOST_LOOKS:
         return None
-    problem = _packed(case.pms, model, config, prior)
-    scale, pose = pivot_scale(problem.columns), pose_columns(0)
-    tests = {}
-    for epoch, (state, known) in case.earlier.items():
-        earlier = gaussian_of(known.hessian, known.gradient, scale)
+    problem = packed(case.pms, shapes=True)
+    best: LoopClosure | None = None
+    for epoch in sorted(case.earlier)[-CANDIDATES:]:
+        state, known = case.earlier[epoch]
+        earlier = gaussian_of(known.hessian, known.gradient, problem.columns)
         if earlier is None:
             continue
-        covariance = earlier.covariance.copy()
-        covariance[pose, pose] += np.diag(np.repeat(settings.tolerance, 3) ** 2)
-        tests[epoch] = fits_again(
-            Gaussian(earlier.mean, covariance),
-            linearise(problem, state),
-            settings,
-            pose=pose,
-            relinearise=relinearisation(problem, state),
+        log_bayes = log_bayes_of_same_place(
+            earlier, linearise(problem, state), settings, relinearisation(problem, state)
         )
-    to = which_epoch(tests)
-    return None if to is None else LoopClosure(case.epoch, to, tests[to].log_bayes)
+        if log_bayes >= settings.accept and (best is None or log_bayes > best.log_bayes):
+            best = LoopClosure(case.epoch, epoch, log_bayes)
+    return best

@@ -1,33 +1,28 @@
-"""Closing the loop: whether the camera went back to where an earlier epoch had it.
+"""Loop closure: whether the camera is back where an earlier epoch had it.
 
-The new epoch's pairs are judged under the earlier epoch's registration (with its uncertainty) against one that is off
-by a prior of scales that starts where re-use would do harm: a nudge below that is no reason to start anew, and the
-test for moves goes on after re-use anyway. Where static tags were seen in both epochs, they decide.
+The current epoch's PMs are judged under the earlier epoch's registration (with its uncertainty, and what a camera put
+back may be off) against one that is elsewhere: the one split point before the first PM. Elsewhere begins where using
+the earlier registration would do harm; a nudge below that is no reason to begin again, and the test for moves goes on.
 """
 
 from __future__ import annotations
 
-import enum
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fgreg.camera_moves.bayes_filter import MoveSettings, Relinearise, check_for_move
-from fgreg.camera_moves.static_tags import TagMotion, log_bayes_of_motion
-from fgreg.camera_moves.whitened import Gaussian, WhiteTerms
-from fgreg.steadiness import MoveScales
+from fgreg.camera_moves.bayes_filter import MoveSettings, Relinearise, move_evidence
+from fgreg.camera_moves.whitened import POSE, Gaussian, WhitenedPms
+from fgreg.graph.split_points import MoveScales
+from fgreg.measurements import EpochStart
 
-SEEN_SIGMAS = 3.0
-"""Differences that matter are seen where they are so many standard deviations of the tags' motion."""
-
-
-class Return(enum.Enum):
-    """What the evidence is good for."""
-
-    SAME = "same"
-    NEW = "new"
-    OPEN = "open"
+MIN_LOOKS, MOST_LOOKS = 8, 30
+"""Looks of the current epoch between which a loop is closed: then it knows its registration as well by itself."""
+MIN_EARLIER = 8
+"""PMs that an earlier epoch has to have for a loop to be closed to it."""
+CANDIDATES = 4
+"""Only so many of the last epochs are asked about."""
 
 
 def elsewhere_scales() -> MoveScales:
@@ -40,99 +35,48 @@ def elsewhere_scales() -> MoveScales:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReturnSettings:
+class LoopClosureSettings:
     """How to decide.
 
     Attributes:
-        elsewhere: prior of the registration's difference where the camera is not back.
-        least_pairs: fewer never re-use an epoch.
-        accept, reject: log Bayes factors of the same place from which it is (or below minus which it is not) re-used;
-            accept by the share of cameras 2 mm or 1 deg off that are taken for back (tools/study_returns.py).
-        junk_probability: of each pair.
-        least_difference: turn (rad) and shift (mm) that matter.
+        elsewhere: prior of the registration's difference where the camera is not back, and of outliers.
+        accept: log Bayes factor of the same place from which it is; by the share of cameras 2 mm or 1 deg off that are
+            taken for back (tools/study_returns.py).
         tolerance: turn (rad) and shift (mm), sigmas, that a camera that is back may be off.
     """
 
-    elsewhere: MoveScales
-    least_pairs: int = 8
+    elsewhere: MoveSettings = field(default_factory=lambda: MoveSettings(elsewhere_scales()))
     accept: float = 4.7
-    reject: float = math.log(100.0)
-    junk_probability: float = 0.04
-    least_difference: tuple[float, float] = (math.radians(1.0), 2.0)
     tolerance: tuple[float, float] = (math.radians(0.15), 0.3)
 
     def __post_init__(self) -> None:
-        if not (self.accept > 0 and self.reject > 0 and self.least_pairs >= 1):
-            raise ValueError("accept and reject have to be > 0, least_pairs >= 1")
+        if not self.accept > 0:
+            raise ValueError(f"accept is {self.accept}, expected a number > 0")
 
 
-@dataclass(frozen=True, slots=True)
-class ReturnTest:
-    """Log Bayes factor of the earlier epoch's registration against another one, and what follows."""
-
-    log_bayes: float
-    decision: Return
-
-
-def fits_again(
-    earlier: Gaussian,
-    terms: WhiteTerms,
-    settings: ReturnSettings,
-    *,
-    pose: slice,
-    relinearise: Relinearise | None = None,
-    tags: TagMotion | None = None,
-) -> ReturnTest:
-    """Whether a new epoch's pairs are of an earlier epoch's registration.
+def log_bayes_of_same_place(
+    earlier: Gaussian, terms: WhitenedPms, settings: LoopClosureSettings, relinearise: Relinearise | None = None
+) -> float:
+    """Log Bayes factor of an earlier epoch's registration for the current epoch's PMs, against elsewhere.
 
     Args:
-        earlier: the shared variables' step given everything before these pairs; ``pose`` that of the earlier epoch.
-        terms: the new epoch's pairs so far, linearised at the earlier epoch's registration; may be none with tags.
-        settings: priors and limits.
-        pose: columns of the earlier epoch's registration.
+        earlier: the shared variables' step given everything before these PMs.
+        terms: these PMs, linearised at the earlier registration.
+        settings: priors.
         relinearise: for large differences.
-        tags: motion of the static tags from the earlier epoch to now, where both saw them.
     """
-    if tags is not None:
-        sure = _sees(tags, settings)
-        return _decided(-log_bayes_of_motion(tags, settings.elsewhere), settings, enough=sure)
-    if terms.count == 0:
-        return ReturnTest(0.0, Return.OPEN)
-    moves = MoveSettings(settings.elsewhere, settings.junk_probability)
-    test = check_for_move(earlier, terms, moves, pose=pose, last=0, relinearise=relinearise)
-    return _decided(-float(test.log_bayes[0]), settings, enough=terms.count >= settings.least_pairs)
+    covariance = earlier.covariance.copy()
+    covariance[POSE, POSE] += _spread(settings)
+    before = replace(earlier, covariance=covariance)
+    return -float(
+        move_evidence(before, terms, np.zeros(1, dtype=np.int64), settings.elsewhere, relinearise).log_bayes[0]
+    )
 
 
-def _sees(tags: TagMotion, settings: ReturnSettings) -> bool:
-    """Whether the tags would show every difference that matters, whichever way it goes."""
-    sigma = np.repeat(settings.least_difference, 3)
-    worst = float(np.linalg.eigvalsh(tags.covariance / np.outer(sigma, sigma))[-1])
-    return worst <= SEEN_SIGMAS**-2
+def back_to(start: EpochStart, epoch: int, settings: LoopClosureSettings | None = None) -> EpochStart:
+    """The start of an epoch in which the camera is where an earlier one had it, within the tolerance."""
+    return EpochStart(start.t, np.eye(4), _spread(settings or LoopClosureSettings()), epoch)
 
 
-def _decided(log_bayes: float, settings: ReturnSettings, *, enough: bool) -> ReturnTest:
-    if enough and log_bayes >= settings.accept:
-        return ReturnTest(log_bayes, Return.SAME)
-    return ReturnTest(log_bayes, Return.NEW if log_bayes <= -settings.reject else Return.OPEN)
-
-
-def which_epoch(tests: dict[int, ReturnTest]) -> int | None:
-    """The earlier epoch to re-use: of those that fit the one that fits best; None where none does."""
-    fitting = {k: t for k, t in tests.items() if t.decision is Return.SAME}
-    return max(fitting, key=lambda k: fitting[k].log_bayes) if fitting else None
-
-
-def default_return_settings() -> ReturnSettings:
-    """Settings that the figures in tools/study_moves.py are for."""
-    return ReturnSettings(elsewhere_scales())
-
-
-__all__ = [
-    "Return",
-    "ReturnSettings",
-    "ReturnTest",
-    "default_return_settings",
-    "elsewhere_scales",
-    "fits_again",
-    "which_epoch",
-]
+def _spread(settings: LoopClosureSettings) -> np.ndarray:
+    return np.diag(np.repeat(settings.tolerance, 3) ** 2)

@@ -15,11 +15,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import chdtri, logsumexp
+from scipy.special import chdtri
 
 from fgreg.frames import BoolArray, FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
 from fgreg.measurements import POSE_FLOOR, usable_covariance
-from fgreg.steadiness import MoveScales
 
 TAG_P = 1e-3
 """A tag that fits a common motion worse than this goes its own way."""
@@ -263,11 +262,3 @@ def restart_watch(watch: TagWatch, frames: int, settings: TagSettings) -> TagWat
     """After an accepted move: the last ``frames`` frames become the reference of the new epoch."""
     reference = watch.recent[-frames:] if frames else ()
     return TagWatch(reference, (), average_tags(reference, settings.steady_share) if reference else {})
-
-
-def log_bayes_of_motion(motion: TagMotion, scales: MoveScales) -> float:
-    """Log Bayes factor of a move by the prior's scales against none, given the measured motion."""
-    step, noise = _difference(np.eye(4), motion.camera_new_T_camera_old), motion.covariance
-    spread = np.concatenate([noise[None], noise + scales.covariance])
-    log = -0.5 * (np.linalg.slogdet(spread)[1] + np.einsum("a,kab,b->k", step, np.linalg.inv(spread), step))
-    return float(logsumexp(log[1:] + np.log(scales.share)) - log[0])

@@ -15,11 +15,13 @@ from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced import Contributions, contributions, evaluate, refine
-from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times, transposed
+from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times
 from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.graph.windows import LEAST_PRECISION
 from fgreg.robust import pm_degrees_of_freedom
 
+POSE = slice(0, 6)
+"""Columns of the registration: problems here are of one epoch."""
 TYPICAL_RAD, TYPICAL_MM = 1e-2, 1.0
 """Steps at which rotations and lengths matter alike: scale of the pivots."""
 LEAST_PIVOT = 1e-14
@@ -44,7 +46,7 @@ class WindowRows:
         there: (n,) which PMs this is for: one look that knows only the window.
         mean, variance: (S, n) rad and rad^2. gain: (S, n, D).
         low, high, soft: (n,) rad.
-        site: (n,) the sigma that stands for the window elsewhere: densities are told in its units.
+        site: (n,) the sigma that stands for the window elsewhere: densities are in its units.
     """
 
     there: BoolArray
@@ -71,8 +73,8 @@ class WindowRows:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WhiteTerms:
-    """n PMs in time order, linearised at S places; steps are all counted from one base point.
+class WhitenedPms:
+    """n PMs, linearised at S places; steps are all counted from one base point.
 
     Attributes:
         residual: (S, n, q), zero in rows that a PM does not have.
@@ -92,26 +94,11 @@ class WhiteTerms:
     def count(self) -> int:
         return int(self.residual.shape[1])
 
-    def last(self, count: int) -> WhiteTerms:
-        """The last ``count`` PMs only."""
-        return self.take(np.arange(self.count)[max(self.count - count, 0) :])
-
-    def take(self, index: IntArray) -> WhiteTerms:
-        """Some of the PMs."""
-        return WhiteTerms(
-            self.residual[:, index],
-            self.jacobian[:, index],
-            self.rest[:, index],
-            self.equations[index],
-            None if self.windows is None else self.windows.take(index),
-        )
-
 
 def pivot_scale(columns: Columns) -> FloatArray:
     """(D,) typical size of each shared variable's step."""
     scale = np.full(columns.size, TYPICAL_RAD)
-    for epoch in range(columns.epochs):
-        scale[6 * epoch + 3 : 6 * epoch + 6] = TYPICAL_MM
+    scale[3:6] = TYPICAL_MM
     scale[columns.beam : columns.beam + 2] = TYPICAL_MM
     if columns.bias is not None:
         scale[columns.bias : columns.bias + 3] = TYPICAL_MM
@@ -120,7 +107,7 @@ def pivot_scale(columns: Columns) -> FloatArray:
     return scale
 
 
-def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: FloatArray | None = None) -> WhiteTerms:
+def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: FloatArray | None = None) -> WhitenedPms:
     """Whitened equations of PMs by Cholesky with pivots, as many rows as there are equations.
 
     Args:
@@ -150,28 +137,16 @@ def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: Floa
     rest = np.maximum(part.cost - np.sum(residual**2, axis=-1), 0.0)
     if at is not None:
         residual = residual - times(jacobian, at[:, None, :])
-    return WhiteTerms(residual, jacobian, rest, equations)
+    return WhitenedPms(residual, jacobian, rest, equations)
 
 
-def linearise(problem: PackedProblem, state: SharedState, base: SharedState | None = None) -> WhiteTerms:
+def linearise(problem: PackedProblem, state: SharedState, base: SharedState | None = None) -> WhitenedPms:
     """The problem's PMs, whitened at S states; steps are counted from ``base`` (one hypothesis; ``state`` where None).
-
-    The private variables are found afresh at each state.
-    """
-    private = initial_private(problem, state)
-    for _ in range(PRIVATE_ROUNDS):
-        _, private = refine(problem, state, private)
-    at = None if base is None else step_between(_repeated(base, state.count), state, problem.columns)
-    return white_terms(problem, state, private, at)
-
-
-def white_terms(
-    problem: PackedProblem, state: SharedState, private: PrivateState, at: FloatArray | None = None
-) -> WhiteTerms:
-    """:func:`linearise` where the private variables are known.
 
     PMs with one look that knows only the window are held by it as the interval it is, where the problem has shapes.
     """
+    private = settled_private(problem, state)
+    at = None if base is None else step_between(_repeated(base, state.count), state, problem.columns)
     equations, scale = pm_degrees_of_freedom(problem), pivot_scale(problem.columns)
     there = window_pms(problem)
     if there is None:
@@ -180,9 +155,16 @@ def white_terms(
     weight = problem.looks.weight.copy()
     weight[look[there], 2, 2] = LEAST_PRECISION
     free = replace(problem, looks=replace(problem.looks, weight=weight))
-    rows = equations - there
-    terms = whiten(contributions(free, state, private).pm, rows, scale, at)
+    terms = whiten(contributions(free, state, private).pm, equations - there, scale, at)
     return replace(terms, equations=equations, windows=_window_rows(free, problem, state, private, there, look, at))
+
+
+def settled_private(problem: PackedProblem, state: SharedState) -> PrivateState:
+    """The private variables of S states, found afresh from the arcs."""
+    private = initial_private(problem, state)
+    for _ in range(PRIVATE_ROUNDS):
+        _, private = refine(problem, state, private)
+    return private
 
 
 def first_looks(problem: PackedProblem) -> IntArray:
@@ -240,8 +222,9 @@ def _repeated(state: SharedState, count: int) -> SharedState:
     return state.take(np.zeros(count, dtype=np.int64)) if state.count != count else state
 
 
-def gaussian_of(hessian: FloatArray, gradient: FloatArray, scale: FloatArray) -> Gaussian | None:
+def gaussian_of(hessian: FloatArray, gradient: FloatArray, columns: Columns) -> Gaussian | None:
     """The Gaussian ``exp(-(d' H d) / 2 - g' d)``; None where H leaves a direction open."""
+    scale = pivot_scale(columns)
     scaled = hessian * scale * scale[:, None]
     root = np.sqrt(np.maximum(np.diag(scaled), 1e-300))
     try:
@@ -251,37 +234,3 @@ def gaussian_of(hessian: FloatArray, gradient: FloatArray, scale: FloatArray) ->
     inverse_lower = np.linalg.inv(lower) / root
     covariance = np.asarray(inverse_lower.T @ inverse_lower * scale * scale[:, None])
     return Gaussian(-covariance @ gradient, covariance)
-
-
-def add_terms(gaussian: Gaussian, terms: WhiteTerms, weight: FloatArray | None = None) -> Gaussian:
-    """The Gaussian with PMs (linearised once) taken in, those of weight zero left out."""
-    mean, covariance = gaussian.mean, gaussian.covariance
-    for j in range(terms.count):
-        if weight is not None and weight[j] == 0.0:
-            continue
-        jacobian = terms.jacobian[0, j]
-        gain = covariance @ jacobian.T
-        spread = np.eye(len(jacobian)) + jacobian @ gain
-        gain = np.linalg.solve(spread, gain.T).T
-        mean = mean - gain @ (terms.residual[0, j] + jacobian @ mean)
-        covariance = covariance - gain @ jacobian @ covariance
-        covariance = 0.5 * (covariance + covariance.T)
-    return Gaussian(mean, covariance)
-
-
-def pose_columns(epoch: int) -> slice:
-    """Where an epoch's registration sits among the shared variables."""
-    return slice(6 * epoch, 6 * epoch + 6)
-
-
-__all__ = [
-    "Gaussian",
-    "WhiteTerms",
-    "add_terms",
-    "gaussian_of",
-    "linearise",
-    "pivot_scale",
-    "pose_columns",
-    "transposed",
-    "whiten",
-]

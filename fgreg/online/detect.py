@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from fgreg.camera_moves.loop_closure import back_to
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.measurements import EpochStart, Measurements
 from fgreg.models import SessionModel
-from fgreg.online.back import back_to
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
 from fgreg.registration import SoundSpeedPrior

@@ -22,13 +22,14 @@ import gtsam
 import numpy as np
 
 from fgreg.batch import Solution
+from fgreg.camera_moves.detector import LoopClosure
+from fgreg.camera_moves.loop_closure import back_to
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.frames import FloatArray, make_transform, rotation_to_direction
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
-from fgreg.online.back import ReturnFound, back_to
 from fgreg.online.checks import check
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
@@ -161,7 +162,7 @@ class OnlineRegistration:
         elif isinstance(event, CameraMoved) and event.detected and event.since_t is not None:
             self._note_move(before, state.now.first, event.since_t, event.t, None, recorded=True)
         elif isinstance(event, Pair):
-            self._guard.look(state, self._serial, self._tools.store)
+            self._guard.look(state, self._tools.store)
             moved = self._adopt_found(event.t) or moved
         self._consult(ask=moved or isinstance(said, TagsRest) or isinstance(event, Pair | Aim))
         return self._estimate
@@ -223,7 +224,7 @@ class OnlineRegistration:
         found = self._guard.found(before)
         if found is None:
             return False
-        if isinstance(found, ReturnFound):
+        if isinstance(found, LoopClosure):
             return self._go_back(found, t)
         since_t = self._tools.store.time(found.first)
         try:
@@ -235,7 +236,7 @@ class OnlineRegistration:
         self._note_move(before, found.first, since_t, t, found.log_bayes)
         return True
 
-    def _go_back(self, found: ReturnFound, t: float) -> bool:
+    def _go_back(self, found: LoopClosure, t: float) -> bool:
         before = self._state
         start = back_to(before.now.start, found.to)
         try:
@@ -293,7 +294,7 @@ class OnlineRegistration:
             yield
         finally:
             self._judge = usual
-        if self._guard.resume(self._state, self._serial, self._tools.store):
+        if self._guard.resume(self._state, self._tools.store):
             self._adopt_found(self._t)
         case = deferred.case
         if case is None and usual is not None and self._serial and (self._judgement is None or not self._on_schedule):

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from typing import Literal
 
+from fgreg.camera_moves.detector import LoopClosure, MoveCase
+from fgreg.camera_moves.loop_closure import CANDIDATES, MIN_EARLIER, MIN_LOOKS, MOST_LOOKS
 from fgreg.camera_moves.static_tags import TagSettings
 from fgreg.config import SolveConfig
+from fgreg.graph.shared_state import SharedState
 from fgreg.models import SessionModel
-from fgreg.online.back import ReturnFound, return_case
-from fgreg.online.early import early_case
 from fgreg.online.events import StaticTags
-from fgreg.online.evidence import GATE, move_case
-from fgreg.online.state import Setting, State
+from fgreg.online.shared import Quadratic
+from fgreg.online.state import NOTHING, Setting, State, kept_by_place, passed_from, summary
 from fgreg.online.store import MeasurementStore
 from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
-from fgreg.online.updates import FEW_PAIRS
-from fgreg.online.watch import Case, Found, InlineWatch, ProcessWatch, Watch, WatchSettings
+from fgreg.online.watch import Found, InlineWatch, ProcessWatch, Watch
 from fgreg.registration import SoundSpeedPrior
 
 WatchKind = Literal["inline", "process"]
@@ -44,14 +44,13 @@ class MoveGuard:
     ) -> None:
         if kind not in ("inline", "process", None):
             raise ValueError(f"watch is {kind!r}, expected 'inline', 'process' or None")
-        self._settings, self._tag_settings, self._setting = WatchSettings(), TagSettings(), setting
+        self._tag_settings, self._setting = TagSettings(), setting
         self._watch: Watch | None = None
         if kind is not None:
             make = InlineWatch if kind == "inline" else ProcessWatch
-            self._watch = make(model, config, sound_speed, self._settings)
+            self._watch = make(model, config, sound_speed)
         self._tags = TagGuard()
         self._paused = False
-        self._score: float | None = None
         self._failure = ""
 
     @property
@@ -59,41 +58,24 @@ class MoveGuard:
         """Why nothing is watched though it should be; empty where it is."""
         return "" if self._watch is None else self._failure or self._watch.failure
 
-    def look(self, state: State, serial: int, store: MeasurementStore) -> None:
-        """A pair more: ask for the proper tests where the cheap look says so, and while the epoch is young."""
-        if self._watch is None or self._paused:
+    def look(self, state: State, store: MeasurementStore) -> None:
+        """A pair more: test the epoch."""
+        if self._watch is None or self._paused or not state.epoch_pairs:
             return
         try:
-            move = None
-            if self._may_look_moved(state):
-                move, self._score = move_case(state, serial, self._setting, self._settings.moves)
-            early = early_case(state, self._setting, store, self._settings.moves)
-            back = return_case(state, self._setting, store, self._settings.returns)
-            if move is not None or early is not None or back is not None:
-                self._watch.ask(Case(state.epoch, move, early, back))
+            self._watch.ask(move_case(state, self._setting, store))
             self._failure = ""
         except Exception as error:  # the pair is in the estimate, whatever becomes of the look at it
-            self._failure, self._score = f"{type(error).__name__}: {error}", None
-
-    def _may_look_moved(self, state: State) -> bool:
-        """Whether a look could show more than the gate: a pair adds at most half its NIS to the log of any move's odds.
-
-        The odds of a move before it are those of none, so the sum of all grows to at most (sum + 1) times that. Among
-        few pairs others may be judged anew with it, and then that is no limit.
-        """
-        if state.nis is None or not state.used or self._score is None or state.epoch_pairs <= FEW_PAIRS:
-            return True
-        self._score = math.log1p(math.exp(min(self._score, 50.0))) + 0.5 * state.nis
-        return self._score >= GATE
+            self._failure = f"{type(error).__name__}: {error}"
 
     def pause(self) -> None:
         """Look at nothing for a while."""
         self._paused = True
 
-    def resume(self, state: State, serial: int, store: MeasurementStore) -> bool:
+    def resume(self, state: State, store: MeasurementStore) -> bool:
         """Look again, at once; whether there was something to look at."""
         self._paused = False
-        self.look(state, serial, store)
+        self.look(state, store)
         return self._watch is not None
 
     def found(self, state: State) -> Found | None:
@@ -101,7 +83,7 @@ class MoveGuard:
         found = None if self._watch is None else self._watch.answer()
         if found is None or found.epoch != state.epoch:
             return None
-        if isinstance(found, ReturnFound):
+        if isinstance(found, LoopClosure):
             return None if state.now.start.motion_known else found
         return found if state.now.first < found.first < state.pairs else None
 
@@ -115,7 +97,6 @@ class MoveGuard:
 
     def epoch_began(self, *, by_tags: bool = False) -> None:
         """Another epoch: what was asked of the old one does not count; tags are compared with those seen from now."""
-        self._score = None
         if self._watch is not None:
             self._watch.forget()
         if not by_tags:
@@ -126,3 +107,36 @@ class MoveGuard:
         if self._watch is not None:
             self._watch.close()
             self._watch = None
+
+
+def move_case(state: State, setting: Setting, store: MeasurementStore) -> MoveCase:
+    """The current epoch as the test takes it."""
+    looks: dict[int, list[int]] = {}
+    for place in range(state.now.first, state.pairs):
+        looks.setdefault(store.number(place), []).append(place)
+    kept = kept_by_place(state)
+    window = None if state.is_open else state.window
+    return MoveCase(
+        epoch=state.epoch,
+        pms=tuple(store.pairs(places, 0) for places in looks.values()),
+        places=tuple(places[0] for places in looks.values()),
+        inlier=kept[[places[0] for places in looks.values()]],
+        state=None if window is None else window.state,
+        known=None if window is None else summary(state.with_now(shelf=NOTHING), window.state, setting),
+        aims=tuple(store.aims),
+        earlier=_earlier(state, setting),
+    )
+
+
+def _earlier(state: State, setting: Setting) -> dict[int, tuple[SharedState, Quadratic]]:
+    """Earlier epochs' shared variables, and what was known of them when they ended."""
+    found: dict[int, tuple[SharedState, Quadratic]] = {}
+    if state.now.start.motion_known or not MIN_LOOKS <= state.epoch_pairs <= MOST_LOOKS:
+        return found
+    for epoch in range(max(0, state.epoch - CANDIDATES), state.epoch):
+        data, until = state.epochs[epoch], state.epochs[: epoch + 1]
+        if data.state is not None and sum(len(chunk.kept) for chunk in data.shelf.chunks) >= MIN_EARLIER:
+            passed, _ = passed_from(until, data.state, setting.columns)
+            then = replace(state, epochs=until, passed=passed)
+            found[epoch] = data.state, summary(then, data.state, setting)
+    return found

@@ -1,4 +1,4 @@
-"""The watch for untold moves: the proper test, made beside the estimate.
+"""The camera-move detector beside the estimate.
 
 ``inline`` makes it at once: the same events give the same epochs (tests, replay, recorded sessions). ``process`` makes
 it in a process of its own, some 10 ms later; its alarm is adopted with the next event. That loses nothing, since the
@@ -7,54 +7,16 @@ pairs from the move on are given to the new epoch anyhow.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Protocol
 
-from fgreg.camera_moves.bayes_filter import MoveSettings
-from fgreg.camera_moves.loop_closure import ReturnSettings, default_return_settings
+from fgreg.camera_moves.detector import CameraMove, LoopClosure, MoveCase, find_camera_move
 from fgreg.config import SolveConfig
 from fgreg.models import SessionModel
-from fgreg.online.back import ReturnCase, ReturnFound, return_tests, returned_by
-from fgreg.online.early import EarlyCase, early_test
-from fgreg.online.evidence import MoveCase, MoveFound, found_by, proper_test, tested_last
 from fgreg.registration import SoundSpeedPrior
 from fgreg.workers.worker_process import Work, WorkerProcess
 
-Found = MoveFound | ReturnFound
-
-
-@dataclass(frozen=True, slots=True)
-class WatchSettings:
-    """How to test: for moves, and for the camera being back where it was."""
-
-    moves: MoveSettings = field(default_factory=MoveSettings)
-    returns: ReturnSettings = field(default_factory=default_return_settings)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Case:
-    """What is to be tested after a pair of an epoch; a return is not asked about where the camera has just moved."""
-
-    epoch: int
-    move: MoveCase | None
-    early: EarlyCase | None
-    back: ReturnCase | None
-
-
-def tested(
-    case: Case, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: WatchSettings
-) -> Found | None:
-    """What the tests of a case find."""
-    of = (model, config, prior, settings.moves)
-    last = None if case.move is None else tested_last(case.move, proper_test(case.move, *of))
-    first = None if case.early is None else early_test(case.early, *of)
-    found = found_by(case.epoch, [test for test in (first, last) if test is not None], settings.moves.threshold)
-    if found is not None:
-        return found
-    if case.back is None:
-        return None
-    return returned_by(case.back, return_tests(case.back, model, config, prior, settings.returns))
+Found = CameraMove | LoopClosure
 
 
 class Watch(Protocol):
@@ -66,7 +28,7 @@ class Watch(Protocol):
     @property
     def failure(self) -> str: ...
 
-    def ask(self, case: Case) -> None:
+    def ask(self, case: MoveCase) -> None:
         """Here is something to be tested."""
 
     def answer(self) -> Found | None:
@@ -82,17 +44,15 @@ class Watch(Protocol):
 class InlineWatch:
     """Tests at once."""
 
-    def __init__(
-        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: WatchSettings
-    ) -> None:
-        self._of = (model, config, sound_speed, settings)
+    def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
+        self._of = (model, config, sound_speed)
         self._found: Found | None = None
         self.failure = ""
 
-    def ask(self, case: Case) -> None:
+    def ask(self, case: MoveCase) -> None:
         """Test now."""
         try:
-            self._found, self.failure = tested(case, *self._of), ""
+            self._found, self.failure = find_camera_move(case, *self._of), ""
         except Exception as error:  # the estimate stands without the test
             self.failure = f"{type(error).__name__}: {error}"
 
@@ -109,23 +69,19 @@ class InlineWatch:
         """Nothing to stop."""
 
 
-def _testing(
-    model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None, settings: WatchSettings
-) -> Work[Case, Found | None]:
-    return partial(tested, model=model, config=config, prior=prior, settings=settings)
+def _testing(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> Work[MoveCase, Found | None]:
+    return partial(find_camera_move, model=model, config=config, sound_speed_prior=prior)
 
 
 class ProcessWatch:
     """Tests in a worker process; what comes while it is busy waits, and only the latest of that is tested."""
 
-    def __init__(
-        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, settings: WatchSettings
-    ) -> None:
-        of = (model, config, sound_speed, settings)
-        self._worker: WorkerProcess[Case, Found | None] = WorkerProcess(
+    def __init__(self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> None:
+        of = (model, config, sound_speed)
+        self._worker: WorkerProcess[MoveCase, Found | None] = WorkerProcess(
             _testing, *of, name="fgreg-watch", what="the watching process"
         )
-        self._waiting: Case | None = None
+        self._waiting: MoveCase | None = None
         self._stale = False
 
     @property
@@ -133,7 +89,7 @@ class ProcessWatch:
         """Why the last case could not be tested."""
         return self._worker.failure
 
-    def ask(self, case: Case) -> None:
+    def ask(self, case: MoveCase) -> None:
         """Send the case, as soon as the process is idle."""
         self._waiting = case
         if not self._worker.busy:

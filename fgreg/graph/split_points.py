@@ -1,13 +1,13 @@
-"""Whether PMs in a row agree on one registration, or rather on two: odds of a camera move among them, in closed form.
+"""Odds that the PMs of one camera epoch are of two registrations, by split point and in closed form: screening.
 
-Of Gaussians throughout: no junk, no windows, no large moves. With everything known so far, the last PMs in it, a move
-of prior covariance S before PM j has the Bayes factor
+A split point is the first PM after an unreported camera move. Everything is Gaussian here, and each move small enough
+to be linear. Given all PMs, a move of prior covariance S at a split point has the Bayes factor, against none,
 
     |1 + S F|^(-1/2) exp(h' (1 + S F)^(-1) S h / 2),
 
-F the information that the PMs from j on have on the move, the shared variables free, and h their pull. Neither side of
-the move has to know a registration by itself. The sum over all j grows by one per PM on average while nothing happens,
-so it seldom passes a threshold (Shiryaev, 1963; Roberts, 1966).
+F the information that the PMs from there on have on the move with the shared variables free, and h their pull. Neither
+side of the move has to know a registration by itself. The sum over all split points grows by one per PM on average
+while nothing happens, so it seldom passes a threshold (Shiryaev, 1963; Roberts, 1966).
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced import pm_contributions
 from fgreg.graph.reduced_solver import Optimum
 
-DOUBT = 2.5
-"""Log of that sum from which a move is to be reckoned with."""
+GATE = 2.5
+"""Log of that sum from which a move is possible and the full test (fgreg.camera_moves) is worth its time."""
 ALARM = 5.4
-"""Log score of an alarm: one in several thousand clean pairs (tools/study_moves.py), and more than one odd pair has."""
+"""Log of that sum from which a move is certain: reached once in several thousand steady pairs (tools/study_moves.py),
+and never by one outlier."""
 
 _SIX = np.arange(6)
 
@@ -69,18 +70,20 @@ def default_scales() -> MoveScales:
 
 
 def log_move_odds(
-    hessian: FloatArray, pull: FloatArray, covariance: FloatArray, scales: MoveScales, pose: slice
+    gradient: FloatArray, hessian: FloatArray, covariance: FloatArray, pose: slice, scales: MoveScales | None = None
 ) -> FloatArray:
-    """(n,) log Bayes factor of a move before each of n PMs, oldest first, against none.
+    """(n - 1,) log Bayes factor of a move before each of n PMs but the first, against none.
 
     Args:
-        hessian, pull: (n, D, D), (n, D) of each PM's half chi square and its negative gradient, at the optimum of all.
+        gradient, hessian: (n, D), (n, D, D) of half the chi square of each PM, in the order of time, at the optimum of
+            all.
         covariance: (D, D) of the shared variables, given all.
-        scales: prior of the move.
         pose: columns of the registration.
+        scales: prior of the move.
     """
-    hessian, pull = np.cumsum(hessian[::-1], axis=0)[::-1], np.cumsum(pull[::-1], axis=0)[::-1, pose]
-    across = hessian[:, pose, :]
+    scales = scales or default_scales()
+    across = np.cumsum(hessian[::-1, pose], axis=0)[-2::-1]
+    pull = -np.cumsum(gradient[::-1, pose], axis=0)[-2::-1]
     information = across[:, :, pose] - across @ covariance @ np.swapaxes(across, -1, -2)
     return logsumexp(_log_factors(scales.covariance, information, pull) + np.log(scales.share), axis=1)
 
@@ -88,18 +91,17 @@ def log_move_odds(
 def odds_in_epoch(
     problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
 ) -> tuple[tuple[int, ...], FloatArray]:
-    """A registration's own odds: the PMs of one epoch in the order of the problem, which is that of time, and
-    :func:`log_move_odds` (n - 1,) of a move before each but the first.
+    """The n PMs of one epoch of a registration, in the order of time, and :func:`log_move_odds` (n - 1,) of them.
 
     Args:
-        problem: of the PMs that count. optimum: one hypothesis. covariance: (D, D) there.
+        problem: of the inliers. optimum: one hypothesis. covariance: (D, D) there.
         epoch: of ``problem.columns``.
     """
     mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
     parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
     pose = slice(6 * epoch, 6 * epoch + 6)
-    log = log_move_odds(parts.hessian[mine], -parts.gradient[mine], covariance, default_scales(), pose)
-    return tuple(problem.pms[pm] for pm in mine), log[1:]
+    log = log_move_odds(parts.gradient[mine], parts.hessian[mine], covariance, pose)
+    return tuple(problem.pms[pm] for pm in mine), log
 
 
 def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:
