@@ -20,6 +20,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +28,9 @@ from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.errors import InputError
 from fgreg.frames import FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
 from fgreg.models import CameraModel, StereoRig
+from fgreg.schema.kinds import Integer, Kind, Matrix, Numbers, Text
+from fgreg.schema.problems import FieldError, Problem, input_error, shown
 from fgreg.session.safe_yaml import load_yaml, read_bounded
-from fgreg.session.schema import Fields, Place, shown
 
 MM_PER = {"m": 1000.0, "mm": 1.0}
 """Units that a calibration's lengths can have."""
@@ -201,43 +203,33 @@ def _checked(rig: StereoRig, name: str, unit: str) -> Calibration:
 
 def _camera_info(document: Mapping[str, object], name: str) -> CameraInfo:
     """A ``camera_info`` file: of camera_calibration (nested matrices) or an echoed message (flat lists)."""
-    problems: list[InputError] = []
-    fields = Fields(document, tuple(document), Place(name), problems)
-    nested = fields.has("camera_matrix")
-    if not nested and not (fields.has("k") or fields.has("K")):
+    file = _Values(document, name)
+    nested = "camera_matrix" in document
+    if not nested and not ("k" in document or "K" in document):
         kinds = "ROS camera_info, OpenCV FileStorage or Kalibr camchain"
         raise InputError(name, "no camera_matrix, K or cam0", f"a calibration: {kinds}")
-    width, height = (fields.integer(f"image_{key}" if nested else key, 1, 32768) for key in ("width", "height"))
+    width, height = (file.read(Integer(1, 32768), f"image_{key}" if nested else key) for key in ("width", "height"))
 
-    def matrix(long: str, letter: str, count: int | None) -> FloatArray:
-        if nested:
-            inner = fields.child(long, ("rows", "cols", "data"))
-            return as_float_array([]) if inner is None else _data(inner, count)
-        key = letter if fields.has(letter) else letter.upper()
-        if count is None and fields.raw(key) == []:
-            return as_float_array([])
-        return fields.numbers(key, count)
+    def matrix(long: str, letter: str, kind: Kind) -> FloatArray:
+        key = letter if letter in document else letter.upper()
+        values: FloatArray = file.read(kind, long, "data") if nested else file.read(kind, key)
+        return values
 
-    model = fields.text("distortion_model", "the name of a distortion model", default="plumb_bob")
-    k, d = matrix("camera_matrix", "k", 9), matrix("distortion_coefficients", "d", None)
-    r, p = matrix("rectification_matrix", "r", 9), matrix("projection_matrix", "p", 12)
-    _refuse_cropped(fields, (width, height))
-    if problems:
-        raise problems[0]
+    k, r = (matrix(long, short, Numbers(9)) for long, short in (("camera_matrix", "k"), ("rectification_matrix", "r")))
+    d, p = matrix("distortion_coefficients", "d", _PARAMETERS), matrix("projection_matrix", "p", Numbers(12))
+    model = file.read(Text("the name of a distortion model"), "distortion_model", default="plumb_bob")
+    _refuse_cropped(file, (width, height))
     return CameraInfo(name, (width, height), k.reshape(3, 3), d, model, r.reshape(3, 3), p.reshape(3, 4))
 
 
-def _data(fields: Fields, count: int | None) -> FloatArray:
-    return as_float_array([]) if count is None and fields.raw("data") == [] else fields.numbers("data", count)
-
-
-def _refuse_cropped(fields: Fields, size: tuple[int, int]) -> None:
+def _refuse_cropped(file: _Values, size: tuple[int, int]) -> None:
     for key in ("binning_x", "binning_y"):
-        if fields.raw(key) not in (None, 0, 1):
-            fields.fail(key, shown(fields.raw(key)), "0 or 1: images without binning")
-    roi = fields.raw("roi")
+        found = file.document.get(key)
+        if found not in (None, 0, 1):
+            raise file.error(shown(found), "0 or 1: images without binning", key)
+    roi = file.document.get("roi")
     if isinstance(roi, Mapping) and (roi.get("width") or 0, roi.get("height") or 0) not in ((0, 0), size):
-        fields.fail("roi", "a part of the image", "the whole image")
+        raise file.error("a part of the image", "the whole image", "roi")
 
 
 # OpenCV FileStorage
@@ -350,51 +342,70 @@ def _whole(width: float, height: float, where: str) -> tuple[int, int]:
 
 
 def _from_kalibr(document: Mapping[str, object], name: str, mm_per_unit: float) -> StereoRig:
-    problems: list[InputError] = []
-    top = Fields(document, tuple(document), Place(name), problems)
+    file = _Values(document, name)
     if any(key.startswith("cam") and key not in ("cam0", "cam1") for key in document):
         raise InputError(name, "more than two cameras", "cam0, the left one, and cam1, the right one")
-    cameras = []
-    for key in ("cam0", "cam1")[: 1 + top.has("cam1")]:
-        value = top.raw(key)
-        known = tuple(value) if isinstance(value, Mapping) else ("intrinsics", "resolution")
-        fields = top.child(key, known)
-        if fields is None:
-            break
-        cameras.append(_kalibr_camera(fields, name, key))
-    right_T_left = None
-    if len(cameras) == 2:
-        inner = top.raw("cam1")
-        known = tuple(inner) if isinstance(inner, Mapping) else ()
-        fields = Fields(inner if isinstance(inner, Mapping) else {}, known, Place(name, "cam1"), problems)
-        matrix = fields.matrix("T_cn_cnm1", 4)
-        if matrix is not None and not is_rigid(matrix, _ROTATION_TOLERANCE):
-            fields.fail("T_cn_cnm1", "a matrix that is not rigid", "the transform from cam0 to cam1")
-        elif matrix is not None:
-            right_T_left = make_transform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3] * mm_per_unit)
-    if problems:
-        raise problems[0]
-    if right_T_left is None:
-        return StereoRig(cameras[0])
-    if cameras[0].image_size != cameras[1].image_size:
+    left = _kalibr_camera(file, "cam0")
+    if "cam1" not in document:
+        return StereoRig(left)
+    right = _kalibr_camera(file, "cam1")
+    matrix = file.read(Matrix(4), "cam1", "T_cn_cnm1")
+    if not is_rigid(matrix, _ROTATION_TOLERANCE):
+        raise file.error("a matrix that is not rigid", "the transform from cam0 to cam1", "cam1", "T_cn_cnm1")
+    if left.image_size != right.image_size:
         raise InputError(f"{name}: cam1.resolution", "another one than cam0's", "two cameras of one size")
-    return StereoRig(cameras[0], cameras[1], as_float_array(right_T_left))
+    right_T_left = make_transform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3] * mm_per_unit)
+    return StereoRig(left, right, as_float_array(right_T_left))
 
 
-def _kalibr_camera(fields: Fields, name: str, key: str) -> CameraModel:
-    before = len(fields.problems)
-    model = fields.text("camera_model", "pinhole", default="pinhole")
-    if model != "pinhole":
-        fields.fail("camera_model", shown(model), "pinhole")
-    intrinsics = fields.numbers("intrinsics", 4)
-    resolution = fields.numbers("resolution", 2)
-    distortion_model = fields.text("distortion_model", "radtan", default="none")
-    has = fields.has("distortion_coeffs") and fields.raw("distortion_coeffs") != []
-    distortion = fields.numbers("distortion_coeffs", None) if has else np.zeros(0)
-    if len(fields.problems) > before:
-        raise fields.problems[before]
-    fu, fv, pu, pv = (float(v) for v in intrinsics)
+def _kalibr_camera(file: _Values, key: str) -> CameraModel:
+    file.read(Text(allowed=("pinhole",)), key, "camera_model", default="pinhole")
+    fu, fv, pu, pv = file.read(Numbers(4), key, "intrinsics")
+    width, height = file.read(Numbers(2), key, "resolution")
+    distortion_model = file.read(Text("radtan"), key, "distortion_model", default="none")
+    distortion = file.read(_PARAMETERS, key, "distortion_coeffs", default=np.zeros(0))
     matrix = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
-    size = _whole(float(resolution[0]), float(resolution[1]), f"{name}: {key}.resolution")
-    parameters = five_parameters(distortion, distortion_model, f"{name}: {key}.distortion_coeffs")
-    return _camera(size, matrix, parameters, f"{name}: {key}.intrinsics")
+    size = _whole(float(width), float(height), f"{file.name}: {key}.resolution")
+    parameters = five_parameters(distortion, distortion_model, f"{file.name}: {key}.distortion_coeffs")
+    return _camera(size, matrix, parameters, f"{file.name}: {key}.intrinsics")
+
+
+# Values of other programs' YAML files: keys that are not asked for do not matter.
+
+
+@dataclass(frozen=True, slots=True)
+class _Parameters(Numbers):
+    """Any number of numbers, also none."""
+
+    def read(self, value: object, folder: Path | None = None, /) -> FloatArray:
+        return as_float_array([]) if value == [] else Numbers.read(self, value, folder)
+
+
+_PARAMETERS = _Parameters(None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """A document; ``name`` is how messages call its file."""
+
+    document: Mapping[str, object]
+    name: str
+
+    def error(self, found: str, expected: str, *path: str) -> InputError:
+        return input_error(Problem(path, found, expected), self.name, self.document)
+
+    def read(self, kind: Kind, *path: str, default: object = None) -> Any:
+        """A value of a kind; ``default`` where it is absent. Raises InputError."""
+        value: object = self.document
+        for i, key in enumerate(path):
+            if not isinstance(value, Mapping):
+                raise self.error(shown(value), f"a mapping with {', '.join(path[i:])}", *path[:i])
+            if key not in value:
+                if default is None:
+                    raise self.error("nothing", kind.expected, *path[: i + 1])
+                return default
+            value = value[key]
+        try:
+            return kind.read(value)
+        except FieldError as error:
+            raise input_error(error.below(*path)[0], self.name, self.document) from None

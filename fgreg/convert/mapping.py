@@ -21,18 +21,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from fgreg.errors import InputError
+from fgreg.events import TrusRecord
 from fgreg.frames import FloatArray, as_float_array
+from fgreg.schema.kinds import Converted, Covariance, Integer, JsonSchema, Kind, ListOf, Number, Text, Transform
+from fgreg.schema.problems import FieldError, input_error, shown
+from fgreg.schema.record import Field, Key, Section, record
 from fgreg.session.safe_yaml import load_yaml
-from fgreg.session.schema import Bounds, Fields, Place, shown
 
 MAPPING_FORMAT = "fgreg-mapping/1"
 
+LOOK = tuple(key for key in record(TrusRecord).fields if not isinstance(key.kind, Covariance))
+"""What a look can have in a table."""
+
 COLUMNS = (
-    *("t", "type", "pm", "scan_deg", "x_mm", "range_mm", "amplitude", "sweep", "frame", "left", "right", "text"),
+    *("t", "type", "pm", *(key.name for key in LOOK), "left", "right", "text"),
     *("camera_T_marker", "marker_x_mm", "marker_y_mm", "marker_z_mm", "marker_qx", "marker_qy", "marker_qz"),
     *("marker_qw", "marker_rx_rad", "marker_ry_rad", "marker_rz_rad", "spot_x_mm", "spot_y_mm", "spot_z_mm"),
     *("corner_column", "corner_row", "camera_new_T_camera_old"),
@@ -45,58 +51,133 @@ TOPICS = ("left", "right", "left_info", "right_info", "marker", "scan", "look", 
 FIELDS = ("marker", "scan", "type", "pm", "sweep", "amplitude", "x_mm", "range_mm", "text")
 """What a PLUS sequence can have for each frame, besides its image and time."""
 
-_SECTIONS = ("columns", "delimiter", "topics", "scan", "clock", "max_gap_s", "same_pm_s", "camera_moved", "fields")
-_GAP = Bounds(0.0, 3600.0, above=True, unit="s")
+
+def _by_name(name: str, known: tuple[str, ...], kind: Kind) -> Section:
+    """A mapping from some of the known names to values of one kind."""
+    return Section(name, tuple(Field(key, key, kind, False, None, Key("")) for key in known))
+
+
+@dataclass(frozen=True, slots=True)
+class Constant(Kind):
+    """A number or a text; a text inside."""
+
+    takes_text = True
+
+    def read(self, value: object, _folder: Path | None = None, /) -> str:
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise FieldError.of(shown(value), self.expected)
+        return str(value)
+
+    @property
+    def expected(self) -> str:
+        return "a number or a text"
+
+    def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"type": ["number", "string"]}
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
     """Where a value comes from: ``scale * cell + offset`` of a column, or one value for all rows."""
 
-    column: str = ""
-    scale: float = 1.0
-    offset: float = 0.0
-    value: str | None = None
+    column: Annotated[str, Key("its name", Text("the name of a column"))] = ""
+    scale: Annotated[float, Key("factor to the unit of the format", Number())] = 1.0
+    offset: Annotated[float, Key("added after that", Number())] = 0.0
+    value: Annotated[str | None, Key("instead: one value for all rows", Constant())] = None
+
+    def __post_init__(self) -> None:
+        if bool(self.column) == (self.value is not None):
+            raise FieldError.of("both column and value, or neither", "one of them")
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnKind(Kind):
+    """A column's name, or a mapping with more on it."""
+
+    takes_text = True
+
+    def read(self, value: object, folder: Path | None = None, /) -> Column:
+        if isinstance(value, Mapping):
+            column: Column = record(Column).read(value, folder)
+            return column
+        return Column(Text(self.expected).read(value))
+
+    @property
+    def expected(self) -> str:
+        return "the name of a column, or a mapping with column, scale, offset, or value"
+
+    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        return {"anyOf": [{"type": "string", "minLength": 1}, record(Column).json_schema(definitions)]}
+
+
+_LENGTH, _ANGLE = Number(0.0, 1e3, above=True), Number(0.0, 180.0, above=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMoves:
-    """When the endoscope's holder says that the camera moved (mm, deg), how well it knows by how much, and where on
-    it the camera is."""
+    """What the endoscope's holder says of the camera's moves."""
 
-    mm: float = 1.0
-    deg: float = 0.5
-    sigma_mm: float = 1.0
-    sigma_deg: float = 0.5
-    tip_T_camera: FloatArray = field(default_factory=lambda: as_float_array(np.eye(4)))
+    mm: Annotated[float, Key("the camera moved where it shifted by more", _LENGTH)] = 1.0
+    deg: Annotated[float, Key("or turned by more", _ANGLE)] = 0.5
+    sigma_mm: Annotated[float, Key("how well the holder knows the shift", _LENGTH)] = 1.0
+    sigma_deg: Annotated[float, Key("how well it knows the turn", _ANGLE)] = 0.5
+    tip_T_camera: Annotated[FloatArray, Key("where on the holder the camera is", Transform(), default="identity")] = (
+        field(default_factory=lambda: as_float_array(np.eye(4)))
+    )
+
+
+def _check_delimiter(text: str) -> None:
+    if len(text) != 1:
+        raise FieldError.of(shown(text), "one character")
+
+
+_GAP = Number(0.0, 3600.0, above=True, unit="s")
+_FRAMES = ListOf(Integer(0, 2**31 - 1), "a list of frame numbers from 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordingMapping:
-    """A mapping, read; empty where there is no file.
+    """A mapping, read; empty where there is no file."""
 
-    Attributes:
-        columns, delimiter: of CSV tables.
-        topics: of ROS 2 recordings, by their roles.
-        joint, angle_unit: of the stage's angle.
-        by_header: times are those of the messages' headers, not those of recording.
-        max_gap_s: most time between what is put together.
-        same_pm_s: looks that follow each other within so long are at the same PM; None: each is at one of its own.
-        moves: of the camera.
-        fields, frames: of PLUS sequences; frames are the numbers of those to take, None: all.
-    """
+    columns: Annotated[
+        Mapping[str, Column], Key("of CSV tables: where each value is", _by_name("Columns", COLUMNS, ColumnKind()))
+    ] = field(default_factory=dict)
+    delimiter: Annotated[
+        str | None, Key("of CSV tables; absent: comma, semicolon or tab", Text("one character", check=_check_delimiter))
+    ] = None
+    topics: Annotated[
+        Mapping[str, str], Key("of ROS 2 recordings, by their roles", _by_name("Topics", TOPICS, Text("a name")))
+    ] = field(default_factory=dict)
+    joint: Annotated[str | None, Key("joint that is the stage", Text("the name of a joint"), name="scan.joint")] = None
+    angle_unit: Annotated[str | None, Key("unit of plain numbers", Text(allowed=("rad", "deg")), name="scan.unit")] = (
+        None
+    )
+    clock: Annotated[
+        str, Key("whose times count: those of headers, or of recording", Text(allowed=("header", "recorder")))
+    ] = "header"
+    max_gap_s: Annotated[float, Key("most time between what is put together", _GAP)] = 0.1
+    same_pm_s: Annotated[
+        float | None, Key("looks that follow each other so soon are at one PM; absent: each is at its own", _GAP)
+    ] = None
+    moves: Annotated[CameraMoves, Key("when the camera moved", name="camera_moved")] = field(
+        default_factory=CameraMoves
+    )
+    fields: Annotated[
+        Mapping[str, str], Key("of PLUS sequences, by their roles", _by_name("Fields", FIELDS, Text("a name")))
+    ] = field(default_factory=dict)
+    frames: Annotated[
+        frozenset[int] | None,
+        Key("numbers of the frames of a PLUS sequence to take", Converted(_FRAMES, frozenset, sorted)),
+    ] = None
 
-    columns: Mapping[str, Column] = field(default_factory=dict)
-    delimiter: str | None = None
-    topics: Mapping[str, str] = field(default_factory=dict)
-    joint: str | None = None
-    angle_unit: str | None = None
-    by_header: bool = True
-    max_gap_s: float = 0.1
-    same_pm_s: float | None = None
-    moves: CameraMoves = field(default_factory=CameraMoves)
-    fields: Mapping[str, str] = field(default_factory=dict)
-    frames: frozenset[int] | None = None
+    @property
+    def by_header(self) -> bool:
+        """Times are those of the messages' headers, not those of recording."""
+        return self.clock == "header"
+
+
+MAPPING = record(RecordingMapping, ("format", MAPPING_FORMAT))
+"""A mapping file."""
 
 
 def read_mapping(path: Path) -> RecordingMapping:
@@ -105,79 +186,9 @@ def read_mapping(path: Path) -> RecordingMapping:
     Raises:
         InputError: the first problem, with key and line.
     """
-    problems: list[InputError] = []
-    top = Fields(load_yaml(path, path.name), ("format", *_SECTIONS, "frames"), Place(path.name), problems)
-    top.text("format", MAPPING_FORMAT, allowed=(MAPPING_FORMAT,))
-    columns: dict[str, Column] = {}
-    if top.has("columns") and (inner := top.child("columns", COLUMNS)) is not None:
-        columns = {name: _column(inner, name) for name in COLUMNS if inner.has(name)}
-    delimiter = top.text("delimiter", "one character") if top.has("delimiter") else None
-    if delimiter is not None and len(delimiter) != 1:
-        top.fail("delimiter", shown(delimiter), "one character")
-    joint = unit = None
-    if top.has("scan") and (inner := top.child("scan", ("joint", "unit"))) is not None:
-        joint = inner.text("joint", "the name of a joint") if inner.has("joint") else None
-        unit = inner.text("unit", "rad or deg", allowed=("rad", "deg")) if inner.has("unit") else None
-    clock = top.text("clock", "header or recorder", default="header", allowed=("header", "recorder"))
-    frames: frozenset[int] | None = None
-    if top.has("frames"):
-        numbers = [entry for entry, _ in top.items("frames", "a list of frame numbers from 0")]
-        if all(type(entry) is int and entry >= 0 for entry in numbers):
-            frames = frozenset(entry for entry in numbers if isinstance(entry, int))
-        else:
-            top.fail("frames", "something else", "a list of frame numbers from 0")
-    found = RecordingMapping(
-        columns=columns,
-        delimiter=delimiter,
-        topics=_texts(top, "topics", TOPICS),
-        joint=joint,
-        angle_unit=unit,
-        by_header=clock == "header",
-        max_gap_s=top.number("max_gap_s", _GAP, default=0.1),
-        same_pm_s=top.number("same_pm_s", _GAP) if top.has("same_pm_s") else None,
-        moves=_moves(top),
-        fields=_texts(top, "fields", FIELDS),
-        frames=frames,
-    )
-    if problems:
-        raise problems[0]
-    return found
-
-
-def _texts(top: Fields, key: str, known: tuple[str, ...]) -> dict[str, str]:
-    inner = top.child(key, known) if top.has(key) else None
-    return {} if inner is None else {name: inner.text(name, "a name") for name in known if inner.has(name)}
-
-
-def _column(columns: Fields, name: str) -> Column:
-    value = columns.raw(name)
-    if not isinstance(value, Mapping):
-        return Column(columns.text(name, "the name of a column, or a mapping with column, scale, offset, or value"))
-    inner = columns.child(name, ("column", "scale", "offset", "value"))
-    if inner is None:
-        return Column()
-    if inner.has("value") == inner.has("column"):
-        inner.fail("", "both column and value, or neither", "one of them")
-    if inner.has("value"):
-        constant = inner.raw("value")
-        if isinstance(constant, bool) or not isinstance(constant, int | float | str):
-            inner.fail("value", shown(constant), "a number or a text")
-        return Column(value=str(constant))
-    column = inner.text("column", "the name of a column")
-    return Column(column, inner.number("scale", default=1.0), inner.number("offset", default=0.0))
-
-
-def _moves(top: Fields) -> CameraMoves:
-    inner = None
-    if top.has("camera_moved"):
-        inner = top.child("camera_moved", ("mm", "deg", "sigma_mm", "sigma_deg", "tip_T_camera"))
-    if inner is None:
-        return CameraMoves()
-    default, length, angle = CameraMoves(), Bounds(0.0, 1e3, above=True), Bounds(0.0, 180.0, above=True)
-    return CameraMoves(
-        mm=inner.number("mm", length, default=default.mm),
-        deg=inner.number("deg", angle, default=default.deg),
-        sigma_mm=inner.number("sigma_mm", length, default=default.sigma_mm),
-        sigma_deg=inner.number("sigma_deg", angle, default=default.sigma_deg),
-        tip_T_camera=inner.transform("tip_T_camera") if inner.has("tip_T_camera") else default.tip_T_camera,
-    )
+    data = load_yaml(path, path.name)
+    try:
+        mapping: RecordingMapping = MAPPING.read(data)
+    except FieldError as error:
+        raise input_error(error.problems[0], path.name, data) from None
+    return mapping

@@ -23,7 +23,7 @@ from fgreg.errors import InputError
 from fgreg.frames import FloatArray, is_rigid
 from fgreg.pairing import PairRefused
 from fgreg.quaternions import turn_about_x
-from fgreg.session.schema import shown
+from fgreg.schema.problems import shown
 
 _DEFAULTS = {
     "marker": ("MarkerToCameraTransform",),

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
+from fgreg.schema.problems import shown
 from fgreg.session.safe_yaml import read_bounded
-from fgreg.session.schema import shown
 
 _TYPES = {"UCHAR": "u1", "CHAR": "i1", "USHORT": "u2", "SHORT": "i2", "UINT": "u4", "INT": "i4", "FLOAT": "f4"}
 _TYPES |= {"DOUBLE": "f8"}

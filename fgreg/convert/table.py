@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from fgreg.convert.drafts import Document, Draft, Imported, rows
-from fgreg.convert.mapping import COLUMNS, Column, RecordingMapping
+from fgreg.convert.mapping import COLUMNS, LOOK, Column, RecordingMapping
 from fgreg.drivers.frame_files import png_bytes, read_picture
 from fgreg.errors import InputError
 from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
 from fgreg.quaternions import rotation_from_quaternion
+from fgreg.schema.files import FrameName
+from fgreg.schema.kinds import Number
+from fgreg.schema.problems import shown
 from fgreg.session.safe_yaml import read_bounded
-from fgreg.session.schema import shown
 
 _MAX_BYTES = 256_000_000
 _DELIMITERS = (",", ";", "\t")
@@ -217,15 +219,17 @@ class _Row:
             raise InputError(f"{self.where}: marker_qx", str(error), "a unit quaternion") from None
 
     def _trus(self) -> Document:
-        trus: Document = {"scan_deg": self.need("scan_deg")}
-        for role in ("x_mm", "range_mm", "amplitude"):
-            value = self.number(role)
+        trus: Document = {}
+        for key in LOOK:
+            name = key.name
+            if isinstance(key.kind, FrameName):
+                value: object = self._frame(name, self.text(name), ".npy") if self.text(name) else None
+            elif isinstance(key.kind, Number):
+                value = self.need(name) if key.required else self.number(name)
+            else:
+                value = self.whole(name) if self.text(name) else None
             if value is not None:
-                trus[role] = value
-        if self.text("sweep"):
-            trus["sweep"] = self.whole("sweep")
-        if name := self.text("frame"):
-            trus["frame"] = self._frame("frame", name, ".npy")
+                trus[name] = value
         return trus
 
     def _frame(self, role: str, name: str, suffix: str) -> str:

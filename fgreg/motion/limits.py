@@ -174,5 +174,5 @@ class MotionLimits:
         return cls(StageModel(limits_device_rad=(low, high), **stage), (sweep_low, sweep_high), **fields)
 
 
-LIMITS = Section(MotionLimits, "limits", record(MotionLimits).fields)
+LIMITS = Section("MotionLimits", record(MotionLimits).fields)
 """``limits`` of a stage in a configuration: reads to what :meth:`MotionLimits.of_session` takes."""

@@ -233,7 +233,9 @@ class Text(Kind):
 
     @property
     def expected(self) -> str:
-        return self.what if len(self.allowed) > 8 or not self.allowed else "one of " + ", ".join(self.allowed)
+        if not self.allowed or len(self.allowed) > 8:
+            return self.what
+        return self.allowed[0] if len(self.allowed) == 1 else "one of " + ", ".join(self.allowed)
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
         return {"enum": [str(entry) for entry in self.allowed]} if self.allowed else {"type": "string", "minLength": 1}

@@ -246,10 +246,13 @@ class Record(Kind):
 
 
 class Section(Record):
-    """A mapping of a file whose keys are fields of the object that holds it (``initial.trus_T_camera``)."""
+    """A mapping that stays one: of its values by attribute.
 
-    def __init__(self, cls: type, name: str, fields: tuple[Field, ...]) -> None:
-        super().__init__(cls, None, fields)
+    Such are the parts of a file whose keys are fields of the object that holds them (``initial`` of a session).
+    """
+
+    def __init__(self, name: str, fields: tuple[Field, ...]) -> None:
+        super().__init__(dict, None, fields)
         self._name = name
 
     def read(self, value: object, folder: Path | None = None, /, **_given: object) -> dict[str, Any]:
@@ -257,7 +260,7 @@ class Section(Record):
 
     @property
     def name(self) -> str:
-        return f"{self.cls.__name__}.{self._name}"
+        return self._name
 
 
 class Tagged(Kind):
@@ -342,7 +345,7 @@ def _fields(cls: type) -> Iterator[Field]:
     for entry in order:
         if isinstance(entry, str):
             parts = tuple(sections[entry])
-            entry = Field(entry, "", Section(cls, entry, parts), False, None, Key(""))
+            entry = Field(entry, "", Section(f"{cls.__name__}.{entry}", parts), False, None, Key(""))
         yield entry
 
 
