@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft as scipy_fft
 
-from fgreg.detection.channels import Band, Baseband, Channels, baseband
+from fgreg.detection.channels import Band, Baseband, Channels, baseband, phasor
 from fgreg.detection.wavefront import RATIO_SIGMA
 from fgreg.errors import EstimationError
 from fgreg.frames import BoolArray, FloatArray
@@ -200,7 +200,7 @@ def _aligned_spectrum(channels: Channels, delay_us: FloatArray, gain: FloatArray
     frequency = step * np.arange(low, high)
     used = np.flatnonzero(gain)
     phase = (2 * np.pi * (delay_us[used] - channels.start_us))[:, None] * frequency[None, :]
-    shifted = channels.spectrum[used, low:high] * np.exp(1j * phase.astype(np.float32))
+    shifted = channels.spectrum[used, low:high] * phasor(phase.astype(np.float32))
     return frequency, np.asarray(gain[used] @ shifted / float((gain**2).sum()), dtype=np.complex128)
 
 

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.channels import Band, Baseband, Channels, baseband
+from fgreg.detection.channels import Band, Baseband, Channels, baseband, phasor
 from fgreg.frames import BoolArray, FloatArray
 from fgreg.models import ProbeModel
 
@@ -250,7 +250,7 @@ def search_nearby(
     row = np.rint(elapsed * peak.signal.rate_mhz).astype(np.intp)
     inside = (row >= 0) & (row < outside)
     weight = np.where(inside, weight, 0.0)
-    turn = np.exp((2j * np.pi * peak.signal.carrier_mhz) * elapsed.astype(np.float32)).astype(np.complex64)
+    turn = phasor((2.0 * np.pi * peak.signal.carrier_mhz * elapsed).astype(np.float32))
     total = (weight * peak.signal.data[np.where(inside, row, outside), index[None, :]] * turn).sum(axis=1)
     variance = peak.signal.variance * np.maximum((weight**2).sum(axis=1), 0.25 * min(MIN_SUPPORT, float(index.size)))
     value = np.abs(total) ** 2 / variance - 0.5 * ((ratio - 1.0) / RATIO_SIGMA) ** 2
