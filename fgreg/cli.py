@@ -26,6 +26,7 @@ from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
 from fgreg.errors import FgregError, InputError
 from fgreg.version import __version__
+from fgreg.workers.threads import one_thread_each
 
 if TYPE_CHECKING:
     from fgreg.pipeline import SolveReport
@@ -57,7 +58,8 @@ def main() -> None:
     """Entry point: known errors become one line and exit status 2."""
     gc.set_threshold(GARBAGE_THRESHOLD)
     try:
-        status = app(standalone_mode=False)
+        with one_thread_each():  # what is worked on at once is frames, solves or devices, never a matrix
+            status = app(standalone_mode=False)
     except FgregError as error:
         _fail(str(error))
     except typer.Abort:

@@ -17,7 +17,6 @@ import typer
 
 from fgreg.cli_options import LimitOption, solve_config
 from fgreg.errors import InputError
-from fgreg.workers.threads import one_thread_each
 
 if TYPE_CHECKING:
     from fgreg.config import SolveConfig
@@ -117,11 +116,10 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
             typer.echo(example(), nl=False)
             return
-        with one_thread_each():  # the devices, the camera's loop and the estimate are processes beside each other
-            from fgreg.estimate import Verdict
-            from fgreg.operation.start import default_folder
-            from fgreg.pipeline import SolveRequest, solve_session
-            from fgreg.report import print_summary, summary_dict
+        from fgreg.estimate import Verdict
+        from fgreg.operation.start import default_folder
+        from fgreg.pipeline import SolveRequest, solve_session
+        from fgreg.report import print_summary, summary_dict
 
         if duration is not None and not 0 < duration < math.inf:
             raise InputError("--duration", str(duration), "seconds > 0")
@@ -131,7 +129,6 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         folder = default_folder() if out is None else out
         silent = as_json or quiet
         with ExitStack() as stack:
-            stack.enter_context(one_thread_each())
             viewer = not (no_viewer or silent)
             seen = viewer or rrd is not None
             if config is None:

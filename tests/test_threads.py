@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from fgreg import cli
 from fgreg.operation.interpreter import SWITCH_S, undisturbed
 from fgreg.workers.threads import NAMES, one_thread_each
 
@@ -19,6 +20,18 @@ def test_processes_get_one_thread_each_unless_the_user_has_said_how_many(monkeyp
     with one_thread_each():
         assert [os.environ[name] for name in NAMES] == ["1", "3", *["1"] * (len(NAMES) - 2)]
     assert [os.environ.get(name) for name in NAMES] == [None, "3", *[None] * (len(NAMES) - 2)]
+
+
+def test_commands_run_with_one_thread_for_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in NAMES:
+        monkeypatch.delenv(name, raising=False)
+    seen: list[str | None] = []
+    monkeypatch.setattr(cli, "app", lambda **_: seen.extend(os.environ.get(name) for name in NAMES))
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+    assert seen == ["1"] * len(NAMES)
+    assert [os.environ.get(name) for name in NAMES] == [None] * len(NAMES)
 
 
 def test_the_interpreter_is_as_before_when_a_session_ends_however_it_does() -> None:

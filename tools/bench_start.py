@@ -22,14 +22,16 @@ import tempfile
 import time
 from pathlib import Path
 
+from fgreg.workers.threads import NAMES
+
 ROOT = Path(__file__).resolve().parent.parent
 LIBRARIES = ("gtsam", "numpy", "poselib", "pydantic", "rich.console", "rich.table", "scipy.special", "typer", "yaml")
 """What ``fgreg solve`` on poses uses; checked against what it loads."""
 
 
 def environment(checkout: Path, byte_code: Path) -> dict[str, str]:
-    """That of a process which imports ``fgreg`` from a checkout."""
-    kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    """That of a process which imports ``fgreg`` from a checkout, as a user has it: no word on numbers of threads."""
+    kept = {key: value for key, value in os.environ.items() if key not in ("PYTHONDONTWRITEBYTECODE", *NAMES)}
     return {**kept, "PYTHONPATH": os.fspath(checkout), "PYTHONPYCACHEPREFIX": os.fspath(byte_code)}
 
 
