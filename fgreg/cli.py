@@ -2,10 +2,9 @@
 
 Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
 starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command
-that needs them.
+that needs them. The annotations of the command modules are objects, not strings (no ``from __future__``): Typer would
+evaluate each string twice, a tenth of ``fgreg --help``.
 """
-
-from __future__ import annotations
 
 import gc
 import json
@@ -159,7 +158,7 @@ def solve(
         raise typer.Exit(EXIT_REFUSED)
 
 
-def _show(report: SolveReport, as_json: bool) -> None:
+def _show(report: "SolveReport", as_json: bool) -> None:
     """The summary of a solve, with what the reader warned of."""
     from fgreg.report import print_summary, summary_dict
 
@@ -172,7 +171,7 @@ def _show(report: SolveReport, as_json: bool) -> None:
         print_summary(report.session.model, report.estimate, extras)
 
 
-def _summary_extras(report: SolveReport) -> Any:
+def _summary_extras(report: "SolveReport") -> Any:
     """What the summary tells besides the estimate."""
     from fgreg.detection.results import MarkerFit, PaFind
     from fgreg.events import PairEvent

@@ -1,7 +1,5 @@
 """The command ``fgreg convert``."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -171,7 +169,7 @@ def _import(
         typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {out}")
 
 
-def _read(source: Path, mapping: RecordingMapping) -> Imported:
+def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
     from fgreg.convert.bag import read_bag
     from fgreg.convert.plus import read_plus
     from fgreg.convert.table import read_table

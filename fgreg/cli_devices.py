@@ -1,7 +1,5 @@
 """The command ``fgreg devices``."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import asdict
@@ -81,7 +79,7 @@ class _Shown:
             typer.echo(json.dumps(document, indent=2))
 
 
-def _line(answer: Answer) -> str:
+def _line(answer: "Answer") -> str:
     mark = "+" if answer.answers else "-"
     if not answer.driver:
         return f"  {mark} {answer.name:<16} {answer.says}"

@@ -1,7 +1,5 @@
 """The commands ``fgreg evaluate`` and ``fgreg advise``."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -153,7 +151,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def named_apart(cases: list[Case], folders: list[Path]) -> list[Case]:
+def named_apart(cases: "list[Case]", folders: list[Path]) -> "list[Case]":
     """Sessions of the same name are called by their folders."""
     names = [case.name for case in cases]
     return [
@@ -174,7 +172,7 @@ def write_text(path: Path, text: str, option: str) -> None:
         raise InputError(option, f"{path}: {error.strerror}", "a file that can be written") from error
 
 
-def read_case(folder: Path, progress: Progress) -> tuple[Case, list[Condition]]:
+def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]":
     """A session with its frames recognised (once) and its truth, and what the frames say against it."""
     from fgreg.config import SolveConfig
     from fgreg.evaluation.case import Case, Truth

@@ -1,7 +1,5 @@
 """The command ``fgreg live``."""
 
-from __future__ import annotations
-
 import json
 import math
 import signal
@@ -157,7 +155,7 @@ def _alone(context: typer.Context) -> None:
             raise InputError(option, "it, and a CONFIG.yaml", f"{key} in the CONFIG.yaml instead")
 
 
-def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> LiveSetup:
+def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> "LiveSetup":
     from fgreg.operation.rooms import simulated_room
 
     if not 0 <= seed < 2**31:
@@ -171,7 +169,7 @@ def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px:
     return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
 
 
-def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> tuple[LiveSetup, SolveConfig]:
+def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> "tuple[LiveSetup, SolveConfig]":
     from fgreg.operation.config import read_config
 
     found = read_config(path)
@@ -181,15 +179,15 @@ def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> tu
 
 
 def _conduct(
-    setup: LiveSetup,
+    setup: "LiveSetup",
     folder: Path,
-    config: SolveConfig,
+    config: "SolveConfig",
     duration_s: float | None,
     rrd: Path | None,
     *,
     viewer: bool,
     silent: bool,
-) -> Figures:
+) -> "Figures":
     from fgreg.motion.guard import emergency_stop_all
     from fgreg.operation.painter import painted
     from fgreg.operation.start import running
@@ -209,7 +207,7 @@ def _conduct(
                 until = math.inf if duration_s is None else time.monotonic() + duration_s
                 shown = -math.inf
 
-                def on_status(status: Status) -> None:
+                def on_status(status: "Status") -> None:
                     nonlocal shown
                     painter.status(status)
                     if status.now_s - shown > SHOW_S:
@@ -227,7 +225,7 @@ def _conduct(
                 signal.signal(number, handler)
 
 
-def figures_dict(figures: Figures) -> dict[str, Any]:
+def figures_dict(figures: "Figures") -> dict[str, Any]:
     """What the loop measured of itself."""
     import numpy as np
 
@@ -243,7 +241,7 @@ def figures_dict(figures: Figures) -> dict[str, Any]:
     }
 
 
-def figures_line(figures: Figures) -> str:
+def figures_line(figures: "Figures") -> str:
     """The same on one line."""
     found = figures_dict(figures)
     latency = found["latency_ms"]
@@ -271,7 +269,7 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
     if not sys.stdout.isatty():
         last: list[str] = [""]
 
-        def line(_session: Running, status: Status) -> None:
+        def line(_session: "Running", status: "Status") -> None:
             if status.text != last[0]:
                 last[0] = status.text
                 console.print(status_line(status), soft_wrap=True)
@@ -280,13 +278,13 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
         return
     with Live(console=console, refresh_per_second=4, transient=True) as area:
 
-        def panel(session: Running, status: Status) -> None:
+        def panel(session: "Running", status: "Status") -> None:
             area.update(status_panel(session.loop.figures, session.model.stage, status))
 
         yield lambda text: console.print(text, style="dim"), panel
 
 
-def status_line(status: Status) -> str:
+def status_line(status: "Status") -> str:
     """One line: how far, the estimate, what was told last."""
     known = status.recorder.known
     lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
@@ -295,7 +293,7 @@ def status_line(status: Status) -> str:
     return f"{status.stage:<11} {state:<36} {status.text}{lost}"
 
 
-def status_panel(figures: Figures, stage: StageModel, status: Status) -> Any:
+def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> Any:
     """The session as a panel: what has to be seen at a glance first, the same as in the viewer."""
     from rich.panel import Panel
     from rich.table import Table

@@ -1,7 +1,5 @@
 """What several commands take: options, and the settings that they make."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -34,7 +32,7 @@ OnlineEstimateOption = Annotated[
 
 def solve_config(
     limit_mm: float, estimate: str, known: tuple[str, ...] = ("sound_speed", "probe_radius")
-) -> SolveConfig:
+) -> "SolveConfig":
     """The settings that the options ask for; ``known``: what this command can estimate besides.
 
     Raises:

@@ -1,7 +1,5 @@
 """The command ``fgreg replay``."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys
@@ -102,7 +100,7 @@ def _speed(text: str) -> float | None:
 
 
 @contextmanager
-def _display(quiet: bool) -> Iterator[tuple[Progress | None, OnStep | None]]:
+def _display(quiet: bool) -> "Iterator[tuple[Progress | None, OnStep | None]]":
     """Lines on standard output; below them, on a terminal, a bar."""
     if quiet:
         yield None, None
@@ -121,7 +119,7 @@ def _display(quiet: bool) -> Iterator[tuple[Progress | None, OnStep | None]]:
                 tasks[step] = bar.add_task(step, total=total)
             bar.update(tasks[step], completed=done, total=total, visible=done < total)
 
-        def on_step(step: ReplayStep) -> None:
+        def on_step(step: "ReplayStep") -> None:
             if step.done == 1:
                 console.print(HEADING, style="bold")
             console.print(step_line(step))
@@ -130,7 +128,7 @@ def _display(quiet: bool) -> Iterator[tuple[Progress | None, OnStep | None]]:
         yield progress, on_step
 
 
-def step_line(step: ReplayStep) -> Text:
+def step_line(step: "ReplayStep") -> "Text":
     """What is known after an event, on one line of at most 80 columns (reasons run on)."""
     from rich.text import Text
 
