@@ -23,6 +23,7 @@ from fgreg.cli_evaluate import add_commands
 from fgreg.cli_live import add_live
 from fgreg.cli_options import EstimateOption, LimitOption, solve_config
 from fgreg.cli_replay import add_replay
+from fgreg.cli_schema import add_schema
 from fgreg.errors import FgregError, InputError
 from fgreg.version import __version__
 from fgreg.workers.threads import one_thread_each
@@ -279,6 +280,7 @@ add_live(app, _summary_extras)
 add_replay(app, _summary_extras)
 add_convert(app)
 add_devices(app)
+add_schema(app)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ translation, so that rotations stay rigid to 1e-8; angles and lengths to 1e-6; c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
@@ -186,6 +186,9 @@ class SessionEstimate:
     ``timing``: where events were taken in one by one.
     """
 
+    version: Annotated[str, Key("version of fgreg that made it", name="fgreg", required=True)] = field(
+        default="", kw_only=True
+    )
     session: Annotated[str, Key("its name")]
     verdict: Annotated[Verdict, Key("ok: usable; warning: a condition is missed; refused: use no transform", VERDICT)]
     reasons: Annotated[
@@ -208,7 +211,6 @@ class SessionEstimate:
     timing: Annotated[
         Timing | None, Key("of `fgreg replay` only; null where there was no such event", name="timing_ms")
     ] = None
-    version: Annotated[str, Key("version of fgreg that made it", name="fgreg", required=True)] = ""
 
 
 RESULT = record(SessionEstimate, ("format", RESULT_FORMAT))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from fgreg.frames import FloatArray
 from fgreg.schema.files import FrameKind, FrameName
@@ -40,6 +40,11 @@ Seconds = Annotated[float, Key("s, not decreasing", SECONDS)]
 class MarkerRecord:
     """A marker as recorded: a pose, the frames to get it from, or both (then the pose wins)."""
 
+    JSON_RULES: ClassVar = (
+        {"anyOf": [{"required": ["camera_T_marker"]}, {"required": ["left"]}]},
+        {"dependentRequired": {"right": ["left"]}},
+    )
+
     camera_T_marker: Annotated[FloatArray | None, Key("the pose", Transform())] = None
     covariance: Annotated[FloatArray | None, Key("of the pose", Covariance(6), requires="camera_T_marker")] = None
     left: Annotated[Path | None, Key("frame of the left camera", _CAMERA_FRAME)] = None
@@ -56,6 +61,11 @@ class MarkerRecord:
 @dataclass(frozen=True, slots=True, eq=False)
 class TrusRecord:
     """A look as recorded: x and range, or the frame to get them from."""
+
+    JSON_RULES: ClassVar = (
+        {"anyOf": [{"required": ["x_mm", "range_mm"]}, {"required": ["frame"]}]},
+        *({"not": {"required": ["frame", key]}} for key in ("x_mm", "range_mm", "covariance")),
+    )
 
     scan_deg: Annotated[float, Key("what the device reads", SCAN_DEG)]
     x_mm: Annotated[float | None, Key("along the axis of rotation", LATERAL_MM)] = None
@@ -95,6 +105,8 @@ class TrusRecord:
 class AimEvent:
     """A calibration shot: the beam was aimed at a known spot."""
 
+    JSON_RULES: ClassVar = ({"oneOf": [{"required": ["camera_p_spot_mm"]}, {"required": ["corner"]}]},)
+
     t: Seconds
     line: int
     marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
@@ -130,6 +142,11 @@ class PairEvent:
 class TrackEvent:
     """A query: where to turn the stage for this beam."""
 
+    JSON_RULES: ClassVar = (
+        {"anyOf": [{"required": [key]} for key in ("trus", "looks", "scan_deg")]},
+        {"not": {"required": ["trus", "looks"]}},
+    )
+
     t: Seconds
     line: int
     marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
@@ -152,6 +169,14 @@ class TrackEvent:
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMovedEvent:
     """The endoscope moved: a new epoch begins."""
+
+    JSON_RULES: ClassVar = (
+        {
+            "dependentSchemas": {
+                "since_t": {"properties": {"detected": {"const": True}}, "required": ["detected"]},
+            }
+        },
+    )
 
     t: Seconds
     line: int

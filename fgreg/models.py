@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -267,6 +267,8 @@ class StereoRig:
 class _CameraSection:
     """``camera`` of ``session.yaml``."""
 
+    JSON_RULES: ClassVar = ({"dependentRequired": {"right": ["right_T_left"], "right_T_left": ["right"]}},)
+
     image_size: Annotated[
         tuple[int, int],
         Key(
@@ -448,7 +450,7 @@ class SessionModel:
     marker: Annotated[MarkerModel | None, Key("the fibre's fiducial")] = None
     board: Annotated[BoardModel | None, Key("the calibration board")] = None
     noise: Annotated[
-        NoiseModel, Key("standard deviations where an observation brings no covariance", default="those shown")
+        NoiseModel, Key("standard deviations where an observation brings no covariance", default="those below")
     ] = field(default_factory=NoiseModel)
     initial_trus_T_camera: Annotated[
         FloatArray | None, Key("a guess of the registration", Transform(), name="initial.trus_T_camera")

@@ -21,6 +21,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "--help": ("numpy", "pydantic", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "solve --help": ("numpy", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "check POSES": ("rich", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "schema events": ("rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve POSES": (*SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve POSES --quiet": ("rich", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve FRAMES": (*SLOW[1:], *OTHER_COMMANDS, *DRAWING, *PROCESSES),

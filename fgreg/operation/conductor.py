@@ -35,6 +35,7 @@ from fgreg.operation.view import (
     View,
 )
 from fgreg.schema.kinds import Integer, Number
+from fgreg.schema.problems import FieldError
 from fgreg.schema.record import Key
 from fgreg.search.hearing import HearingModel
 from fgreg.search.planner import Found, NotFound, Prediction, SearchPlanner, Turn
@@ -81,7 +82,7 @@ class ConductorSettings:
         Key(
             "least amplitude that counts as heard, in the source's unit",
             Number(0.0, 1e12, above=True),
-            required=True,
+            default="required, but in the simulated room",
             example="20.0",
         ),
     ] = 0.0
@@ -91,7 +92,8 @@ class ConductorSettings:
         if self.aims < 0 or not 1 <= self.pms <= self.most_pms:
             raise ValueError("aims has to be 0 or more, pms from 1 to most_pms")
         if not (math.isfinite(self.hearing_threshold) and self.hearing_threshold > 0):
-            raise ValueError(f"hearing_threshold is {self.hearing_threshold}, expected a number > 0")
+            found = "nothing" if self.hearing_threshold == 0.0 else str(self.hearing_threshold)
+            raise FieldError.of(found, "a number > 0", "hearing_threshold")
 
 
 class Conductor:

@@ -22,13 +22,14 @@ from fgreg.errors import InputError
 from fgreg.models import SessionModel, StereoRig
 from fgreg.motion.limits import MotionLimits
 from fgreg.operation.conductor import ConductorSettings
-from fgreg.operation.config_keys import LIVE, CalibrationOptions, LiveDocument, RoomOptions
+from fgreg.operation.config_keys import LIVE, CalibrationOptions, LiveDocument, LiveSettings, RoomOptions
 from fgreg.operation.holder import HolderSettings
 from fgreg.operation.rooms import HEARING_THRESHOLD, room_truth
 from fgreg.operation.start import LiveSetup, StageSetup, setup_text
 from fgreg.operation.status import Devices
 from fgreg.pairing import Latencies
 from fgreg.schema.problems import FieldError, input_error, nearest, place_text
+from fgreg.schema.record import record
 from fgreg.session.reading import SETUP_FILE
 from fgreg.session.safe_yaml import load_yaml, parse_yaml, read_bounded
 from fgreg.session.setup import read_setup
@@ -176,7 +177,9 @@ class _Reader:
         devices = self._devices(document)
         room = self._room(document, devices)
         settings = document.settings
-        setup, label, rectified = self._session(document, devices, room)
+        if settings is None:
+            raise FieldError.of("nothing", record(LiveSettings).expected, "settings")
+        setup, label, rectified = self._session(document, devices, room, settings.conductor.aims)
         model = self._model(setup, label)
         _check_model(model, devices, settings.conductor.aims)
         limits = (document.stage[1].limits if document.stage else None) or {}
@@ -249,14 +252,17 @@ class _Reader:
         return found.model
 
     def _session(
-        self, document: LiveDocument, devices: Mapping[Role, tuple[Chosen, ...]], room: RoomOptions | None
+        self,
+        document: LiveDocument,
+        devices: Mapping[Role, tuple[Chosen, ...]],
+        room: RoomOptions | None,
+        aims: int,
     ) -> tuple[str, str, Any]:
         """Text of the ``session.yaml``, what messages call it, the rectification of the pictures."""
         if room is not None:
             from fgreg.simulation.documents import session_document
             from fgreg.simulation.room import room_config
 
-            aims = document.settings.conductor.aims
             config = room_config(room.seed, room.width, aims=aims, bump_every_s=room.bump_every_s)
             return setup_text(session_document(config.scene)), "the simulated room", None
         path = document.session

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import MISSING, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from fgreg.config import SolveConfig
 from fgreg.drivers.registry import DriverChoice, DriverEntry, Role, drivers_of
@@ -92,6 +92,16 @@ class OneOrMore(Kind):
 class LiveDocument:
     """A CONFIG.yaml: a driver with its options for each role."""
 
+    JSON_RULES: ClassVar = (
+        {
+            "if": {"not": {"properties": {"camera": {"properties": {"driver": {"const": "simulated"}}}}}},
+            "then": {
+                "required": ["session", "settings"],
+                "properties": {"settings": {"required": ["hearing_threshold"]}},
+            },
+        },
+    )
+
     session: Annotated[
         Path | None,
         Key("how things are set up; copied into the new session's folder", ExistingPath(), example="session.yaml"),
@@ -121,7 +131,7 @@ class LiveDocument:
         tuple[Choice, ...],
         Key("Who says what is to be done; a list where there are several.", OneOrMore(DriverChoice(Role.OPERATOR))),
     ] = ()
-    settings: Annotated[LiveSettings, Key("Of the session.")]
+    settings: Annotated[LiveSettings | None, Key("Of the session.")] = None
 
 
 LIVE = record(LiveDocument, ("format", LIVE_FORMAT))
@@ -156,7 +166,7 @@ def _lines() -> Iterator[str]:
     yield ""
     yield "settings:"
     for entry in record(LiveSettings).fields:
-        yield f"  {'' if entry.required else '# '}{example_line(entry)}"
+        yield f"  {'' if entry.key.example else '# '}{example_line(entry)}"
 
 
 def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
@@ -181,8 +191,7 @@ def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
 def example_line(entry: Field) -> str:
     """As in an example: ``name: value  # help; default``."""
     key, kind = entry.key, entry.kind
-    absent = entry.default is MISSING or entry.default is None
-    if key.example and (absent or entry.required):
+    if key.example:
         value = key.example
     else:
         value = entry.default if isinstance(entry.default, str) else one_line_yaml(kind.write(entry.default))

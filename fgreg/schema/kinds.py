@@ -23,7 +23,8 @@ MAX_TRANSLATION_MM = 2000.0
 _SYMMETRY_TOLERANCE = 1e-6
 _MIN_CORRELATION_EIGENVALUE = 1e-9
 _SIGMA_RANGE = (1e-9, 1e6)
-_FINITE = 1e100
+_UNBOUNDED, _FINITE = 1e12, 1e100
+"""Bounds that only keep out what is no measured number; of parts of a matrix, the second."""
 
 JsonSchema = dict[str, Any]
 
@@ -75,8 +76,8 @@ class Number(Kind):
         decimals: digits after the point that are written; None: all.
     """
 
-    low: float = -1e12
-    high: float = 1e12
+    low: float = -_UNBOUNDED
+    high: float = _UNBOUNDED
     above: bool = False
     unit: str = ""
     degrees: bool = False
@@ -105,11 +106,12 @@ class Number(Kind):
     @property
     def expected(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
-        if (self.low, self.high) in ((-1e12, 1e12), (-_FINITE, _FINITE)):
+        if self.low <= -_UNBOUNDED and self.high >= _UNBOUNDED:
             return f"a finite number{' in' if unit else ''}{unit}"
         if self.low == -self.high:
             return f"a number within +-{self.high:g}{unit}"
-        return f"a number {'>' if self.above else '>='} {self.low:g} and <= {self.high:g}{unit}"
+        low = f"a number {'>' if self.above else '>='} {self.low:g}"
+        return f"{low} and <= {self.high:g}{unit}" if self.high < _UNBOUNDED else f"{low}{unit}"
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
         low = "exclusiveMinimum" if self.above else "minimum"

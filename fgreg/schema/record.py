@@ -6,7 +6,8 @@
         direction: Annotated[int, Key("-1 where the device turns the other way", OneOf((1, -1)))] = 1
 
 reads ``{step_deg: 2.0}``. A field without a :class:`Key` is not in the file: who reads gives its value. Rules between
-fields are checked where the object is made: ``__post_init__`` raises :class:`FieldError` with the key's name.
+fields are checked where the object is made: ``__post_init__`` raises :class:`FieldError` with the key's name. Those
+that JSON Schema can say, too, are a class's ``JSON_RULES``.
 """
 
 from __future__ import annotations
@@ -211,7 +212,8 @@ class Record(Kind):
     @property
     def name(self) -> str:
         """Of its JSON Schema."""
-        return self.cls.__name__
+        tags = [value for key, value in self.constants.items() if key != "format"]
+        return ".".join([self.cls.__name__.removeprefix("_"), *tags])
 
     def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
         if self.name not in definitions:
@@ -242,7 +244,8 @@ class Record(Kind):
             for field in self.fields
             if field.key.required_if
         ]
-        return {**out, "allOf": conditions} if conditions else out
+        rules = [*conditions, *getattr(self.cls, "JSON_RULES", ())]
+        return {**out, "allOf": rules} if rules else out
 
 
 class Section(Record):

@@ -72,8 +72,7 @@ def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, ver
     """
     document = RESULT.write(replace(estimate, session=model.name, version=version))
     # The format's line comes first, and as it is: an older result is known by it.
-    first = {"fgreg": document.pop("fgreg")}
-    text = f"format: {document.pop('format')}\n" + yaml_text(first | document, _ONE_LINE)
+    text = f"format: {document.pop('format')}\n" + yaml_text(document, _ONE_LINE)
     temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
     try:
         try:
