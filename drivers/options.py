@@ -1,7 +1,5 @@
 """What each driver can be told in a configuration: its keys, with type, unit, default, bounds and a line of help."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

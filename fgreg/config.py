@@ -1,7 +1,5 @@
 """What a user may set for a solve; raises on a value that cannot be, never repairs."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

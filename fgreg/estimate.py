@@ -4,8 +4,6 @@ The classes are the description of ``result.yaml``, too. Transforms are written 
 translation, so that rotations stay rigid to 1e-8; angles and lengths to 1e-6; covariances to ten digits; times whole.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum

@@ -4,8 +4,6 @@
 still the *device's*, in degrees, as the file has them: measurements.py holds what the estimator sees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,12 +5,10 @@ The classes are the description of ``session.yaml``, too: keys, bounds and units
 line that names the key.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -293,12 +291,12 @@ class _CameraSection:
 
         return StereoRig(camera(self.left), None if self.right is None else camera(self.right), self.right_T_left)
 
-    @staticmethod
-    def of(rig: StereoRig) -> _CameraSection:
+    @classmethod
+    def of(cls, rig: StereoRig) -> Self:
         """The section that describes a rig."""
         left, right = rig.left, rig.right
         lens = None if right is None else _LensSection(right.matrix, right.distortion)
-        return _CameraSection(left.image_size, _LensSection(left.matrix, left.distortion), lens, rig.right_T_left)
+        return cls(left.image_size, _LensSection(left.matrix, left.distortion), lens, rig.right_T_left)
 
 
 STEREO_RIG = Converted(record(_CameraSection), _CameraSection.rig, _CameraSection.of)

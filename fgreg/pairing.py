@@ -7,8 +7,6 @@ arrives gets the host's time as well. :class:`DeviceClock` brings a device's tim
 Host times are seconds of ``time.monotonic()``: one clock for all processes of a machine, which nobody sets.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import deque

@@ -16,8 +16,6 @@ fields: {marker: MarkerToCameraTransform, scan: StageAngle, pm: Pm}
 frames: [3, 4, 17]
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

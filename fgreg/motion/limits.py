@@ -1,7 +1,5 @@
 """What motion is allowed: three kinds, each with its conditions. The figures are the session's and the operator's."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -4,8 +4,6 @@ No devices, no clock of its own, no estimate: :meth:`Conductor.step` gets a view
 for. Whether the stage may really turn is decided elsewhere (fgreg.motion): here is only what would be useful.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import StrEnum

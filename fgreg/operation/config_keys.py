@@ -1,7 +1,5 @@
 """What a CONFIG.yaml of a live session may say, and a commented example of all of it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ While the camera moves no registration holds. A move is measured between two res
 that the noise of single samples and the way in between do not count. Pure state: samples in, moves out.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -101,8 +101,14 @@ class Record(Kind):
         self._known = frozenset(self.names)
         self._required = tuple(field for field in self.fields if field.required)
         self._related = tuple(field for field in self.fields if field.key.requires or field.key.required_if)
-        self._parts = {} if fields else dict(_parts(cls))
-        self._not_stored = {} if fields else dict(_not_stored(cls))
+        self._parts: dict[str, Record] = {}
+        self._not_stored: dict[str, object] = {}
+        for field, hint, metadata in () if fields else _metadata(cls):
+            for entry in metadata:
+                if isinstance(entry, Inline):
+                    self._parts[field.name] = record(hint)
+                elif isinstance(entry, NotStored):
+                    self._not_stored[field.name] = entry.value
 
     def read(self, value: object, folder: Path | None = None, /, **given: object) -> Any:
         """The object; ``given`` are the fields that are not in the file."""
@@ -313,19 +319,16 @@ def record(cls: type, constant: tuple[str, str] | None = None) -> Record:
 
 def _fields(cls: type) -> Iterator[Field]:
     """The described fields of a dataclass; those of a section together, where the first of them is."""
-    hints = typing.get_type_hints(cls, include_extras=True)
     sections: dict[str, list[Field]] = {}
     order: list[Field | str] = []
-    for field in dataclasses.fields(cls):
-        hint = hints[field.name]
-        metadata = getattr(hint, "__metadata__", ())
+    for field, hint, metadata in _metadata(cls):
         if any(isinstance(entry, Inline) for entry in metadata):
-            order += [dataclasses.replace(entry, part=field.name) for entry in record(hint.__origin__).fields]
+            order += [dataclasses.replace(entry, part=field.name) for entry in record(hint).fields]
             continue
         key = next((entry for entry in metadata if isinstance(entry, Key)), None)
         if key is None:
             continue
-        kind = key.kind or kind_of(hint.__origin__)
+        kind = key.kind or kind_of(hint)
         converted = isinstance(kind, Number | Numbers) and (kind if isinstance(kind, Number) else kind.each).degrees
         name = key.name or (field.name.removesuffix("_rad") + "_deg" if converted else field.name)
         if field.default is not dataclasses.MISSING:
@@ -352,15 +355,13 @@ def _fields(cls: type) -> Iterator[Field]:
         yield entry
 
 
-def _parts(cls: type) -> Iterator[tuple[str, Record]]:
-    for name, hint in typing.get_type_hints(cls, include_extras=True).items():
-        if any(isinstance(entry, Inline) for entry in getattr(hint, "__metadata__", ())):
-            yield name, record(hint.__origin__)
-
-
-def _not_stored(cls: type) -> Iterator[tuple[str, object]]:
-    for name, hint in typing.get_type_hints(cls, include_extras=True).items():
-        yield from ((name, entry.value) for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, NotStored))
+def _metadata(cls: type) -> Iterator[tuple[dataclasses.Field[Any], Any, tuple[object, ...]]]:
+    """Each field with its type and what its ``Annotated`` says. Modules of described classes do not postpone the
+    evaluation of annotations, which would be compiled again here."""
+    for field in dataclasses.fields(cls):
+        if isinstance(field.type, str):
+            raise TypeError(f"annotations of {cls.__module__} are texts: they must not be postponed")
+        yield field, getattr(field.type, "__origin__", field.type), getattr(field.type, "__metadata__", ())
 
 
 def kind_of(hint: Any) -> Kind:

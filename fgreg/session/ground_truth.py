@@ -1,7 +1,5 @@
 """The truth about a session, where it is known: simulation, or a phantom that was measured."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
