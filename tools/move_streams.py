@@ -58,9 +58,9 @@ def bump_of(seed: int, sigma_mm: float, sigma_rad: float) -> FloatArray:
 
 
 def two_epochs(
-    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool, told: bool = False, looks: int = 1
+    seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool, reported: bool = False, looks: int = 1
 ) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """PMs before and after a motion; same beam and window edge. ``told``: as epochs 0 and 1, else all as epoch 0.
+    """PMs before and after a motion; same beam and window edge. ``reported``: as epochs 0 and 1, else all as epoch 0.
 
     With several ``looks`` at each PM they are 2 deg apart, with amplitudes, and share a marker observation.
     """
@@ -74,7 +74,7 @@ def two_epochs(
         np.random.default_rng([seed, 1]), aims=12, pairs=before, first_hit=first_hit, marker_T_laser=beam,
         trus_T_camera=trus_T_camera,
     )  # fmt: skip
-    # The same seed draws the same window edge; without aims all that follows is drawn anew.
+    # The same seed draws the same window edge; without aims all that follows is drawn again.
     _, second, moved = make(
         np.random.default_rng([seed, 1]), aims=0, pairs=after, first_hit=first_hit, marker_T_laser=beam,
         trus_T_camera=trus_T_camera @ inverse(motion),
@@ -82,12 +82,12 @@ def two_epochs(
     t = first.pairs[-1].t + 0.5 if first.pairs else 0.0
     later = tuple(
         replace(
-            pair, t=pair.t + t, pm=pair.pm + before, epoch=int(told),
+            pair, t=pair.t + t, pm=pair.pm + before, epoch=int(reported),
             marker=replace(pair.marker, id=pair.marker.id + 100000),
         )
         for pair in second.pairs
     )  # fmt: skip
-    epochs = (*first.epochs, EpochStart(t)) if told else first.epochs
+    epochs = (*first.epochs, EpochStart(t)) if reported else first.epochs
     return model, Measurements(first.aims, first.pairs + later, epochs), (truth, moved)
 
 

@@ -1,6 +1,6 @@
-"""Camera moves before an epoch's seventh PM: what is said of the pairs that they mix, and when that is over.
+"""Unreported camera moves before an epoch's seventh PM: the verdict on the mixed pairs, and when the move is found.
 
-Simulated streams as in tools/study_moves.py: so many PMs, a move that nobody tells, up to 20 PMs more. The online
+Simulated streams as in tools/study_moves.py: so many PMs, an unreported move, up to 20 PMs more. The online
 engine takes them pair by pair; after each PM its full solve judges what there is (``settle``). Moves:
 
   room    2 deg and 2.5 mm a side and axis about the tissue's middle, as somebody bumps into the simulated room's camera
@@ -39,7 +39,7 @@ SIGMAS = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Stood:
-    """How a session stood after one PM: verdict, largest error at the targets and its prediction (mm), found moves."""
+    """A session after one PM: verdict, largest error at the targets and its prediction (mm), found moves."""
 
     verdict: Verdict
     error_mm: float
@@ -48,7 +48,7 @@ class Stood:
 
     @property
     def wrong(self) -> bool:
-        """Whether what is said of the error is not true."""
+        """Whether the predicted error is not true."""
         limit = CONFIG.limit_mm
         return self.error_mm > SIGMAS * self.predicted_mm or self.predicted_mm <= limit < self.error_mm
 

@@ -1,16 +1,16 @@
-"""Finding out that the camera moved: power and false alarms of the online engine, beside the ideal detector.
+"""Unreported camera moves: power and false alarms of the online engine, beside the ideal detector.
 
 Poses with the documented noise, 12 aims, pair by pair through the engine (``watch="inline"``). What is measured:
 
   clean     streams of steady pairs: false alarms (target: at most 1 in 2,000 pairs)
-  junk      the same with a fifth of the pairs replaced by junk
+  outliers  the same with a fifth of the pairs replaced by outliers
   shifts    15 steady pairs, then a shift in a random direction about the camera: share found within so many pairs
             (targets: 5 mm or 3 deg, first-hit: 80 % within 2 and 93 % within 6; window only: 55 % and 85 %; 2 mm or
             1 deg, first-hit: 50 % within 6 and 80 % within 15)
 
-The ideal detector is told the old registration, the beam, the window's edge and the very shift, and sums up
+The ideal detector knows the old registration, the beam, the window's edge and the very shift, and sums up
 likelihood ratios (Shiryaev and Roberts); its threshold is set to the same rate of false alarms on clean pairs.
-What there is so far is printed every tenth of a row.
+Results up to then are printed every tenth of a row.
 """
 
 from __future__ import annotations
@@ -90,13 +90,13 @@ def excursions(scores: FloatArray, threshold: float) -> int:
     return int(np.sum(above[1:] & ~above[:-1]))
 
 
-def false_alarms(seed: int, *, pairs: int, first_hit: bool, junk: float) -> int:
-    """Moves found in one steady stream; a share of its pairs replaced by junk."""
+def false_alarms(seed: int, *, pairs: int, first_hit: bool, outliers: float) -> int:
+    """Moves found in one steady stream; a share of its pairs replaced by outliers."""
     rng = np.random.default_rng([seed, 3])
     model, measurements, _ = make_measurements(rng, aims=12, pairs=pairs, first_hit=first_hit)
-    if junk > 0.0:
-        spoilt = rng.uniform(size=pairs) < junk
-        spoilt[:START] = False  # what the first registration does about junk is not in question here
+    if outliers > 0.0:
+        spoilt = rng.uniform(size=pairs) < outliers
+        spoilt[:START] = False  # what the first registration does about outliers is not in question here
         kinds = rng.integers(len(KINDS), size=pairs)
         measurements = replace(
             measurements,
@@ -119,7 +119,7 @@ def ideal_clean_scores(seed: int, *, pairs: int, first_hit: bool, mm: float, deg
 
 @dataclass(frozen=True, slots=True)
 class Shifted:
-    """Pairs from the shift to the alarm (infinite: none), how far off the place told is, and the ideal's scores."""
+    """Pairs from the shift to the alarm (infinite: none), how far off its reported place is, and the ideal's scores."""
 
     found_after: float
     misplaced: int
@@ -165,7 +165,7 @@ def report_shifts(name: str, found: list[Shifted], ideal_threshold: float, targe
         print(f"  within {count:2d} pairs: {100 * share:5.1f} %   ideal {100 * best:5.1f} %{target}")
     error = [abs(row.misplaced) <= 1 for row in found if np.isfinite(row.found_after)]
     late = np.mean(error) if error else float("nan")
-    print(f"  first pair after the move, told at the alarm: right or next to it in {100 * late:.0f} %", flush=True)
+    print(f"  first pair after the move, by the alarm: right or next to it in {100 * late:.0f} %", flush=True)
 
 
 def report_alarms(counts: Iterable[int], streams: int, per_stream: int, name: str, *, target: bool) -> None:
@@ -182,7 +182,7 @@ def report_alarms(counts: Iterable[int], streams: int, per_stream: int, name: st
 
 
 def tenths(rows: Iterable[Shifted], total: int) -> Iterator[list[Shifted]]:
-    """All rows so far, ten times."""
+    """All rows up to then, ten times."""
     out: list[Shifted] = []
     for row in rows:
         out.append(row)
@@ -199,9 +199,11 @@ ROWS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--what", default="clean,junk,shifts", help="which parts, with commas between")
+    parser.add_argument("--what", default="clean,outliers,shifts", help="which parts, with commas between")
     parser.add_argument("--rows", default=",".join(ROWS), help=f"which shifts, of {', '.join(ROWS)}")
-    parser.add_argument("--sweep", choices=["first-hit", "window", "both"], default="both", help="of clean and junk")
+    parser.add_argument(
+        "--sweep", choices=["first-hit", "window", "both"], default="both", help="of clean and outliers"
+    )
     parser.add_argument("--shifts", type=int, default=500, help="shifts of each row")
     parser.add_argument("--clean-pairs", type=int, default=40000, help="steady pairs of each kind")
     parser.add_argument("--stream", type=int, default=108, help="pairs of each steady stream; the first 8 register it")
@@ -209,8 +211,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     what, rows = set(args.what.split(",")), args.rows.split(",")
-    if not what <= {"clean", "junk", "shifts"}:
-        parser.error(f"--what is {args.what}, expected some of clean, junk, shifts")
+    if not what <= {"clean", "outliers", "shifts"}:
+        parser.error(f"--what is {args.what}, expected some of clean, outliers, shifts")
     if not set(rows) <= set(ROWS):
         parser.error(f"--rows is {args.rows}, expected some of {', '.join(ROWS)}")
     per_stream = args.stream - START
@@ -226,11 +228,11 @@ def main() -> None:
                 shifts = pool.map(one_shift, [7000000 * args.seed + s for s in range(args.shifts)], chunksize=4)
                 for found in tenths(shifts, args.shifts):
                     report_shifts(name, found, threshold, targets)
-        for part, junk in (("clean", 0.0), ("junk", 0.2)):
+        for part, share in (("clean", 0.0), ("outliers", 0.2)):
             for first_hit in sweeps if part in what else ():
-                one = partial(false_alarms, pairs=args.stream, first_hit=first_hit, junk=junk)
-                name = f"{100 * junk:.0f} % junk, {'first-hit' if first_hit else 'window only'}"
-                report_alarms(pool.map(one, seeds, chunksize=4), len(seeds), per_stream, name, target=not junk)
+                one = partial(false_alarms, pairs=args.stream, first_hit=first_hit, outliers=share)
+                name = f"{100 * share:.0f} % outliers, {'first-hit' if first_hit else 'window only'}"
+                report_alarms(pool.map(one, seeds, chunksize=4), len(seeds), per_stream, name, target=not share)
 
 
 if __name__ == "__main__":

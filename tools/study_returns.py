@@ -1,15 +1,15 @@
-"""Camera moves beside the test on pairs: static tags, the scope put back, and moves that are told.
+"""Camera moves beside the test on pairs: static tags, loop closures, and reported moves.
 
   tags-clean  frames of three static tags while nothing moves: false alarms (target: at most 1 in 2,000 pairs, 10 frames
               each)
   tags-shifts shifts about the camera, 60 steady frames before: share found within 10 frames, that is before the next
               pair (target: 99 %). Tags 0.1, 0.1, 0.8 mm and 0.01 rad; a fifth of that variance wanders with a time
-              constant of 200 frames (and is drawn anew by a shift), the rest is new in every frame
-  returns     15 pairs, then the scope taken away and put back (told, without a motion), or to a place 2 mm or 1 deg
+              constant of 200 frames (and is drawn again by a shift), the rest is new in every frame
+  returns     15 pairs, then the scope taken away and put back (reported, without a motion), or to a place 2 mm or 1 deg
               off, 5 mm or 3 deg off, or anywhere: after how many pairs the engine uses the old registration again, and
               how often wrongly (target: at most 1 in 2,000 pairs)
-  told        15 (or so many) pairs, a shift of up to 15 mm and 9 deg an axis, told with a motion known to 2 mm and 1
-              deg (each axis; or in all) or with none: RMS target error after n pairs, beside that of the steady epoch
+  reported    15 (or so many) pairs, a shift of up to 15 mm and 9 deg an axis, reported with a motion known to 2 mm and
+              1 deg (each axis; or in all) or with none: RMS target error after n pairs, beside that of the steady epoch
               (target with motion: at most 1.2 of it after 3 pairs), of a fresh registration with the same aims, and of
               one with a known beam, 150 aims (target: no worse at every count, paired on the same pairs). In brackets
               what an ideal estimator has: the information of all measurements at the truth, windows as Gaussians
@@ -63,7 +63,7 @@ class TagScene:
         self.settle()
 
     def settle(self) -> None:
-        """What stays of the errors is drawn anew."""
+        """What stays of the errors is drawn again."""
         self.wander = {tag: self.rng.normal(size=6) for tag in self.tags}
 
     def move(self, motion: FloatArray) -> None:
@@ -149,7 +149,7 @@ def returns(count: int, seed: int, steady: int, *, first_hit: bool) -> None:
 
 def _used_again_after(seed: int, motion: FloatArray, steady: int, *, first_hit: bool) -> float:
     """Pairs of the new epoch after which the engine ties it to the old one; infinite: it does not."""
-    model, measurements, _ = two_epochs(seed, motion, steady, AFTER, first_hit=first_hit, told=True)
+    model, measurements, _ = two_epochs(seed, motion, steady, AFTER, first_hit=first_hit, reported=True)
     engine, pairs = OnlineRegistration(model, CONFIG, judge=None), 0
     for index, event in events_in_order(measurements):
         estimate = engine.add(event)
@@ -163,7 +163,7 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def told(count: int, seed: int, steady_pairs: int, counts: tuple[int, ...], *, first_hit: bool) -> None:
+def reported(count: int, seed: int, steady_pairs: int, counts: tuple[int, ...], *, first_hit: bool) -> None:
     steady: list[tuple[float, float]] = []
     error: dict[tuple[str, int], list[float]] = {}
     ideal: dict[tuple[str, int], list[float]] = {}
@@ -171,13 +171,13 @@ def told(count: int, seed: int, steady_pairs: int, counts: tuple[int, ...], *, f
         rng = np.random.default_rng([seed, s, 3])
         motion = make_transform(exp_so3(rng.uniform(-0.15, 0.15, 3)), rng.uniform(-15.0, 15.0, 3))
         number = seed * 100000 + s
-        model, whole, truths = two_epochs(number, motion, steady_pairs, AFTER, first_hit=first_hit, told=True)
+        model, whole, truths = two_epochs(number, motion, steady_pairs, AFTER, first_hit=first_hit, reported=True)
         unit = rng.normal(size=6)
         starts = {}
         for name, sigma in (("an axis", KINEMATICS), ("in all", KINEMATICS / math.sqrt(3.0))):
             noise = unit * sigma
             measured = motion @ make_transform(exp_so3(noise[:3]), noise[3:])
-            starts[f"told, 2 mm and 1 deg {name}"] = EpochStart(whole.epochs[1].t, measured, np.diag(sigma**2))
+            starts[f"reported, 2 mm and 1 deg {name}"] = EpochStart(whole.epochs[1].t, measured, np.diag(sigma**2))
         old = replace(whole, pairs=whole.pairs[:steady_pairs], epochs=whole.epochs[:1])
         first = _error(old, 0, truths[0], model)
         steady.append((first, _least(old, 0, truths[:1], model)))
@@ -188,7 +188,7 @@ def told(count: int, seed: int, steady_pairs: int, counts: tuple[int, ...], *, f
             alone = replace(cut, pairs=own, epochs=whole.epochs[:1])
             cases = {
                 **{name: (replace(cut, epochs=(whole.epochs[0], e)), 1, truths) for name, e in starts.items()},
-                "told, motion not known": (cut, 1, truths),
+                "reported, motion not known": (cut, 1, truths),
                 "fresh, same aims": (alone, 0, truths[1:]),
                 "fresh, known beam": (replace(alone, aims=many), 0, truths[1:]),
             }
@@ -196,7 +196,7 @@ def told(count: int, seed: int, steady_pairs: int, counts: tuple[int, ...], *, f
                 error.setdefault((name, n), []).append(_error(of, epoch, truths[1], model))
                 ideal.setdefault((name, n), []).append(_least(of, epoch, true, model))
         if (s + 1) % max(count // 10, 1) == 0:
-            _print_told(steady, error, ideal, counts, first_hit)
+            _print_reported(steady, error, ideal, counts, first_hit)
 
 
 def _error(of: Measurements, epoch: int, truth: Truth, model: SessionModel) -> float:
@@ -219,7 +219,7 @@ def _least(of: Measurements, epoch: int, truths: tuple[Truth, ...], model: Sessi
     return ideal_tre(covariance, state, epoch, model.targets_mm)
 
 
-def _print_told(
+def _print_reported(
     steady: list[tuple[float, float]],
     error: dict[tuple[str, int], list[float]],
     ideal: dict[tuple[str, int], list[float]],
@@ -229,7 +229,8 @@ def _print_told(
     kind = "first-hit" if first_hit else "window only"
     base, least = _rms([e for e, _ in steady]), _rms([e for _, e in steady])
     print(
-        f"told moves ({kind}), {len(steady)} sessions: RMS target error of the steady epoch {base:.2f} ({least:.2f}) mm"
+        f"reported moves ({kind}), {len(steady)} sessions: RMS target error of the steady epoch {base:.2f} "
+        f"({least:.2f}) mm"
     )
     for name in sorted({name for name, _ in error}):
         row = []
@@ -243,8 +244,8 @@ def _print_told(
             )
         print(f"  {name}, after pairs {', '.join(row)}", flush=True)
     for other in ("fresh, same aims", "fresh, known beam"):
-        row = [f"{n}: {_paired(error['told, motion not known', n], error[other, n])}" for n in counts]
-        print(f"  told, motion not known, over {other}, the same pairs: {', '.join(row)}", flush=True)
+        row = [f"{n}: {_paired(error['reported, motion not known', n], error[other, n])}" for n in counts]
+        print(f"  reported, motion not known, over {other}, the same pairs: {', '.join(row)}", flush=True)
 
 
 def _paired(ours: list[float], others: list[float]) -> str:
@@ -264,12 +265,12 @@ def _paired(ours: list[float], others: list[float]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("mode", choices=["tags-clean", "tags-shifts", "returns", "told"])
+    parser.add_argument("mode", choices=["tags-clean", "tags-shifts", "returns", "reported"])
     parser.add_argument("--count", type=int, help="frames (tags-clean), or shifts or sessions a row")
     parser.add_argument("--window-only", action="store_true", help="looks know only the window")
-    parser.add_argument("--steady", type=int, default=15, help="returns, told: pairs of the first epoch")
+    parser.add_argument("--steady", type=int, default=15, help="returns, reported: pairs of the first epoch")
     parser.add_argument(
-        "--after", type=int, nargs="+", default=[3, 4, 6, 10, 15], help="told: numbers of pairs after it"
+        "--after", type=int, nargs="+", default=[3, 4, 6, 10, 15], help="reported: numbers of pairs after it"
     )
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
@@ -281,7 +282,7 @@ def main() -> None:
     elif args.mode == "returns":
         returns(args.count or 200, args.seed, args.steady, first_hit=first_hit)
     else:
-        told(args.count or 100, args.seed, args.steady, tuple(args.after), first_hit=first_hit)
+        reported(args.count or 100, args.seed, args.steady, tuple(args.after), first_hit=first_hit)
 
 
 if __name__ == "__main__":
