@@ -11,9 +11,10 @@ from itertools import combinations
 import numpy as np
 import poselib
 
-from fgreg.frames import FloatArray, inverse, log_so3, make_transform, transform_points
+from fgreg.frames import FloatArray, inverse, make_transform, transform_points
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import arc_points, perpendicular_basis
+from fgreg.initialization import distinct_rotations
 from fgreg.measurements import Aim
 
 TRIPLES = 160
@@ -72,14 +73,7 @@ def consensus_starts(
     projected = np.sum(gap * along_arc, axis=-1)
     square = np.sum(gap**2, axis=-1) - slack * projected**2 / (variance + slack * np.sum(along_arc**2, axis=-1))
     score = np.sum(np.minimum(square / variance, SCORE_LIMIT), axis=1)
-    chosen: list[int] = []
-    for index in np.argsort(score)[: 40 * keep]:
-        turn = log_so3(camera_R_trus[chosen].swapaxes(-1, -2) @ camera_R_trus[index]) if chosen else np.ones((1, 3))
-        if np.linalg.norm(turn, axis=-1).min() > 0.1:
-            chosen.append(int(index))
-        if len(chosen) == keep:
-            break
-    return inverse(found[chosen])
+    return inverse(found[distinct_rotations(camera_R_trus, np.argsort(score)[: 40 * keep], keep)])
 
 
 def _minimal_poses(origin: FloatArray, direction: FloatArray, points: FloatArray) -> FloatArray:

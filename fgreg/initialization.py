@@ -9,21 +9,27 @@ al.) over triples adds starts that the descent can miss.
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations
 
 import numpy as np
 import poselib
 
-from fgreg.frames import FloatArray, exp_so3, hat, inverse, log_so3, make_transform, transform_points
+from fgreg.frames import FloatArray, IntArray, exp_so3, hat, inverse, make_transform, transform_points
 from fgreg.measurements import Aim
 
 SEED = 20260
 TRIPLES = 24
 DESCENT_STEPS = 25
+SETTLED_RAD = 1e-3
+"""A descent ends where no start turns by more than this in a step."""
+SAME_START_RAD = 0.1
+"""Rotations no farther apart than this are one start."""
 CLEAR_AXIS = 0.4
 """A second axis of the spots this much shorter than the first cannot be the beam's."""
 
 
+@cache
 def cube_rotations() -> FloatArray:
     """The 24 rotations of the cube, (24, 3, 3): starts no further than 62.8 deg from any rotation."""
     out = []
@@ -63,6 +69,21 @@ def beam_starts(aims: tuple[Aim, ...]) -> list[tuple[FloatArray, FloatArray]]:
     return starts
 
 
+def distinct_rotations(rotation: FloatArray, order: IntArray, keep: int) -> IntArray:
+    """Which of rotations (n, 3, 3), taken in this order, are ``SAME_START_RAD`` from all before; at most ``keep``."""
+    flat = rotation[order].reshape(-1, 9)
+    near = flat @ flat.T > 1.0 + 2.0 * np.cos(SAME_START_RAD)
+    free = np.ones(len(order), dtype=bool)
+    chosen: list[int] = []
+    for place in range(len(order)):
+        if free[place]:
+            chosen.append(place)
+            free &= ~near[place]
+        if len(chosen) == keep:
+            break
+    return np.asarray(order[chosen])
+
+
 def registration_starts(origin_mm: FloatArray, direction: FloatArray, trus_p: FloatArray, keep: int = 12) -> FloatArray:
     """Distinct registrations that bring points onto lines, best first.
 
@@ -79,15 +100,7 @@ def registration_starts(origin_mm: FloatArray, direction: FloatArray, trus_p: Fl
     if 3 <= len(trus_p) <= 14:
         rotations.append(_minimal_rotations(origin_mm, direction, trus_p))
     camera_R_trus, cost = _descend(np.concatenate(rotations), origin_mm, across, trus_p)
-    order = np.argsort(cost)
-    chosen: list[int] = []
-    for index in order:
-        turn = log_so3(camera_R_trus[chosen].swapaxes(-1, -2) @ camera_R_trus[index]) if chosen else np.ones((1, 3))
-        if np.linalg.norm(turn, axis=-1).min() > 0.1:
-            chosen.append(int(index))
-        if len(chosen) == keep:
-            break
-    rotation = camera_R_trus[chosen]
+    rotation = camera_R_trus[distinct_rotations(camera_R_trus, np.argsort(cost), keep)]
     translation = _best_translation(rotation, origin_mm, across, trus_p)
     return inverse(make_transform(rotation, translation))
 
@@ -132,6 +145,8 @@ def _descend(
         rotation = np.where(good[:, None, None], trial, rotation)
         cost = np.where(good, trial_cost, cost)
         damping = np.where(good, damping * 0.3, damping * 6.0)
+        if np.abs(step).max() < SETTLED_RAD:
+            break
     return rotation, cost
 
 
