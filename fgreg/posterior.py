@@ -30,8 +30,8 @@ DEGREES_OF_FREEDOM = 6.0
 QUANTILE = 0.95
 MOST_TRANSLATION_MM = 2000.0
 """No camera is farther from a probe (the session format's bound): far out, rounding alone may look like a fit."""
-CHUNK = 100
-"""Samples evaluated at once: what stays in the cache."""
+CHUNK = 4000
+"""Samples times PMs that are evaluated at once: what stays in the cache."""
 REFINED_PMS = 8
 """With fewer PMs the samples reach so far that the private variables are refined once more for each."""
 FITTING, TAILS = 0.4, 4.0
@@ -211,7 +211,7 @@ class _Students:
     def log(self, x: FloatArray) -> FloatArray:
         """(S,) log density up to a constant common to all mixtures."""
         size = x.shape[1]
-        out = np.empty((len(self.share), len(x)))
+        out = np.empty((len(self.root), len(x)))
         for group, root in enumerate(self.root):
             mine = np.flatnonzero(self.group == group)
             # About the group's first centre: squares of small numbers only.
@@ -220,9 +220,8 @@ class _Students:
             centre = np.linalg.solve(root, (self.centre[mine] - origin).T)
             square = np.sum(centre**2, axis=0)[:, None] - 2.0 * centre.T @ at + np.sum(at**2, axis=0)
             square = np.maximum(square, 0.0) / (DEGREES_OF_FREEDOM * self.scale[mine, None] ** 2)
-            log = -0.5 * (DEGREES_OF_FREEDOM + size) * np.log1p(square)
-            volume = np.log(np.diag(root)).sum() + size * np.log(self.scale[mine])
-            out[mine] = log + (np.log(self.share[mine]) - volume)[:, None]
+            kernel = np.exp(-0.5 * (DEGREES_OF_FREEDOM + size) * np.log(1.0 + square))
+            out[group] = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
         return logsumexp(out, axis=0)
 
 
@@ -274,37 +273,29 @@ class _Target:
     def columns(self) -> Columns:
         return self.modes[0].problem.columns
 
-    def nearest(self, tangent: FloatArray) -> FloatArray:
-        """(S,) the mode nearest each sample, by its own covariance."""
-        if len(self.modes) == 1:
-            return np.zeros(len(tangent), dtype=np.int64)
-        state = self.state(tangent)
-        far = []
-        for mode in self.modes:
-            step = step_between(mode.optimum.state, state, self.columns)
-            whitened = np.linalg.solve(_root(mode.covariance), step.T)
-            far.append(np.sum(whitened**2, axis=0))
-        return np.asarray(np.argmin(far, axis=0))
-
     def state(self, tangent: FloatArray) -> SharedState:
         base = self.modes[0].optimum.state
         return _repeat(base, len(tangent)).retract(step_of_tangent(tangent, self.columns), self.columns)
 
-    def log(self, tangent: FloatArray) -> FloatArray:
+    def log(self, tangent: FloatArray) -> tuple[FloatArray, IntArray]:
+        """(S,) log density of samples, and (S,) the mode nearest to each by its own covariance."""
+        columns, steps = self.columns, [step_of_tangent(tangent, self.columns)]
+        nearest = np.zeros(len(tangent), dtype=np.int64)
+        if len(self.modes) > 1:
+            state = _repeat(self.modes[0].optimum.state, len(tangent)).retract(steps[0], columns)
+            steps += [step_between(mode.optimum.state, state, columns) for mode in self.modes[1:]]
+            far = [
+                np.sum(np.linalg.solve(_root(mode.covariance), step.T) ** 2, axis=0)
+                for mode, step in zip(self.modes, steps, strict=True)
+            ]
+            nearest = np.argmin(far, axis=0)
         out = np.empty(len(tangent))
-        columns = self.columns
-        which = self.nearest(tangent)
-        for index, mode in enumerate(self.modes):
-            rows = np.flatnonzero(which == index)
-            for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
-                if not len(part):
-                    continue
-                if index == 0:
-                    step = step_of_tangent(tangent[part], columns)
-                else:
-                    step = step_between(mode.optimum.state, self.state(tangent[part]), columns)
-                out[part] = log_density(mode, step)
-        return out + _log_volume(tangent, columns)
+        for index, (mode, step) in enumerate(zip(self.modes, steps, strict=True)):
+            rows = np.flatnonzero(nearest == index)
+            for part in np.array_split(rows, max(1, -(-len(rows) * len(mode.problem.pms) // CHUNK))):
+                if len(part):
+                    out[part] = log_density(mode, step[part])
+        return out + _log_volume(tangent, columns), nearest
 
 
 def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: int) -> Posterior:
@@ -334,7 +325,7 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
             root=np.stack([_root(mode.covariance) for mode in modes]),
         )
     ]
-    x, log_target = np.zeros((0, columns.size)), np.zeros(0)
+    x, log_target, nearest = np.zeros((0, columns.size)), np.zeros(0), np.zeros(0, dtype=np.int64)
     counts: list[int] = []
     log_proposal = np.zeros((0, 0))
     draws = 300
@@ -346,7 +337,9 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
             log_proposal = np.concatenate([np.concatenate([log_proposal, old_under_new[None]]), new_under_all], axis=1)
         else:
             log_proposal = new_under_all
-        x, log_target = np.concatenate([x, fresh]), np.concatenate([log_target, target.log(fresh)])
+        log_fresh, nearest_fresh = target.log(fresh)
+        x, log_target = np.concatenate([x, fresh]), np.concatenate([log_target, log_fresh])
+        nearest = np.concatenate([nearest, nearest_fresh])
         counts.append(draws)
         share = np.log(np.array(counts) / sum(counts))
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
@@ -362,9 +355,8 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
     if effective < LEAST_SAMPLES:
         return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=effective)
     weight = np.exp(log_weight - logsumexp(log_weight))
-    which = target.nearest(x)
-    mass = np.bincount(which, weight, minlength=len(modes))
-    main = np.where(which == int(np.argmax(mass)), weight, 0.0)
+    mass = np.bincount(nearest, weight, minlength=len(modes))
+    main = np.where(nearest == int(np.argmax(mass)), weight, 0.0)
     return _about_mean(target, x, weight, main / main.sum(), log_target, effective)
 
 
@@ -429,8 +421,8 @@ def target_errors(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> F
     camera_p = transform_points(inverse(estimate), targets_mm)
     twist = posterior.step[:, 6 * epoch : 6 * epoch + 6]
     # A sample is estimate * (Exp(omega), v): in camera axes it moves p to Exp(omega) p + v.
-    moved = np.einsum("sij,nj->sni", exp_so3(twist[:, :3]), camera_p) + twist[:, None, 3:] - camera_p
-    return np.asarray(np.linalg.norm(moved, axis=-1))
+    moved = (exp_so3(twist[:, :3]) - np.eye(3)) @ camera_p.T + twist[:, 3:, None]
+    return np.asarray(np.sqrt(np.einsum("sin,sin->sn", moved, moved)))
 
 
 def predicted_tre(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> PredictedTre:
