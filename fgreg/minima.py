@@ -34,8 +34,9 @@ from fgreg.robust import (
 
 SEARCH_PAIRS = 40
 """The search for minima looks at no more pairs than this, spread over the session; all are used from there on."""
-SEARCH_TOLERANCE = 1e-4
-"""Newton decrement (chi square) at which a search stops: the joint solve goes on from the best."""
+OTHERS_TOLERANCE, OTHERS_WITHIN = 1e-2, 15.0
+"""Of other hypotheses (mirrored, ...) only the cost matters: Newton decrement at which their search stops, and by how
+much chi square above the best fit they are given up."""
 SAME_MINIMUM_MM = 1.5
 """Minima whose registrations move no target by more than this are one."""
 BEAM_CHI2 = 30.0
@@ -110,9 +111,8 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
     if len(aims) > MIN_KEPT_AIMS and not _is_clean(alone, found):
         candidates += [nominal_frame(origin, direction) for origin, direction in consensus_beams(aims)]
         robust = graduated(alone, _beam_states(candidates, model), robust_aims=True)
-        at = int(np.argmin(robust.cost))
         none = np.zeros(0, dtype=bool)
-        kept = sort_shots(alone, robust.state.take([at]), none, robust.aim_kept[at]).aim_kept
+        kept = sort_shots(alone, robust.state.take([0]), none, robust.aim_kept[0]).aim_kept
         if MIN_KEPT_AIMS <= kept.sum() < len(aims):
             fitting = tuple(aim for aim, keep in zip(aims, kept, strict=True) if keep)
             alone = pack(Measurements(fitting, (), measurements.epochs[:1]), model)
@@ -220,7 +220,7 @@ def search_epoch(
         return EpochSearch((), None)
     subset = replace(measurements, pairs=_search_subset(pairs), epochs=measurements.epochs[:1])
     problem = pack(subset, model)
-    found = optimize(problem, _starts(problem, frames, model), tolerance=SEARCH_TOLERANCE, keep_within=keep_within)
+    found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
     minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
     if len(problem.pms) > MIN_KEPT_PMS and not _is_clean(problem, found):
         return _search_among_junk(subset, problem, model, frames, minima, keep_within)
@@ -229,8 +229,8 @@ def search_epoch(
     mirrored = optimize(
         mirrored_problem,
         _starts(mirrored_problem, frames, model),
-        tolerance=SEARCH_TOLERANCE,
-        keep_within=keep_within,
+        tolerance=OTHERS_TOLERANCE,
+        keep_within=OTHERS_WITHIN,
         best_cost=minima[0].cost,
     )
     cost = mirrored.evaluation.cost
@@ -269,30 +269,34 @@ def _search_among_junk(
 ) -> EpochSearch:
     """As :func:`search_epoch`, where a PM deviates: consensus, truncated cost, then the minima of what is kept."""
     plain = [minimum.state for minimum in minima]
-    robust = _robust_minima(problem, frames, model, plain)
-    mirrored = _robust_minima(_mirrored(problem), frames, model, [])
-    other_way = _robust_minima(_other_way(problem), frames, model, []) if problem.looks.edge_gain.any() else None
-    order = np.argsort(robust.cost)
+    robust = graduated(problem, _robust_starts(problem, frames, model, plain), keep_within=keep_within)
+    base, aims_cost = float(robust.cost[0]), float(robust.aim_cost[0].sum())
+
+    def other(of: PackedProblem) -> RobustOptimum:
+        return graduated(of, _robust_starts(of, frames, model, []), keep_within=OTHERS_WITHIN, best_cost=base)
+
+    mirrored = other(_mirrored(problem))
+    other_way = other(_other_way(problem)) if problem.looks.edge_gain.any() else None
     aims = np.ones(len(problem.aims.rotation), dtype=bool)
-    kept = sort_shots(problem, robust.state.take([order[0]]), robust.pm_kept[order[0]], aims, doubt_aims=False).pm_kept
+    best = robust.state.take([0])
+    kept = sort_shots(problem, best, robust.pm_kept[0], aims, doubt_aims=False).pm_kept
     if kept.sum() < MIN_KEPT_PMS:
         kept = np.ones(len(problem.pms), dtype=bool)
     names = {pm for pm, keep in zip(problem.pms, kept, strict=True) if keep}
     fitting = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm in names))
     reduced = pack(fitting, model)
     states = [robust.state, *plain, _starts(reduced, frames, model)]
-    found = optimize(reduced, stack_states(states), tolerance=SEARCH_TOLERANCE, keep_within=keep_within)
+    found = optimize(reduced, stack_states(states), keep_within=keep_within)
     all_minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
-    base, level = float(robust.cost[order[0]]), all_minima[0].cost
+    level = all_minima[0].cost
     # Another set of shots that fit each other as well as these do is as good an answer.
-    best = robust.pm_kept[order[0]]
-    for index in order[1:]:
-        both, either = (robust.pm_kept[index] & best).sum(), (robust.pm_kept[index] | best).sum()
+    for index, of_it in enumerate(robust.pm_kept):
+        both, either = (of_it & robust.pm_kept[0]).sum(), (of_it | robust.pm_kept[0]).sum()
         if both < RIVAL_OVERLAP * either:
             all_minima += (Minimum(level + float(robust.cost[index]) - base, robust.state.take([index])),)
     # The pairs without the aims: a marker swapped or knocked between calibration and registration.
-    free = graduated(pack(replace(measurements, aims=()), model), robust.state)
-    aims_cost = float(robust.parts.aim.cost[order[0]].sum())
+    alone = pack(replace(measurements, aims=()), model)
+    free = graduated(alone, robust.state, keep_within=OTHERS_WITHIN, best_cost=base - aims_cost)
     return EpochSearch(
         tuple(sorted(all_minima, key=lambda minimum: minimum.cost)),
         level + float(mirrored.cost.min()) - base,
@@ -300,7 +304,7 @@ def _search_among_junk(
         level + float(free.cost.min()) + aims_cost - base,
         clean=False,
         mirrored_outside_cost=_shifted(_least(mirrored.cost, from_outside(problem, mirrored.state)), level - base),
-        outside=bool(from_outside(problem, robust.state.take([order[0]]))[0]),
+        outside=bool(from_outside(problem, best)[0]),
     )
 
 
@@ -308,10 +312,10 @@ def _shifted(cost: float | None, by: float) -> float | None:
     return None if cost is None else cost + by
 
 
-def _robust_minima(
+def _robust_starts(
     problem: PackedProblem, frames: Sequence[FloatArray], model: SessionModel, others: list[SharedState]
-) -> RobustOptimum:
-    """Minima of the truncated cost of a one-epoch problem from consensus starts, and from others."""
+) -> SharedState:
+    """Starts of a one-epoch problem by consensus, and others."""
     states = list(others)
     for frame in frames:
         starts = consensus_starts(problem, frame, SPOT_DISTANCE_MM)
@@ -320,7 +324,7 @@ def _robust_minima(
     if model.initial_trus_T_camera is not None or not states:
         guess = np.eye(4) if model.initial_trus_T_camera is None else model.initial_trus_T_camera
         states.append(make_state(guess[None, None], frames[0], model.probe.radius_mm))
-    return graduated(problem, stack_states(states))
+    return stack_states(states)
 
 
 def choose_minimum(search: EpochSearch, model: SessionModel, config: SolveConfig) -> tuple[Minimum, bool]:

@@ -125,17 +125,19 @@ def read_aims(
     """One estimate per aim of ``measurements``, in order."""
     shots = registration.shots
     at = shots.evaluation
+    # In the plane across the chart's z axis; across the beam, which is next to it, they are a little shorter.
+    residual, slope = at.aim_residual[0], registration.optimum.state.beam[0, 2:]
+    square = np.sum(residual**2, axis=1) - (residual @ slope) ** 2 / (1.0 + slope @ slope)
     out = []
     for index, aim in enumerate(measurements.aims):
         nis, kept = float(shots.innovations.aim[index]), bool(shots.aim_kept[index])
-        residual = at.aim_residual[0, index]
         out.append(
             AimEstimate(
                 t=aim.t,
                 used=kept,
                 reason="" if kept else junk_reason(nis),
                 lambda_mm=float(at.aim_lambda_mm[0, index]) - origin_shift_mm,
-                residual_mm=float(np.linalg.norm(residual)),
+                residual_mm=float(np.sqrt(square[index])),
                 nis=nis,
             )
         )

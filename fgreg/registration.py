@@ -140,7 +140,8 @@ def joint_start(
     # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
     frame = nominal_frame(beam.beam_origin()[0], beam.beam_direction()[0])
     stacked = np.stack([transforms[k] for k in solvable])[None]
-    return make_state(stacked, frame, model.probe.radius_mm)
+    start = make_state(stacked, frame, model.probe.radius_mm)
+    return replace(start, edge_rad=beam.edge_rad, bias_mm=beam.bias_mm)
 
 
 def _points_backwards(optimum: Optimum) -> bool:
@@ -321,7 +322,7 @@ def _solve_jointly(
     whole = packed(measurements)
     everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
     if clean and aim_kept.all():
-        optimum = optimize(whole, start, tolerance=1e-7)
+        optimum = optimize(whole, start, tolerance=1e-8)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
         beyond = deviant(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
@@ -346,7 +347,7 @@ def _solve_jointly(
         kept = _enough(whole, judged.pm_kept, judged.aim_kept)
     chosen = _keep(measurements, whole.pms, *kept)
     problem = packed(chosen)
-    optimum = optimize(problem, judged.state, tolerance=1e-7)
+    optimum = optimize(problem, judged.state, tolerance=1e-8)
     found = innovations_at(whole, optimum.state, *kept)
     deviants = deviant(whole, found, kept[0])
     private = initial_private(whole, optimum.state)

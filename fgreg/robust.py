@@ -13,18 +13,27 @@ What is kept is then solved by plain least squares: a session without junk is an
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
 
 from fgreg.frames import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Contributions, Parts, contributions, refine
-from fgreg.graph.reduced_blocks import PrivateState, initial_private
+from fgreg.graph.reduced import (
+    Contributions,
+    Costs,
+    Evaluation,
+    Loss,
+    Parts,
+    Weights,
+    contributions,
+    evaluate,
+    private_at,
+)
+from fgreg.graph.reduced_blocks import PrivateState
+from fgreg.graph.reduced_solver import distinct, optimize
 from fgreg.graph.shared_state import SharedState
 
 JUNK_P = 1e-3
@@ -40,7 +49,8 @@ CAUCHY_SCALES = (100.0, 20.0, 4.0)
 STEPS_PER_SCALE = 3
 MAX_STEPS = 30
 SETTLE_ROUNDS = 8
-WEIGHT_FLOOR = 1e-12
+TOLERANCE = 1e-4
+"""Newton decrement (chi square) at which a descent ends."""
 WANDERS_MM, WANDERING_CHI2 = 1.0, 1e4
 """A PM that moves by more in one step, after several, has no place that fits; it counts as so far off."""
 UNKNOWN = 1e-9
@@ -114,142 +124,96 @@ def plausible_cost(problem: PackedProblem) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobustOptimum:
-    """S hypotheses at local minima of the truncated cost.
+    """Distinct hypotheses at local minima of the truncated cost, best first.
 
     Attributes:
-        state, private: of each hypothesis.
-        parts: the reduced problem there.
-        cost: (S,) truncated chi square.
+        state: of each hypothesis.
+        cost: (S,) truncated chi square. aim_cost: (S, A) chi square of each aim.
         pm_kept (S, J), aim_kept (S, A): which shots count in full.
     """
 
     state: SharedState
-    private: PrivateState
-    parts: Parts
     cost: FloatArray
+    aim_cost: FloatArray
     pm_kept: BoolArray
     aim_kept: BoolArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Weights:
-    pm: FloatArray
-    aim: FloatArray
-    cost: FloatArray
+def _hessian_of(parts: Parts, pm: BoolArray, aim: BoolArray) -> FloatArray:
+    """Hessian (D, D) of the parts that are kept, one hypothesis."""
+    return np.asarray(
+        parts.prior.hessian[0, 0] + parts.pm.hessian[0, pm].sum(axis=0) + parts.aim.hessian[0, aim].sum(axis=0)
+    )
 
 
-def _weighted(parts: Parts, pm: FloatArray, aim: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gradient (S, D) and Hessian (S, D, D) of the weighted sum of all parts."""
-    gradient, hessian = parts.prior.gradient[:, 0].copy(), parts.prior.hessian[:, 0].copy()
-    for weight, part in ((pm, parts.pm), (aim, parts.aim)):
-        gradient += np.einsum("sn,sna->sa", weight, part.gradient)
-        hessian += np.einsum("sn,snab->sab", weight, part.hessian)
-    return gradient, hessian
-
-
-def _cauchy(parts: Parts, scale: float, aim_scale: float) -> _Weights:
+def _cauchy(costs: Costs, scale: float, aim_scale: float) -> Weights:
     """Cauchy loss: cost k log(1 + c / k), weight 1 / (1 + c / k). An infinite scale is least squares."""
-    cost = parts.prior.cost[:, 0].copy()
+    total = costs.prior
     weights = []
-    for part, k in ((parts.pm, scale), (parts.aim, aim_scale)):
-        c = np.maximum(part.cost, 0.0)
+    for cost, k in ((costs.pm, scale), (costs.aim, aim_scale)):
+        c = np.maximum(cost, 0.0)
         weights.append(1.0 / (1.0 + c / k))
-        cost += np.sum(c if np.isinf(k) else k * np.log1p(c / k), axis=1)
-    return _Weights(weights[0], weights[1], cost)
+        total = total + np.sum(c if np.isinf(k) else k * np.log1p(c / k), axis=1)
+    return Weights(weights[0], weights[1], total)
 
 
-def _truncated(parts: Parts, limit: FloatArray, aim_limit: float) -> _Weights:
-    cost = parts.prior.cost[:, 0] + np.sum(np.minimum(parts.pm.cost, limit), axis=1)
-    cost += np.sum(np.minimum(parts.aim.cost, aim_limit), axis=1)
-    return _Weights((parts.pm.cost <= limit).astype(float), (parts.aim.cost <= aim_limit).astype(float), cost)
+def _truncated(costs: Costs, limit: FloatArray, aim_limit: float) -> Weights:
+    total = costs.prior + np.minimum(costs.pm, limit).sum(axis=1) + np.minimum(costs.aim, aim_limit).sum(axis=1)
+    return Weights((costs.pm <= limit).astype(float), (costs.aim <= aim_limit).astype(float), total)
 
 
-def _fixed(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> _Weights:
-    cost = parts.prior.cost[:, 0] + np.sum(pm_kept * parts.pm.cost, axis=1) + np.sum(aim_kept * parts.aim.cost, axis=1)
-    return _Weights(_repeated(pm_kept, parts.pm), _repeated(aim_kept, parts.aim), cost)
+def _fixed(costs: Costs, pm_kept: BoolArray, aim_kept: BoolArray) -> Weights:
+    pm, aim = pm_kept + np.zeros_like(costs.pm), aim_kept + np.zeros_like(costs.aim)
+    return Weights(pm, aim, costs.prior + (pm * costs.pm).sum(axis=1) + (aim * costs.aim).sum(axis=1))
 
 
-def _repeated(kept: BoolArray, part: Contributions) -> FloatArray:
-    """Weights (S, n) of 0 and 1 for every hypothesis."""
-    return np.array(np.broadcast_to(kept, part.cost.shape), dtype=np.float64)
+def _settled(problem: PackedProblem, state: SharedState, loss: Loss) -> Evaluation:
+    """The starts as they are, in which a PM that still wanders counts as far off, whatever it passes on its way."""
+
+    def honest(costs: Costs) -> Weights:
+        far = np.where(costs.moved_mm > WANDERS_MM, np.maximum(costs.pm, WANDERING_CHI2), costs.pm)
+        return loss(replace(costs, pm=far))
+
+    return evaluate(problem, state, private_at(problem, state), honest)
 
 
-Loss = Callable[[Parts], _Weights]
-
-
-def _select(good: BoolArray, new: Any, old: Any) -> Any:
-    """``new`` where good (S,), else ``old``: arrays that lead with S, or dataclasses of such."""
-    if isinstance(new, np.ndarray):
-        return np.where(good.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-    return type(new)(*(_select(good, getattr(new, name), getattr(old, name)) for name in new.__slots__))
-
-
-def _honest(parts: Parts, before: PrivateState) -> Parts:
-    """Parts in which a PM that still wanders counts as far off, whatever it passes on its way."""
+def _settled_parts(problem: PackedProblem, state: SharedState) -> Parts:
+    """What each shot adds at shared variables (one hypothesis); a PM that wanders counts as far off."""
+    before = private_at(problem, state)
+    parts = contributions(problem, state, before)
     wanders = np.linalg.norm(parts.private.trus_p_pm - before.trus_p_pm, axis=-1) > WANDERS_MM
-    if not wanders.any():
-        return parts
     cost = np.where(wanders, np.maximum(parts.pm.cost, WANDERING_CHI2), parts.pm.cost)
     return replace(parts, pm=replace(parts.pm, cost=cost))
 
 
-class _Descent:
-    """Levenberg-Marquardt with weights that follow the costs (iteratively reweighted least squares)."""
-
-    def __init__(self, problem: PackedProblem, state: SharedState, private: PrivateState | None = None) -> None:
-        self.problem, self.state = problem, state
-        self.settle(initial_private(problem, state) if private is None else private)
-
-    def settle(self, private: PrivateState | None = None) -> None:
-        """Find the private variables at the present state, from the arcs where none are given.
-
-        On the way from a far start a PM may end up on the far side of its arc, where it seems to fit.
-        """
-        private = initial_private(self.problem, self.state) if private is None else private
-        for _ in range(3):
-            _, private = refine(self.problem, self.state, private)
-        self.parts = _honest(contributions(self.problem, self.state, private), private)
-
-    def run(self, loss: Loss, steps: int, tolerance: float = 1e-4) -> _Weights:
-        """At most so many steps under one loss; until the Newton decrement (chi square) is below the tolerance."""
-        here = loss(self.parts)
-        damping = np.full(self.state.count, 1e-4)
-        done = np.zeros(self.state.count, dtype=bool)
-        for _ in range(steps):
-            gradient, hessian = _weighted(self.parts, here.pm, here.aim)
-            diagonal = np.arange(hessian.shape[1])
-            hessian[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-            hessian[:, diagonal, diagonal] += WEIGHT_FLOOR
-            step = np.asarray(-np.linalg.solve(hessian, gradient[..., None])[..., 0], dtype=np.float64)
-            moved = self.state.retract(step, self.problem.columns)
-            before = self.parts.private
-            points = before.trus_p_pm + (self.parts.point_gain @ step[:, None, :, None])[..., 0]
-            _, ahead = refine(self.problem, moved, replace(before, trus_p_pm=points))
-            trial = contributions(self.problem, moved, ahead)
-            there = loss(trial)
-            good = np.isfinite(there.cost) & (there.cost <= here.cost + 1e-9 * (1.0 + np.abs(here.cost)))
-            self.state = _select(good, moved, self.state)
-            self.parts = _select(good, trial, self.parts)
-            here = _select(good, there, here)
-            damping = np.clip(np.where(good, damping * 0.1, damping * 8.0), 1e-9, 1e12)
-            done |= (good & (-np.sum(step * gradient, axis=1) < tolerance)) | (damping > 1e9)
-            if done.all():
-                break
-        return here
-
-
-def graduated(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
+def graduated(
+    problem: PackedProblem,
+    state: SharedState,
+    *,
+    robust_aims: bool = False,
+    keep_within: float | None = None,
+    best_cost: float = np.inf,
+) -> RobustOptimum:
     """Local minima of the truncated cost from S starts, by way of narrowing Cauchy losses.
 
     Args:
         problem: the packed measurements.
         state: S starts.
         robust_aims: doubt the aims, too; else they count in full.
+        keep_within, best_cost: of the truncated cost, as of :func:`fgreg.graph.reduced_solver.optimize`.
     """
-    descent = _Descent(problem, state)
+    start: Evaluation | None = None
+    private: PrivateState | None = None
     for scale in CAUCHY_SCALES:
-        descent.run(partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf), STEPS_PER_SCALE)
-    return _truncated_minima(descent, robust_aims=robust_aims)
+        loss = partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf)
+        start = _settled(problem, state, loss) if private is None else None
+        found = optimize(
+            problem, state, private, max_iterations=STEPS_PER_SCALE, tolerance=TOLERANCE, loss=loss, start=start
+        )
+        # Most starts have come together by then.
+        index = distinct(problem, found.state, found.evaluation)
+        state, private = found.state.take(index), found.evaluation.private.take(index)
+    return _truncated_minima(problem, state, robust_aims=robust_aims, keep_within=keep_within, best_cost=best_cost)
 
 
 def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
@@ -258,17 +222,35 @@ def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims
     The wide losses may lead away from a start that is good already, and into another minimum.
     """
     far = graduated(problem, state, robust_aims=robust_aims)
-    near = _truncated_minima(_Descent(problem, state), robust_aims=robust_aims)
+    near = _truncated_minima(problem, state, robust_aims=robust_aims)
     return near if near.cost[0] < far.cost[0] else far
 
 
-def _truncated_minima(descent: _Descent, *, robust_aims: bool) -> RobustOptimum:
-    limit, aim_limit = pm_limits(descent.problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
+def _truncated_minima(
+    problem: PackedProblem,
+    state: SharedState,
+    *,
+    robust_aims: bool,
+    keep_within: float | None = None,
+    best_cost: float = np.inf,
+) -> RobustOptimum:
+    limit, aim_limit = pm_limits(problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
+    loss = partial(_truncated, limit=limit, aim_limit=aim_limit)
     for _ in range(2):
-        descent.settle()
-        weights = descent.run(partial(_truncated, limit=limit, aim_limit=aim_limit), MAX_STEPS)
+        found = optimize(
+            problem,
+            state,
+            max_iterations=MAX_STEPS,
+            tolerance=TOLERANCE,
+            keep_within=keep_within,
+            best_cost=best_cost,
+            loss=loss,
+            start=_settled(problem, state, loss),
+        )
+        state = found.state
+    at, index = found.evaluation, distinct(problem, state, found.evaluation)
     return RobustOptimum(
-        descent.state, descent.parts.private, descent.parts, weights.cost, weights.pm > 0.5, weights.aim > 0.5
+        state.take(index), at.cost[index], at.aim_cost[index], at.pm_weight[index] > 0.5, at.aim_weight[index] > 0.5
     )
 
 
@@ -293,8 +275,8 @@ def innovations(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> Innova
     With total Hessian H, leaving a shot of cost c, gradient g, Hessian A out moves the optimum to where the rest costs
     g' (H - A)^-1 g less: the innovation is c + g' (H - A)^-1 g. For a shot that was not in it is c - g' (H + A)^-1 g.
     """
-    _, hessian = _weighted(parts, _repeated(pm_kept, parts.pm), _repeated(aim_kept, parts.aim))
-    return Innovations(_innovation(parts.pm, hessian[0], pm_kept), _innovation(parts.aim, hessian[0], aim_kept))
+    hessian = _hessian_of(parts, pm_kept, aim_kept)
+    return Innovations(_innovation(parts.pm, hessian, pm_kept), _innovation(parts.aim, hessian, aim_kept))
 
 
 def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
@@ -330,7 +312,7 @@ def innovations_at(
 
     ``private`` where its private variables are known, else they are found.
     """
-    parts = _Descent(problem, state, private).parts
+    parts = _settled_parts(problem, state) if private is None else contributions(problem, state, private)
     return innovations(parts, pm_kept, aim_kept)
 
 
@@ -384,11 +366,9 @@ def sort_shots(
     seen: set[bytes] = set()
     settled = False
     for _ in range(SETTLE_ROUNDS):
-        descent = _Descent(problem, state)
-        descent.run(partial(_fixed, pm_kept=pm_kept, aim_kept=aim_kept), MAX_STEPS)
-        descent.settle()
-        state = descent.state
-        found = innovations(descent.parts, pm_kept, aim_kept)
+        loss = partial(_fixed, pm_kept=pm_kept, aim_kept=aim_kept)
+        state = optimize(problem, state, max_iterations=MAX_STEPS, tolerance=TOLERANCE, loss=loss).state
+        found = innovations(_settled_parts(problem, state), pm_kept, aim_kept)
         beyond = deviant(problem, found, pm_kept)
         pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
         aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
@@ -405,9 +385,8 @@ def sort_shots(
 
 def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted) -> BoolArray:
     """Whether PMs that are not in ``problem``, over the same shared variables, fit what is kept of it (J,)."""
-    kept = _Descent(problem, judged.state).parts
-    _, hessian = _weighted(kept, _repeated(judged.pm_kept, kept.pm), _repeated(judged.aim_kept, kept.aim))
+    hessian = _hessian_of(_settled_parts(problem, judged.state), judged.pm_kept, judged.aim_kept)
     none = np.zeros(len(others.pms), dtype=bool)
-    innovation = _innovation(_Descent(others, judged.state).parts.pm, hessian[0], none)
+    innovation = _innovation(_settled_parts(others, judged.state).pm, hessian, none)
     limits = limits_among(others, none, int(judged.pm_kept.sum()), len(judged.pm_kept))
     return np.asarray(innovation <= limits)

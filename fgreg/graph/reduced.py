@@ -17,22 +17,28 @@ chi squares (twice the negative log of the density). Same optimum as fgreg.graph
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from fgreg.frames import FloatArray, hat, log_so3
-from fgreg.graph.packing import EpochLink, PackedProblem
+from fgreg.graph.packing import BeamArrays, EpochLink, PackedProblem
 from fgreg.graph.reduced_blocks import (
-    LineBlock,
-    LookBlock,
+    Chart,
+    Groups,
     PrivateState,
-    beam_columns,
-    inverse2,
+    Whitening,
+    along_beam,
+    cross,
+    initial_private,
+    inner,
     inverse3,
     line_block,
-    look_block,
-    sum_by,
+    look_columns,
+    look_rows,
+    outer,
     times,
     transposed,
 )
@@ -50,9 +56,9 @@ class Evaluation:
         private: private variables after this evaluation's refinement, at the *same* shared variables.
         point_gain: (S, J, 3, D): how the PMs move with the shared variables.
         point_covariance: (S, J, 3, 3): of the PMs given the shared variables.
-        line_residual (S, B, 2) mm, line_covariance (S, B, 2, 2), lambda_mm (S, B).
-        look_residual: (S, L, 3) over (x mm, range mm, rotation rad).
-        aim_residual (S, A, 2) mm, aim_covariance (S, A, 2, 2), aim_lambda_mm (S, A).
+        pm_weight: (S, J), aim_weight: (S, A): with which they count. aim_cost: (S, A) chi square of each.
+        lambda_mm: (S, B). aim_lambda_mm: (S, A). look_residual: (S, L, 3) over (x mm, range mm, rotation rad).
+        aim_residual: (S, A, 2) mm, along x and y of the beam chart's nominal frame.
     """
 
     cost: FloatArray
@@ -61,27 +67,42 @@ class Evaluation:
     private: PrivateState
     point_gain: FloatArray
     point_covariance: FloatArray
-    line_residual: FloatArray
-    line_covariance: FloatArray
+    pm_weight: FloatArray
+    aim_weight: FloatArray
+    aim_cost: FloatArray
     lambda_mm: FloatArray
     look_residual: FloatArray
     aim_residual: FloatArray
-    aim_covariance: FloatArray
     aim_lambda_mm: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _System:
-    """Residuals, weights and the normal equations of the PMs at one linearisation point."""
+    """Residuals in units of their standard deviations, and the normal equations of the PMs, at one linearisation point.
 
-    line: LineBlock
-    line_weight: FloatArray
-    look: LookBlock
-    aim: LineBlock
-    aim_covariance: FloatArray
-    aim_weight: FloatArray
-    h_pp: FloatArray
-    b_p: FloatArray
+    S is the last dimension. Lines are the beams of the PMs, then those of the aims (n = B + A).
+
+    Attributes:
+        line: (n, 4, 2, S) residual and derivative by the point, camera axes, of points ``camera_p`` (n, 3, S).
+        laser_p: (n, 3, S) those points in the chart's nominal frame. whitening: of the lines.
+        beam_by_point: (B, 3, 2, S) derivative by the PM, TRUS axes.
+        look: (L, 3, 4 + K, S) residual, derivatives by the PM and by the variables of ``look_columns``; ``look_raw``
+            the same in mm and rad.
+        aim_residual_mm: (A, 2, S) in the chart's coordinates.
+        point_step: (J, 3, S), point_covariance: (J, 3, 3, S).
+        pm_cost: (J, S), aim_cost: (A, S), prior_cost: (S,).
+    """
+
+    beams: Groups
+    looks: Groups
+    line: FloatArray
+    camera_p: FloatArray
+    laser_p: FloatArray
+    whitening: Whitening
+    beam_by_point: FloatArray
+    look: FloatArray
+    look_raw: FloatArray
+    aim_residual_mm: FloatArray
     point_covariance: FloatArray
     point_step: FloatArray
     pm_cost: FloatArray
@@ -92,71 +113,114 @@ class _System:
     @property
     def cost(self) -> FloatArray:
         """(S,) chi square of everything."""
-        return np.asarray(self.pm_cost.sum(axis=1) + self.aim_cost.sum(axis=1) + self.prior_cost)
+        return np.asarray(self.pm_cost.sum(axis=0) + self.aim_cost.sum(axis=0) + self.prior_cost)
 
 
 def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -> _System:
-    pms = len(problem.pms)
-    epoch = problem.beam_epoch
-    line = line_block(
-        problem.beams,
-        private.beam_error,
-        state,
-        private.trus_p_pm[:, problem.beam_pm],
-        state.rotation[:, epoch],
-        state.translation_mm[:, epoch],
-    )
-    line_weight = inverse2(line.covariance)
-    line_weighted = times(line_weight, line.residual)
-    look = look_block(problem, state, private.trus_p_pm[:, problem.look_pm])
-    look_weight = problem.looks.weight
-    look_weighted = times(look_weight, look.residual)
-    look_by_point_t = transposed(look.by_point)
-    h_pp = sum_by(line.across @ line_weight @ transposed(line.across), problem.beam_pm, pms)
-    h_pp = h_pp + sum_by(look_by_point_t @ look_weight @ look.by_point, problem.look_pm, pms)
-    b_p = sum_by(times(line.across, line_weighted), problem.beam_pm, pms)
-    b_p = b_p + sum_by(times(look_by_point_t, look_weighted), problem.look_pm, pms)
+    pms, count = len(problem.pms), len(problem.beam_pm)
+    chart = Chart.of(state)
+    beams, looks = Groups.of(problem.beam_pm, pms), Groups.of(problem.look_pm, pms)
+    points, shift = inner(private.trus_p_pm), inner(private.aim_shift)
+    rotation, translation = inner(state.rotation), inner(state.translation_mm)
+    if len(rotation) > 1:
+        rotation, translation = rotation[problem.beam_epoch], translation[problem.beam_epoch]
+    camera_p = np.einsum("nijs,nis->njs", rotation, beams.spread(points) - translation)
+    markers, error = problem.beams, inner(private.beam_error)
+    if len(shift):
+        camera_p = np.concatenate([camera_p, problem.aim_spot_mm[..., None] + shift])
+        markers, error = _joined(markers, problem.aims), np.concatenate([error, inner(private.aim_error)])
+    block = line_block(markers, error, chart, camera_p)
+    # What the spot of an aim is off its measured place is eliminated like the marker's error.
+    by_spot = block.rows[count:, 1:]
+    spot_spread = _times_each(problem.aim_spot_covariance, by_spot)
+    if len(shift):
+        block.rows[count:, 0] -= np.einsum("niks,nis->nks", by_spot, shift)
+        for place, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+            block.covariance[count:, place] += np.einsum("nks,nks->ns", by_spot[:, :, i], spot_spread[:, :, j])
+    whitening = Whitening.of(block.covariance)
+    line = whitening.rows(block.rows)
+    by_point = np.einsum("nijs,njks->niks", rotation, line[:count, 1:])
+
+    look_raw = look_rows(problem, state, looks.spread(points))
+    look = _times_each(_look_root(problem.looks.weight), look_raw)
+    look_by_point, look_residual = look[:, :, 1:4], look[:, :, 0]
+
+    h_pp = beams.sum(np.einsum("niks,njks->nijs", by_point, by_point))
+    h_pp = h_pp + looks.sum(np.einsum("nkis,nkjs->nijs", look_by_point, look_by_point))
+    b_p = beams.sum(np.einsum("niks,nks->nis", by_point, line[:count, 0]))
+    b_p = b_p + looks.sum(np.einsum("nkis,nks->nis", look_by_point, look_residual))
     point_covariance = inverse3(h_pp)
-    point_step = -times(point_covariance, b_p)
-
-    aim = line_block(problem.aims, private.aim_error, state, problem.aim_spot_mm + private.aim_shift, None, None)
-    aim = replace(aim, residual=aim.residual - times(transposed(aim.across), private.aim_shift))
-    aim_spread = problem.aim_spot_covariance @ aim.across
-    aim_covariance = aim.covariance + transposed(aim.across) @ aim_spread
-    aim_weight = inverse2(aim_covariance)
-    aim_weighted = times(aim_weight, aim.residual)
-
-    pm_cost = sum_by(np.sum(line.residual * line_weighted, axis=-1), problem.beam_pm, pms)
-    pm_cost = pm_cost + sum_by(np.sum(look.residual * look_weighted, axis=-1), problem.look_pm, pms)
-    pm_cost = pm_cost + np.sum(b_p * point_step, axis=-1)
+    point_step = -np.einsum("nijs,njs->nis", point_covariance, b_p)
+    line_cost = np.einsum("nis,nis->ns", line[:, 0], line[:, 0])
+    pm_cost = beams.sum(line_cost[:count]) + looks.sum(np.einsum("nks,nks->ns", look_residual, look_residual))
+    pm_cost = pm_cost + np.einsum("nis,nis->ns", b_p, point_step)
 
     # The private variables' optimum at these shared ones, as linearised here.
-    line_update = line.residual + times(transposed(line.across), point_step[:, problem.beam_pm])
-    beam_error = -times(problem.beams.covariance @ transposed(line.marker_jacobian), times(line_weight, line_update))
-    aim_error = -times(problem.aims.covariance @ transposed(aim.marker_jacobian), aim_weighted)
-    aim_shift = -times(aim_spread, aim_weighted)
+    updated = line[:, 0].copy()
+    updated[:count] += np.einsum("niks,nis->nks", by_point, beams.spread(point_step))
+    back = whitening.back(updated)
+    error = -np.einsum("niks,nks->nis", block.spread, back)
+    refined = PrivateState(
+        trus_p_pm=outer(points + point_step),
+        beam_error=outer(error[:count]),
+        aim_error=outer(error[count:]),
+        aim_shift=outer(-np.einsum("niks,nks->nis", spot_spread, back[count:])),
+    )
     return _System(
+        beams=beams,
+        looks=looks,
         line=line,
-        line_weight=line_weight,
+        camera_p=camera_p,
+        laser_p=block.laser_p,
+        whitening=whitening,
+        beam_by_point=by_point,
         look=look,
-        aim=aim,
-        aim_covariance=aim_covariance,
-        aim_weight=aim_weight,
-        h_pp=h_pp,
-        b_p=b_p,
+        look_raw=look_raw,
+        aim_residual_mm=block.rows[count:, 0],
         point_covariance=point_covariance,
         point_step=point_step,
         pm_cost=pm_cost,
-        aim_cost=np.sum(aim.residual * aim_weighted, axis=-1),
+        aim_cost=line_cost[count:],
         prior_cost=_prior_cost(problem, state),
-        private=PrivateState(private.trus_p_pm + point_step, beam_error, aim_error, aim_shift),
+        private=refined,
     )
+
+
+def _joined(first: BeamArrays, second: BeamArrays) -> BeamArrays:
+    return BeamArrays(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in BeamArrays.__slots__))
+
+
+def _times_each(matrix: FloatArray, values: FloatArray) -> FloatArray:
+    """Products (n, i, ..., S) of matrices (n, i, j) with values (n, j, ..., S): the same one for all hypotheses."""
+    flat = values.reshape(*values.shape[:2], math.prod(values.shape[2:]))
+    return np.asarray((matrix @ flat).reshape(len(matrix), matrix.shape[1], *values.shape[2:]))
+
+
+def _look_root(weight: FloatArray) -> FloatArray:
+    """U (L, 3, 3) with ``U' U`` the weights, which couple x and range only."""
+    root = np.zeros_like(weight)
+    root[:, 0, 0] = np.sqrt(weight[:, 0, 0])
+    root[:, 0, 1] = weight[:, 0, 1] / root[:, 0, 0]
+    root[:, 1, 1] = np.sqrt(weight[:, 1, 1] - root[:, 0, 1] ** 2)
+    root[:, 2, 2] = np.sqrt(weight[:, 2, 2])
+    return root
 
 
 def refine(problem: PackedProblem, state: SharedState, private: PrivateState) -> tuple[FloatArray, PrivateState]:
     """One step of the private variables at fixed shared ones: the cost (S,) and the private variables after it."""
     system = _system(problem, state, private)
     return system.cost, system.private
+
+
+def private_at(problem: PackedProblem, state: SharedState) -> PrivateState:
+    """The private variables at shared ones, from the arcs.
+
+    On the way from a far start a PM may end up on the far side of its arc, where it seems to fit.
+    """
+    private = initial_private(problem, state)
+    for _ in range(3):
+        _, private = refine(problem, state, private)
+    return private
 
 
 def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
@@ -170,51 +234,63 @@ def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateSt
     or junk of the density given: the sum of both.
     """
     system = _system(problem, state, private)
-    pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost
+    pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost.T
     if problem.log_junk is not None:
         pms = np.logaddexp(pms, problem.log_junk)
-    return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=1) + system.prior_cost))
+    return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=0) + system.prior_cost))
 
 
 def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
     """(S, J) log of what the windows' own shapes make of the Gaussian stand-ins' density of each PM."""
     if problem.shapes is None:
         return np.zeros((state.count, len(problem.pms)))
-    by_point = system.look.by_point[..., 2, :]
-    offset = system.look.residual[..., 2] + np.sum(by_point * system.point_step[:, problem.look_pm], axis=-1)
-    variance = np.sum(by_point * times(system.point_covariance[:, problem.look_pm], by_point), axis=-1)
-    return log_shape_ratios(problem, state.edge_rad, offset, variance)
+    by_point = system.look_raw[:, 2, 1:4]
+    offset = system.look_raw[:, 2, 0] + np.einsum("nis,nis->ns", by_point, system.looks.spread(system.point_step))
+    spread = np.einsum("nijs,njs->nis", system.looks.spread(system.point_covariance), by_point)
+    variance = np.einsum("nis,nis->ns", by_point, spread)
+    return log_shape_ratios(problem, state.edge_rad, offset.T, variance.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SharedDerivatives:
-    """Derivatives of all residuals by the shared variables (.., D), and how the PMs move with them (S, J, 3, D)."""
+    """Derivatives of all residuals by the shared variables, in units of standard deviations.
+
+    ``line`` (S, B + A, 2, D); ``h_ps`` (S, J, 3, D) of the PMs' normal equations, ``point_gain`` (S, J, 3, D) how the
+    PMs move with the shared variables.
+    """
 
     line: FloatArray
-    aim: FloatArray
     h_ps: FloatArray
     point_gain: FloatArray
 
 
 def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _System) -> _SharedDerivatives:
-    columns, size = problem.columns, problem.columns.size
-    count, pms = state.count, len(problem.pms)
-    line, look = system.line, system.look
-    by_shared = np.zeros((count, len(problem.beam_pm), 2, size))
-    pose = np.concatenate([line.to_camera @ hat(line.point_on_beam), -line.to_camera], axis=-1)
+    columns, pms = problem.columns, len(problem.beam_pm)
+    by_camera = system.line[:, 1:]
+    lines = len(by_camera)
+    line = np.zeros((state.count, lines, 2, columns.size))
+    pose = np.empty((pms, 6, 2, state.count))
+    pose[:, :3] = cross(by_camera[:pms], system.camera_p[:pms, :, None])
+    np.negative(by_camera[:pms], out=pose[:, 3:])
+    pose = pose.transpose(3, 0, 2, 1)
     for epoch in range(columns.epochs):
-        mine = problem.beam_epoch == epoch
-        by_shared[:, mine, :, 6 * epoch : 6 * epoch + 6] = pose[:, mine]
-    aim_by_shared = np.zeros((count, len(problem.aims.rotation), 2, size))
-    for block, columns_of in ((line, by_shared), (system.aim, aim_by_shared)):
-        if not columns_of.shape[1]:
-            continue
-        columns_of[..., columns.beam : columns.beam + 4] = beam_columns(block, state)
-        if columns.bias is not None:
-            columns_of[..., columns.bias : columns.bias + 3] = block.to_camera
-    h_ps = sum_by(line.across @ (system.line_weight @ by_shared), problem.beam_pm, pms)
-    h_ps = h_ps + sum_by(transposed(look.by_point) @ (problem.looks.weight @ look.by_shared), problem.look_pm, pms)
-    return _SharedDerivatives(by_shared, aim_by_shared, h_ps, -system.point_covariance @ h_ps)
+        mine = np.flatnonzero(problem.beam_epoch == epoch) if columns.epochs > 1 else slice(0, pms)
+        line[:, mine, :, 6 * epoch : 6 * epoch + 6] = pose[:, mine]
+    chart = np.zeros((lines, 4, 2, state.count))
+    chart[:, 0, 0] = chart[:, 1, 1] = -1.0
+    chart[:, 2, 0] = chart[:, 3, 1] = -system.laser_p[:, 2]
+    line[..., columns.beam : columns.beam + 4] = system.whitening.rows(chart).transpose(3, 0, 2, 1)
+    if columns.bias is not None:
+        line[..., columns.bias : columns.bias + 3] = by_camera.transpose(3, 0, 2, 1)
+    h_ps = _summed(system.beams, outer(system.beam_by_point) @ line[:, :pms])
+    by_look = np.einsum("nkis,nkjs->nijs", system.look[:, :, 1:4], system.look[:, :, 4:])
+    h_ps[..., look_columns(problem)] += outer(system.looks.sum(by_look))
+    return _SharedDerivatives(line, h_ps, -outer(system.point_covariance) @ h_ps)
+
+
+def _summed(groups: Groups, values: FloatArray) -> FloatArray:
+    """(S, n, ...) to (S, count, ...)."""
+    return groups.sum(values.swapaxes(0, 1)).swapaxes(0, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,23 +318,23 @@ class Parts:
 
 def contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Parts:
     """:func:`evaluate`, but not summed: the terms of the sum."""
-    pms, size = len(problem.pms), problem.columns.size
+    size, pms = problem.columns.size, len(problem.beam_pm)
     system = _system(problem, state, private)
     by = _shared_derivatives(problem, state, system)
-    line, look, aim = system.line, system.look, system.aim
-    line_t, look_t = transposed(system.line_weight @ by.line), transposed(problem.looks.weight @ look.by_shared)
-    hessian = sum_by(line_t @ by.line, problem.beam_pm, pms) + sum_by(look_t @ look.by_shared, problem.look_pm, pms)
-    hessian = hessian + transposed(by.h_ps) @ by.point_gain
-    gradient = sum_by(times(line_t, line.residual), problem.beam_pm, pms)
-    gradient = gradient + sum_by(times(look_t, look.residual), problem.look_pm, pms)
-    gradient = gradient + times(transposed(by.h_ps), system.point_step)
-    aim_weighted = times(system.aim_weight, aim.residual)
-    aim_t = transposed(by.aim)
+    look, columns = system.look, np.array(look_columns(problem))
+    line_t, residual = transposed(by.line), outer(system.line[:, 0])
+    line_hessian, line_gradient = line_t @ by.line, times(line_t, residual)
+    hessian = _summed(system.beams, line_hessian[:, :pms]) + transposed(by.h_ps) @ by.point_gain
+    gradient = _summed(system.beams, line_gradient[:, :pms]) + times(transposed(by.h_ps), outer(system.point_step))
+    look_hessian = np.einsum("nkis,nkjs->nijs", look[:, :, 4:], look[:, :, 4:])
+    hessian[..., columns[:, None], columns] += outer(system.looks.sum(look_hessian))
+    look_gradient = np.einsum("nkis,nks->nis", look[:, :, 4:], look[:, :, 0])
+    gradient[..., columns] += outer(system.looks.sum(look_gradient))
     prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
     _add_priors(problem, state, prior_gradient, prior_hessian)
     return Parts(
-        pm=Contributions(system.pm_cost, gradient, hessian),
-        aim=Contributions(system.aim_cost, times(aim_t, aim_weighted), aim_t @ system.aim_weight @ by.aim),
+        pm=Contributions(outer(system.pm_cost), gradient, hessian),
+        aim=Contributions(outer(system.aim_cost), line_gradient[:, pms:], line_hessian[:, pms:]),
         prior=Contributions(system.prior_cost[:, None], prior_gradient[:, None], prior_hessian[:, None]),
         private=system.private,
         point_gain=by.point_gain,
@@ -271,41 +347,79 @@ def pm_contributions(problem: PackedProblem, state: SharedState, private: Privat
     return Contributions(parts.cost[0], parts.gradient[0], parts.hessian[0])
 
 
-def evaluate(problem: PackedProblem, state: SharedState, private: PrivateState) -> Evaluation:
+@dataclass(frozen=True, slots=True, eq=False)
+class Costs:
+    """Chi squares of S hypotheses: of each PM (S, J), each aim (S, A), the priors (S,).
+
+    ``moved_mm`` (S, J): how far each PM moved when the private variables were refined.
+    """
+
+    pm: FloatArray
+    aim: FloatArray
+    prior: FloatArray
+    moved_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """How a loss counts: weights of the PMs (S, J) and aims (S, A), and the cost (S,) as it is by that loss."""
+
+    pm: FloatArray
+    aim: FloatArray
+    cost: FloatArray
+
+
+Loss = Callable[[Costs], Weights]
+
+
+def least_squares(costs: Costs) -> Weights:
+    """The loss under which everything counts in full."""
+    total = costs.pm.sum(axis=1) + costs.aim.sum(axis=1) + costs.prior
+    return Weights(np.ones_like(costs.pm), np.ones_like(costs.aim), total)
+
+
+def evaluate(
+    problem: PackedProblem, state: SharedState, private: PrivateState, loss: Loss = least_squares
+) -> Evaluation:
     """Cost, gradient and Gauss-Newton Hessian on the shared variables, private ones eliminated.
 
     Args:
         problem: the packed measurements.
         state: S hypotheses.
         private: where the private variables are linearised; refined once here (returned in ``private``).
+        loss: of each PM's and aim's chi square.
     """
     system = _system(problem, state, private)
     by = _shared_derivatives(problem, state, system)
-    line, look, aim = system.line, system.look, system.aim
-    weighted = system.line_weight @ by.line
-    look_weighted = problem.looks.weight @ look.by_shared
-    aim_weighted = system.aim_weight @ by.aim
-    hessian = _stacked(by.line, weighted) + _stacked(look.by_shared, look_weighted)
-    hessian += _stacked(by.h_ps, by.point_gain) + _stacked(by.aim, aim_weighted)
-    gradient = _stacked(weighted, line.residual[..., None]) + _stacked(look_weighted, look.residual[..., None])
-    gradient += _stacked(by.h_ps, system.point_step[..., None])
-    gradient += _stacked(aim_weighted, aim.residual[..., None])
-    gradient = gradient[..., 0]
+    moved_mm = np.sqrt(np.einsum("nis,nis->ns", system.point_step, system.point_step))
+    weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(moved_mm)))
+    look, columns, pms = system.look, np.array(look_columns(problem)), len(problem.beam_pm)
+    line, h_ps, look_t = by.line, by.h_ps, look[:, :, 4:]
+    if loss is not least_squares:
+        line = line * np.concatenate([weights.pm[:, problem.beam_pm], weights.aim], axis=1)[..., None, None]
+        h_ps = h_ps * weights.pm[..., None, None]
+        look_t = look_t * inner(weights.pm)[problem.look_pm, None, None]
+    hessian = _stacked(line, by.line) + _stacked(h_ps, by.point_gain)
+    hessian[:, columns[:, None], columns] += np.einsum("nkis,nkjs->sij", look_t, look[:, :, 4:])
+    gradient = _stacked(line, outer(system.line[:, 0])[..., None])
+    gradient = (gradient + _stacked(h_ps, outer(system.point_step)[..., None]))[..., 0]
+    gradient[:, columns] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
     _add_priors(problem, state, gradient, hessian)
+    lambda_mm = outer(along_beam(state, system.laser_p))
     return Evaluation(
-        cost=system.cost,
+        cost=weights.cost,
         gradient=gradient,
         hessian=hessian,
         private=system.private,
         point_gain=by.point_gain,
-        point_covariance=system.point_covariance,
-        line_residual=line.residual,
-        line_covariance=line.covariance,
-        lambda_mm=line.lambda_mm,
-        look_residual=look.residual,
-        aim_residual=aim.residual,
-        aim_covariance=system.aim_covariance,
-        aim_lambda_mm=aim.lambda_mm,
+        point_covariance=outer(system.point_covariance),
+        pm_weight=weights.pm,
+        aim_weight=weights.aim,
+        aim_cost=outer(system.aim_cost),
+        lambda_mm=lambda_mm[:, :pms],
+        look_residual=outer(system.look_raw[:, :, 0]),
+        aim_residual=outer(system.aim_residual_mm),
+        aim_lambda_mm=lambda_mm[:, pms:],
     )
 
 

@@ -1,16 +1,21 @@
 """Residuals of the reduced problem in blocks, and the private variables they are linearised at.
 
-Shapes lead with S, the hypotheses side by side; see fgreg.graph.reduced for how the blocks are put together.
+From outside shapes lead with S, the hypotheses side by side; in here it is the last dimension, (n, ..., S): arithmetic
+runs along it, and a marker's own matrices meet all hypotheses in one product.
+
+A beam is the line ``(x + z a, y + z b, z)`` of the chart's nominal frame. A point ``laser_p`` of that frame is off it
+by ``laser_p_xy - (x, y) - laser_p_z (a, b)``: two residuals, linear in the chart, their covariance from the marker's.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fgreg.frames import FloatArray, IntArray, exp_so3, hat, make_transform
+from fgreg.frames import FloatArray, IntArray, exp_so3, make_transform
 from fgreg.graph.packing import LINE_SIGMA_MM, BeamArrays, PackedProblem
 from fgreg.graph.shared_state import SharedState
 from fgreg.sensitivity import arc_of_rotation
@@ -34,16 +39,14 @@ class PrivateState:
         return PrivateState(*(getattr(self, name)[index] for name in self.__slots__))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LineBlock:
-    across: FloatArray
-    residual: FloatArray
-    covariance: FloatArray
-    marker_jacobian: FloatArray
-    lambda_mm: FloatArray
-    point_on_beam: FloatArray
-    to_camera: FloatArray
-    marker_rotation: FloatArray
+def inner(values: FloatArray) -> FloatArray:
+    """(S, ...) to (..., S), contiguous."""
+    return np.ascontiguousarray(values.transpose(*range(1, values.ndim), 0))
+
+
+def outer(values: FloatArray) -> FloatArray:
+    """(..., S) to (S, ...), a view."""
+    return values.transpose(-1, *range(values.ndim - 1))
 
 
 def perpendicular_basis(direction: FloatArray) -> FloatArray:
@@ -66,36 +69,59 @@ def times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
-def inverse2(matrix: FloatArray) -> FloatArray:
-    """Inverses of symmetric (..., 2, 2) matrices."""
-    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    out = np.empty_like(matrix)
-    det = a * d - b * b
-    out[..., 0, 0], out[..., 1, 1] = d / det, a / det
-    out[..., 0, 1] = out[..., 1, 0] = -b / det
-    return out
+_NEXT = np.array([1, 2, 0])
+
+
+def cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Cross products along the second dimension: (n, 3, ...) each, broadcast."""
+    return np.asarray((first * second[:, _NEXT] - first[:, _NEXT] * second)[:, _NEXT])
 
 
 def inverse3(matrix: FloatArray) -> FloatArray:
-    """Inverses of (..., 3, 3) matrices by cofactors: many times faster than LAPACK one by one."""
-    m = matrix
-    out = np.empty_like(m)
-    for i in range(3):
-        for j in range(3):
-            a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
-            out[..., j, i] = m[..., a, c] * m[..., b, d] - m[..., a, d] * m[..., b, c]
-    determinant = np.sum(m[..., 0, :] * out[..., :, 0], axis=-1)
-    out /= determinant[..., None, None]
+    """Inverses of symmetric (n, 3, 3, S) matrices by cofactors."""
+    a, b, c = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 0, 2]
+    d, e, f = matrix[:, 1, 1], matrix[:, 1, 2], matrix[:, 2, 2]
+    out = np.empty_like(matrix)
+    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
+    out[:, 0, 0] = first
+    out[:, 0, 1] = out[:, 1, 0] = second
+    out[:, 0, 2] = out[:, 2, 0] = third
+    out[:, 1, 1] = a * f - c * c
+    out[:, 1, 2] = out[:, 2, 1] = b * c - a * e
+    out[:, 2, 2] = a * d - b * b
+    out /= (a * first + b * second + c * third)[:, None, None]
     return out
 
 
-def sum_by(values: FloatArray, index: IntArray, groups: int) -> FloatArray:
-    """Sum (S, n, ...) over entries of the same group: (S, groups, ...)."""
-    if len(index) == groups and (index == np.arange(groups)).all():
-        return values
-    out = np.zeros((values.shape[0], groups, *values.shape[2:]))
-    np.add.at(out.swapaxes(0, 1), index, values.swapaxes(0, 1))
-    return out
+@dataclass(frozen=True, slots=True, eq=False)
+class Groups:
+    """Which group each of n entries belongs to: ``index`` (n,), and that as a matrix of ones (count, n).
+
+    Both are None where every entry is a group of its own, in order.
+    """
+
+    index: IntArray | None
+    matrix: FloatArray | None
+
+    @classmethod
+    def of(cls, index: IntArray, count: int) -> Groups:
+        """Entries (n,) of ``count`` groups."""
+        if len(index) == count and (index == np.arange(count)).all():
+            return cls(None, None)
+        matrix = np.zeros((count, len(index)))
+        matrix[index, np.arange(len(index))] = 1.0
+        return cls(index, matrix)
+
+    def sum(self, values: FloatArray) -> FloatArray:
+        """(n, ...) to (count, ...)."""
+        if self.matrix is None:
+            return values
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        return np.asarray((self.matrix @ flat).reshape(len(self.matrix), *values.shape[1:]))
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """(count, ...) to (n, ...)."""
+        return values if self.index is None else values[self.index]
 
 
 def moved_markers(beams: BeamArrays, error: FloatArray, bias_mm: FloatArray) -> FloatArray:
@@ -108,69 +134,136 @@ def moved_markers(beams: BeamArrays, error: FloatArray, bias_mm: FloatArray) -> 
     return make_transform(exp_so3(turn) @ beams.rotation, translation)
 
 
-def line_block(
-    beams: BeamArrays,
-    error: FloatArray,
-    state: SharedState,
-    points: FloatArray,
-    rotation: FloatArray | None,
-    translation_mm: FloatArray | None,
-) -> LineBlock:
-    """Two residuals across the beam for points (S, n, 3), in TRUS (with rotation, translation) or camera axes."""
-    if not len(beams.rotation):
-        return _no_lines(state.count)
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """The beams of S hypotheses: nominal frame as rotation (3, 3, S) and origin (3, S), (x, y) and (a, b) (2, S).
+
+    ``bias_mm`` (3, S): of the markers, camera axes.
+    """
+
+    rotation: FloatArray
+    origin_mm: FloatArray
+    offset_mm: FloatArray
+    slope: FloatArray
+    bias_mm: FloatArray
+
+    @classmethod
+    def of(cls, state: SharedState) -> Chart:
+        """The charts of a state."""
+        frame = state.marker_T_nominal
+        return cls(
+            inner(frame[:, :3, :3]), inner(frame[:, :3, 3]), inner(state.beam[:, :2]), inner(state.beam[:, 2:]),
+            inner(state.bias_mm),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineBlock:
+    """Points against beams, with the markers' errors as they are estimated.
+
+    Attributes:
+        rows: (n, 4, 2, S) the residual (mm, the marker's error linearised at zero) and its derivative by the point,
+            camera axes.
+        covariance: (n, 3, S): the entries 00, 01 and 11 of what the marker's pose leaves open, mm^2.
+        spread: (n, 6, 2, S) the marker's covariance times the derivative by its error.
+        laser_p: (n, 3, S) the point in the chart's nominal frame, mm.
+    """
+
+    rows: FloatArray
+    covariance: FloatArray
+    spread: FloatArray
+    laser_p: FloatArray
+
+
+def line_block(beams: BeamArrays, error: FloatArray, chart: Chart, camera_p: FloatArray) -> LineBlock:
+    """Points (n, 3, S), camera axes, against beams of markers with errors (n, 6, S)."""
+    n, count = len(error), camera_p.shape[-1]
+    shift, half_turn = error[:, 3:], _half_hat(error[:, :3])
     # The marker moves by Exp of a twist (w, n) about its observed origin: t + n + w x n / 2 to second order.
-    half_turn = 0.5 * hat(error[..., :3])
-    marker_rotation = exp_so3(error[..., :3]) @ beams.rotation
-    origin = times(marker_rotation, state.beam_origin()[:, None, :])
-    direction = times(marker_rotation, state.beam_direction()[:, None, :])
-    marker_t = beams.translation_mm + error[..., 3:] + times(half_turn, error[..., 3:]) - state.bias_mm[:, None, :]
-    if rotation is None or translation_mm is None:
-        start, along = origin + marker_t, direction
-    else:
-        start, along = times(rotation, origin + marker_t) + translation_mm, times(rotation, direction)
-    offset = points - start
-    lambda_mm = np.sum(along * offset, axis=-1)
-    basis = perpendicular_basis(along)
-    residual = times(transposed(basis), offset)
-    to_camera = transposed(basis) if rotation is None else transposed(basis) @ rotation
-    from_marker = origin + lambda_mm[..., None] * direction
-    jacobian = np.empty((*residual.shape, 6))
-    turn = hat(from_marker)
-    jacobian[..., :3] = to_camera @ (turn + turn @ half_turn + 0.5 * hat(error[..., 3:]))
-    jacobian[..., 3:] = -to_camera @ (np.eye(3) + half_turn)
-    covariance = jacobian @ beams.covariance @ transposed(jacobian)
-    covariance[..., 0, 0] += LINE_SIGMA_MM**2
-    covariance[..., 1, 1] += LINE_SIGMA_MM**2
-    return LineBlock(
-        across=basis,
-        residual=residual - times(jacobian, error),
-        covariance=covariance,
-        marker_jacobian=jacobian,
-        lambda_mm=lambda_mm,
-        point_on_beam=from_marker + marker_t,
-        to_camera=to_camera,
-        marker_rotation=marker_rotation,
-    )
+    marker_t = beams.translation_mm[..., None] + shift + np.einsum("nijs,njs->nis", half_turn, shift) - chart.bias_mm
+    from_marker = camera_p - marker_t
+    turn = _exp(error[:, :3], half_turn)
+    marker_p = transposed(beams.rotation) @ np.einsum("nijs,nis->njs", turn, from_marker) - chart.origin_mm[None]
+    laser_p = np.einsum("ijs,nis->njs", chart.rotation, marker_p)
+    across = chart.rotation[:, :2] - chart.rotation[:, 2:] * chart.slope
+    marker_rows = (beams.rotation @ across.reshape(3, 2 * count)).reshape(n, 3, 2, count)
+    rows = np.empty((n, 4, 2, count))
+    by_camera = rows[:, 1:]
+    np.einsum("nijs,njks->niks", turn, marker_rows, out=by_camera)
+    by_marker = np.empty((n, 2, 3, 2, count))
+    by_marker[:, 0] = cross(by_camera, (from_marker + 0.5 * shift)[:, :, None])
+    np.negative(by_camera, out=by_marker[:, 1])
+    by_marker = by_marker + np.einsum("ngiks,nijs->ngjks", by_marker, half_turn)
+    by_marker = by_marker.reshape(n, 6, 2, count)
+    spread = (beams.covariance @ by_marker.reshape(n, 6, 2 * count)).reshape(n, 6, 2, count)
+    covariance = np.empty((n, 3, count))
+    a, b = chart.slope
+    for place, (i, j, floor) in enumerate(((0, 0, 1.0 + a * a), (0, 1, a * b), (1, 1, 1.0 + b * b))):
+        np.einsum("nks,nks->ns", by_marker[:, :, i], spread[:, :, j], out=covariance[:, place])
+        covariance[:, place] += LINE_SIGMA_MM**2 * floor
+    residual = laser_p[:, :2] - chart.offset_mm - laser_p[:, 2:] * chart.slope
+    rows[:, 0] = residual - np.einsum("nkis,nks->nis", by_marker, error)
+    return LineBlock(rows, covariance, spread, laser_p)
 
 
-def _no_lines(count: int) -> LineBlock:
-    """Of no beams."""
+def _half_hat(w: FloatArray) -> FloatArray:
+    """Half the cross-product matrices (n, 3, 3, S) of vectors (n, 3, S)."""
+    half = 0.5 * w
+    out = np.zeros((len(w), 3, *w.shape[1:]))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -half[:, 2], half[:, 1], -half[:, 0]
+    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = half[:, 2], -half[:, 1], half[:, 0]
+    return out
 
-    def none(*shape: int) -> FloatArray:
-        return np.zeros((count, 0, *shape))
 
-    return LineBlock(none(3, 2), none(2), none(2, 2), none(2, 6), none(), none(3), none(2, 3), none(3, 3))
+def _exp(w: FloatArray, half_hat: FloatArray) -> FloatArray:
+    """Rotations (n, 3, 3, S) by vectors (n, 3, S), their :func:`_half_hat` given (Rodrigues)."""
+    half = 0.5 * np.sqrt(np.einsum("nis,nis->ns", w, w)) + 1e-30
+    ratio = np.sin(half) / half
+    once, twice = 2.0 * ratio * np.cos(half), 2.0 * ratio * ratio
+    out = once[:, None, None] * half_hat
+    out += twice[:, None, None] * np.einsum("nijs,njks->niks", half_hat, half_hat)
+    for i in range(3):
+        out[:, i, i] += 1.0
+    return np.asarray(out)
 
 
-def beam_columns(block: LineBlock, state: SharedState) -> FloatArray:
-    """Derivative of the line residual by the beam chart: (S, n, 2, 4)."""
-    r0 = state.marker_T_nominal[:, None, :3, :3]
-    length = np.sqrt(1.0 + np.sum(state.beam[:, 2:] ** 2, axis=1))
-    unit = np.concatenate([state.beam[:, 2:], np.ones((state.count, 1))], axis=1) / length[:, None]
-    tilt = (np.eye(3) - unit[:, :, None] * unit[:, None, :])[:, :, :2] / length[:, None, None]
-    turn = block.to_camera @ block.marker_rotation @ r0
-    return -np.concatenate([turn[..., :2], block.lambda_mm[..., None, None] * (turn @ tilt[:, None])], axis=-1)
+def along_beam(state: SharedState, laser_p: FloatArray) -> FloatArray:
+    """(n, S) distance from the chart's point (x, y, 0) along the unit direction, of the foot of points (n, 3, S)."""
+    (x, y, a, b) = state.beam.T
+    ahead = laser_p[:, 2] + (laser_p[:, 0] - x) * a + (laser_p[:, 1] - y) * b
+    return np.asarray(ahead / np.sqrt(1.0 + a * a + b * b))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Whitening:
+    """Cholesky factors of n x S covariances of two residuals (entries 00, 01, 11 of each)."""
+
+    first: FloatArray
+    below: FloatArray
+    second: FloatArray
+
+    @classmethod
+    def of(cls, covariance: FloatArray) -> Whitening:
+        """From the entries (n, 3, S)."""
+        first = np.sqrt(covariance[:, 0])
+        below = covariance[:, 1] / first
+        return cls(first, below, np.sqrt(covariance[:, 2] - below * below))
+
+    def rows(self, values: FloatArray) -> FloatArray:
+        """Values (n, ..., 2, S) in units of their standard deviations."""
+        shape = (len(self.first), *(1,) * (values.ndim - 3), self.first.shape[-1])
+        first, below, second = (part.reshape(shape) for part in (self.first, self.below, self.second))
+        out = np.empty(np.broadcast_shapes(values.shape, (*shape[:-1], 1, shape[-1])))
+        np.divide(values[..., 0, :], first, out=out[..., 0, :])
+        np.divide(values[..., 1, :] - below * out[..., 0, :], second, out=out[..., 1, :])
+        return out
+
+    def back(self, values: FloatArray) -> FloatArray:
+        """Whitened values (n, 2, S) as the inverse covariance would have made them of the plain ones."""
+        second = values[:, 1] / self.second
+        out = np.empty_like(values)
+        out[:, 0], out[:, 1] = (values[:, 0] - self.below * second) / self.first, second
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,42 +278,55 @@ class LookBlock:
 def look_block(problem: PackedProblem, state: SharedState, points: FloatArray) -> LookBlock:
     """Looks against the points (S, L, 3), TRUS mm."""
     looks, columns = problem.looks, problem.columns
-    radius = state.radius_mm[:, None]
-    ratio = state.sound_speed_ratio[:, None]
-    sin_scan, cos_scan = np.sin(looks.scan_rad), np.cos(looks.scan_rad)
-    dy = points[..., 1] - radius * sin_scan
-    dz = points[..., 2] - radius * cos_scan
-    distance = np.maximum(np.hypot(dy, dz), 1e-9)
+    rows = look_rows(problem, state, inner(points))
+    whole = np.zeros((len(looks.scan_rad), 3, columns.size, state.count))
+    whole[:, :, look_columns(problem)] = rows[:, :, 4:]
+    return LookBlock(outer(rows[:, :, 0]), outer(rows[:, :, 1:4]), outer(whole))
+
+
+def look_columns(problem: PackedProblem) -> list[int]:
+    """The shared variables that looks depend on beside their point: window edge, sound speed, radius."""
+    columns = problem.columns
+    return [at for at in (columns.edge, columns.sound_speed, columns.radius) if at is not None]
+
+
+def look_rows(problem: PackedProblem, state: SharedState, points: FloatArray) -> FloatArray:
+    """Looks against points (L, 3, S), TRUS mm: (L, 3, 4 + K, S) over (x, range, rotation).
+
+    The residual, its derivatives by the point, and by the K variables of :func:`look_columns`.
+    """
+    looks, columns = problem.looks, problem.columns
+    scan, heard_mm = looks.scan_rad[:, None], looks.range_mm[:, None]
+    radius = state.radius_mm
+    sin_scan, cos_scan = np.sin(scan), np.cos(scan)
+    dy = points[:, 1] - radius * sin_scan
+    dz = points[:, 2] - radius * cos_scan
+    distance = np.maximum(np.sqrt(dy * dy + dz * dz), 1e-9)
     sin_theta, cos_theta = dy / distance, dz / distance
     sin_delta = sin_theta * cos_scan - cos_theta * sin_scan
     cos_delta = cos_theta * cos_scan + sin_theta * sin_scan
-    heard = ratio * looks.range_mm
-    rotation = np.arctan2(heard * sin_delta, radius + heard * cos_delta)
-    square = radius**2 + heard**2 + 2.0 * radius * heard * cos_delta
-    per_delta = heard * (heard + radius * cos_delta) / square
-    per_range = radius * sin_delta / square
+    heard = state.sound_speed_ratio * heard_mm
+    towards = radius + heard * cos_delta
+    rotation = np.arctan2(heard * sin_delta, towards)
+    square = radius * (towards + heard * cos_delta) + heard * heard
+    per_mm = heard * (heard + radius * cos_delta) / (square * distance)
 
-    residual = np.empty((*distance.shape, 3))
-    residual[..., 0] = points[..., 0] - looks.x_mm
-    residual[..., 1] = distance - heard
-    residual[..., 2] = rotation - looks.centre_rad - looks.edge_gain * state.edge_rad[:, None]
-
-    by_point = np.zeros((*distance.shape, 3, 3))
-    by_point[..., 0, 0] = 1.0
-    by_point[..., 1, 1], by_point[..., 1, 2] = sin_theta, cos_theta
-    by_point[..., 2, 1] = per_delta * cos_theta / distance
-    by_point[..., 2, 2] = -per_delta * sin_theta / distance
-
-    by_shared = np.zeros((*distance.shape, 3, columns.size))
-    by_shared[..., 2, columns.edge] = -looks.edge_gain
+    out = np.zeros((len(looks.scan_rad), 3, 4 + len(look_columns(problem)), distance.shape[-1]))
+    out[:, 0, 0] = points[:, 0] - looks.x_mm[:, None]
+    out[:, 1, 0] = distance - heard
+    out[:, 2, 0] = rotation - looks.centre_rad[:, None] - looks.edge_gain[:, None] * state.edge_rad
+    out[:, 0, 1] = 1.0
+    out[:, 1, 2], out[:, 1, 3] = sin_theta, cos_theta
+    out[:, 2, 2], out[:, 2, 3] = per_mm * cos_theta, -per_mm * sin_theta
+    out[:, 2, 4] = -looks.edge_gain[:, None]
+    place = 5
     if columns.sound_speed is not None:
-        by_shared[..., 1, columns.sound_speed] = -looks.range_mm
-        by_shared[..., 2, columns.sound_speed] = per_range * looks.range_mm
+        out[:, 1, place], out[:, 2, place] = -heard_mm, radius * sin_delta / square * heard_mm
+        place += 1
     if columns.radius is not None:
         # Moving the elements outwards by dR moves the arc's centre along the plane: range and theta' both change.
-        by_shared[..., 1, columns.radius] = -cos_delta
-        by_shared[..., 2, columns.radius] = per_delta * sin_delta / distance - heard * sin_delta / square
-    return LookBlock(residual, by_point, by_shared)
+        out[:, 1, place], out[:, 2, place] = -cos_delta, per_mm * sin_delta - heard * sin_delta / square
+    return out
 
 
 def initial_private(problem: PackedProblem, state: SharedState) -> PrivateState:

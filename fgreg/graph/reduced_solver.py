@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
-from fgreg.frames import BoolArray, FloatArray, IntArray
+from fgreg.frames import BoolArray, IntArray
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Evaluation, evaluate, refine
-from fgreg.graph.reduced_blocks import PrivateState, initial_private
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.reduced import Evaluation, Loss, evaluate, least_squares, private_at, refine
+from fgreg.graph.reduced_blocks import PrivateState
+from fgreg.graph.shared_state import SharedState, step_between
 
 WEIGHT_FLOOR = 1e-12
 """Curvature lent to shared variables that nothing observes (a registration without pairs): they stay where they are."""
 
 
+LONG_STEP = 0.1
+"""Newton decrement (chi square) above which the private variables are refined before a step is judged."""
+STALLED = 1e-6
+"""Newton decrement (chi square) at which a step that gains nothing is the last: private variables lag by as much."""
 CREEPING = 10.0
 """At most so many times what one step promised is what all the steps after it may still gain."""
 
@@ -39,6 +44,8 @@ def optimize(
     tolerance: float = 1e-6,
     keep_within: float | None = None,
     best_cost: float = np.inf,
+    loss: Loss = least_squares,
+    start: Evaluation | None = None,
 ) -> Optimum:
     """Levenberg-Marquardt on the shared variables, all hypotheses side by side.
 
@@ -52,12 +59,12 @@ def optimize(
         keep_within: stop early on hypotheses whose cost exceeds the best converged one by more than this.
         best_cost: a cost that is known to be reached otherwise: hypotheses that will not come to within ``keep_within``
             of it are left where they are.
+        loss: of each PM's and aim's chi square: iteratively reweighted least squares.
+        start: the evaluation at the starts, where that is known.
     """
-    if private is None:
-        private = initial_private(problem, state)
-        for _ in range(3):
-            _, private = refine(problem, state, private)
-    current = evaluate(problem, state, private)
+    current = start
+    if current is None:
+        current = evaluate(problem, state, private_at(problem, state) if private is None else private, loss)
     count = state.count
     damping = np.full(count, 1e-4)
     active = np.ones(count, dtype=bool)
@@ -74,16 +81,18 @@ def optimize(
         moved = state.take(index).retract(step, problem.columns)
         before = current.private.take(index)
         points = before.trus_p_pm + (current.point_gain[index] @ step[:, None, :, None])[..., 0]
-        _, ahead = refine(problem, moved, replace(before, trus_p_pm=points))
-        trial = evaluate(problem, moved, ahead)
+        ahead = replace(before, trus_p_pm=points)
+        if decrement.max() > LONG_STEP:
+            _, ahead = refine(problem, moved, ahead)
+        trial = evaluate(problem, moved, ahead, loss)
         good = np.isfinite(trial.cost) & (trial.cost <= current.cost[index] + 1e-9 * (1.0 + current.cost[index]))
+        stalled = (decrement < STALLED) & (trial.cost >= current.cost[index])
         if len(index) == count and good.all():
             state, current = moved, trial
         elif good.any():
-            state = _merge_state(state, moved, index, good)
-            current = _merge_evaluation(current, trial, index, good)
+            state, current = _merged(state, moved, index[good], good), _merged(current, trial, index[good], good)
         damping[index] = np.clip(np.where(good, damping[index] * 0.1, damping[index] * 8.0), 1e-9, 1e12)
-        active[index[(good & (decrement < tolerance)) | (damping[index] > 1e9)]] = False
+        active[index[(good & (decrement < tolerance)) | stalled | (damping[index] > 1e9)]] = False
         if keep_within is not None:
             if not active.all():
                 active &= current.cost <= current.cost[~active].min() + keep_within
@@ -94,29 +103,32 @@ def optimize(
     return Optimum(state, current, ~active, iteration)
 
 
-def _replace_rows(old: FloatArray, new: FloatArray, rows: IntArray, good: BoolArray) -> FloatArray:
-    out = old.copy()
-    out[rows[good]] = new[good]
-    return out
+def distinct(problem: PackedProblem, state: SharedState, at: Evaluation) -> IntArray:
+    """Which hypotheses to go on with, best first: none that is within a standard deviation of a better one."""
+    left, chosen = np.argsort(at.cost), []
+    while len(left):
+        best = int(left[0])
+        chosen.append(best)
+        others = state.take(left)
+        step = step_between(state.take([best]), others, problem.columns)
+        near = np.einsum("sa,ab,sb->s", step, at.hessian[best], step) < 1.0
+        same_chart = (others.marker_T_nominal == state.marker_T_nominal[best]).all(axis=(1, 2))
+        near[0] = True
+        left = left[~(near & same_chart)]
+    return np.array(chosen)
 
 
-def _merge_state(old: SharedState, new: SharedState, rows: IntArray, good: BoolArray) -> SharedState:
-    """``old`` with its ``rows`` replaced by those of ``new`` that are ``good``."""
-    return SharedState(
-        *(_replace_rows(getattr(old, name), getattr(new, name), rows, good) for name in SharedState.__slots__)
-    )
+T = TypeVar("T")
 
 
-def _merge_evaluation(old: Evaluation, new: Evaluation, rows: IntArray, good: BoolArray) -> Evaluation:
-    arrays = {
-        name: _replace_rows(getattr(old, name), getattr(new, name), rows, good)
-        for name in Evaluation.__slots__
-        if name != "private"
-    }
-    private = PrivateState(
-        *(
-            _replace_rows(getattr(old.private, name), getattr(new.private, name), rows, good)
-            for name in PrivateState.__slots__
-        )
-    )
-    return Evaluation(private=private, **arrays)
+def _merged(old: T, new: T, rows: IntArray, good: BoolArray) -> T:
+    """``old`` with its ``rows`` replaced by those of ``new`` that are ``good``; dataclasses of arrays (S, ...)."""
+    out = {}
+    for name in old.__slots__:  # type: ignore[attr-defined]
+        value, other = getattr(old, name), getattr(new, name)
+        if isinstance(value, np.ndarray):
+            out[name] = value.copy()
+            out[name][rows] = other[good]
+        else:
+            out[name] = _merged(value, other, rows, good)
+    return type(old)(**out)

@@ -21,7 +21,8 @@ from fgreg.graph.shared_state import SharedState
 from fgreg.graph.windows import LEAST_PRECISION
 from fgreg.sensitivity import interval_moments, log_interval
 
-ROUNDS = 30
+ROUNDS, FEW_ROUNDS = 30, 12
+"""Sites that are not settled after so many rounds are given up; those of a session that settle do so in six or so."""
 SETTLED = 0.02
 """Sites have settled when no rotation, nor its standard deviation, moves by more than this share of the latter."""
 DAMPING = 0.8
@@ -53,11 +54,11 @@ def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, 
     """
     if problem.shapes is None:
         return None
-    settled = settle(problem, optimum.state, optimum.evaluation)
+    settled = settle(problem, optimum.state, optimum.evaluation, rounds=FEW_ROUNDS)
     if settled is None:
         return None
     problem, state, at = settled
-    return problem, optimize(problem, state, at.private, tolerance=1e-7)
+    return problem, optimize(problem, state, at.private)
 
 
 def settle(
@@ -67,20 +68,21 @@ def settle(
     *,
     settled: float = SETTLED,
     damping: float = DAMPING,
+    rounds: int = ROUNDS,
 ) -> tuple[PackedProblem, SharedState, Evaluation] | None:
     """Sites for the windows' shapes, and where they settled: near their optimum; None where they do not settle.
 
     Args:
         problem: with the Gaussian priors as first sites, which stay where it has no shapes.
         state: to start from, one hypothesis. at: the problem there.
-        settled, damping: in place of ``SETTLED`` and ``DAMPING``.
+        settled, damping, rounds: in place of ``SETTLED``, ``DAMPING`` and ``ROUNDS``.
     """
     if not len(problem.look_pm):
         return None
     precision = problem.looks.weight[:, 2, 2].copy()
     centre = problem.looks.centre_rad.copy()
     before, sigma_before = np.full((2, len(precision)), np.inf)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         covariance = inverse_hessian(at.hessian[0])
         if covariance is None:
             return None
