@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from credible_region import credible_region
+from credible_region import credible_region, ellipsoid_contains
 
 from fgreg.answer import answer
 from fgreg.config import SolveConfig
@@ -13,20 +13,26 @@ from fgreg.graph.packing import pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state
 from fgreg.models import NoiseModel
-from fgreg.posterior import Mode, light, log_density, sample_posterior
+from fgreg.posterior import Mode, light, log_density, pose_tangent, sample_posterior
 from fgreg.registration import register
 from tests.forward import make_measurements, make_session
 
 
 @pytest.mark.parametrize("first_hit", [True, False])
-def test_the_truth_is_inside_as_often_as_it_says(first_hit: bool) -> None:
-    inside = 0
-    for seed in range(24):
+def test_the_truth_is_where_the_posterior_says(first_hit: bool) -> None:
+    nees, in_region, in_ellipsoid = [], 0, 0
+    for seed in range(12):
         model, measurements, truth = make_measurements(np.random.default_rng(300 + seed), pairs=10, first_hit=first_hit)
         found = answer(register(measurements, model, SolveConfig()), SolveConfig())
-        region = credible_region(found.modes, found.posterior)
-        inside += region.contains(np.stack(truth.trus_T_camera))
-    assert inside >= 20  # of 24: fewer has a chance of 1 % where 95 % is the truth
+        posterior = found.posterior
+        error = pose_tangent(posterior.mean.trus_T_camera()[0], truth.trus_T_camera[0])
+        nees.append(error @ np.linalg.solve(posterior.covariance[:6, :6], error))
+        in_ellipsoid += ellipsoid_contains(posterior, truth.trus_T_camera[0])
+        in_region += credible_region(found.modes, posterior).contains(np.stack(truth.trus_T_camera))
+    assert 4.0 < np.mean(nees) < 9.0  # a chi square of six: 6 +- 1
+    # Of 12: fewer has a chance of 2 % where 95 % is the truth.
+    assert in_region >= 10
+    assert in_ellipsoid >= 10
 
 
 def test_the_region_holds_its_share_of_fresh_samples_and_nothing_far() -> None:
