@@ -31,7 +31,7 @@ from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.posterior import Posterior, predicted_tre
 from fgreg.readout import read_aims, read_laser, read_pairs
-from fgreg.registration import Registration, SoundSpeedPrior, register
+from fgreg.registration import EpochSearch, Registration, SoundSpeedPrior, register
 from fgreg.surface import fit_surface
 from fgreg.tracking import Snapshot, make_snapshot, track
 from fgreg.verdict import (
@@ -96,6 +96,7 @@ def solve(
     config: SolveConfig,
     conditions: Sequence[Condition] = (),
     sound_speed_prior: SoundSpeedPrior | None = None,
+    known: Mapping[int, EpochSearch] | None = None,
 ) -> Solution:
     """Calibrate, register, judge, and answer the tracking queries from all of it.
 
@@ -106,9 +107,10 @@ def solve(
         config: limits of the verdict.
         conditions: found before (detection), to be weighed with those found here.
         sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
+        known: epochs whose minima are known and not searched for again.
     """
     try:
-        registration = register(measurements, model, config, sound_speed_prior)
+        registration = register(measurements, model, config, sound_speed_prior, known)
     except EstimationError as error:
         return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
     answered = answer(registration, config)

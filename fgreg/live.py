@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-from array import array
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -12,7 +11,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from fgreg.checkpoint import Checkpoints, Moment, Resumable
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.estimate import TrackEstimate
@@ -58,7 +56,7 @@ class Engine(Protocol):
     def refresh(self) -> OnlineEstimate: ...
     def measurements(self) -> Measurements: ...
     def marker_T_laser(self) -> FloatArray | None: ...
-    def catching_up(self) -> AbstractContextManager[None]: ...
+    def restoring(self) -> AbstractContextManager[None]: ...
     @property
     def estimate(self) -> OnlineEstimate | None: ...
     @property
@@ -119,7 +117,6 @@ class LiveSession:
         estimate: after the last event that was taken in; None before the first.
         config: of the estimate.
         late: events may be handed over later than others that happened after them: they get the last one's time.
-        checkpoints: what spares it to take in all events again when it is opened.
         engine: that has taken in what is recorded; a revived session has another one.
     """
 
@@ -129,7 +126,6 @@ class LiveSession:
         self.journal, self.config = journal, config
         self.estimate: OnlineEstimate | None = None
         self.late = False
-        self.checkpoints = Checkpoints(journal.folder, config)
         self._make_engine = make_engine
         self._untaken: list[Event] = []  # on disk, not in the estimate yet: something came between
         self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
@@ -142,9 +138,6 @@ class LiveSession:
         """Nothing is taken in yet."""
         self._engine, self._feed = engine, EpochFeed(engine)
         self._recogniser = EventRecogniser(self.journal.model)
-        self._moment: Moment | None = None  # the last one that a checkpoint can be made of, while events of before come
-        self._begin, self._opening = 0, False
-        self._taken = array("q")  # lines of the events that are measurements in the engine
 
     @classmethod
     def open(
@@ -172,7 +165,7 @@ class LiveSession:
         return found
 
     def revive(self) -> OnlineEstimate | None:
-        """Go on with a new engine where the old one's process has ended: from the checkpoint and what is on disk.
+        """Go on with a new engine where the old one's process has ended: from what is on disk.
 
         Nothing is lost, and the session stays open. An event at which that has happened :data:`MOST_DEATHS` times is
         recorded as refused.
@@ -188,7 +181,6 @@ class LiveSession:
             if self._deaths[event.line] >= MOST_DEATHS:
                 self._refuse(event, event.line, f"the registration's process has ended {MOST_DEATHS} times at it")
         self._write_waiting(patient=False)
-        self.checkpoints.close()
         self._begin_with(self._make_engine(self.journal.model, self.config, None))
         self._take_up(self.journal.reread())
         self._untaken.clear()
@@ -206,31 +198,19 @@ class LiveSession:
 
     def close(self) -> None:
         """Unlock the session."""
-        self.checkpoints.close()
         self.journal.close()
 
     def _take_up(self, events: Sequence[Event]) -> None:
-        """Take in what is recorded, from the checkpoint on where there is one to go on from."""
-        if isinstance(self._engine, Resumable):
-            found = self.checkpoints.resume(events, self.journal.model, self._engine)
-            if found is not None:
-                self._begin, self._taken, self._recogniser = found.line, found.taken, found.recogniser
-                self._feed.epoch, self._feed.noticed = found.epoch, found.noticed
-                self.estimate = self._engine.estimate
-            elif self.checkpoints.spent:
-                self._begin_with(self._make_engine(self.journal.model, self.config, None))
+        """Take in what is recorded, estimated once at its end."""
         refused = refused_lines(events)
-        self._opening = True
-        with self._engine.catching_up():
+        with self._engine.restoring():
             for event in events:
-                if event.line > self._begin and event.line not in refused:
+                if event.line not in refused:
                     with contextlib.suppress(EventRefused):  # noted now: the time before did not get so far
                         self._take(event)
         if self.estimate is not None:
             self.estimate = self._engine.estimate
-        self._opening, self.engine = False, self._engine
-        if self._moment is not None:
-            self.checkpoints.offer(self._moment)
+        self.engine = self._engine
         self._tell_moves()
         self._write_waiting()
 
@@ -381,23 +361,6 @@ class LiveSession:
             raise
         if estimate is not None:
             self.estimate = estimate
-            if not isinstance(event, CameraMovedEvent):
-                self._taken.append(event.line)
-            self._rest(event.line)
-
-    def _rest(self, line: int) -> None:
-        """Let a checkpoint be written, where the engine has come to a rest with the event on a line."""
-        write = self._engine.rest() if isinstance(self._engine, Resumable) else None
-        if write is None:
-            return
-        feed = self._feed
-        moment = Moment(
-            write, line, feed.epoch, feed.noticed, self._recogniser.recollection(), self._taken, len(self._taken)
-        )
-        if self._opening:
-            self._moment = moment
-        else:
-            self.checkpoints.offer(moment)
 
     def _tell_moves(self) -> None:
         """Moves that the engine found out by itself become events: the epochs are then the same for every reader."""
@@ -443,6 +406,12 @@ class LiveSession:
             self._unwritten.pop(0)
 
 
-def online_engine(model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> Engine:
-    """The incremental engine, its judgement in the same process: the same events always give the same estimates."""
-    return OnlineRegistration(model, config, judge="inline", sound_speed_prior=sound_speed_prior)
+def online_engine(
+    model: SessionModel,
+    config: SolveConfig,
+    sound_speed_prior: SoundSpeedPrior | None,
+    *,
+    find_moves: bool = True,
+) -> Engine:
+    """The incremental engine, its full solve in the same process: the same events always give the same estimates."""
+    return OnlineRegistration(model, config, find_moves=find_moves, sound_speed_prior=sound_speed_prior)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -137,7 +138,9 @@ def replay_session(
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
         prior = sound_speed_prior(recognised, config)
-        engine = (make_engine or online_engine)(session.model, config, prior)
+        # Moves that were detected when the session was recorded are events: they are taken as they were found then.
+        recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
+        engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config, prior)
         player = _Player(session, recognised, engine, viewer, request.speed)
         player.play(on_step)
         taken, found = player.taken(), player.found()

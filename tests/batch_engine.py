@@ -112,7 +112,7 @@ class BatchEngine:
             True,
         )
 
-    def catching_up(self) -> AbstractContextManager[None]:
+    def restoring(self) -> AbstractContextManager[None]:
         return nullcontext()
 
     def marker_T_laser(self) -> FloatArray | None:

@@ -16,8 +16,8 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Aim, EpochStart, Measurements
 from fgreg.models import SessionModel
-from fgreg.online.shared import Quadratic
 from fgreg.registration import pack_session, register
+from fgreg.smoother.shared_variables import Quadratic
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
 CONFIG = SolveConfig()

@@ -34,6 +34,13 @@ def run(engine: OnlineRegistration, measurements: Measurements) -> list[OnlineEs
     return [engine.add(event) for event in events(measurements)]
 
 
+def restored(engine: OnlineRegistration, measurements: Measurements) -> OnlineRegistration:
+    """The engine with measurements taken in at once, registered at their end: a quick way to a long epoch."""
+    with engine.restoring():
+        run(engine, measurements)
+    return engine
+
+
 def first(measurements: Measurements, pairs: int) -> Measurements:
     """The measurements up to so many pairs."""
     taken = measurements.pairs[:pairs]
@@ -56,10 +63,18 @@ def sigmas_apart(found: Registration, estimate: OnlineEstimate) -> float:
     return float(np.sqrt(tangent @ np.linalg.solve(covariance, tangent)))
 
 
-def untold_move(
+def sigmas_between(found: OnlineEstimate, expected: OnlineEstimate) -> float:
+    """Mahalanobis distance of two registrations as reported, by the covariance expected."""
+    if found.trus_T_camera is None or expected.trus_T_camera is None or expected.covariance is None:
+        return 0.0 if found.trus_T_camera is expected.trus_T_camera else float("inf")
+    tangent = pose_tangent(expected.trus_T_camera, found.trus_T_camera)
+    return float(np.sqrt(tangent @ np.linalg.solve(expected.covariance, tangent)))
+
+
+def unreported_move(
     seed: int, motion: FloatArray, after: int, before: int
 ) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """Pairs before and after a motion, all told to be of epoch 0."""
+    """Pairs before and after a motion, all recorded as of epoch 0."""
     rng = np.random.default_rng(seed)
     trus_T_camera, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
     again = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 1])  # so that both have one window edge

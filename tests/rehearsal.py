@@ -76,7 +76,7 @@ class Rehearsal:
         assert model is not None, problems
         self.model: SessionModel = model
         self.stage = SimulatedStage(self.model.stage, device_rad=math.radians(20.0), clock=lambda: self.now_s)
-        self.engine = OnlineRegistration(self.model, SolveConfig(), judge="inline")
+        self.engine = OnlineRegistration(self.model, SolveConfig())
         settings = ConductorSettings(aims=self.room.config.aims, hearing_threshold=self.threshold)
         self.conductor = Conductor(self.model, settings)
         self.poses = PoseHistory()

@@ -27,7 +27,7 @@ from fgreg.targets import tre_mm
 from fgreg.verdict import ABOUT_EVEN, FEW_PMS, unsteady
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
-from tests.online_streams import untold_move
+from tests.online_streams import unreported_move
 
 FAST = SolveConfig(posterior_effective=60.0, posterior_samples=600)
 BUMP = make_transform(exp_so3(np.array([0.03, -0.02, 0.03])), np.array([3.0, -4.0, 2.0]))
@@ -36,8 +36,8 @@ BUMP = make_transform(exp_so3(np.array([0.03, -0.02, 0.03])), np.array([3.0, -4.
 @cache
 def _ran(before: int) -> tuple[SessionModel, Measurements, tuple[Truth, Truth], OnlineRegistration]:
     """A session with a move after so few PMs, and the engine that went through it: to look at only."""
-    model, measurements, truths = untold_move(3, BUMP, 12, before)
-    engine = OnlineRegistration(model, judge=None)
+    model, measurements, truths = unreported_move(3, BUMP, 12, before)
+    engine = OnlineRegistration(model, verdicts=False)
     for _, event in events_in_order(measurements):
         engine.add(event)
     return model, measurements, truths, engine

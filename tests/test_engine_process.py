@@ -20,8 +20,10 @@ from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.events import OnlineEvent
 from fgreg.tracking import track
 from tests.forward import make_measurements
+from tests.online_streams import restored
 
 Case = tuple[SessionModel, Measurements]
+PATIENCE_S = 60.0
 
 
 def events(measurements: Measurements) -> tuple[OnlineEvent, ...]:
@@ -30,35 +32,37 @@ def events(measurements: Measurements) -> tuple[OnlineEvent, ...]:
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    model, measurements, _ = make_measurements(np.random.default_rng(5), aims=10, pairs=12)
+    model, measurements, _ = make_measurements(np.random.default_rng(5), aims=10, pairs=9)
     return model, measurements
 
 
 @pytest.fixture(scope="module")
 def started(case: Case) -> Iterator[EngineProcess]:
-    """After all events of the case."""
+    """After all events of the case, and the full solve of them."""
     with EngineProcess(case[0], SolveConfig(), None) as engine:
         for event in events(case[1]):
             engine.add(event)
+        end = time.monotonic() + PATIENCE_S
+        while not engine.refresh().settled:
+            assert time.monotonic() < end
+            time.sleep(0.02)
         yield engine
 
 
 def test_it_says_what_the_engine_says(case: Case, started: EngineProcess) -> None:
     model, measurements = case
-    here = OnlineRegistration(model, judge=None)
-    for event in events(measurements):
-        known = here.add(event)
-    there = started.refresh()
-    assert there.optimum_trus_T_camera is not None
-    assert known.optimum_trus_T_camera is not None
-    np.testing.assert_allclose(there.optimum_trus_T_camera, known.optimum_trus_T_camera, atol=1e-7)
-    assert there.pairs == known.pairs
+    here = restored(OnlineRegistration(model, find_moves=False), measurements)
+    there, known = started.refresh(), here.estimate
+    assert (there.verdict, there.reasons, there.pairs) == (known.verdict, known.reasons, known.pairs)
+    assert there.trus_T_camera is not None
+    assert known.trus_T_camera is not None
+    np.testing.assert_allclose(there.trus_T_camera, known.trus_T_camera, atol=1e-6)
     taken = started.measurements()
     assert len(taken.pairs) == len(measurements.pairs)
     beam, wanted = started.marker_T_laser(), here.marker_T_laser()
     assert beam is not None
     assert wanted is not None
-    np.testing.assert_allclose(beam, wanted, atol=1e-7)
+    np.testing.assert_allclose(beam, wanted, atol=0.01)
 
 
 def test_queries_are_answered_from_its_snapshot(case: Case, started: EngineProcess) -> None:
@@ -81,7 +85,7 @@ def test_a_refused_event_is_refused_here_and_later_ones_work(case: Case, started
     wrong = replace(pair, t=late + 1.0, look=replace(pair.look, range_mm=float("nan")))
     with pytest.raises(EventRefused, match="range_mm"):
         started.add(wrong)
-    assert started.add(replace(pair, t=late + 2.0, pm=77)).pairs >= 12
+    assert started.add(replace(pair, t=late + 2.0, pm=77)).pairs >= 9
 
 
 def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:

@@ -1,4 +1,4 @@
-"""Sessions with the registration in a process: opened again from a checkpoint, and going on where the process ends."""
+"""Sessions with the registration in a process: opened again, and going on where the process ends."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from fgreg.operation import recorder as recorder_module
 from fgreg.operation.recorder import UNWATCHED, Recorder
 from fgreg.operation.start import NewestSnapshots
 from fgreg.registration import SoundSpeedPrior
-from fgreg.session.checkpoint_file import CHECKPOINT_FILE
 from fgreg.session.reading import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
@@ -39,8 +38,8 @@ PATIENCE_S = 120.0
 
 @pytest.fixture
 def session(tmp_path: Path) -> tuple[Path, Shots]:
-    """An empty session, and the events of 8 aims and 26 pairs in two epochs for it."""
-    config = replace(PRESETS["camera-move"], aims=8, pairs=26)
+    """An empty session, and the events of 8 aims and 22 pairs in two epochs for it."""
+    config = replace(PRESETS["camera-move"], aims=8, pairs=22)
     write_session(simulate(config, 3), tmp_path / "s")
     events = read_session(tmp_path / "s").events
     (tmp_path / "s" / "events.jsonl").unlink()
@@ -85,74 +84,60 @@ def same(a: OnlineEstimate | None, b: OnlineEstimate | None, atol: float = 1e-9)
         np.testing.assert_allclose(x, y, rtol=0, atol=atol)
 
 
-def test_what_a_process_wrote_is_taken_up_by_another_and_by_this_one_and_the_reverse(
+def test_what_a_process_recorded_is_opened_by_another_and_by_this_one_and_the_reverse(
     session: tuple[Path, Shots],
 ) -> None:
     folder, events = session
-    path = folder / CHECKPOINT_FILE
     with processes() as engines:
         with LiveSession.open(folder, make_engine=engines) as live:
             for event in events[:-5]:
                 live.add(event)
             unbroken = live.settle()
-        by_process = path.read_bytes()
-        assert len(engines.made) == 1  # nothing to go on from costs no second process
+        assert len(engines.made) == 1
         with LiveSession.open(folder, make_engine=engines) as live:
-            assert not live.checkpoints.note
-            opened = live.estimate
-        path.unlink()
-        with LiveSession.open(folder, make_engine=engines) as live:
-            assert "there is none" in live.checkpoints.note
-            same(opened, live.estimate)  # at once, without asking for a judgement
-            same(unbroken, live.estimate, 1e-6)
-            assert live.estimate is not None
-            assert live.estimate.settled
-        path.unlink()
+            opened = live.estimate  # at once, without asking for a full solve
+            assert opened is not None
+            assert opened.settled
+            same(opened, unbroken, 1e-6)
         with LiveSession.open(folder) as live:
-            here = live.settle()
-        by_this = path.read_bytes()
-        same(opened, here)
-        path.write_bytes(by_process)
-        with LiveSession.open(folder) as live:
-            assert not live.checkpoints.note
-            same(live.estimate, here)
-        path.write_bytes(by_this)
+            same(live.estimate, opened)
+            for event in events[-5:-2]:
+                live.add(event)
         with LiveSession.open(folder, make_engine=engines) as live:
-            assert not live.checkpoints.note
-            same(live.estimate, here)
-            for event in events[-5:]:
+            for event in events[-2:]:
                 live.add(event)
             end = live.settle()
-        assert end.pairs == here.pairs + 5
+        assert end.pairs == unbroken.pairs + 5
 
 
-def test_a_checkpoint_that_cannot_be_taken_up_costs_another_process_and_nothing_else(
+def test_a_process_that_ends_while_a_session_is_opened_is_told(
     session: tuple[Path, Shots], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, events = session
     with LiveSession.open(folder) as live:
-        for event in events[:20]:
+        for event in events[:12]:
             live.add(event)
         expected = live.settle()
     with processes() as engines:
-        real = EngineProcess.resume
+        with monkeypatch.context() as patch:
+            real = EngineProcess.add
 
-        def dying(self: EngineProcess, source: object) -> OnlineEstimate:
-            engines.kill()
-            return real(self, source)  # type: ignore[arg-type]
+            def dying(self: EngineProcess, event: OnlineEvent) -> OnlineEstimate:
+                engines.kill()
+                return real(self, event)
 
-        monkeypatch.setattr(EngineProcess, "resume", dying)
-        with LiveSession.open(folder, make_engine=engines) as live:
-            assert "has ended" in live.checkpoints.note
-            assert len(engines.made) == 2
-            same(live.settle(), expected)
+            patch.setattr(EngineProcess, "add", dying)
+            with pytest.raises(EngineGone):
+                LiveSession.open(folder, make_engine=engines)
+        with LiveSession.open(folder, make_engine=engines) as live:  # nothing is lost, and the session is not locked
+            same(live.settle(), expected, 1e-6)
 
 
 def test_a_killed_registration_is_revived_without_the_session_being_closed(session: tuple[Path, Shots]) -> None:
     folder, events = session
     with processes() as engines, LiveSession.open(folder, make_engine=engines) as live:
         for number, event in enumerate(events):
-            if number in (3, 19, 20):
+            if number in (3, 17, 18):
                 engines.kill()
                 with pytest.raises(EngineGone):
                     live.add(event)
@@ -278,19 +263,21 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
                 time.sleep(0.005)
             raise AssertionError(recorder.state)
 
-        shots = [event for event in events if not isinstance(event, CameraMovedEvent)][:32]
-        for event in shots[:16]:
-            recorder.hand_over(event)
-        until(16)
-        for start in (16, 24):
-            killer = threading.Timer(0.05, engines.kill)
-            killer.start()
-            for event in shots[start : start + 8]:
+        shots = [event for event in events if not isinstance(event, CameraMovedEvent)]
+        try:
+            for event in shots[:14]:
                 recorder.hand_over(event)
-            killer.join()
-            until(start + 8)
-            recorder.hand_over(NoteEvent(shots[start + 7].t, 0, "after"))
-        recorder.close()
+            until(14)
+            for start in (14, 22):
+                killer = threading.Timer(0.05, engines.kill)
+                killer.start()
+                for event in shots[start : start + 8]:
+                    recorder.hand_over(event)
+                killer.join()
+                until(start + 8)
+                recorder.hand_over(NoteEvent(shots[start + 7].t, 0, "after"))
+        finally:
+            recorder.close()
         assert recorder.state.refused == 0
         taken = live.measurements()
     assert len(engines.made) == 3

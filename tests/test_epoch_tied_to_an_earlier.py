@@ -8,25 +8,25 @@ import numpy as np
 import pytest
 
 from fgreg.batch import distance_to_explicit
+from fgreg.camera_moves.detector import LoopClosure
 from fgreg.camera_moves.loop_closure import back_to
 from fgreg.config import SolveConfig
 from fgreg.frames import FloatArray, inverse, make_transform
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.models import SessionModel
-from fgreg.online import CameraMoved, OnlineRegistration
+from fgreg.online import OnlineRegistration
 from fgreg.online.detect import events_in_order, find_epochs, split_epochs
-from fgreg.online.tie import with_motion
 from fgreg.registration import register
 from fgreg.targets import tre_mm
 from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
-from tests.online_streams import batch, sigmas_apart
+from tests.online_streams import batch, first, restored, sigmas_apart
 
 AWAY = make_transform(np.eye(3), np.array([12.0, -9.0, 5.0]))
 CONFIG = SolveConfig()
 
 
-def _there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, Measurements, list[FloatArray]]:
-    """Epochs in turn at home and away, told without motions; the true registration of each."""
+def there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, Measurements, list[FloatArray]]:
+    """Epochs in turn at home and away, reported without motions; the true registration of each."""
     rng = np.random.default_rng(seed)
     home, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
     pairs: list[Pair] = []
@@ -53,7 +53,7 @@ def _there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, M
 
 
 def test_the_tied_epoch_has_the_earlier_ones_registration_within_the_tolerance() -> None:
-    model, measurements, truths = _there_and_back(3, (14, 8, 4))
+    model, measurements, truths = there_and_back(3, (14, 8, 4))
     tied = replace(measurements, epochs=(*measurements.epochs[:2], back_to(measurements.epochs[2], 0)))
     free, found = register(measurements, model, CONFIG), register(tied, model, CONFIG)
     assert found.epochs == (0, 1, 2)
@@ -65,7 +65,7 @@ def test_the_tied_epoch_has_the_earlier_ones_registration_within_the_tolerance()
 
 
 def test_an_epoch_tied_to_one_that_is_left_out_stands_alone() -> None:
-    model, measurements, _ = _there_and_back(3, (14, 8, 8))
+    model, measurements, _ = there_and_back(3, (14, 8, 8))
     only = tuple(pair for pair in measurements.pairs if pair.epoch)
     tied = Measurements(measurements.aims, only, (*measurements.epochs[:2], back_to(measurements.epochs[2], 0)))
     found = register(tied, model, CONFIG)
@@ -73,20 +73,17 @@ def test_an_epoch_tied_to_one_that_is_left_out_stands_alone() -> None:
     assert 1 in found.epochs
 
 
-@pytest.mark.parametrize("counts", [(12, 3, 6), (9, 7, 4, 6)])
-def test_the_engine_with_a_tie_is_at_the_batch_optimum(counts: tuple[int, ...]) -> None:
-    model, measurements, _ = _there_and_back(5, counts)
-    engine = OnlineRegistration(model, judge=None, watch=None)
+@pytest.mark.parametrize("counts", [(12, 3, 5), (9, 7, 4, 5)])
+def test_the_engine_with_a_closed_loop_is_at_the_batch_optimum(counts: tuple[int, ...]) -> None:
+    model, measurements, _ = there_and_back(5, counts)
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    restored(engine, first(measurements, sum(counts[:2])))
+    later = [event for _, event in events_in_order(measurements) if event.t > engine.estimate.t]
     compared = 0
-    for _, event in events_in_order(measurements):
-        if isinstance(event, CameraMoved) and engine.state.epoch == 2:
-            engine.add(event)
-            continue
+    for event in later:
         estimate = engine.add(event)
-        if engine.state.epoch == 2 and engine.state.epoch_pairs == 2 and engine.state.now.start.after is None:
-            state = with_motion(engine.state, back_to(engine.state.now.start, 0), engine._tools)
-            engine._state = state
-            assert state.window is not None
+        if engine.state.epoch == 2 and engine.state.epoch_pairs == 2:
+            engine._close_loop(LoopClosure(2, 0, 9.0), estimate.t)
             continue
         if engine.state.epoch >= 2 and engine.state.epoch_pairs > 2 and estimate.optimum_trus_T_camera is not None:
             assert sigmas_apart(batch(engine.measurements(), model), estimate) < 0.05
@@ -95,11 +92,12 @@ def test_the_engine_with_a_tie_is_at_the_batch_optimum(counts: tuple[int, ...]) 
     assert engine.measurements().epochs[2].after == 0
 
 
-def test_the_engine_finds_out_that_the_camera_is_back_and_the_batch_does_too() -> None:
-    model, measurements, truths = _there_and_back(7, (25, 4, 24))
-    engine = OnlineRegistration(model, judge=None)
+def test_the_engine_closes_the_loop_and_the_batch_does_too() -> None:
+    model, measurements, truths = there_and_back(7, (25, 4, 12))
+    engine = restored(OnlineRegistration(model, verdicts=False), first(measurements, 29))
     for _, event in events_in_order(measurements):
-        engine.add(event)
+        if event.t > engine.estimate.t:
+            engine.add(event)
     assert engine.moves == ()
     (back,) = engine.returns
     assert (back.epoch, back.to) == (2, 0)

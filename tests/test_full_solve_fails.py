@@ -7,28 +7,40 @@ import pytest
 
 from fgreg.estimate import Verdict
 from fgreg.online import OnlineRegistration
-from fgreg.online import judge as judge_module
+from fgreg.online import full_solve as full_solve_module
 from tests.forward import make_measurements
-from tests.online_streams import events
+from tests.online_streams import first, restored
 
 
-def test_a_judge_that_fails_is_told_for_as_long_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(4), aims=14, pairs=18)
-    stream = list(events(measurements))
-    engine = OnlineRegistration(model, watch=None)
-    for event in stream[:-6]:
-        before = engine.add(event)
-    assert before.verdict is Verdict.OK
+def _failing(*_: object, **__: object) -> object:
+    raise ArithmeticError("no posterior")
 
-    def failing(*_: object) -> object:
-        raise ArithmeticError("no posterior")
 
+def test_a_full_solve_that_fails_is_reported_for_as_long_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), aims=14, pairs=17)
+    engine = restored(OnlineRegistration(model), first(measurements, 14))
+    assert engine.estimate.verdict is Verdict.OK
     with monkeypatch.context() as patch:
-        patch.setattr(judge_module, "judge", failing)
-        for event in stream[-6:]:
-            after = engine.add(event)  # the fifteenth pair is due, the sixteenth not
-    assert after.verdict is Verdict.WARNING
-    assert any("the full solve failed: ArithmeticError: no posterior" in reason for reason in after.reasons)
-    settled = engine.settle()
-    assert settled.settled
-    assert not any("full solve failed" in reason for reason in settled.reasons)
+        patch.setattr(full_solve_module, "solve", _failing)
+        for pair in measurements.pairs[14:16]:  # the fifteenth pair is due, the sixteenth not
+            after = engine.add(pair)
+            assert after.verdict is Verdict.WARNING
+            assert any("the full solve failed: ArithmeticError: no posterior" in reason for reason in after.reasons)
+            assert after.trus_T_camera is not None
+    # The next event asks again.
+    again = engine.add(measurements.pairs[16])
+    assert again.settled
+    assert again.verdict is Verdict.OK
+    assert not any("full solve failed" in reason for reason in again.reasons)
+
+
+def test_a_full_solve_that_fails_when_a_session_is_opened_again_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(4), aims=14, pairs=8)
+    engine = OnlineRegistration(model, find_moves=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(full_solve_module, "solve", _failing)
+        restored(engine, first(measurements, 7))
+    assert engine.estimate.verdict is Verdict.REFUSED
+    assert any("no posterior" in reason for reason in engine.estimate.reasons)
+    assert len(engine.measurements().pairs) == 7
+    assert engine.add(measurements.pairs[7]).settled

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fgreg.config import SolveConfig
 from fgreg.events import AimEvent, CameraMovedEvent, PairEvent
 from fgreg.live import LiveSession
-from fgreg.online.engine_process import EngineProcess
+from fgreg.online import OnlineRegistration
 from fgreg.posterior import pose_tangent
 from fgreg.replay import ReplayRequest, replay_session
 from fgreg.session.reading import read_session
@@ -18,41 +19,40 @@ from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
 
+FAST = SolveConfig(posterior_effective=60.0, posterior_samples=600)
 PATIENCE_S = 60.0
+
+
+def _waited(live: LiveSession, engine: OnlineRegistration) -> None:
+    """As long as the full solve works: pairs are seconds apart."""
+    end = time.monotonic() + PATIENCE_S
+    while engine._solver.busy:
+        assert time.monotonic() < end
+        time.sleep(0.005)
+        live.refresh()
 
 
 def test_settled_a_live_session_and_its_replay_have_the_same_epochs_verdict_and_registration(tmp_path: Path) -> None:
     folder = tmp_path / "s"
-    write_session(simulate(replace(PRESETS["camera-move"], aims=8, pairs=32), 4), folder)
-    given = [e for e in read_session(folder).events if isinstance(e, AimEvent | PairEvent)]  # nobody tells the move
-    (folder / "events.jsonl").unlink()
+    write_session(simulate(replace(PRESETS["camera-move"], aims=8, pairs=22), 6), folder)
+    given = [e for e in read_session(folder).events if isinstance(e, AimEvent | PairEvent)]  # no one reports the move
     given[12] = replace(given[12], t=given[11].t - 3.0)  # handed over later than it happened
-    engines: list[EngineProcess] = []
-
-    def make_engine(*arguments: object) -> EngineProcess:
-        engines.append(EngineProcess(*arguments))  # type: ignore[arg-type]
-        return engines[-1]
-
-    try:
-        with LiveSession.open(folder, make_engine=make_engine, late=True) as live:
-            for number, event in enumerate(given):
-                live.add(event)
-                if number % 3 == 0:
-                    live.refresh()
-            end = time.monotonic() + PATIENCE_S
-            while not live.engine.moves and time.monotonic() < end:  # the watch answers when it is ready
-                time.sleep(0.05)
-                live.refresh()
-            settled, taken = live.settle(), live.measurements()
-    finally:
-        for engine in engines:
-            engine.close()
+    model = read_session(folder).model
+    (folder / "events.jsonl").unlink()
+    with (
+        OnlineRegistration(model, FAST, full_solve="worker") as engine,
+        LiveSession.open(folder, FAST, make_engine=lambda *_: engine, late=True) as live,
+    ):
+        for event in given:
+            live.add(event)
+            _waited(live, engine)
+        settled, taken = live.settle(), live.measurements()
     events = read_session(folder).events
     moves = [event for event in events if isinstance(event, CameraMovedEvent)]
     assert len(moves) == 1
     assert moves[0].detected
     assert events[12].t == events[11].t
-    replayed = replay_session(ReplayRequest(folder, tmp_path / "replay.yaml"))
+    replayed = replay_session(ReplayRequest(folder, tmp_path / "replay.yaml"), FAST)
     there = replayed.settled
     assert there is not None
     assert (settled.verdict, settled.epoch, settled.pairs) == (there.verdict, there.epoch, there.pairs)

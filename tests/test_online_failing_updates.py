@@ -12,40 +12,44 @@ import numpy as np
 import pytest
 
 import fgreg.online.engine as engine_module
-import fgreg.online.state as state_module
-import fgreg.online.summary as summary_module
-import fgreg.online.updates as updates_module
-import fgreg.online.window as window_module
+import fgreg.smoother.isam_window as window_module
+import fgreg.smoother.marginal_prior as prior_module
+import fgreg.smoother.updates as updates_module
 from fgreg.errors import EventRefused
 from fgreg.factors.adapter import FactorError
 from fgreg.frames import as_float_array
-from fgreg.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.measurements import Aim, Measurements, Pair
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags
+from fgreg.online.estimate import gaussian_tre
+from fgreg.smoother.updates import LEAVE, MOST
 from tests.forward import make_measurements
-from tests.online_streams import run
+from tests.online_streams import batch, first, restored, sigmas_apart
 
-FOLLOWING = 10
+FOLLOWING = 3
 
 
 @lru_cache
 def _base(pairs: int) -> tuple[SessionModel, Measurements, OnlineRegistration]:
     model, measurements, _ = make_measurements(np.random.default_rng(8), pairs=pairs + FOLLOWING)
-    engine = OnlineRegistration(model, judge=None)
-    run(engine, replace(measurements, pairs=measurements.pairs[:pairs]))
-    return model, measurements, engine
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    return model, measurements, restored(engine, first(measurements, pairs))
 
 
 def _engine(pairs: int) -> tuple[OnlineRegistration, Measurements, tuple[Pair, ...]]:
     """An engine with so many pairs taken in, and the pairs that follow."""
     model, measurements, base = _base(pairs)
-    engine = OnlineRegistration(model, judge=None)
-    # The state is a value and may be shared; what is stored is not.
-    engine._state, engine._t, engine._serial, engine._estimate = base._state, base._t, base._serial, base._estimate
-    engine._tools.store.aims.extend(measurements.aims)
-    for pair in measurements.pairs[:pairs]:
-        engine._tools.store.append(pair)
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    for name in ("_state", "_t", "_serial", "_estimate", "_misplaced"):  # all are values
+        setattr(engine, name, getattr(base, name))
     return engine, measurements, measurements.pairs[pairs:]
+
+
+@lru_cache
+def _expected(pairs: int) -> list[OnlineEstimate]:
+    """The estimates at the pairs that follow."""
+    engine, _, after = _engine(pairs)
+    return [engine.add(pair) for pair in after]
 
 
 def _bits(estimate: OnlineEstimate) -> bytes:
@@ -79,12 +83,10 @@ FAILURES: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "the private variables' system is singular": lambda patch: patch.setattr(
         window_module, "dtrtrs", lambda _, right: (right, 1)
     ),
-    "the summary raises": lambda patch: patch.setattr(
-        summary_module, "contributions", _raise(ArithmeticError("summary overflow"))
-    ),
     "ISAM2 is indeterminate": lambda patch: patch.setattr(
-        window_module, "updated", _raise(RuntimeError("Indeterminant linear system"))
+        gtsam.ISAM2, "update", _raise(RuntimeError("Indeterminant linear system detected"))
     ),
+    "ISAM2 throws": lambda patch: patch.setattr(gtsam.ISAM2, "update", _raise(RuntimeError("an invalid key"))),
     "the joint covariance is not finite": lambda patch: patch.setattr(window_module, "finite", lambda _: False),
     "the predicted error is not finite": lambda patch: patch.setattr(
         engine_module, "gaussian_tre", _raise(FloatingPointError("overflow"))
@@ -92,24 +94,21 @@ FAILURES: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "the innovation raises": lambda patch: patch.setattr(
         updates_module, "innovation", _raise(np.linalg.LinAlgError("not positive definite"))
     ),
+    "looking for misplaced PMs raises": lambda patch: patch.setattr(
+        engine_module, "misplaced_pms", _raise(np.linalg.LinAlgError("not positive definite"))
+    ),
 }
 
 
-@pytest.mark.parametrize(
-    # Beyond 40 pairs not every pair touches the summary; the test below waits for one that does.
-    ("failure", "pairs"),
-    [(name, 14) for name in FAILURES] + [(name, 45) for name in FAILURES if name != "the summary raises"],
-)
+@pytest.mark.parametrize("failure", FAILURES)
+@pytest.mark.parametrize("pairs", [16, 45], ids=["all in the active window", "most in the marginal prior"])
 def test_a_failing_update_changes_nothing_and_later_events_work(
     failure: str, pairs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     engine, _, after = _engine(pairs)
-    reference, _, _ = _engine(pairs)
     before, state = _bits(engine.estimate), engine.state
     with monkeypatch.context() as patch:
         FAILURES[failure](patch)
-        # ``relaxed`` holds its own name of the function that updates a window.
-        patch.setattr(state_module, "updated", window_module.updated)
         with pytest.raises(EventRefused) as refused:
             engine.add(after[0])
     assert refused.value.reason
@@ -118,41 +117,48 @@ def test_a_failing_update_changes_nothing_and_later_events_work(
     assert _bits(engine.estimate) == before
     assert len(engine.measurements().pairs) == pairs
     # The next events give what they give where nothing had failed.
-    for pair in after[:3]:
-        found, expected = engine.add(pair), reference.add(pair)
+    for pair, expected in zip(after, _expected(pairs), strict=True):
+        found = engine.add(pair)
         np.testing.assert_allclose(
             np.asarray(found.trus_T_camera), np.asarray(expected.trus_T_camera), rtol=0, atol=1e-8
         )
         assert (found.used, found.pairs, found.verdict) == (expected.used, expected.pairs, expected.verdict)
 
 
-def test_a_failure_while_old_pairs_go_into_the_summary_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine, _, after = _engine(45)
-    refused = 0
-    for pair in after:
-        here, before = engine.state, _bits(engine.estimate)
-        with monkeypatch.context() as patch:
-            patch.setattr(summary_module, "contributions", _raise(ArithmeticError("summary overflow")))
-            reason = ""
-            try:
-                engine.add(pair)
-            except EventRefused as error:
-                reason = error.reason
-        if reason:
-            refused += 1
-            assert "summary overflow" in reason
-            assert engine.state is here
-            assert _bits(engine.estimate) == before
-            engine.add(pair)
-    assert refused
+def test_a_failure_while_pairs_go_into_the_marginal_prior_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, _, after = _engine(MOST - 1)
+    engine.add(after[0])
+    here, before = engine.state, _bits(engine.estimate)
+    assert not here.marginalised
+    with monkeypatch.context() as patch:
+        patch.setattr(prior_module, "evaluate", _raise(ArithmeticError("overflow")))
+        with pytest.raises(EventRefused, match="overflow"):
+            engine.add(after[1])
+    assert engine.state is here
+    assert _bits(engine.estimate) == before
+    assert engine.add(after[1]).pairs == MOST + 1
+    assert len(engine.state.marginalised) == LEAVE
+
+
+def test_numbers_that_overflow_at_few_pairs_leave_the_pair_and_the_full_solve_registers_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Among few pairs that contradict each other full steps lead anywhere: that is no defect of the pair.
+    model, measurements, _ = _base(6)
+    engine, _, after = _engine(6)
+    with monkeypatch.context() as patch:
+        patch.setattr(updates_module, "updated", _raise(ArithmeticError("not finite")))
+        estimate = engine.add(after[0])
+    assert len(engine.measurements().pairs) == estimate.pairs == 7
+    assert sigmas_apart(batch(first(measurements, 7), model), estimate) < 0.05
 
 
 def test_a_failing_camera_move_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine, _, after = _engine(12)
+    engine, _, after = _engine(16)
     before, state = _bits(engine.estimate), engine.state
     move = CameraMoved(after[0].t, np.eye(4), np.diag([1e-4] * 3 + [1.0] * 3))
     with monkeypatch.context() as patch:
-        patch.setattr(updates_module, "passed_from", _raise(RuntimeError("no elimination")))
+        patch.setattr(prior_module, "evaluate", _raise(RuntimeError("no elimination")))
         with pytest.raises(EventRefused, match="no elimination"):
             engine.add(move)
     assert engine.state is state
@@ -160,21 +166,41 @@ def test_a_failing_camera_move_changes_nothing(monkeypatch: pytest.MonkeyPatch) 
     assert engine.add(move).epoch == 1
 
 
-def test_a_failing_judge_leaves_the_estimate_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(8), pairs=10)
-    engine = OnlineRegistration(model, judge="inline")
-    run(engine, replace(measurements, pairs=measurements.pairs[:9]))
+@pytest.mark.parametrize("what", ["it raises", "its registration raises", "its estimate raises"])
+def test_a_failing_full_solve_leaves_the_incremental_estimate_and_says_so(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(8), pairs=12)
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    restored(engine, first(measurements, 8))
+    tre, calls = gaussian_tre, 0
+
+    def second_call(*arguments: Any) -> Any:  # the first one is of the pair itself
+        nonlocal calls
+        calls += 1
+        if calls == 2:
+            raise ArithmeticError("a defect")
+        return tre(*arguments)
+
     with monkeypatch.context() as patch:
-        patch.setattr("fgreg.online.judge.solve", _raise(RuntimeError("no judgement")))
-        estimate = engine.add(measurements.pairs[9])
+        match what:
+            case "it raises":
+                patch.setattr("fgreg.online.full_solve.register", _raise(RuntimeError("a defect")))
+            case "its registration raises":
+                patch.setattr(engine_module, "initialised", _raise(RuntimeError("a defect")))
+            case _:
+                patch.setattr(engine_module, "gaussian_tre", second_call)
+        estimate = engine.add(measurements.pairs[8])
     assert estimate.trus_T_camera is not None
-    assert any("no judgement" in reason for reason in estimate.reasons)
+    assert estimate.pairs == len(engine.state.shots) == 9
+    assert any("the full solve failed" in reason and "a defect" in reason for reason in estimate.reasons)
+    assert not any("a defect" in reason for reason in engine.add(measurements.pairs[9]).reasons)
 
 
 def test_the_linearisation_point_is_handed_to_python_factors_uncopied() -> None:
     # GTSAM's wrapper copies all values at each callback unless their C++ object has a live Python wrapper: the window
     # holds it, and a copy of ISAM2 has one of its own.
-    engine, _, _ = _engine(12)
+    engine, _, _ = _engine(16)
     window = engine.state.window
     assert window is not None
     seen: list[gtsam.Values] = []
@@ -187,7 +213,7 @@ def test_the_linearisation_point_is_handed_to_python_factors_uncopied() -> None:
 
     isam = gtsam.ISAM2(window.isam)
     theta = isam.getLinearizationPoint()
-    key = gtsam.symbol("L", window.numbers + 1000)
+    key = gtsam.symbol("L", 1000)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [key], probe))
     values.insert(key, 0.0)
@@ -252,7 +278,7 @@ def _spoil(pair: Pair, what: str) -> Any:
     ],
 )
 def test_bad_numbers_are_refused_before_the_graph_sees_them(what: str, said: str) -> None:
-    engine, _, after = _engine(9)
+    engine, _, after = _engine(16)
     before, state = _bits(engine.estimate), engine.state
     with pytest.raises(EventRefused, match=said):
         engine.add(_spoil(after[0], what))
@@ -262,7 +288,7 @@ def test_bad_numbers_are_refused_before_the_graph_sees_them(what: str, said: str
 
 
 def test_bad_aims_moves_and_tags_are_refused() -> None:
-    engine, measurements, after = _engine(9)
+    engine, measurements, after = _engine(16)
     t, aim = after[0].t, measurements.aims[0]
     bad: list[Any] = [
         Aim(t, aim.marker, np.array([0.0, np.nan, 1.0]), aim.covariance),
@@ -275,11 +301,3 @@ def test_bad_aims_moves_and_tags_are_refused() -> None:
         with pytest.raises(EventRefused):
             engine.add(event)
     assert engine.add(StaticTags(t, {3: np.eye(4)}, {3: np.eye(6)})).trus_T_camera is not None
-
-
-def test_more_pairs_cannot_be_reassigned_than_the_epoch_has() -> None:
-    engine, _, _ = _engine(9)
-    before = _bits(engine.estimate)
-    with pytest.raises(EventRefused, match="of 9 in the epoch"):
-        engine.reassign(10, EpochStart(1.0))
-    assert _bits(engine.estimate) == before

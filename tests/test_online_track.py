@@ -9,11 +9,12 @@ import pytest
 
 from fgreg.batch import solve
 from fgreg.config import SolveConfig
-from fgreg.measurements import Aim, Measurements, Pair, Track
+from fgreg.measurements import Measurements, Track
 from fgreg.models import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.tracking import track
 from tests.forward import make_measurements
+from tests.online_streams import restored
 from tests.track_cases import held_out, query_of
 
 
@@ -23,17 +24,14 @@ def _session(seed: int, pairs: int) -> tuple[SessionModel, Measurements, list[Tr
     return model, used, [query_of(pairs, looks=1) for pairs in out]
 
 
-def _ran(engine: OnlineRegistration, measurements: Measurements) -> None:
-    events: list[Aim | Pair] = [*measurements.aims, *measurements.pairs]
-    for event in sorted(events, key=lambda event: event.t):
-        engine.add(event)
+def _engine(model: SessionModel) -> OnlineRegistration:
+    return OnlineRegistration(model, verdicts=False, find_moves=False)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_after_settling_the_answers_are_those_of_the_full_solve(seed: int) -> None:
     model, used, queries = _session(seed, 25)
-    engine = OnlineRegistration(model, judge=None)
-    _ran(engine, used)
+    engine = restored(_engine(model), used)
     engine.settle()
     silent = [replace(query, looks=(), look_markers=()) for query in queries]
     expected = solve(used, [*queries, *silent], model, SolveConfig()).tracks
@@ -56,8 +54,7 @@ def test_after_settling_the_answers_are_those_of_the_full_solve(seed: int) -> No
 
 def test_a_snapshot_is_made_once_an_event() -> None:
     model, used, queries = _session(2, 15)
-    engine = OnlineRegistration(model, judge=None)
-    _ran(engine, replace(used, pairs=used.pairs[:-1]))
+    engine = restored(_engine(model), replace(used, pairs=used.pairs[:-1]))
     first = engine.snapshot()
     assert engine.snapshot() is first
     assert engine.track(queries[0]) == track(queries[0], first)
@@ -70,11 +67,11 @@ def test_a_snapshot_is_made_once_an_event() -> None:
 
 def test_before_a_registration_and_after_a_move_nothing_old_is_presented() -> None:
     model, used, queries = _session(3, 15)
-    engine = OnlineRegistration(model, judge=None)
+    engine = _engine(model)
     answer = engine.track(queries[0])
     assert answer.stage_rad is None
     assert "the registration of camera epoch 0 is refused: no registration of this camera epoch" in answer.reason
-    _ran(engine, used)
+    restored(engine, used)
     assert engine.track(queries[0]).stage_rad is not None
     engine.add(CameraMoved(used.pairs[-1].t + 1.0, None, None))
     old, new = engine.track(queries[0]), engine.track(replace(queries[0], epoch=1))
@@ -87,8 +84,7 @@ def test_before_a_registration_and_after_a_move_nothing_old_is_presented() -> No
 def test_after_a_measured_motion_the_sigma_is_wider_and_after_a_vague_one_nothing_is_answered() -> None:
     model, used, queries = _session(4, 25)
     for sigma_rad, sigma_mm in ((0.005, 0.7), (0.2, 20.0)):
-        engine = OnlineRegistration(model, judge=None)
-        _ran(engine, used)
+        engine = restored(_engine(model), used)
         before = engine.track(queries[0])
         loose = np.diag(np.square([sigma_rad] * 3 + [sigma_mm] * 3))
         engine.add(CameraMoved(used.pairs[-1].t + 1.0, np.eye(4), loose))

@@ -14,7 +14,7 @@ thread may have to wait before it can even call. Each client also times a fixed 
 that takes than in isolation is what the machine's other work costs, whoever waits.
 
     python tools/bench_queries.py
-    python tools/bench_queries.py --seconds 10 --judge process
+    python tools/bench_queries.py --seconds 10 --full-solve worker
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +46,7 @@ from fgreg.models import SessionModel
 from fgreg.online import OnlineRegistration
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
+from fgreg.online.solver import Where
 from fgreg.tracking import Snapshot, track
 from tests.forward import make_measurements, make_session
 from tests.test_tracking import surface_case
@@ -181,15 +182,21 @@ def _session(pairs: int) -> tuple[SessionModel, Measurements, list[Track]]:
 class Updates:
     """The stream: pair after pair, from the start again when a session is through."""
 
-    def __init__(self, model: SessionModel, used: Measurements, judge: Literal["inline", "process"] | None) -> None:
-        self._model, self._used, self._judge = model, used, judge
+    def __init__(self, model: SessionModel, used: Measurements, full_solve: Where | None) -> None:
+        self._model, self._used, self._where = model, used, full_solve
         self.add_s: list[float] = []
         self.publish_s: list[float] = []
 
     def run(self, shared: SharedSnapshot, going: Callable[[], bool]) -> None:
         """Add and publish while ``going``."""
         while going():
-            with OnlineRegistration(self._model, SolveConfig(), judge=self._judge, watch=None) as engine:
+            with OnlineRegistration(
+                self._model,
+                SolveConfig(),
+                full_solve=self._where or "in_process",
+                verdicts=self._where is not None,
+                find_moves=False,
+            ) as engine:
                 for aim in self._used.aims:
                     engine.add(aim)
                 for k, pair in enumerate(self._used.pairs):
@@ -207,7 +214,7 @@ class Updates:
 def under_updates(options: argparse.Namespace) -> None:
     """Each kind of client beside the stream."""
     model, used, queries = _session(options.pairs)
-    judge = None if options.judge == "none" else options.judge
+    where = None if options.full_solve == "none" else options.full_solve
     print(f"under a stream of updates, {options.seconds:g} s each, a query every {options.period_ms:g} ms (ms)")
     for name, in_process, round_trip in (
         ("own process, shared snapshot", False, False),
@@ -217,7 +224,7 @@ def under_updates(options: argparse.Namespace) -> None:
     ):
         with SharedSnapshot(Layout.of(model)) as shared, QueryServer(shared.name) as server:
             client = Client(shared.name, server.address, round_trip, queries, options.seconds, 1e-3 * options.period_ms)
-            updates = Updates(model, used, judge)
+            updates = Updates(model, used, where)
             if in_process:
                 found: list[Times] = []
                 thread = threading.Thread(target=_collect, args=(client, found))
@@ -253,7 +260,12 @@ def main() -> None:
     parser.add_argument("--period-ms", type=float, default=10.0, help="between queries (default 10)")
     parser.add_argument("--repeats", type=int, default=3000, help="queries of each kind alone (default 3000)")
     parser.add_argument("--pairs", type=int, default=1000, help="of the session that is streamed (default 1000)")
-    parser.add_argument("--judge", choices=("none", "inline", "process"), default="none", help="(default none)")
+    parser.add_argument(
+        "--full-solve",
+        choices=("none", "in_process", "worker"),
+        default="none",
+        help="where posterior and verdict are computed meanwhile (default none)",
+    )
     parser.add_argument("--switch-ms", type=float, help="interpreter's switch interval in the updating process")
     parser.add_argument("--only", choices=("alone", "under"))
     options = parser.parse_args()

@@ -66,7 +66,7 @@ def course(task: tuple[int, int], *, kind: str, first_hit: bool, looks: int) -> 
     model, measurements, (_, moved) = two_epochs(
         seed, motion_of(kind, seed), before, AFTER, first_hit=first_hit, looks=looks
     )
-    engine, out = OnlineRegistration(model, CONFIG, judge=None), {}
+    engine, out = OnlineRegistration(model, CONFIG, verdicts=False), {}
     for aim in measurements.aims:
         engine.add(aim)
     for n, pair in enumerate(measurements.pairs, 1):

@@ -198,7 +198,7 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
 
     def make_engine(*arguments: object) -> OnlineRegistration:
         model, config, prior = arguments
-        engines.append(OnlineRegistration(model, config, judge="inline", sound_speed_prior=prior))  # type: ignore[arg-type]
+        engines.append(OnlineRegistration(model, config, sound_speed_prior=prior))  # type: ignore[arg-type]
         return engines[-1]
 
     request = ReplayRequest(folder, folder / "replay.yaml")

@@ -1,6 +1,6 @@
 """Unreported camera moves: power and false alarms of the online engine, beside the ideal detector.
 
-Poses with the documented noise, 12 aims, pair by pair through the engine (``watch="inline"``). What is measured:
+Poses with the documented noise, 12 aims, pair by pair through the engine, its full solve in process. What is measured:
 
   clean     streams of steady pairs: false alarms (target: at most 1 in 2,000 pairs)
   outliers  the same with a fifth of the pairs replaced by outliers
@@ -48,7 +48,7 @@ RATE = 2000.0
 
 def moves_found(model: SessionModel, measurements: Measurements, from_pair: int | None) -> tuple[DetectedMove, ...]:
     """What the engine finds; it stops at the first move found after so many pairs, where that is asked for."""
-    engine, pairs = OnlineRegistration(model, CONFIG, judge=None), 0
+    engine, pairs = OnlineRegistration(model, CONFIG, verdicts=False), 0
     for index, event in events_in_order(measurements):
         engine.add(event)
         pairs += index is not None

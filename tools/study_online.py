@@ -69,7 +69,7 @@ class Agreement:
 
 def agreement(measurements: Measurements, model: SessionModel, every: int) -> Agreement:
     """The session through both, compared after each pair from the 8th of its epoch on."""
-    engine, out, late = OnlineRegistration(model, judge=None), [], []
+    engine, out, late = OnlineRegistration(model, verdicts=False, find_moves=False), [], []
     same, count = True, 0
     for event in events(measurements):
         begin = time.process_time()

@@ -150,7 +150,7 @@ def returns(count: int, seed: int, steady: int, *, first_hit: bool) -> None:
 def _used_again_after(seed: int, motion: FloatArray, steady: int, *, first_hit: bool) -> float:
     """Pairs of the new epoch after which the engine ties it to the old one; infinite: it does not."""
     model, measurements, _ = two_epochs(seed, motion, steady, AFTER, first_hit=first_hit, reported=True)
-    engine, pairs = OnlineRegistration(model, CONFIG, judge=None), 0
+    engine, pairs = OnlineRegistration(model, CONFIG, verdicts=False), 0
     for index, event in events_in_order(measurements):
         estimate = engine.add(event)
         pairs += index is not None

@@ -43,7 +43,7 @@ from fgreg.registration import SoundSpeedPrior, pack_session
 from fgreg.robust import pm_limits
 
 if TYPE_CHECKING:
-    from fgreg.online.shared import Quadratic
+    from fgreg.smoother.shared_variables import Quadratic
 
 MIN_KNOWN = 6
 """PMs that a registration takes: with fewer on either side of a split point there is nothing that could have moved."""

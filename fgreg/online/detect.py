@@ -46,7 +46,7 @@ def find_epochs(
     if config.estimate_radius:
         config = replace(config, estimate_radius=False)
     engine = OnlineRegistration(
-        model, config, judge=None, watch="inline", sound_speed_prior=sound_speed_prior, start=measurements.epochs[0]
+        model, config, verdicts=False, sound_speed_prior=sound_speed_prior, start=measurements.epochs[0]
     )
     index_of: list[int] = []
     for index, event in events_in_order(measurements):

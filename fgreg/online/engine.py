@@ -1,58 +1,72 @@
 """The online registration: events in, estimates out.
 
-Marker poses, PMs, lambda and theta' of recent pairs are variables in ISAM2, with the factors of the reference graph
-(fgreg.online.window); older pairs are summed up in chunks that are linearised anew in turn (fgreg.online.summary).
-An event either becomes part of the state or, whatever fails on the way, leaves it as it was.
+Recent pairs are factors in iSAM2, everything older is one marginal prior (fgreg.smoother). An event either becomes part
+of the state or, whatever fails on the way, leaves it as it was.
 
-The incremental state is a function of the sequence of events only. The judge decides what is *reported* beside it: the
-shift from optimum to posterior mean, the widening of the covariance at few pairs, the verdict and its reasons.
+Beside it the full solve (fgreg.online.full_solve) registers all measurements from no guess: while an epoch is young,
+when a shot does not fit, and from time to time. Its optimum and inliers are taken over, and it decides what is
+*reported*: the shift from optimum to posterior mean, the covariance at few pairs, the verdict and its reasons. Before
+it, every pair is tested for an unreported move of the camera.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from types import TracebackType
-from typing import Literal
 
 import gtsam
 import numpy as np
 
-from fgreg.batch import Solution
-from fgreg.camera_moves.detector import LoopClosure
-from fgreg.camera_moves.loop_closure import back_to
+from fgreg.batch import Solution, solve
+from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase, find_camera_move
+from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
+from fgreg.camera_moves.static_tags import TagSettings
 from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
 from fgreg.estimate import TrackEstimate, Verdict
 from fgreg.frames import FloatArray, make_transform, rotation_to_direction
+from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.models import SessionModel
 from fgreg.online.checks import check
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
-from fgreg.online.guard import MoveGuard, WatchKind
-from fgreg.online.judge import Case, DeferredJudge, InlineJudge, Judge, Judgement, ProcessJudge, judge
-from fgreg.online.numbers import Sink, Source
-from fgreg.online.rest import Noticed, Rest, rested, with_effort
-from fgreg.online.rest_codec import read_rest, write_rest
-from fgreg.online.restart import Tools, all_measurements
-from fgreg.online.shared import POSE
-from fgreg.online.state import EpochData, Recent, State, kept_by_place, make_setting
-from fgreg.online.store import MeasurementStore
-from fgreg.online.tag_guard import TagsMoved, TagsRest
-from fgreg.online.tie import with_motion
+from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
+from fgreg.online.solver import Where, make_solver
+from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
 from fgreg.online.tracking import online_snapshot
-from fgreg.online.updates import is_kept, with_aim, with_move, with_pair
-from fgreg.registration import SoundSpeedPrior
+from fgreg.registration import EpochSearch, Minimum, SoundSpeedPrior
+from fgreg.smoother.initialise import initialised
+from fgreg.smoother.innovation import misplaced_pms
+from fgreg.smoother.shared_variables import POSE, Quadratic
+from fgreg.smoother.state import Epoch, State, looks_by_pm, make_setting
+from fgreg.smoother.updates import FIRST_PAIRS, with_aim, with_motion, with_move, with_pair
 from fgreg.surface import TissueSurface
 from fgreg.tracking import Snapshot, track
 from fgreg.verdict import accuracy
 
-NOT_JUDGED = "this camera epoch has not been judged by the full solve yet: take the estimate as preliminary"
+NOT_SOLVED = "this camera epoch has not been through the full solve yet: take the estimate as preliminary"
 NO_REGISTRATION = "no registration of this camera epoch"
+LEAST_PMS = 3
+"""PMs that an epoch needs to be registered at all."""
+FIRST_PMS = 8
+"""Up to so many PMs of an epoch, as up to its first pairs, the full solve runs at each pair."""
+LATER_PAIRS = (12, 15, 20, 25, 30, 40, 60, 80)
+"""After the first ones the full solve runs at so many pairs, and whenever they have doubled."""
+LOOP_PMS = (MOST_LOOKS, 18, 10)
+"""A loop that was closed at some pair is looked for again at so many PMs."""
+MOST_ROUNDS = 4
+"""Full solves at one event: each camera move that one finds asks for another."""
+
+
+def is_due(pairs: int) -> bool:
+    """Whether the full solve runs because an epoch has come to so many pairs."""
+    if pairs <= LATER_PAIRS[-1]:
+        return pairs <= FIRST_PAIRS or pairs in LATER_PAIRS
+    return bool(pairs % LATER_PAIRS[-1] == 0 and (pairs // LATER_PAIRS[-1]).bit_count() == 1)
 
 
 class OnlineRegistration:
@@ -61,10 +75,10 @@ class OnlineRegistration:
     Args:
         model: the session's set-up.
         config: settings of estimate and verdict.
-        judge: ``inline`` judges within ``add`` at fixed counts of pairs (deterministic, some tenths of a second each),
-            ``process`` in a process of its own (adopted when ready), None never.
-        watch: how camera moves that nobody tells are looked for: ``inline`` within ``add`` (deterministic), ``process``
-            in a process of its own (an alarm is adopted with the next event), None not at all.
+        full_solve: ``in_process`` within :meth:`add` (deterministic), ``worker`` in a process of its own, whose results
+            are taken over with the next event or by :meth:`refresh`.
+        verdicts: False leaves posterior and verdict out of the full solve, which only registers.
+        find_moves: whether unreported camera moves are looked for.
         sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
         start: of the first epoch.
 
@@ -77,34 +91,33 @@ class OnlineRegistration:
         model: SessionModel,
         config: SolveConfig | None = None,
         *,
-        judge: Literal["inline", "process"] | None = "inline",
-        watch: WatchKind | None = "inline",
+        full_solve: Where = "in_process",
+        verdicts: bool = True,
+        find_moves: bool = True,
         sound_speed_prior: SoundSpeedPrior | None = None,
         start: EpochStart | None = None,
     ) -> None:
         self._model, self._config, self._prior = model, config or SolveConfig(), sound_speed_prior
-        self._tools = Tools(make_setting(model, self._config, sound_speed_prior), self._config, MeasurementStore())
-        self._state = State((EpochData(start or EpochStart(0.0), 0),))
+        self._setting = make_setting(model, self._config, sound_speed_prior)
+        self._state = State((Epoch(start or EpochStart(0.0), 0),))
         self._t = -math.inf
-        self._serial = 0
-        self._judgement: Judgement | None = None
-        self._caught: Judgement | None = None
+        self._serial = 0  # of the measurements and their epochs
+        self._division = 0  # of the pairs into epochs
+        self._asked = 0  # division of the case that is under way
+        self._solve_wanted = self._move_wanted = self._move_untested = False
+        self._misplaced: frozenset[int] = frozenset()
+        self._restoring = False
+        self._report: Report | None = None
         self._snapshot: tuple[OnlineEstimate, Snapshot] | None = None
         self._surface: TissueSurface | None = None
-        kinds: dict[str, Callable[[], Judge]] = {
-            "inline": lambda: InlineJudge(model, self._config, sound_speed_prior),
-            "process": lambda: ProcessJudge(model, self._config, sound_speed_prior),
-        }
-        if judge is not None and judge not in kinds:
-            raise ValueError(f"judge is {judge!r}, expected 'inline', 'process' or None")
-        self._guard = MoveGuard(watch, model, self._config, sound_speed_prior, self._tools.setting)
+        self._find_moves, self._verdicts = find_moves, verdicts
+        self._move_failure = ""  # of the camera-move test
+        self._tags = TagGuard()
         self._moves: list[DetectedMove] = []
         self._returns: list[DetectedReturn] = []
         self._noticed: dict[int, str] = {}
-        self._suspicion = ""
-        self._judge: Judge | None = None if judge is None else kinds[judge]()
-        self._on_schedule = judge != "process"
-        self._estimate = self._report(self._state, 0.0, None)
+        self._solver = make_solver(full_solve, model, self._config, sound_speed_prior, verdicts=verdicts)
+        self._estimate = self._estimated(self._state, 0.0)
 
     def __enter__(self) -> OnlineRegistration:
         return self
@@ -113,244 +126,317 @@ class OnlineRegistration:
         self.close()
 
     def close(self) -> None:
-        """End the processes beside it, where there are any; the estimate stays."""
-        self._guard.close()
-        if self._judge is not None:
-            self._judge.close()
-            self._judge = None
+        """End the worker process, where there is one; the estimate stays."""
+        self._solver.close()
 
     # --- events -----------------------------------------------------------------------------------------------------
 
     def add(self, event: OnlineEvent) -> OnlineEstimate:
         """Take in one event.
 
-        A pair's own ``epoch`` is not looked at: it belongs to the epoch that lasts.
+        A pair's own ``epoch`` is not looked at: it belongs to the current epoch.
 
         Raises:
             EventRefused: the event cannot be taken in, or the update failed; everything is as it was before.
         """
         check(event, self._t)
-        if not isinstance(event, CameraMoved):  # what is told comes before what is still being looked at
-            self._adopt_found(event.t)
+        if not isinstance(event, CameraMoved):  # what is reported comes before what is still being looked for
+            self._fetch()
         before = self._state
         try:
-            guard, said = self._guard.see(event) if isinstance(event, StaticTags) else (None, None)
-            state = rested(with_effort(self._next(event, said)), self._tools.setting)
-            estimate = self._report(state, event.t, self._judgement)
+            tags, found = self._seen(event)
+            state = self._next(event, found)
+            estimate = self._estimated(state, event.t)
+            misplaced = self._misplaced if self._restoring else self._misplaced_now(state, event)
         except EventRefused:
             raise
         except Exception as error:  # whatever failed, the state before still stands
             raise EventRefused(f"the update failed: {type(error).__name__}: {error}") from error
         # From here on nothing fails: what the event brought is kept.
-        if isinstance(event, Pair):
-            self._tools.store.append(event)
-        elif isinstance(event, Aim):
-            self._tools.store.append_aim(event)
-        self._state, self._t = state, event.t
+        self._state, self._t, self._estimate, self._tags = state, event.t, estimate, tags
         self._serial += 1
-        moved = state.epoch != before.epoch
-        self._estimate = estimate
-        if moved:
-            self._guard.epoch_began(by_tags=guard is not None)
-            if self._suspicion:
-                self._suspicion = ""
-                self._estimate = self._report(state, event.t, self._judgement)
-        if guard is not None:
-            self._guard.keep(guard)
-        if isinstance(said, TagsMoved):
-            self._note_move(before, state.now.first, said.since_t, event.t, None)
+        if state.epoch != before.epoch:
+            self._divided(by_tags=found is not None)
+        if isinstance(found, TagsMoved):
+            self._note_move(before, state.now.first, found.since_t, event.t, None)
         elif isinstance(event, CameraMoved) and event.detected and event.since_t is not None:
             self._note_move(before, state.now.first, event.since_t, event.t, None, recorded=True)
-        elif isinstance(event, Pair):
-            self._guard.look(state, self._tools.store)
-            moved = self._adopt_found(event.t) or moved
-        self._consult(ask=moved or isinstance(said, TagsRest) or isinstance(event, Pair | Aim))
+        self._want(event, found, misplaced)
+        self._solve(event.t)
+        if isinstance(event, Pair) and state is not self._state and self._state.shots:
+            self._state = replace(self._state, nis=state.nis, used=self._state.shots[-1].inlier)
+            self._estimate = replace(self._estimate, nis=self._state.nis, used=self._state.used)
         return self._estimate
 
-    def _next(self, event: OnlineEvent, said: TagsMoved | TagsRest | None) -> State:
-        state = replace(self._state, steps=self._state.steps + 1)
+    def _seen(self, event: OnlineEvent) -> tuple[TagGuard, TagsMoved | TagsRest | None]:
+        """What a frame of static tags says, and the tags' state after it."""
+        if not (isinstance(event, StaticTags) and self._find_moves):
+            return self._tags, None
+        return guarded(self._tags, event, TagSettings())
+
+    def _next(self, event: OnlineEvent, found: TagsMoved | TagsRest | None) -> State:
+        state, setting = self._state, self._setting
         if isinstance(event, Pair):
-            return with_pair(state, event, self._tools)
+            return with_pair(state, event, setting)
         if isinstance(event, Aim):
-            return with_aim(state, event, self._tools)
+            return with_aim(state, event, setting)
         if isinstance(event, CameraMoved):
             start = EpochStart(event.t, event.camera_new_T_camera_old, event.covariance)
             if event.since_t is not None:
-                return with_move(state, replace(start, t=event.since_t), self._tools, self._pairs_since(event.since_t))
+                return with_move(state, replace(start, t=event.since_t), setting, self._pairs_since(event.since_t))
             if self._noticed.get(state.epoch) and (state.window is None or not state.epoch_pairs):
-                # Whether this is the move that was found out, or another, is not known: the motion of neither is.
+                # Whether this is the move that was detected, or another, is not known: the motion of neither is.
                 start = EpochStart(event.t)
-            return with_move(state, start, self._tools)
-        if isinstance(said, TagsMoved):
-            return with_move(state, EpochStart(said.since_t), self._tools, self._pairs_since(said.since_t))
-        if isinstance(said, TagsRest):
-            start = EpochStart(state.now.start.t, said.camera_new_T_camera_old, said.covariance)
-            return with_motion(state, start, self._tools)
+            return with_move(state, start, setting)
+        if isinstance(found, TagsMoved):
+            return with_move(state, EpochStart(found.since_t), setting, self._pairs_since(found.since_t))
+        if isinstance(found, TagsRest):
+            start = EpochStart(state.now.start.t, found.camera_new_T_camera_old, found.covariance)
+            return with_motion(state, start, setting)
         return replace(state, nis=None, used=False)
 
     def _pairs_since(self, t: float) -> int:
         """How many of the epoch's pairs were taken at a time or later."""
-        store, first = self._tools.store, self._state.now.first
-        return sum(store.time(place) >= t for place in range(first, self._state.pairs))
+        return sum(shot.pair.t >= t for shot in self._state.current)
 
-    def reassign(self, last: int, start: EpochStart) -> OnlineEstimate:
-        """A new epoch to which the last so many pairs belong already: the camera moved before them, untold.
+    def _misplaced_now(self, state: State, event: OnlineEvent) -> frozenset[int]:
+        """PMs that the last full solve did not leave as inliers or outliers, but that the estimate now has so."""
+        return misplaced_pms(state, self._setting) if isinstance(event, Pair | Aim) else frozenset()
 
-        Raises:
-            EventRefused: they are not all of the epoch that lasts, or the update failed; nothing has changed then.
-        """
-        if not 0 <= last <= self._state.epoch_pairs:
-            raise EventRefused(f"{last} pairs are to be reassigned, of {self._state.epoch_pairs} in the epoch")
+    def _divided(self, *, by_tags: bool = False) -> None:
+        """The pairs have another division into epochs: what was asked before does not count."""
+        self._division += 1
+        self._misplaced = frozenset()
+        if not by_tags:
+            self._tags = TagGuard()
+
+    # --- the full solve ---------------------------------------------------------------------------------------------
+
+    def _want(self, event: OnlineEvent, found: TagsMoved | TagsRest | None, misplaced: frozenset[int]) -> None:
+        """What the full solve is to do after an event."""
+        state = self._state
+        if self._solver.failure and state.epoch_pairs:  # what the last full solve was to say has not been said
+            self._solve_wanted = True
+        if isinstance(event, Pair):
+            self._move_wanted = self._find_moves
+            rejected = state.nis is not None and not state.used
+            no_estimate = state.window is None or state.is_open
+            due = is_due(state.epoch_pairs) or state.epoch_pms <= FIRST_PMS
+            if no_estimate or rejected or due or not misplaced <= self._misplaced:
+                self._solve_wanted = True
+        elif isinstance(event, Aim):
+            if state.epoch_pairs and (state.window is None or state.epoch_pairs <= FIRST_PAIRS):
+                self._solve_wanted = True
+        elif (found is not None or isinstance(event, CameraMoved)) and state.epoch_pairs:
+            self._solve_wanted = True
+
+    def _solve(self, t: float) -> None:
+        """Hand over what is wanted, and take over what has come back."""
+        if self._restoring:
+            return
+        for _ in range(MOST_ROUNDS):
+            if not self._solver.busy:
+                case = self._case()
+                if case is None:
+                    return
+                self._asked, self._solve_wanted, self._move_wanted = self._division, False, False
+                self._move_untested = case.move is not None and case.move.known is None
+                self._solver.submit(case)
+                if self._solver.busy and case.measurements is not None and self._state.window is None:
+                    self._state = replace(self._state, why_none="its pairs are being registered")
+                    self._estimate = self._estimated(self._state, self._estimate.t)
+            if not self._fetch(t):
+                break
+        if self._solver.failure or self._move_failure:
+            self._estimate = self._estimated(self._state, self._estimate.t)
+
+    def _fetch(self, t: float | None = None) -> bool:
+        """Take over a result that has come back; whether there was one."""
+        found = self._solver.fetch()
+        if found is None:
+            if self._solver.lost:  # with its process: the next one is asked again
+                self._solver.lost, self._solve_wanted = False, True
+            return False
+        if self._asked != self._division or found.epoch != self._state.epoch:
+            self._solve_wanted = True
+            return True
+        t = self._t if t is None else t
+        if found.move_failure is not None:
+            self._move_failure = found.move_failure
+        if isinstance(found.move, CameraMove):
+            self._reassign(found.move, t)
+        elif isinstance(found.move, LoopClosure):
+            self._close_loop(found.move, t)
+        else:
+            self._take_over(found)
+        return True
+
+    def _case(self) -> FullSolveCase | None:
+        """What is wanted and possible now."""
+        state = self._state
+        move = None
+        if self._move_wanted:
+            try:
+                move = self._move_case()
+            except Exception as error:  # the pair counts without it
+                self._move_failure = f"{type(error).__name__}: {error}"
+        measurements = state.measurements() if self._solve_wanted and self._solvable else None
+        if self._solve_wanted and not self._solvable and state.epoch_pairs:
+            why = f"{state.epoch_pms} pairs are too few for a registration: take at least {self._config.min_pairs}"
+            self._state = replace(state, why_none=why)
+            self._estimate = self._estimated(self._state, self._estimate.t)
+        if move is None and measurements is None:
+            return None
+        return FullSolveCase(self._serial, state.epoch, measurements, self._known(), move)
+
+    @property
+    def _solvable(self) -> bool:
+        """Whether the current epoch can have a registration."""
+        return self._state.window is not None or self._state.epoch_pms >= LEAST_PMS
+
+    def _known(self) -> dict[int, EpochSearch]:
+        """Minima of earlier epochs: theirs are not searched for again."""
+        out = {}
+        for k, epoch in enumerate(self._state.epochs[:-1]):
+            mine = [shot for shot in self._state.shots if shot.pair.epoch == k]
+            if epoch.state is not None and len({shot.label for shot in mine}) >= LEAST_PMS:
+                clean = all(shot.inlier for shot in mine)
+                out[k] = EpochSearch((Minimum(0.0, epoch.state),), None, clean=clean)
+        return out
+
+    def _move_case(self) -> MoveCase | None:
+        state, window = self._state, self._state.window
+        looks = looks_by_pm(state.current, state.now.first)
+        # Two minima among many PMs are what a move leaves: the pairs of either side are the outliers of the other.
+        sound = state.carried is not None and (not state.is_open or state.epoch_pms >= 2 * MIN_KNOWN)
+        return MoveCase(
+            epoch=state.epoch,
+            pms=tuple(tuple(state.shots[place].pair for place in places) for places in looks.values()),
+            places=tuple(places[0] for places in looks.values()),
+            inlier=np.array([state.shots[places[0]].inlier for places in looks.values()], dtype=bool),
+            state=window.state if window is not None and sound else None,
+            known=state.carried.at(window.state, self._setting.columns) if window and state.carried and sound else None,
+            aims=state.aims,
+            earlier=self._earlier(state.epoch) if state.epoch_pairs <= MOST_LOOKS else {},
+        )
+
+    def _earlier(self, to: int) -> dict[int, tuple[SharedState, Quadratic]]:
+        """Registrations of the epochs before one, that the camera may be back to; none where the motion is known."""
+        state = self._state
+        if state.epochs[to].start.motion_known:
+            return {}
+        out = {}
+        for k, epoch in enumerate(state.epochs[:to]):
+            pms = {shot.label for shot in state.shots if shot.pair.epoch == k}
+            if epoch.state is not None and epoch.covariance is not None and len(pms) >= MIN_EARLIER:
+                information = np.asarray(np.linalg.inv(epoch.covariance))
+                out[k] = (epoch.state, Quadratic(epoch.state, 0.0, np.zeros(len(information)), information))
+        return out
+
+    def _take_over(self, found: FullSolveResult) -> None:
+        """Optimum, inliers and report of a full solve; where that fails the incremental estimate stands without it."""
+        before = self._state, self._misplaced, self._report, self._surface
         try:
-            self._reassign(last, start)
+            if found.report is not None:
+                self._report = found.report
+                self._surface = found.report.surface or self._surface
+            if found.initial is not None:
+                self._state = initialised(self._state, found.initial, self._setting)
+                # Pairs that came before there was a registration could not be tested for a move.
+                self._move_wanted, self._move_untested = self._move_wanted or self._move_untested, False
+                self._misplaced = misplaced_pms(self._state, self._setting)
+            elif found.why_none:
+                self._state = replace(self._state, window=None, why_none=found.why_none)
+            self._estimate = self._estimated(self._state, self._estimate.t)
         except Exception as error:
-            raise EventRefused(f"the update failed: {type(error).__name__}: {error}") from error
-        self._consult(ask=True)
-        return self._estimate
+            self._state, self._misplaced, self._report, self._surface = before
+            self._solver.failure = f"{type(error).__name__}: {error}"
+            self._estimate = self._estimated(self._state, self._estimate.t)
 
-    def _reassign(self, last: int, start: EpochStart) -> None:
-        nis, place = self._state.nis, self._state.pairs - 1
-        state = with_effort(with_move(replace(self._state, steps=self._state.steps + 1), start, self._tools, last))
-        state = replace(state, nis=nis, used=nis is not None and is_kept(state, place))
-        estimate = self._report(state, max(self._t, start.t), self._judgement)
+    def _reassign(self, found: CameraMove, t: float) -> None:
+        """A new epoch from a pair on: the camera moved before it, unreported."""
+        before = self._state
+        since_t = before.shots[found.first].pair.t
+        self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - found.first)
+        self._serial += 1
+        self._divided()
+        self._solve_wanted = True
+        self._note_move(before, found.first, since_t, t, found.log_bayes)
+
+    def _close_loop(self, found: LoopClosure, t: float) -> None:
+        """The camera is where an earlier epoch had it: that one's registration counts again."""
+        before = self._state
+        try:
+            state = with_motion(before, back_to(before.now.start, found.to), self._setting)
+            state = replace(state, nis=before.nis, used=before.used)
+            estimate = self._estimated(state, self._estimate.t)
+        except Exception:  # it is the same camera epoch without it, only less well known
+            return
+        self._returns.append(DetectedReturn(before.epoch, found.to, t, found.log_bayes))
         self._state, self._estimate = state, estimate
         self._serial += 1
-        self._guard.epoch_began()
-        self._suspicion = ""
-
-    def _adopt_found(self, t: float) -> bool:
-        """Begin a new epoch, or tie the one that lasts to an earlier one, where the watch says so; whether it does."""
-        before = self._state
-        found = self._guard.found(before)
-        if found is None:
-            return False
-        if isinstance(found, LoopClosure):
-            return self._go_back(found, t)
-        since_t = self._tools.store.time(found.first)
-        try:
-            self._reassign(before.pairs - found.first, EpochStart(since_t))
-        except Exception as error:  # the old registration is not to be trusted, and there is no new one
-            self._suspicion = f"the camera has moved, and its pairs cannot be given to a new epoch: {error}"
-            self._estimate = self._report(before, self._estimate.t, self._judgement)
-            return False
-        self._note_move(before, found.first, since_t, t, found.log_bayes)
-        return True
-
-    def _go_back(self, found: LoopClosure, t: float) -> bool:
-        before = self._state
-        start = back_to(before.now.start, found.to)
-        try:
-            state = with_motion(replace(before, steps=before.steps + 1), start, self._tools)
-            state = replace(state, nis=before.nis, used=before.used)
-            self._estimate = self._report(state, self._estimate.t, None)
-        except Exception:  # it is the same camera epoch without it, only less well known
-            return False
-        self._returns.append(DetectedReturn(before.epoch, found.to, t, found.log_bayes))
-        self._state, self._serial, self._judgement = state, self._serial + 1, None
-        return True
+        self._division += 1
+        self._solve_wanted = True
 
     def _note_move(
         self, before: State, first: int, since_t: float, t: float, log_bayes: float | None, *, recorded: bool = False
     ) -> None:
-        """Tell of a move that was found out, now or (``recorded``) when the session was recorded."""
-        last_t = self._tools.store.time(first - 1) if first else before.now.start.t
+        """A move was detected, now or (``recorded``) when the session was recorded."""
+        last_t = before.shots[first - 1].pair.t if first else before.now.start.t
         move = DetectedMove(before.epoch - len(self._moves), first, since_t, last_t, t, log_bayes)
         if not recorded:
             self._moves.append(move)
         self._noticed[self._state.epoch] = move.text
-        self._estimate = self._report(self._state, self._estimate.t, self._judgement)
-
-    def _consult(self, *, ask: bool) -> None:
-        """Ask the judge, adopt what it answers."""
-        if self._judge is None:
-            return
-        if ask:
-            self._judge.ask(self._case, self._state.epoch_pairs)
-        found = self._judge.answer()
-        if found is not None:
-            self._surface = found.surface or self._surface
-            if found.epoch == self._state.epoch:
-                self._judgement = found
-        if self._judge.failure or found is not None:
-            self._estimate = self._report(self._state, self._estimate.t, self._judgement)
-
-    def _case(self) -> Case:
-        return Case(self._serial, self._state.epoch, self.measurements())
+        self._estimate = self._estimated(self._state, self._estimate.t)
 
     @contextmanager
-    def catching_up(self) -> Iterator[None]:
-        """While many events of before are taken in again: judged once, at the end.
+    def restoring(self) -> Iterator[None]:
+        """While events of a recorded session are taken in again: nothing is estimated until the end, then all at once.
 
-        ``inline`` judges where the last judgement was due: what is reported afterwards is what it reports after the
-        same events, but for the time that it takes. ``process`` judges all of it, and so does ``inline`` where nothing
-        was due since a rest of such an engine. Moves that were found out are among the events; only after the last one
-        they are looked for again.
+        Camera moves that were detected then are among the events, and loops are closed again; new moves are looked for
+        in the current epoch only.
         """
-        usual, deferred = self._judge, DeferredJudge()
-        self._judge = deferred if usual is not None and self._on_schedule else None
-        self._guard.pause()
-        self._caught = None
+        self._restoring = True
         try:
             yield
         finally:
-            self._judge = usual
-        if self._guard.resume(self._state, self._tools.store):
-            self._adopt_found(self._t)
-        case = deferred.case
-        if case is None and usual is not None and self._serial and (self._judgement is None or not self._on_schedule):
-            case = self._case()
-        if case is not None:
-            found, _ = judge(case, self._model, self._config, self._prior)
-            self._caught, self._surface = found, found.surface or self._surface
-            if found.epoch == self._state.epoch:
-                self._judgement = found
-                self._estimate = self._report(self._state, self._estimate.t, found)
+            self._restoring = False
+        if not self._state.shots:
+            return
+        try:
+            self._solve_all()
+            if self._find_moves and self._close_loops_again():
+                self._solve_all()
+        except Exception as error:  # the events are there; the next one asks again
+            self._solver.failure = f"{type(error).__name__}: {error}"
+            self._estimate = self._estimated(self._state, self._estimate.t)
+        self._move_wanted = self._find_moves and bool(self._state.epoch_pairs)
+        self._solve_wanted = not self._solvable  # that says how many are too few
+        self._solve(self._t)
 
-    def rest(self) -> Callable[[Sink], None] | None:
-        """What writes down the engine as it is now (at any later time), where the last event ended with a rest.
+    def _solve_all(self) -> None:
+        """The full solve of everything, here and now."""
+        case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements(), None, None)
+        self._take_over(full_solve(case, self._model, self._config, self._prior, verdicts=self._verdicts))
 
-        What a judging process says comes when it comes, and is not written: whoever goes on from here judges anew.
-        """
-        state = self._state
-        if state.window is None or state.window.seed is None:
-            return None
-        noticed = Noticed(tuple(self._moves), tuple(self._returns), self._suspicion)
-        judgement = self._judgement if self._on_schedule else None
-        found = Rest(state, self._t, self._serial, self._estimate.t, judgement, self._surface, noticed)
-        if isinstance(self._judge, DeferredJudge):
-            return partial(self._write_caught, found, self._judge.case)
-        return partial(self._write, found)
-
-    def _write(self, rest: Rest, sink: Sink) -> None:
-        write_rest(sink, rest, self._tools.store.aims, self._tools.store)
-
-    def _write_caught(self, rest: Rest, case: Case | None, sink: Sink) -> None:
-        """Write a rest from :meth:`catching_up`, judged as it was due up to there."""
-        if case is not None:
-            found = self._caught
-            if found is None or found.serial != case.serial:
-                found, _ = judge(case, self._model, self._config, self._prior)
-            rest = replace(rest, judgement=found, surface=found.surface or rest.surface)
-        self._write(rest, sink)
-
-    def resume(self, source: Source) -> OnlineEstimate:
-        """Go on from a rest of an engine with the same model and configuration; the source has to end with it.
-
-        Raises:
-            ValueError: it holds something else, or this engine has taken in something already.
-            RuntimeError, ArithmeticError: the window cannot be opened.
-        """
-        if self._serial:
-            raise ValueError("events were taken in already")
-        rest, store = read_rest(source, self._tools.setting)
-        source.finish()
-        self._tools = replace(self._tools, store=store)
-        self._state, self._t, self._serial = rest.state, rest.t, rest.serial
-        self._judgement, self._surface = rest.judgement, rest.surface
-        self._moves, self._returns = list(rest.noticed.moves), list(rest.noticed.returns)
-        self._noticed, self._suspicion = rest.noticed.texts(), rest.noticed.suspicion
-        self._estimate = self._report(self._state, rest.estimate_t, rest.judgement)
-        return self._estimate
+    def _close_loops_again(self) -> bool:
+        """Close the loops that were closed when the pairs came: no event says so. Whether there are any."""
+        state, before = self._state, len(self._returns)
+        for epoch in range(1, len(state.epochs)):
+            earlier = self._earlier(epoch)
+            shots = [shot for shot in state.shots if shot.pair.epoch == epoch][:MOST_LOOKS]
+            pms = [tuple(shots[place].pair for place in places) for places in looks_by_pm(shots).values()]
+            for size in sorted({min(count, len(pms)) for count in LOOP_PMS}, reverse=True) if earlier else ():
+                inlier = np.ones(size, dtype=bool)
+                case = MoveCase(epoch, tuple(pms[:size]), tuple(range(size)), inlier, None, None, state.aims, earlier)
+                found = find_camera_move(case, self._model, self._config, self._prior)
+                if isinstance(found, LoopClosure):
+                    epochs = list(self._state.epochs)
+                    epochs[epoch] = replace(epochs[epoch], start=back_to(epochs[epoch].start, found.to))
+                    self._state = replace(self._state, epochs=tuple(epochs), window=None)
+                    self._returns.append(DetectedReturn(epoch, found.to, pms[size - 1][0].t, found.log_bayes))
+                    break
+        return len(self._returns) > before
 
     # --- what is known ----------------------------------------------------------------------------------------------
 
@@ -360,13 +446,14 @@ class OnlineRegistration:
         return self._estimate
 
     def refresh(self) -> OnlineEstimate:
-        """Adopt what the judge, and the watch for moves, have found since, without an event."""
-        self._consult(ask=self._adopt_found(self._t))
+        """Take over what the full solve has found since, without an event."""
+        self._fetch()
+        self._solve(self._t)
         return self._estimate
 
     @property
     def moves(self) -> tuple[DetectedMove, ...]:
-        """Camera moves that were found out, in the order of time; their epochs are numbered as told."""
+        """Camera moves that were detected, in the order of time; their epochs are numbered as reported."""
         return tuple(self._moves)
 
     @property
@@ -375,122 +462,110 @@ class OnlineRegistration:
         return tuple(self._returns)
 
     @property
-    def recent(self) -> tuple[Recent, ...]:
-        """The last pairs' quadratics and what was known before each, oldest first: for tests on moves."""
-        return self._state.recent
-
-    @property
     def state(self) -> State:
         """The incremental state; a value, never changed in place."""
         return self._state
 
     @property
     def kept(self) -> tuple[bool, ...]:
-        """Whether each pair counts, in the order in which they came."""
-        return tuple(kept_by_place(self._state).tolist())
+        """Whether each pair is an inlier, in the order in which they came."""
+        return tuple(shot.inlier for shot in self._state.shots)
 
     def measurements(self) -> Measurements:
         """All that was taken in, as the batch solve takes it."""
-        return all_measurements(self._state, self._tools.store)
+        return self._state.measurements()
 
     def marker_T_laser(self) -> FloatArray | None:
-        """(4, 4) the beam as the present epoch's estimate has it, origin by its chart; None where there is none yet."""
+        """(4, 4) the beam as the present estimate has it, origin by its chart; None where there is none yet."""
         if self._state.window is None:
             return None
         shared = self._state.window.state
         return make_transform(rotation_to_direction(shared.beam_direction()[0]), shared.beam_origin()[0])
 
     def settle(self) -> OnlineEstimate:
-        """Judge now, by the full solve of everything so far; the estimate is then that solve's."""
-        self.solution()
+        """Run the full solve of everything now, unless it is done; the estimate is then that solve's."""
+        if not self._estimate.settled or self._known():
+            self.solution()
         return self._estimate
 
     def solution(self) -> Solution:
-        """The full solve of everything so far, adopted as :meth:`settle` does."""
-        found, solution = judge(self._case(), self._model, self._config, self._prior)
-        if self._judge is not None:
-            self._judge.forgive()
-        self._judgement, self._surface = found, found.surface or self._surface
-        self._estimate = self._report(self._state, self._estimate.t, found)
+        """The full solve of everything, taken over as :meth:`settle` does."""
+        measurements = self.measurements()
+        solution = solve(measurements, [], self._model, self._config, sound_speed_prior=self._prior)
+        case = FullSolveCase(self._serial, self._state.epoch, measurements, None, None)
+        self._solver.failure = ""
+        self._solve_wanted = False
+        self._take_over(result_of(case, measurements, solution))
         return solution
 
     def track(self, query: Track) -> TrackEstimate:
         """Answer a query from the estimate as it is; the graph is not touched."""
-        self._adopt_found(self._t)
+        self._fetch()
         return track(query, self.snapshot())
 
     def snapshot(self) -> Snapshot:
         """All that queries need of the estimate as it is; made once per event, on demand."""
         if self._snapshot is None or self._snapshot[0] is not self._estimate:
             window = self._state.window
-            optimum = None if window is None else (window.state, window.covariance, self._tools.setting.columns)
+            optimum = None if window is None else (window.state, window.covariance, self._setting.columns)
             made = online_snapshot(self._model, self._config, self._estimate, optimum, self._surface)
             self._snapshot = (self._estimate, made)
         return self._snapshot[1]
 
     # --- reporting --------------------------------------------------------------------------------------------------
 
-    def _report(self, state: State, t: float, found: Judgement | None) -> OnlineEstimate:
-        """The estimate of a state, with what the judge said of its epoch, and what is known of moves."""
-        estimate = self._judged(state, t, found)
-        known = [(Verdict.REFUSED, self._suspicion), (Verdict.WARNING, self._noticed.get(state.epoch, ""))]
-        if self._guard.failure:
-            text = f"camera moves are not looked for: {self._guard.failure}; tell them by camera_moved"
-            known.append((Verdict.WARNING, text))
-        if self._judge is not None and self._judge.failure:
-            text = f"the full solve failed: {self._judge.failure}: what it said before may hold no longer"
-            known.append((Verdict.WARNING, text))
-        told = [(verdict, text) for verdict, text in known if text]
-        if not told:
+    def _estimated(self, state: State, t: float) -> OnlineEstimate:
+        """The estimate of a state, with what the full solve said of its epoch, and what is known of moves."""
+        estimate = self._reported(state, t)
+        known = [self._noticed.get(state.epoch, "")]
+        if self._solver.failure:
+            known.append(f"the full solve failed: {self._solver.failure}: what it said before may hold no longer")
+        if self._move_failure:
+            known.append(f"camera moves are not looked for: {self._move_failure}")
+        texts = tuple(text for text in known if text)
+        if not texts:
             return estimate
-        verdict = max(estimate.verdict, *(verdict for verdict, _ in told), key=lambda v: v.severity)
-        return replace(estimate, verdict=verdict, reasons=(*(text for _, text in told), *estimate.reasons))
+        verdict = max(estimate.verdict, Verdict.WARNING, key=lambda v: v.severity)
+        return replace(estimate, verdict=verdict, reasons=(*texts, *estimate.reasons))
 
-    def _judged(self, state: State, t: float, found: Judgement | None) -> OnlineEstimate:
-        if found is not None and found.epoch != state.epoch:
-            found = None
-        exact = found is not None and found.serial == self._serial and state is self._state
+    def _reported(self, state: State, t: float) -> OnlineEstimate:
+        report = self._report
+        if report is not None and report.epoch != state.epoch:
+            report = None
         window = state.window
         optimum = None if window is None else window.state.trus_T_camera()[0]
-        count = _looks_kept(state)
-        if exact and found is not None:
+        count = state.epoch_pairs if window is None else sum(shot.inlier for shot in state.current)
+        if report is not None and report.serial == self._serial and state is self._state:
             return OnlineEstimate(
-                t, state.epoch, found.trus_T_camera, found.covariance, found.predicted_tre, state.nis, state.used,
-                found.verdict, found.reasons, found.pairs, optimum, True,
+                t, state.epoch, report.trus_T_camera, report.covariance, report.predicted_tre, state.nis, state.used,
+                report.verdict, report.reasons, report.pairs, optimum, True,
             )  # fmt: skip
         if window is None or optimum is None:
-            why = state.why_none or "take pairs"
-            reason = f"{NO_REGISTRATION}: {why}"
+            reason = f"{NO_REGISTRATION}: {state.why_none}"
             return OnlineEstimate(
                 t, state.epoch, None, None, None, state.nis, state.used, Verdict.REFUSED, (reason,), count, None, False
             )
         covariance = window.covariance[POSE, POSE]
         pose = optimum
         verdict: Verdict = Verdict.WARNING
-        reasons: tuple[str, ...] = (NOT_JUDGED,)
+        reasons: tuple[str, ...] = (NOT_SOLVED,)
         if state.is_open:
             verdict, reasons = (
                 Verdict.REFUSED,
                 ("two registrations explain these pairs equally well: take more", *reasons),
             )
-        if found is not None:
-            covariance, shift = found.applied(covariance)
+        if report is not None:
+            covariance, shift = report.applied(covariance)
             if np.any(shift):
                 pose = optimum @ gtsam.Pose3.Expmap(shift).matrix()
-            verdict, reasons = found.verdict, found.reasons
+            verdict, reasons = report.verdict, report.reasons
         tre = gaussian_tre(covariance, pose, self._model.targets_mm)
         if not (math.isfinite(tre.worst_mm) and np.isfinite(pose).all()):
             raise ArithmeticError("the reported registration is not finite")
         for condition in accuracy(tre, self._config):
-            if condition.verdict.severity > verdict.severity or found is None:
+            if condition.verdict.severity > verdict.severity or report is None:
                 verdict = max(verdict, condition.verdict, key=lambda v: v.severity)
                 reasons = (*reasons, condition.text)
         return OnlineEstimate(
             t, state.epoch, pose, covariance, tre, state.nis, state.used, verdict, reasons, count, optimum, False
         )
-
-
-def _looks_kept(state: State) -> int:
-    """Looks of the epoch that lasts that count."""
-    kept = sum(len(group.bundle.pairs) for group in (state.window.groups if state.window else ()) if group.kept)
-    return kept + state.now.shelf.counts[2]

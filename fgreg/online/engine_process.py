@@ -11,9 +11,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
@@ -27,7 +26,6 @@ from fgreg.models import SessionModel
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
-from fgreg.online.numbers import Numbers, Sink, Source
 from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.registration import SoundSpeedPrior
@@ -36,7 +34,7 @@ from fgreg.workers.worker_process import NICENESS
 
 START_S = 60.0
 IDLE_S = 0.1
-"""Between looks at what the judge has found, while no event comes."""
+"""Between looks at what the full solve has found, while no event comes."""
 
 
 GONE = "the registration's process has ended: open the session again"
@@ -58,22 +56,19 @@ class EngineProcess:
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._writing, their_writing = context.Pipe()
         # Not a daemon: it has children of its own. It ends when this end of the pipe is closed, by whatever.
         self._process = context.Process(
             target=_serve,
-            args=(theirs, their_writing, model, config, sound_speed_prior),
+            args=(theirs, model, config, sound_speed_prior),
             name="fgreg-engine",
             daemon=False,
         )
-        self._turn, self._writing_turn = threading.Lock(), threading.Lock()
-        self._rest: int | None = None
+        self._turn = threading.Lock()
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
         self._returns: tuple[DetectedReturn, ...] = ()
         self._process.start()
         theirs.close()
-        their_writing.close()
         try:
             if not self._connection.poll(START_S):
                 raise EngineGone(f"the registration's process did not start within {START_S:.0f} s")
@@ -103,7 +98,7 @@ class EngineProcess:
         with self._turn:
             try:
                 self._connection.send((name, arguments))
-                how, value, self._estimate, self._moves, self._returns, self._rest = self._connection.recv()
+                how, value, self._estimate, self._moves, self._returns = self._connection.recv()
             except (EOFError, OSError):
                 raise EngineGone(GONE) from None
         if how == "refused":
@@ -152,41 +147,13 @@ class EngineProcess:
             reader.close()
 
     @contextmanager
-    def catching_up(self) -> Iterator[None]:
+    def restoring(self) -> Iterator[None]:
         """As of the engine: judged once at the end. Raises EngineGone."""
-        self._call("catch up")
+        self._call("restore")
         try:
             yield
         finally:
-            self._call("caught up")
-
-    def rest(self) -> Callable[[Sink], None] | None:
-        """As :meth:`fgreg.online.engine.OnlineRegistration.rest`, where the last call was an event that ended with one.
-
-        It is written down beside the events, by a thread of the process; what writes it raises EngineGone, and
-        RuntimeError where a later rest has taken its place.
-        """
-        return None if self._rest is None else partial(self._write, self._rest)
-
-    def _write(self, number: int, sink: Sink) -> None:
-        with self._writing_turn:
-            try:
-                self._writing.send(number)
-                found = self._writing.recv()
-            except (EOFError, OSError):
-                raise EngineGone(GONE) from None
-        if not isinstance(found, Numbers):
-            raise RuntimeError(found)
-        sink.append(found)
-
-    def resume(self, source: Source) -> OnlineEstimate:
-        """As :meth:`fgreg.online.engine.OnlineRegistration.resume`. Raises ValueError, EngineGone."""
-        try:
-            return self._known(self._call("resume", source.rest()))
-        except EngineGone:
-            raise
-        except FgregError as error:
-            raise ValueError(str(error)) from None
+            self._call("restored")
 
     @property
     def estimate(self) -> OnlineEstimate | None:
@@ -205,9 +172,8 @@ class EngineProcess:
 
     def close(self) -> None:
         """End the process."""
-        for connection in (self._connection, self._writing):
-            with suppress(OSError):
-                connection.close()
+        with suppress(OSError):
+            self._connection.close()
         self._process.join(5.0)
         if self._process.is_alive():
             self._process.kill()
@@ -216,7 +182,6 @@ class EngineProcess:
 
 def _serve(
     connection: Connection[Any, Any],
-    writing: Connection[Any, Any],
     model: SessionModel,
     config: SolveConfig,
     prior: SoundSpeedPrior | None,
@@ -225,76 +190,39 @@ def _serve(
     os.nice(NICENESS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main program ends it, in its own time
     with (
-        OnlineRegistration(model, config, judge="process", watch="process", sound_speed_prior=prior) as engine,
+        OnlineRegistration(model, config, full_solve="worker", sound_speed_prior=prior) as engine,
         SharedSnapshot(Layout.of(model)) as shared,
         suppress(EOFError, OSError),
     ):
-        rests = _Rests(writing)
         connection.send(shared.name)
-        _Server(connection, engine, shared, rests).run()
+        _Server(connection, engine, shared).run()
     os._exit(0)  # there is nothing to save, and nobody to wait for
 
 
-class _Rests:
-    """Writes rests down in a thread of its own, the latest only: events do not wait for it."""
-
-    def __init__(self, connection: Connection[Any, Any]) -> None:
-        self._connection = connection
-        self._latest: tuple[int, Callable[[Sink], None] | None] = (0, None)
-        threading.Thread(target=self._run, name="rests", daemon=True).start()
-
-    def keep(self, write: Callable[[Sink], None]) -> int:
-        """Keep a rest; its number."""
-        self._latest = (self._latest[0] + 1, write)
-        return self._latest[0]
-
-    def _run(self) -> None:
-        with suppress(EOFError, OSError):
-            while True:
-                wanted = self._connection.recv()
-                self._connection.send(self._written(wanted))
-
-    def _written(self, wanted: int) -> Numbers | str:
-        number, write = self._latest
-        if number != wanted or write is None:
-            return "a later rest has taken its place"
-        sink = Sink()
-        try:
-            write(sink)
-        except Exception as error:  # the session does without
-            return f"{type(error).__name__}: {error}"
-        return sink.numbers()
-
-
 class _Server:
-    def __init__(
-        self, connection: Connection[Any, Any], engine: OnlineRegistration, shared: SharedSnapshot, rests: _Rests
-    ) -> None:
-        self._connection, self._engine, self._shared, self._rests = connection, engine, shared, rests
+    def __init__(self, connection: Connection[Any, Any], engine: OnlineRegistration, shared: SharedSnapshot) -> None:
+        self._connection, self._engine, self._shared = connection, engine, shared
         self._published: OnlineEstimate | None = None
-        self._catching_up: Any = None
+        self._restoring: Any = None
 
     def run(self) -> None:
         """Until the other end closes."""
         self._publish()
         while True:
             if not self._connection.poll(IDLE_S):
-                if self._catching_up is None:
+                if self._restoring is None:
                     self._engine.refresh()
                 self._publish()
                 continue
             name, arguments = self._connection.recv()
-            rest = None
             try:
                 answer = ("done", self._do(name, arguments))
-                if name == "add" and (write := self._engine.rest()) is not None:
-                    rest = self._rests.keep(write)
             except EventRefused as error:
                 answer = ("refused", error.reason)
             except Exception as error:  # a defect: the estimate stands, and the caller is told
                 answer = ("failed", f"{type(error).__name__}: {error}")
             self._publish()
-            self._connection.send((*answer, self._engine.estimate, self._engine.moves, self._engine.returns, rest))
+            self._connection.send((*answer, self._engine.estimate, self._engine.moves, self._engine.returns))
 
     def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
         engine = self._engine
@@ -305,18 +233,16 @@ class _Server:
                 return engine.settle()
             case "refresh":
                 return engine.refresh()
-            case "resume":
-                return engine.resume(Source(*arguments))
             case "measurements":
                 return engine.measurements()
             case "marker_T_laser":
                 return engine.marker_T_laser()
-            case "catch up":
-                self._catching_up = engine.catching_up()
-                self._catching_up.__enter__()
+            case "restore":
+                self._restoring = engine.restoring()
+                self._restoring.__enter__()
                 return None
-            case "caught up":
-                ending, self._catching_up = self._catching_up, None
+            case "restored":
+                ending, self._restoring = self._restoring, None
                 ending.__exit__(None, None, None)
                 return None
         raise ValueError(f"{name} is nothing that the engine does")

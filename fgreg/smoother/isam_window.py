@@ -1,12 +1,12 @@
-"""The window: recent pairs as the real factors in ISAM2, beside one summary factor of everything older.
+"""The active window: recent pairs as factors in iSAM2, and one marginal prior of everything older.
 
 All variables of a recent pair are in the graph as they are in the reference (fgreg.graph.explicit): its marker pose,
-PM, lambda and theta' are *variables*, nothing is eliminated by hand. Two facts of GTSAM's Python wrapper rule how ISAM2
+PM, lambda and theta' are *variables*, nothing is eliminated by hand. Two facts of GTSAM's Python wrapper rule how iSAM2
 is used here:
 
 - A Python factor is given all values by copy unless their C++ object has a live Python wrapper. So the linearisation
-  point is held as long as ISAM2 lives (``Window.theta``).
-- An update that throws leaves ISAM2 poisoned. So every update works on a copy, and the copy becomes the window only
+  point is held as long as iSAM2 lives (``Window.theta``).
+- An update that throws leaves iSAM2 unusable. So every update works on a copy, and the copy becomes the window only
   when it has succeeded and every number is finite.
 """
 
@@ -30,8 +30,8 @@ from fgreg.graph.explicit_values import beam_of_chart
 from fgreg.graph.shared_state import SharedState
 from fgreg.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
 from fgreg.models import SessionModel
-from fgreg.online.shared import Layout, Quadratic, finite, number_at, summary_factor
 from fgreg.sensitivity import arc_of_rotation, sensitivity_priors
+from fgreg.smoother.shared_variables import Layout, Quadratic, finite, marginal_prior_factor, number_at
 
 THRESHOLDS: dict[Variable, tuple[float, ...]] = {
     Variable.trus_T_camera: (6e-4, 6e-4, 6e-4, 0.06, 0.06, 0.06),
@@ -87,45 +87,22 @@ class Prepared:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bundle:
-    """The looks at one PM as measured.
+class Group:
+    """The looks at one inlier PM, in the active window.
 
     Attributes:
-        label: PM number (an own one where a look was split off as junk).
+        label: PM number (one of its own where a look was split off as an outlier).
         places: of its pairs in the session's order.
         pairs: themselves.
-        kept: whether it counts in the estimate.
+        prepared: as factors, when the group came.
+        slots: where those are in iSAM2; empty before.
     """
 
     label: int
     places: tuple[int, ...]
     pairs: tuple[Pair, ...]
-    kept: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Group:
-    """The looks at one PM that is in the window, used or not.
-
-    Attributes:
-        bundle: its looks.
-        prepared: as factors, when it came or was last prepared.
-        slots: where those are in ISAM2; empty where it is left out.
-    """
-
-    bundle: Bundle
     prepared: Prepared
     slots: tuple[int, ...] = ()
-
-    @property
-    def label(self) -> int:
-        """Of the PM."""
-        return self.bundle.label
-
-    @property
-    def kept(self) -> bool:
-        """Whether it counts in the estimate."""
-        return self.bundle.kept
 
 
 def private_keys(pairs: Sequence[Pair], first: int) -> tuple[list[int], list[int], int, list[int]]:
@@ -137,12 +114,12 @@ def private_keys(pairs: Sequence[Pair], first: int) -> tuple[list[int], list[int
 
 
 def free_number(groups: Sequence[Group], count: int) -> int:
-    """The first of so many numbers in a row that no private variables of a window's groups have.
+    """The first of so many numbers in a row that no private variables of the groups have.
 
-    Numbers are used again and again, so that GTSAM's keys are few: of each a double is made once, which is slow.
+    Numbers are used again, so that GTSAM's keys are few: a value of type double is made once for each, which is slow.
     """
     free = 0
-    for first, taken in sorted((group.prepared.first, len(group.bundle.pairs)) for group in groups):
+    for first, taken in sorted((group.prepared.first, len(group.pairs)) for group in groups):
         if free + count <= first:
             break
         free = max(free, first + taken)
@@ -309,58 +286,30 @@ def _settle(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GroupSeed:
-    """A group as numbers: what :class:`Group` is but for GTSAM's objects, which follow from it.
-
-    ``values``: its private variables in the window: (shots, 13) poses (rows of 3x4) and lambda, flat, then the PM (3)
-    and the thetas; None where it is left out.
-    """
-
-    bundle: Bundle
-    rows: FloatArray
-    residual: FloatArray
-    state: SharedState
-    far: bool
-    values: FloatArray | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WindowSeed:
-    """All that a window is opened from, but for its summary: shared variables, and groups, oldest first."""
-
-    at: SharedState
-    groups: tuple[GroupSeed, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """ISAM2 with the recent pairs in it, and the shared variables' Gaussian.
+    """iSAM2 with the recent pairs in it, and the shared variables' Gaussian.
 
     Attributes:
         isam: never updated in place once it is in a window.
         theta: its linearisation point, held so that Python factors are not given copies of it.
         epoch: index of the registration's variable.
         groups: oldest first.
-        summary_slot: where the summary factor is.
+        prior_slot: where the marginal prior is.
         state: the estimate (one hypothesis, one epoch).
         covariance: (D, D) of the shared variables.
-        numbers: from which on the next private variables are counted.
-        seed: from which it was opened, where it was and nothing has changed since.
     """
 
     isam: gtsam.ISAM2
     theta: gtsam.Values
     epoch: int
     groups: tuple[Group, ...]
-    summary_slot: int
+    prior_slot: int
     state: SharedState
     covariance: FloatArray
-    numbers: int
-    seed: WindowSeed | None = None
 
 
 def empty_isam() -> gtsam.ISAM2:
-    """ISAM2 that eliminates by QR (see fgreg.graph.explicit_solver) and re-linearises by the thresholds above."""
+    """iSAM2 that eliminates by QR (see fgreg.graph.explicit_solver) and re-linearises by the thresholds above."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1
@@ -375,97 +324,77 @@ def empty_isam() -> gtsam.ISAM2:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """What an update does to a window.
+    """What an update does to a window: groups that come, labels of groups that leave, another marginal prior."""
 
-    Attributes:
-        take_in: groups that count from now on, new ones or some of those left out.
-        leave_out: labels of groups that stay and no longer count.
-        forget: labels of groups that go.
-        set_aside: new groups that do not count.
-        summary: another summary.
-    """
-
-    take_in: tuple[Group, ...] = ()
-    leave_out: tuple[int, ...] = ()
-    forget: tuple[int, ...] = ()
-    set_aside: tuple[Group, ...] = ()
-    summary: Quadratic | None = None
+    add: tuple[Group, ...] = ()
+    remove: tuple[int, ...] = ()
+    prior: Quadratic | None = None
 
 
-def open_window(groups: Sequence[Group], summary: Quadratic, layout: Layout, epoch: int, numbers: int) -> Window:
-    """A window anew: these groups and a summary.
+def open_window(groups: Sequence[Group], prior: Quadratic, layout: Layout, epoch: int) -> Window:
+    """A new window of these groups and a marginal prior, whose state is the start.
 
     Raises:
-        RuntimeError: an indeterminate system, or another failure of GTSAM.
-        ArithmeticError: a result that is not finite.
+        ArithmeticError: an indeterminate system, or a result that is not finite.
+        RuntimeError: another failure of GTSAM.
     """
     isam = empty_isam()
     theta = isam.getLinearizationPoint()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    layout.insert(values, summary.state, epoch)
-    graph.add(summary_factor(summary, layout, epoch))
+    layout.insert(values, prior.state, epoch)
+    graph.add(marginal_prior_factor(prior, layout, epoch))
     for group in groups:
-        if group.kept:
-            graph.push_back(group.prepared.graph)
-            values.insert(group.prepared.values)
-    slots = list(isam.update(graph, values).getNewFactorsIndices())
-    placed, at = [], 1
-    for group in groups:
-        size = group.prepared.graph.size() if group.kept else 0
-        placed.append(_with_slots(group, tuple(slots[at : at + size])))
-        at += size
-    return _read(isam, theta, layout, epoch, tuple(placed), slots[0], summary.state, numbers)
+        graph.push_back(group.prepared.graph)
+        values.insert(group.prepared.values)
+    slots = _update(isam, graph, values)
+    placed = _placed(groups, slots[1:])
+    return _read(isam, theta, layout, epoch, placed, slots[0], prior.state)
 
 
-def updated(window: Window, change: Change, layout: Layout, numbers: int) -> Window:
-    """The window after one update of ISAM2; the window given is left as it was.
+def updated(window: Window, change: Change, layout: Layout) -> Window:
+    """The window after one update of iSAM2; the window given is left as it was.
 
     Raises:
-        RuntimeError: an indeterminate system, or another failure of GTSAM.
-        ArithmeticError: a result that is not finite.
+        ArithmeticError: an indeterminate system, or a result that is not finite.
+        RuntimeError: another failure of GTSAM.
     """
     isam = gtsam.ISAM2(window.isam)
     theta = isam.getLinearizationPoint()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    removed: list[int] = []
-    summary_slot = window.summary_slot
-    if change.summary is not None:
-        graph.add(summary_factor(change.summary, layout, window.epoch))
-        removed.append(summary_slot)
-    gone = set(change.leave_out) | set(change.forget)
-    for group in window.groups:
-        if group.label in gone:
-            removed.extend(group.slots)
-    for group in change.take_in:
+    removed = [slot for group in window.groups if group.label in change.remove for slot in group.slots]
+    if change.prior is not None:
+        graph.add(marginal_prior_factor(change.prior, layout, window.epoch))
+        removed.append(window.prior_slot)
+    for group in change.add:
         graph.push_back(group.prepared.graph)
         values.insert(group.prepared.values)
-    slots = list(isam.update(graph, values, removed).getNewFactorsIndices())
-    at = 0
-    if change.summary is not None:
-        summary_slot, at = slots[0], 1
-    new: dict[int, Group] = {}
-    for group in change.take_in:
+    slots = _update(isam, graph, values, removed)
+    prior_slot = window.prior_slot if change.prior is None else slots.pop(0)
+    stay = [group for group in window.groups if group.label not in change.remove]
+    groups = (*stay, *_placed(change.add, slots))
+    return _read(isam, theta, layout, window.epoch, groups, prior_slot, window.state)
+
+
+def _update(
+    isam: gtsam.ISAM2, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: Sequence[int] = ()
+) -> list[int]:
+    """Update in place; slots of the new factors."""
+    try:
+        return list(isam.update(graph, values, list(removed)).getNewFactorsIndices())
+    except RuntimeError as error:
+        if "ndetermina" not in str(error):  # GTSAM writes "Indeterminate" and "Indeterminant"
+            raise
+        raise ArithmeticError("the pairs leave the registration undetermined") from error
+
+
+def _placed(groups: Sequence[Group], slots: Sequence[int]) -> tuple[Group, ...]:
+    """Groups with the slots of their factors, which come in their order."""
+    out, at = [], 0
+    for group in groups:
         size = group.prepared.graph.size()
-        new[group.label] = _with_slots(group, tuple(slots[at : at + size]))
+        out.append(replace(group, slots=tuple(slots[at : at + size])))
         at += size
-    groups = []
-    for group in window.groups:
-        if group.label in change.forget and group.label not in new:
-            continue
-        if group.label in new:
-            groups.append(new.pop(group.label))
-        elif group.label in change.leave_out:
-            groups.append(_with_slots(group, ()))
-        else:
-            groups.append(group)
-    groups.extend(new.values())
-    groups.extend(change.set_aside)
-    return _read(isam, theta, layout, window.epoch, tuple(groups), summary_slot, window.state, numbers)
-
-
-def _with_slots(group: Group, slots: tuple[int, ...]) -> Group:
-    bundle = replace(group.bundle, kept=bool(slots))
-    return Group(bundle, group.prepared, slots)
+    return tuple(out)
 
 
 def _read(
@@ -474,12 +403,11 @@ def _read(
     layout: Layout,
     epoch: int,
     groups: tuple[Group, ...],
-    summary_slot: int,
+    prior_slot: int,
     like: SharedState,
-    numbers: int,
 ) -> Window:
     state = layout.read(isam, epoch, like)
     covariance = np.asarray(isam.jointMarginalCovariance(list(layout.keys(epoch))).fullMatrix())
     if not (finite(state) and np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
         raise ArithmeticError("the estimate or its covariance is not finite")
-    return Window(isam, theta, epoch, groups, summary_slot, state, covariance, numbers)
+    return Window(isam, theta, epoch, groups, prior_slot, state, covariance)

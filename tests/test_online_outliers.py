@@ -1,21 +1,21 @@
-"""Junk among the pairs of a stream: who counts online is who counts in the batch solve."""
+"""Outliers among the pairs of a stream: the inliers are those of the batch solve."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fgreg.config import SolveConfig
 from fgreg.graph.packing import pack
 from fgreg.measurements import Measurements, Pair
 from fgreg.online import OnlineRegistration
-from fgreg.online.state import WINDOW
-from fgreg.online.updates import pms_in_epoch
 from fgreg.registration import register, register_near
 from fgreg.robust import limits_among
+from fgreg.smoother.updates import LEAVE, MOST
 from tests.forward import make_measurements
-from tests.online_streams import batch, run, sigmas_apart
+from tests.online_streams import batch, first, restored, sigmas_apart
 
 
 def _with_false_pms(measurements: Measurements, places: list[int]) -> Measurements:
@@ -26,11 +26,11 @@ def _with_false_pms(measurements: Measurements, places: list[int]) -> Measuremen
     return replace(measurements, pairs=tuple(pairs))
 
 
-def test_who_counts_near_an_optimum_is_who_counts_after_a_search() -> None:
+def test_inliers_near_an_optimum_are_those_after_a_search() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(11), pairs=24)
     spoiled = _with_false_pms(measurements, [3, 9, 14, 20])
     found = register(spoiled, model, SolveConfig())
-    # From the optimum of before the last pairs, with the junk among them.
+    # From the optimum of before the last pairs, with the outliers among them.
     before = register(replace(spoiled, pairs=spoiled.pairs[:18]), model, SolveConfig())
     near = register_near(spoiled, model, SolveConfig(), before.optimum.state, [0])
     np.testing.assert_array_equal(near.shots.pm_kept, found.shots.pm_kept)
@@ -39,7 +39,7 @@ def test_who_counts_near_an_optimum_is_who_counts_after_a_search() -> None:
     np.testing.assert_allclose(near.optimum.state.trus_T_camera()[0], there, rtol=0, atol=1e-4)
 
 
-def test_a_pm_at_the_border_has_one_limit_whether_it_counts_or_not() -> None:
+def test_a_pm_at_the_border_has_one_limit_as_inlier_and_as_outlier() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(12), pairs=10)
     problem = pack(measurements, model)
     counts = np.ones(10, dtype=bool)
@@ -52,41 +52,47 @@ def test_a_pm_at_the_border_has_one_limit_whether_it_counts_or_not() -> None:
 
 
 def test_online_and_batch_reject_the_same_pairs_while_few_are_there() -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(13), pairs=22)
-    spoiled = _with_false_pms(measurements, [9, 12, 17])
-    engine = OnlineRegistration(model, judge=None)
-    estimate = run(engine, spoiled)[-1]
+    model, measurements, _ = make_measurements(np.random.default_rng(13), pairs=18)
+    spoiled = _with_false_pms(measurements, [9, 12, 16])
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    restored(engine, first(spoiled, 7))
+    for pair in spoiled.pairs[7:]:
+        estimate = engine.add(pair)
     found = batch(spoiled, model)
     np.testing.assert_array_equal(engine.kept, found.shots.pm_kept[found.shots.problem.look_pm])
-    assert not np.array(engine.kept)[[9, 12, 17]].any()
+    assert not np.array(engine.kept)[[9, 12, 16]].any()
     assert sigmas_apart(found, estimate) < 0.05
 
 
-def test_a_junk_look_is_split_off_beyond_the_first_pairs_and_later_looks_join_the_good_ones() -> None:
+def test_a_look_that_is_an_outlier_is_split_off_and_later_looks_join_the_good_ones() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(14), pairs=15, looks_per_pm=3)
     spoiled = _with_false_pms(measurements, [43])  # the second of the last PM's three looks
-    engine = OnlineRegistration(model, judge=None)
-    estimate = run(engine, spoiled)[-1]
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    restored(engine, first(spoiled, 39))
+    for pair in spoiled.pairs[39:]:
+        estimate = engine.add(pair)
     found = batch(spoiled, model)
     assert engine.kept[42:] == (True, False, True)
     np.testing.assert_array_equal(engine.kept, found.shots.pm_kept[found.shots.problem.look_pm])
     assert sigmas_apart(found, estimate) < 0.05
 
 
-def test_a_look_at_the_oldest_pm_of_a_full_window_does_not_count_twice() -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(15), pairs=30, looks_per_pm=2)
-    engine = OnlineRegistration(model, judge=None)
-    run(engine, replace(measurements, pairs=()))
-    looks = iter(measurements.pairs[::2])
-    t = 0.0
-    while engine.state.window is None or len(engine.state.window.groups) < WINDOW:
-        pair = next(looks)
-        t = pair.t
-        engine.add(pair)
-    oldest = engine.state.window.groups[0].label
-    before = pms_in_epoch(engine.state)
-    again = next(pair for pair in measurements.pairs[1::2] if pair.pm == oldest)
-    assert engine.add(replace(again, t=t + 1.0)).used
+@pytest.mark.parametrize("pms", [MOST, MOST + 1], ids=["still in the active window", "in the marginal prior"])
+def test_another_look_at_the_oldest_pm_does_not_count_it_twice(pms: int) -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(15), pairs=MOST + 1, looks_per_pm=2)
+    once = replace(measurements, pairs=measurements.pairs[: 2 * pms : 2])
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    restored(engine, first(once, MOST - 1))
+    for pair in once.pairs[MOST - 1 :]:
+        estimate = engine.add(pair)
+    assert len(engine.state.marginalised) == (LEAVE if pms > MOST else 0)
+    oldest = engine.state.shots[0].label
+    again = replace(next(pair for pair in measurements.pairs[1::2] if pair.pm == oldest), t=estimate.t + 1.0)
+    estimate = engine.add(again)
+    assert estimate.used
+    assert estimate.pairs == pms + 1
     assert engine.state.window is not None
     assert oldest in {group.label for group in engine.state.window.groups}
-    assert pms_in_epoch(engine.state) == before
+    assert oldest not in engine.state.marginalised
+    assert engine.state.epoch_pms == pms
+    assert sigmas_apart(batch(replace(once, pairs=(*once.pairs, again)), model), estimate) < 0.05

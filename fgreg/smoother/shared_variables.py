@@ -19,7 +19,8 @@ from fgreg.factors.adapter import Residual, custom_factor
 from fgreg.frames import FloatArray, exp_so3, hat, log_so3
 from fgreg.graph.columns import Columns
 from fgreg.graph.explicit import Variable
-from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.explicit_values import laser_chart
+from fgreg.graph.shared_state import SharedState, nominal_frame, step_between
 
 POSE = slice(0, 6)
 LEAST_PIVOT = 1e-4
@@ -141,6 +142,12 @@ class Layout:
             sizes.append(1)
         return tuple(sizes)
 
+    def in_chart(self, state: SharedState) -> SharedState:
+        """A state (one hypothesis) with its beam in this layout's chart."""
+        marker_T_laser = nominal_frame(state.beam_origin()[0], state.beam_direction()[0])
+        chart, _ = laser_chart(marker_T_laser, self.marker_T_nominal)
+        return replace(state, beam=chart[None], marker_T_nominal=self.marker_T_nominal[None])
+
     def insert(self, values: gtsam.Values, state: SharedState, epoch: int) -> None:
         """Put a state into values."""
         keys = self.keys(epoch)
@@ -177,7 +184,7 @@ def finite(state: SharedState) -> bool:
     return math.isfinite(sum(float(getattr(state, name).sum()) for name in SharedState.__slots__))
 
 
-def summary_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> gtsam.CustomFactor:
+def marginal_prior_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> gtsam.CustomFactor:
     """A quadratic as a factor on the shared variables: ``rows * step + residual`` of unit noise.
 
     GTSAM's own containers of linear factors hold at most three variables in Python, and take the registration's chart
@@ -216,4 +223,4 @@ def summary_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> gtsam.Cu
         return error, [by_pose.tolist(), *others]
 
     noise = gtsam.noiseModel.Unit.Create(len(rows))
-    return custom_factor("summary of older shots", noise, keys, len(rows), sizes, evaluate)
+    return custom_factor("marginal prior", noise, keys, len(rows), sizes, evaluate)

@@ -1,0 +1,196 @@
+"""The full solve: other minima, inliers, posterior, verdict, and unreported camera moves.
+
+The incremental estimate (fgreg.smoother) is one optimum and its Gaussian. The posterior's mean is off the optimum, its
+covariance is wider at few pairs, and whether two minima can be told apart, or something is suspicious, takes the search
+from no guess. All that is the batch solve's. It runs within the engine's calls, where everything has to be
+deterministic (replay, tests), or in a worker process, where no event waits for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.batch import Solution, solve
+from fgreg.camera_moves.detector import CameraMove, LoopClosure, MoveCase, find_camera_move
+from fgreg.config import SolveConfig
+from fgreg.errors import EstimationError
+from fgreg.estimate import PredictedTre, Verdict
+from fgreg.frames import FloatArray
+from fgreg.measurements import Measurements
+from fgreg.models import SessionModel
+from fgreg.posterior import pose_tangent
+from fgreg.registration import EpochSearch, Registration, SoundSpeedPrior, register
+from fgreg.smoother.initialise import Initial, initial_of
+from fgreg.surface import TissueSurface
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FullSolveCase:
+    """What is to be solved.
+
+    Attributes:
+        serial: which measurements these are. epoch: the current one.
+        measurements: everything that was taken in; None where only a camera move is looked for.
+        known: minima of earlier epochs, which are not searched for again.
+        move: for the camera-move test; None where none is looked for.
+    """
+
+    serial: int
+    epoch: int
+    measurements: Measurements | None
+    known: Mapping[int, EpochSearch] | None
+    move: MoveCase | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """What the full solve said of the current epoch, in terms that carry over to the pairs that come after it.
+
+    Attributes:
+        serial: of the case. epoch: that was current. pairs: looks that were inliers.
+        verdict, reasons: of the solve.
+        trus_T_camera, covariance, predicted_tre: as the solve reports them; None where it has no registration.
+        shift: (6,) from the optimum to the reported registration, in units of the optimum's Gaussian (its Cholesky
+            factor). root, optimum_root: (6, 6) Cholesky factors of the reported covariance and of the optimum's.
+        surface: the tissue that the PMs trace, where they trace any.
+    """
+
+    serial: int
+    epoch: int
+    pairs: int
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    trus_T_camera: FloatArray | None
+    covariance: FloatArray | None
+    predicted_tre: PredictedTre | None
+    shift: FloatArray | None
+    root: FloatArray | None
+    optimum_root: FloatArray | None
+    surface: TissueSurface | None = None
+
+    def applied(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The posterior's covariance, and the tangent from optimum to mean, for an optimum of this covariance (6, 6).
+
+        With L_P, L_C the Cholesky factors of the reported posterior's and optimum's covariances: A C A', A = L_P / L_C.
+        """
+        if self.shift is None or self.root is None or self.optimum_root is None:
+            return covariance, np.zeros(6)
+        widen = np.linalg.solve(self.optimum_root.T, self.root.T).T
+        wide = widen @ covariance @ widen.T
+        return 0.5 * (wide + wide.T), np.linalg.cholesky(covariance) @ self.shift
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FullSolveResult:
+    """What a case led to.
+
+    Attributes:
+        serial, epoch: of the case.
+        move: an unreported camera move, or a loop closure; nothing else was computed then.
+        initial: the registration; None where there is none, for the reason ``why_none``, or none was asked for.
+        report: None where none was asked for.
+        move_failure: why the camera-move test failed, empty where it did not; None where none was asked for.
+    """
+
+    serial: int
+    epoch: int
+    move: CameraMove | LoopClosure | None = None
+    initial: Initial | None = None
+    why_none: str = ""
+    report: Report | None = None
+    move_failure: str | None = None
+
+
+def full_solve(
+    case: FullSolveCase,
+    model: SessionModel,
+    config: SolveConfig,
+    sound_speed: SoundSpeedPrior | None,
+    *,
+    verdicts: bool = True,
+) -> FullSolveResult:
+    """Look for a camera move; where there is none, register, and say how good that is.
+
+    ``verdicts``: False leaves posterior and verdict out.
+    """
+    failure = None
+    if case.move is not None:
+        failure = ""
+        try:
+            move = find_camera_move(case.move, model, config, sound_speed)
+        except Exception as error:  # the registration does not depend on it
+            failure = f"{type(error).__name__}: {error}"
+        else:
+            if move is not None:
+                return FullSolveResult(case.serial, case.epoch, move, move_failure="")
+    return replace(_solved(case, model, config, sound_speed, verdicts=verdicts), move_failure=failure)
+
+
+def _solved(
+    case: FullSolveCase,
+    model: SessionModel,
+    config: SolveConfig,
+    sound_speed: SoundSpeedPrior | None,
+    *,
+    verdicts: bool,
+) -> FullSolveResult:
+    if case.measurements is None:
+        return FullSolveResult(case.serial, case.epoch)
+    if not verdicts:
+        try:
+            found = register(case.measurements, model, config, sound_speed, case.known)
+        except EstimationError as error:
+            return FullSolveResult(case.serial, case.epoch, why_none=str(error))
+        return _registered(case, case.measurements, found, None)
+    solution = solve(case.measurements, [], model, config, sound_speed_prior=sound_speed, known=case.known)
+    return result_of(case, case.measurements, solution)
+
+
+def result_of(case: FullSolveCase, measurements: Measurements, solution: Solution) -> FullSolveResult:
+    """What carries over of a batch solve of a case."""
+    report = _report(solution, case.serial, case.epoch)
+    if solution.registration is None:
+        return FullSolveResult(case.serial, case.epoch, why_none=solution.reasons[-1], report=report)
+    return _registered(case, measurements, solution.registration, report)
+
+
+def _registered(
+    case: FullSolveCase, measurements: Measurements, found: Registration, report: Report | None
+) -> FullSolveResult:
+    initial = initial_of(found, measurements, case.epoch)
+    return FullSolveResult(case.serial, case.epoch, initial=initial, report=report)
+
+
+def _plain(values: FloatArray | None) -> FloatArray | None:
+    """A copy laid out row by row: the last digits of what is made of it depend on that."""
+    return None if values is None else np.array(values, dtype=np.float64, order="C")
+
+
+def _report(solution: Solution, serial: int, epoch: int) -> Report:
+    data = solution.epochs[epoch]
+    pose, covariance, registration = _plain(data.trus_T_camera), _plain(data.covariance), solution.registration
+    shift = root = optimum_root = None
+    if pose is not None and covariance is not None and registration is not None and epoch in registration.epochs:
+        place = registration.epochs.index(epoch)
+        block = slice(6 * place, 6 * place + 6)
+        optimum_root = np.asarray(np.linalg.cholesky(registration.covariance[block, block]))
+        root = np.asarray(np.linalg.cholesky(covariance))
+        optimum = registration.optimum.state.trus_T_camera(place)[0]
+        shift = np.asarray(np.linalg.solve(optimum_root, pose_tangent(optimum, pose)))
+    return Report(
+        serial,
+        epoch,
+        data.pairs,
+        max(data.verdict, solution.verdict, key=lambda v: v.severity),
+        solution.reasons,
+        pose,
+        covariance,
+        data.predicted_tre,
+        shift,
+        root,
+        optimum_root,
+        None if solution.snapshot is None else solution.snapshot.surface,
+    )

@@ -1,0 +1,133 @@
+"""Where the full solve runs: within the engine's calls, or in a worker process."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal, Protocol
+
+from fgreg.config import SolveConfig
+from fgreg.models import SessionModel
+from fgreg.online.full_solve import FullSolveCase, FullSolveResult, full_solve
+from fgreg.registration import SoundSpeedPrior
+from fgreg.workers.worker_process import Work, WorkerProcess
+
+Where = Literal["in_process", "worker"]
+
+
+class Solver(Protocol):
+    """Solves one case after another.
+
+    ``busy``: one is under way. ``failure``: why the last one could not be solved; empty where it could. ``lost``: it
+    was lost with the process that worked on it.
+    """
+
+    failure: str
+    lost: bool
+
+    @property
+    def busy(self) -> bool: ...
+
+    def submit(self, case: FullSolveCase) -> None:
+        """Solve a case; not to be called while ``busy``."""
+
+    def fetch(self) -> FullSolveResult | None:
+        """The result that has not been fetched yet."""
+
+    def close(self) -> None:
+        """Stop."""
+
+
+class InProcessSolver:
+    """Solves at once: the same events give the same results."""
+
+    def __init__(
+        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
+    ) -> None:
+        self._work = partial(full_solve, model=model, config=config, sound_speed=sound_speed, verdicts=verdicts)
+        self._found: FullSolveResult | None = None
+        self.failure = ""
+        self.busy = self.lost = False
+
+    def submit(self, case: FullSolveCase) -> None:
+        """Solve now."""
+        self._found, self.failure = None, ""
+        try:
+            self._found = self._work(case)
+        except Exception as error:  # the incremental estimate stands without it
+            self.failure = f"{type(error).__name__}: {error}"
+
+    def fetch(self) -> FullSolveResult | None:
+        """What :meth:`submit` found."""
+        found, self._found = self._found, None
+        return found
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+
+class WorkerSolver:
+    """Solves in a worker process."""
+
+    def __init__(
+        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
+    ) -> None:
+        self._worker: WorkerProcess[FullSolveCase, FullSolveResult] = WorkerProcess(
+            _work, model, config, sound_speed, verdicts, name="fgreg-solve", what="the full solve's process"
+        )
+
+    @property
+    def busy(self) -> bool:
+        """Whether a case is under way."""
+        return self._worker.busy
+
+    @property
+    def failure(self) -> str:
+        """What went wrong with the last case."""
+        return self._worker.failure
+
+    @failure.setter
+    def failure(self, text: str) -> None:
+        self._worker.failure = text
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last case was lost with its process."""
+        return self._worker.lost
+
+    @lost.setter
+    def lost(self, value: bool) -> None:
+        self._worker.lost = value
+
+    def submit(self, case: FullSolveCase) -> None:
+        """Hand a case over."""
+        self._worker.send(case)
+
+    def fetch(self) -> FullSolveResult | None:
+        """The result that has come back."""
+        found = self._worker.fetch()
+        return None if found is None else found[0]
+
+    def close(self) -> None:
+        """End the process."""
+        self._worker.close()
+
+
+def _work(
+    model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, verdicts: bool
+) -> Work[FullSolveCase, FullSolveResult]:
+    return partial(full_solve, model=model, config=config, sound_speed=sound_speed, verdicts=verdicts)
+
+
+def make_solver(
+    where: Where, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
+) -> Solver:
+    """A solver of the kind.
+
+    Raises:
+        ValueError: there is no such kind.
+    """
+    if where == "in_process":
+        return InProcessSolver(model, config, sound_speed, verdicts=verdicts)
+    if where == "worker":
+        return WorkerSolver(model, config, sound_speed, verdicts=verdicts)
+    raise ValueError(f"full_solve is {where!r}, expected 'in_process' or 'worker'")

@@ -1,0 +1,184 @@
+"""The incremental estimate from a registration of all measurements: its optimum, and which shots it counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.frames import FloatArray
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import Measurements
+from fgreg.registration import Registration
+from fgreg.smoother.innovation import sigma_distance
+from fgreg.smoother.isam_window import Change, Group, Window, free_number, open_window, prepare
+from fgreg.smoother.marginal_prior import one_epoch
+from fgreg.smoother.shared_variables import Layout, Quadratic
+from fgreg.smoother.state import Setting, Shot, State, carried_prior, looks_by_pm, own_prior, total_prior
+from fgreg.smoother.updates import LEAVE, MOST, settled, with_aim, with_pair
+
+SAME_SIGMA = 0.02
+"""Two estimates are the same where they are no farther apart, in their own standard deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Initial:
+    """What a registration of all measurements up to an event says.
+
+    Attributes:
+        epochs: numbers of those that were solved.
+        state: their registrations with the common variables (one hypothesis); covariance: (D, D).
+        labels, inlier: of all pairs, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
+        is_open: the current epoch has two minima that cannot be told apart.
+    """
+
+    epochs: tuple[int, ...]
+    state: SharedState
+    covariance: FloatArray
+    labels: tuple[int, ...]
+    inlier: tuple[bool, ...]
+    aim_inlier: tuple[bool, ...]
+    is_open: bool
+
+
+def initial_of(found: Registration, measurements: Measurements, epoch: int) -> Initial:
+    """What carries over of a registration of the measurements, whose current epoch is given."""
+    shots = found.shots
+    look_pm = iter(shots.problem.look_pm.tolist())
+    labels, inlier = [], []
+    for pair in measurements.pairs:
+        pm = next(look_pm) if pair.epoch in found.epochs else None
+        labels.append(pair.pm if pm is None else shots.problem.pms[pm])
+        inlier.append(pm is not None and bool(shots.pm_kept[pm]))
+    return Initial(
+        found.epochs,
+        found.optimum.state,
+        found.covariance,
+        tuple(labels),
+        tuple(inlier),
+        tuple(bool(kept) for kept in shots.aim_kept),
+        epoch in found.ambiguous,
+    )
+
+
+def initialised(state: State, found: Initial, setting: Setting) -> State:
+    """The state with a registration of its measurements taken over; what came since is added to it.
+
+    The state is as it was, where the same shots count and the estimate is the same.
+    """
+    count, aims = len(found.labels), len(found.aim_inlier)
+    if count == len(state.shots) and aims == len(state.aims) and _is_same(state, found, setting):
+        return replace(state, is_open=found.is_open)
+    later, later_aims = state.shots[count:], state.aims[aims:]
+    nis = state.nis
+    state = _taken_over(replace(state, shots=state.shots[:count], aims=state.aims[:aims]), found, setting)
+    for aim in later_aims:
+        state = with_aim(state, aim, setting)
+    for shot in later:
+        state = with_pair(state, shot.pair, setting)
+    used = bool(state.shots) and state.shots[-1].inlier and nis is not None
+    return replace(state, nis=nis, used=used)
+
+
+def _is_same(state: State, found: Initial, setting: Setting) -> bool:
+    window, layout = state.window, state.layout
+    if window is None or layout is None or state.epoch not in found.epochs:
+        return False
+    mine = tuple((shot.label, shot.inlier) for shot in state.shots)
+    if mine != tuple(zip(found.labels, found.inlier, strict=True)) or state.aim_inlier != found.aim_inlier:
+        return False
+    there = _here(found, state)
+    there = layout.in_chart(there)
+    return sigma_distance(there, window.state, window.covariance, setting.columns) < SAME_SIGMA
+
+
+def _here(found: Initial, state: State) -> SharedState:
+    """The registration of the current epoch."""
+    return one_epoch(found.state, found.epochs.index(state.epoch))
+
+
+def _taken_over(state: State, found: Initial, setting: Setting) -> State:
+    """The state at a registration of exactly its measurements."""
+    layout = Layout(setting.columns, found.state.marker_T_nominal[0].copy())
+    shots = tuple(
+        Shot(shot.pair, label, inlier)
+        for shot, label, inlier in zip(state.shots, found.labels, found.inlier, strict=True)
+    )
+    epochs = list(state.epochs)
+    common = slice(6 * len(found.epochs), None)
+    for k, epoch in enumerate(epochs):
+        if k not in found.epochs:
+            epochs[k] = replace(epoch, state=None, covariance=None)
+            continue
+        place = found.epochs.index(k)
+        columns = np.r_[6 * place : 6 * place + 6, np.arange(len(found.covariance))[common]]
+        covariance = found.covariance[np.ix_(columns, columns)]
+        epochs[k] = replace(epoch, state=one_epoch(found.state, place), covariance=covariance)
+    state = replace(
+        state,
+        epochs=tuple(epochs),
+        aim_inlier=found.aim_inlier,
+        shots=shots,
+        layout=layout,
+        window=None,
+        is_open=found.is_open,
+        why_none="",
+    )
+    if state.epoch not in found.epochs:
+        return replace(state, why_none="its pairs do not determine it: take more")
+    here = _here(found, state)
+    state, carried = carried_prior(state, here, setting)
+    state = replace(state, carried=carried)
+    looks = looks_by_pm([shot for shot in state.current if shot.inlier])
+    labels = [label for _, label in looks]
+    recent = labels if len(labels) < MOST else labels[-LEAVE:]
+    try:
+        opened = _opened(state, recent, here, layout, setting)
+        stays = (
+            opened.window is not None
+            and sigma_distance(here, opened.window.state, opened.window.covariance, setting.columns) < SAME_SIGMA
+        )
+    except (ArithmeticError, RuntimeError):
+        stays = False
+    if stays:
+        return opened
+    # Among few pairs that contradict each other full Gauss-Newton steps lead away from the optimum that damped ones
+    # found. The optimum stands: all pairs are marginalised there, and the window starts empty.
+    older = frozenset(shot.label for shot in state.current if shot.inlier)
+    covariance = state.now.covariance
+    assert covariance is not None
+    information = _inverse(covariance)
+    rest = Quadratic(here, 0.0, -carried.gradient, information - carried.hessian)
+    state = replace(state, marginalised=older, older=rest)
+    try:
+        return _with_window(state, open_window((), total_prior(state, here, setting), layout, state.epoch))
+    except ArithmeticError:  # as three pairs can leave it
+        return replace(state, why_none="these pairs leave the registration undetermined: take more")
+
+
+def _inverse(covariance: FloatArray) -> FloatArray:
+    scale = np.outer(1.0 / np.sqrt(np.diag(covariance)), 1.0 / np.sqrt(np.diag(covariance)))
+    information = np.linalg.inv(covariance * scale) * scale
+    return np.asarray(0.5 * (information + information.T))
+
+
+def _with_window(state: State, window: Window) -> State:
+    now = replace(state.now, state=window.state, covariance=window.covariance)
+    return replace(state, window=window, epochs=(*state.epochs[:-1], now))
+
+
+def _opened(state: State, recent: list[int], here: SharedState, layout: Layout, setting: Setting) -> State:
+    """The state with a window of some PMs, all other inliers marginalised."""
+    looks = looks_by_pm(state.current, state.now.first)
+    inliers = {shot.label for shot in state.current if shot.inlier}
+    older = frozenset(inliers - set(recent))
+    state = replace(state, marginalised=older, older=own_prior(state, older, here, setting))
+    groups: list[Group] = []
+    for label in recent:
+        places = tuple(looks[state.epoch, label])
+        pairs = tuple(replace(state.shots[place].pair, pm=label) for place in places)
+        number = free_number(groups, len(pairs))
+        prepared = prepare(pairs, layout, here, state.epoch, setting.model, number)
+        groups.append(Group(label, places, pairs, prepared))
+    window = open_window(groups, total_prior(state, here, setting), layout, state.epoch)
+    return settled(state, window, layout, Change(), setting)

@@ -1,0 +1,133 @@
+"""The marginal prior: what all shots outside the active window say about the shared variables of the current epoch.
+
+It is made by the reduced graph (fgreg.graph.reduced), where each shot's own variables are eliminated already. The
+registrations of earlier epochs are eliminated here by the Schur complement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fgreg.frames import FloatArray, inverse
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.reduced import Evaluation, evaluate, refine
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import EpochStart
+from fgreg.smoother.shared_variables import Quadratic, small_step
+
+PRIVATE_ROUNDS = 3
+EARLIER_ROUNDS = 5
+EARLIER_SETTLED = 1e-4
+"""Newton decrement (chi square) below which the earlier registrations are at their optimum."""
+UNSEEN = 1e-12
+"""Eigenvalue of a correlation matrix below which a direction of an earlier registration is left open by its pairs."""
+FAR_RAD, FAR_MM, FAR_EDGE_RAD, FAR_RATIO = 2e-3, 0.2, 1e-3, 1e-3
+"""Steps of the estimate from the linearisation point beyond which a marginal prior is linearised again."""
+
+
+def marginal_prior(problem: PackedProblem, state: SharedState) -> tuple[Quadratic, SharedState]:
+    """A problem's shots, priors and links, with all registrations eliminated but that of its last epoch.
+
+    Args:
+        problem: inliers only; its last epoch is the current one.
+        state: one hypothesis of the problem's epochs.
+
+    Returns:
+        the prior about the state's last epoch, and the state with the earlier registrations at their optimum given the
+        other shared variables.
+
+    Raises:
+        ArithmeticError: a number is not finite.
+    """
+    earlier = 6 * (problem.columns.epochs - 1)
+    private = _settled(problem, state, initial_private(problem, state), PRIVATE_ROUNDS)
+    at = evaluate(problem, state, private)
+    back = np.zeros((0, 0))
+    for _ in range(EARLIER_ROUNDS if earlier else 0):
+        back = _pseudo_inverse(at.hessian[0, :earlier, :earlier])
+        step = np.zeros((1, problem.columns.size))
+        step[0, :earlier] = -back @ at.gradient[0, :earlier]
+        if float(-step[0, :earlier] @ at.gradient[0, :earlier]) < EARLIER_SETTLED:
+            break
+        state, at = _moved(problem, state, at, step)
+    hessian, gradient = at.hessian[0], at.gradient[0]
+    cost = float(at.cost[0])
+    if earlier:
+        cross = hessian[:earlier, earlier:]
+        hessian = hessian[earlier:, earlier:] - cross.T @ back @ cross
+        cost -= float(gradient[:earlier] @ back @ gradient[:earlier])
+        gradient = gradient[earlier:] - cross.T @ back @ gradient[:earlier]
+        hessian = 0.5 * (hessian + hessian.T)
+    if not (np.isfinite(cost) and np.isfinite(gradient).all() and np.isfinite(hessian).all()):
+        raise ArithmeticError("the marginal prior is not finite")
+    return Quadratic(one_epoch(state, -1), cost, gradient, hessian), state
+
+
+def _settled(problem: PackedProblem, state: SharedState, private: PrivateState, rounds: int) -> PrivateState:
+    with np.errstate(all="ignore"):  # far from everything numbers may overflow: who sums them up looks at them
+        for _ in range(rounds):
+            _, private = refine(problem, state, private)
+    return private
+
+
+def _moved(
+    problem: PackedProblem, state: SharedState, at: Evaluation, step: FloatArray
+) -> tuple[SharedState, Evaluation]:
+    """The problem after a step of its shared variables."""
+    points = at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0]
+    state = state.retract(step, problem.columns)
+    private = _settled(problem, state, replace(at.private, trus_p_pm=points), 1)
+    return state, evaluate(problem, state, private)
+
+
+def _pseudo_inverse(hessian: FloatArray) -> FloatArray:
+    """Inverse over the directions that are seen: an epoch of one or two pairs leaves some of its registration open."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    outer = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(hessian * outer, rcond=UNSEEN, hermitian=True) * outer)
+
+
+def has_moved(prior: Quadratic, state: SharedState, problem: PackedProblem) -> bool:
+    """Whether the estimate is so far from a prior's linearisation point that it is to be linearised again.
+
+    Only variables count that the prior knows anything of.
+    """
+    step = np.abs(small_step(prior.state, state, problem.columns))
+    return bool(((step > _limits(problem)) & (np.diag(prior.hessian) > 0.0)).any())
+
+
+def _limits(problem: PackedProblem) -> FloatArray:
+    columns = problem.columns
+    limits = np.full(columns.size, FAR_MM)
+    limits[:3] = limits[columns.beam + 2 : columns.beam + 4] = FAR_RAD
+    limits[columns.edge] = FAR_EDGE_RAD
+    if columns.sound_speed is not None:
+        limits[columns.sound_speed] = FAR_RATIO
+    return limits
+
+
+def one_epoch(state: SharedState, place: int) -> SharedState:
+    """The shared variables with one of the registrations."""
+    index = [place % state.rotation.shape[1]]
+    return replace(state, rotation=state.rotation[:, index], translation_mm=state.translation_mm[:, index])
+
+
+def with_registrations(common: SharedState, each: list[SharedState]) -> SharedState:
+    """The common variables of one state, and the registrations of several, in their order."""
+    return replace(
+        common,
+        rotation=np.concatenate([one.rotation for one in each], axis=1),
+        translation_mm=np.concatenate([one.translation_mm for one in each], axis=1),
+    )
+
+
+def carried_over(state: SharedState, start: EpochStart) -> SharedState:
+    """The shared variables of a new epoch: its registration by the measured motion, else as it was."""
+    motion = start.camera_new_T_camera_old
+    if motion is None:
+        return state
+    moved = state.trus_T_camera()[0] @ inverse(motion)
+    return replace(state, rotation=moved[None, None, :3, :3].copy(), translation_mm=moved[None, None, :3, 3].copy())

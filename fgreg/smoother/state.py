@@ -1,0 +1,235 @@
+"""The incremental estimate as a value: what was taken in, which shots count, and the active window.
+
+Nothing here changes a state: an update that fails on its way leaves the one before as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.config import SolveConfig
+from fgreg.epochs import restrict_epochs
+from fgreg.frames import FloatArray
+from fgreg.graph.columns import Columns
+from fgreg.graph.packing import PackedProblem
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.models import SessionModel
+from fgreg.registration import SoundSpeedPrior, pack_session
+from fgreg.smoother.isam_window import Window
+from fgreg.smoother.marginal_prior import marginal_prior, one_epoch, with_registrations
+from fgreg.smoother.shared_variables import Layout, Quadratic
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setting:
+    """What does not change: the session's set-up, the configuration, what is known of the sound speed.
+
+    ``empty``: a problem of no shots and one epoch, for its columns.
+    """
+
+    model: SessionModel
+    config: SolveConfig
+    sound_speed: SoundSpeedPrior | None
+    empty: PackedProblem
+
+    @property
+    def columns(self) -> Columns:
+        """Of the shared variables of one epoch."""
+        return self.empty.columns
+
+    def pack(self, measurements: Measurements) -> PackedProblem:
+        """Measurements as arrays, with the windows as Gaussians."""
+        return pack_session(measurements, self.model, self.config, self.sound_speed)
+
+
+def make_setting(model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> Setting:
+    """The setting of a session.
+
+    Raises:
+        ValueError: the configuration makes the probe's radius a variable, which the graph's factors do not know.
+    """
+    if config.estimate_radius:
+        raise ValueError("estimate_radius is set; online registration holds the probe's radius as the session gives it")
+    gaussian = replace(config, window_shape=False)
+    empty = pack_session(Measurements((), (), (EpochStart(0.0),)), model, gaussian, sound_speed)
+    return Setting(model, gaussian, sound_speed, empty)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """A pair, and how it counts.
+
+    Attributes:
+        pair: with the number of its camera epoch.
+        label: number of its PM in the estimate: ``pair.pm``, or one of its own where it was split off as an outlier.
+        inlier: whether it counts.
+    """
+
+    pair: Pair
+    label: int
+    inlier: bool
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Epoch and label of its PM."""
+        return self.pair.epoch, self.label
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Epoch:
+    """One camera epoch.
+
+    Attributes:
+        start: with the measured motion, where there is one.
+        first: place of its first pair in the session's order.
+        state: its registration with the common variables when last estimated; None where it was never registered.
+        covariance: (D, D) there.
+    """
+
+    start: EpochStart
+    first: int
+    state: SharedState | None = None
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """All that the incremental estimate is.
+
+    Attributes:
+        epochs: the last one is the current one.
+        aims, aim_inlier: calibration shots, and which of them count.
+        shots: pairs, in the session's order.
+        layout: None until a first registration.
+        window: None where the current epoch has no registration (yet).
+        carried: prior on the current epoch's shared variables from the aims, the earlier epochs and what is known
+            beforehand; older: from the epoch's own pairs that have left the window. Their sum is the window's prior.
+        marginalised: labels of the PMs in ``older``.
+        why_none: why there is no registration, where there is none.
+        is_open: two minima cannot be told apart.
+        nis, used: of the last event, where it was a pair.
+    """
+
+    epochs: tuple[Epoch, ...]
+    aims: tuple[Aim, ...] = ()
+    aim_inlier: tuple[bool, ...] = ()
+    shots: tuple[Shot, ...] = ()
+    layout: Layout | None = None
+    window: Window | None = None
+    carried: Quadratic | None = None
+    older: Quadratic | None = None
+    marginalised: frozenset[int] = frozenset()
+    why_none: str = "take pairs"
+    is_open: bool = False
+    nis: float | None = None
+    used: bool = False
+
+    @property
+    def epoch(self) -> int:
+        """Index of the current epoch."""
+        return len(self.epochs) - 1
+
+    @property
+    def now(self) -> Epoch:
+        """The current epoch."""
+        return self.epochs[-1]
+
+    @property
+    def current(self) -> tuple[Shot, ...]:
+        """Shots of the current epoch."""
+        return self.shots[self.now.first :]
+
+    @property
+    def epoch_pairs(self) -> int:
+        """Pairs of the current epoch."""
+        return len(self.shots) - self.now.first
+
+    @property
+    def epoch_pms(self) -> int:
+        """PMs of the current epoch."""
+        return len({shot.label for shot in self.current})
+
+    def measurements(self) -> Measurements:
+        """Everything that was taken in, as the batch solve takes it."""
+        pairs = tuple(shot.pair for shot in self.shots)
+        return Measurements(self.aims, pairs, tuple(epoch.start for epoch in self.epochs))
+
+    def counts(self) -> tuple[int, int]:
+        """PMs that are inliers, and all PMs, over the epochs that have a registration."""
+        known = {k for k, epoch in enumerate(self.epochs) if epoch.state is not None}
+        pms = {shot.key: shot.inlier for shot in self.shots if shot.pair.epoch in known}
+        return sum(pms.values()), len(pms)
+
+
+def looks_by_pm(shots: Sequence[Shot], first: int = 0) -> dict[tuple[int, int], list[int]]:
+    """Places of the looks at each PM, by epoch and label, in the order of first looks; ``first``: of the first shot."""
+    out: dict[tuple[int, int], list[int]] = {}
+    for place, shot in enumerate(shots, first):
+        out.setdefault(shot.key, []).append(place)
+    return out
+
+
+def numbered(shots: Sequence[Shot], numbers: dict[tuple[int, int], int], epoch: int | None = None) -> tuple[Pair, ...]:
+    """Pairs with the number of their PM in the estimate; all of one epoch where that is given."""
+    return tuple(
+        replace(shot.pair, pm=numbers[shot.key], epoch=shot.pair.epoch if epoch is None else epoch) for shot in shots
+    )
+
+
+def pairs_of_epoch(shots: Sequence[Shot]) -> tuple[Pair, ...]:
+    """Pairs of one epoch under their labels, as epoch 0."""
+    return tuple(replace(shot.pair, pm=shot.label, epoch=0) for shot in shots)
+
+
+def own_prior(state: State, labels: frozenset[int], at: SharedState, setting: Setting) -> Quadratic | None:
+    """What inlier PMs of the current epoch say about its shared variables, at a state near their optimum.
+
+    Raises:
+        ArithmeticError: a number is not finite.
+    """
+    if not labels:
+        return None
+    shots = [shot for shot in state.current if shot.label in labels]
+    problem = setting.pack(Measurements((), pairs_of_epoch(shots), (EpochStart(0.0),)))
+    problem = replace(problem, prior_information=np.zeros_like(problem.prior_information))
+    return marginal_prior(problem, at)[0]
+
+
+def carried_prior(state: State, at: SharedState, setting: Setting) -> tuple[State, Quadratic]:
+    """What the aims, the earlier epochs and prior knowledge say about the current epoch's shared variables.
+
+    Args:
+        state: ``layout`` has to be that of ``at``.
+        at: shared variables of the current epoch (one hypothesis).
+
+    Returns:
+        the state with the earlier registrations estimated again, and the prior about ``at``.
+
+    Raises:
+        ArithmeticError: a number is not finite.
+    """
+    now = state.epoch
+    known = [k for k, epoch in enumerate(state.epochs[:-1]) if epoch.state is not None]
+    shots = [shot for shot in state.shots[: state.now.first] if shot.inlier and shot.pair.epoch in known]
+    numbers = {key: number for number, key in enumerate(looks_by_pm(shots))}
+    aims = tuple(aim for aim, inlier in zip(state.aims, state.aim_inlier, strict=True) if inlier)
+    starts = tuple(epoch.start for epoch in state.epochs)
+    problem = setting.pack(restrict_epochs(Measurements(aims, numbered(shots, numbers), starts), [*known, now]))
+    each = [found for k in known if (found := state.epochs[k].state) is not None]
+    prior, settled = marginal_prior(problem, with_registrations(at, [*each, at]))
+    epochs = list(state.epochs)
+    for place, k in enumerate(known):
+        epochs[k] = replace(epochs[k], state=one_epoch(settled, place))
+    return replace(state, epochs=tuple(epochs)), prior
+
+
+def total_prior(state: State, at: SharedState, setting: Setting) -> Quadratic:
+    """The window's marginal prior about a state near its linearisation points."""
+    if state.carried is None:
+        raise ValueError("there is no registration")
+    prior = state.carried.at(at, setting.columns)
+    return prior if state.older is None else prior.plus(state.older.at(at, setting.columns))

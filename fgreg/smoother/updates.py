@@ -1,0 +1,212 @@
+"""What each kind of event makes of a state: one pair more, one aim more, a camera that moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fgreg.graph.shared_state import SharedState
+from fgreg.measurements import Aim, EpochStart, Pair
+from fgreg.smoother.innovation import aim_fits, innovation, limit_of, sigma_distance
+from fgreg.smoother.isam_window import Change, Group, Window, free_number, open_window, prepare, updated
+from fgreg.smoother.marginal_prior import carried_over, has_moved
+from fgreg.smoother.shared_variables import Layout
+from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, own_prior, total_prior
+
+MOST, LEAVE = 32, 16
+"""Most PMs in the active window, and how many of the oldest leave it at once when one more comes."""
+FIRST_PAIRS = 10
+"""Up to so many pairs of an epoch the full solve runs at each, and an update may lead anywhere."""
+MOST_UPDATES = 8
+SETTLED_SIGMA = 0.05
+"""Updates are repeated until the estimate moves by less, in its own standard deviations."""
+
+
+def with_pair(state: State, pair: Pair, setting: Setting) -> State:
+    """The state with one pair more, which is an inlier where its innovation is within the limit.
+
+    Where there is no registration yet it only joins the others. Where it contradicts them so much that no registration
+    is left, the epoch has none until it is registered again.
+
+    Raises:
+        ArithmeticError: a result that is not finite, or a system that is undetermined, though there are many pairs.
+        RuntimeError: another failure of GTSAM.
+    """
+    shot = Shot(replace(pair, epoch=state.epoch), pair.pm, inlier=False)
+    joined = replace(state, shots=(*state.shots, shot), nis=None, used=False)
+    if state.window is None or state.layout is None:
+        return joined
+    try:
+        return _one_more(joined, state.window, state.layout, setting)
+    except ArithmeticError as error:  # full steps may lead anywhere among few pairs that contradict each other
+        if sum(other.inlier for other in state.current) > FIRST_PAIRS:
+            raise
+        return replace(joined, window=None, why_none=f"the pairs contradict each other ({error})")
+
+
+def _one_more(state: State, window: Window, layout: Layout, setting: Setting) -> State:
+    """:func:`with_pair` where there is a registration; the pair is the state's last shot, an outlier so far."""
+    place, shot = len(state.shots) - 1, state.shots[-1]
+    label = shot.label
+    places = [state.now.first + i for i, other in enumerate(state.current) if other.label == label]
+    if label in state.marginalised:  # an older PM is looked at again: all its looks come back into the window
+        state = replace(state, marginalised=state.marginalised - {label})
+        state = replace(state, older=own_prior(state, state.marginalised, window.state, setting))
+        change = Change(prior=total_prior(state, window.state, setting))
+        state = settled(state, window, layout, change, setting)
+        window = _window(state)
+    pairs = tuple(replace(state.shots[p].pair, pm=label) for p in places)
+    number = free_number(window.groups, len(pairs))
+    prepared = prepare(pairs, layout, window.state, state.epoch, setting.model, number)
+    same = next((group for group in window.groups if group.label == label), None)
+    known = None if same is None else same.prepared.quadratic.at(window.state, layout.columns)
+    nis = innovation(prepared, window.covariance, known)
+    inliers, count = state.counts()
+    fits = nis <= limit_of(len(prepared.rows), inliers + (same is None), count)
+    state = replace(state, nis=nis, used=fits)
+    if not fits:
+        # Which of several looks at a PM is the outlier is for the full solve to say; until then it is the last one.
+        return _split_off(state, place) if same is not None else state
+    shots = list(state.shots)
+    for p in places:
+        shots[p] = replace(shots[p], inlier=True)
+    state = replace(state, shots=tuple(shots))
+    change = Change((Group(label, tuple(places), pairs, prepared),), () if same is None else (label,))
+    state, change = _marginalised(state, window, change, setting)
+    return settled(state, window, layout, change, setting)
+
+
+def _split_off(state: State, place: int) -> State:
+    """The state in which a look is a PM of its own, an outlier."""
+    spare = min(0, *(shot.label for shot in state.shots)) - 1
+    shots = list(state.shots)
+    shots[place] = replace(shots[place], label=spare, inlier=False)
+    return replace(state, shots=tuple(shots))
+
+
+def _window(state: State) -> Window:
+    if state.window is None:
+        raise ValueError("there is no registration")
+    return state.window
+
+
+def _marginalised(state: State, window: Window, change: Change, setting: Setting) -> tuple[State, Change]:
+    """The oldest PMs become part of the marginal prior, where the window is full, in the update that is due."""
+    stay = [group for group in window.groups if group.label not in change.remove]
+    if len(stay) < MOST:
+        return state, change
+    oldest = frozenset(group.label for group in stay[:LEAVE])
+    more = own_prior(state, oldest, window.state, setting)
+    if more is None:
+        return state, change
+    older = more if state.older is None else state.older.at(window.state, setting.columns).plus(more)
+    state = replace(state, older=older, marginalised=state.marginalised | oldest)
+    prior = total_prior(state, window.state, setting)
+    return state, replace(change, remove=(*change.remove, *oldest), prior=prior)
+
+
+def settled(
+    state: State, window: Window, layout: Layout, change: Change, setting: Setting, limit: float = SETTLED_SIGMA
+) -> State:
+    """Update the window until the estimate stands still, with the marginal prior linearised again on the way.
+
+    Raises:
+        ArithmeticError: an indeterminate system, or a result that is not finite.
+        RuntimeError: another failure of GTSAM.
+    """
+    for _ in range(MOST_UPDATES):
+        before = window.state
+        window = updated(window, change, layout)
+        state, again = _relinearised(state, window.state, setting)
+        if not again and sigma_distance(before, window.state, window.covariance, setting.columns) < limit:
+            break
+        change = Change(prior=total_prior(state, window.state, setting)) if again else Change()
+    now = replace(state.now, state=window.state, covariance=window.covariance)
+    return replace(state, window=window, epochs=(*state.epochs[:-1], now))
+
+
+def _relinearised(state: State, at: SharedState, setting: Setting) -> tuple[State, bool]:
+    """The state with those parts of its marginal prior linearised again that the estimate has moved away from."""
+    again = False
+    if state.carried is not None and has_moved(state.carried, at, setting.empty):
+        state, carried = carried_prior(state, at, setting)
+        state, again = replace(state, carried=carried), True
+    if state.older is not None and has_moved(state.older, at, setting.empty):
+        state, again = replace(state, older=own_prior(state, state.marginalised, at, setting)), True
+    return state, again
+
+
+def with_aim(state: State, aim: Aim, setting: Setting) -> State:
+    """The state with one calibration shot more, which counts where it agrees with the estimate."""
+    window, layout = state.window, state.layout
+    fits = window is None or aim_fits(aim, window, setting)
+    aims, inlier = (*state.aims, aim), (*state.aim_inlier, fits)
+    state = replace(state, aims=aims, aim_inlier=inlier, nis=None, used=False)
+    if window is None or layout is None or not fits:
+        return state
+    state, carried = carried_prior(state, window.state, setting)
+    state = replace(state, carried=carried)
+    change = Change(prior=total_prior(state, window.state, setting))
+    return settled(state, window, layout, change, setting)
+
+
+def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) -> State:
+    """The state with a new epoch, to which the last so many pairs belong already.
+
+    A measured motion ties the new registration to the old one, so that it is known at once. Otherwise, and where pairs
+    change their epoch, the epoch has none until it is registered.
+
+    Raises:
+        ValueError: they are not all of the current epoch.
+    """
+    first = len(state.shots) - last
+    if not 0 <= last <= state.epoch_pairs:
+        raise ValueError(f"the last {last} pairs are not all of the current epoch")
+    shots = list(state.shots)
+    for place in range(first, len(shots)):
+        pair = replace(shots[place].pair, epoch=state.epoch + 1)
+        shots[place] = Shot(pair, pair.pm, inlier=False)
+    moved = replace(
+        state,
+        epochs=(*state.epochs, Epoch(start, first)),
+        shots=tuple(shots),
+        window=None,
+        carried=None,
+        older=None,
+        marginalised=frozenset(),
+        why_none="the camera has moved: take pairs",
+        is_open=False,
+        nis=None,
+        used=False,
+    )
+    return moved if last else tied(moved, setting)
+
+
+def tied(state: State, setting: Setting) -> State:
+    """The state whose current epoch, which has no pairs yet, is registered by the measured motion that it began with.
+
+    As it is where there is no such motion, or no registration that it is counted from.
+    """
+    start, layout = state.now.start, state.layout
+    before = state.epochs[start.old(state.epoch)].state if start.motion_known and state.epoch else None
+    if before is None or layout is None:
+        return state
+    at = carried_over(before, start)
+    state, carried = carried_prior(state, at, setting)
+    window = open_window((), carried, layout, state.epoch)
+    now = replace(state.now, state=window.state, covariance=window.covariance)
+    return replace(state, carried=carried, window=window, epochs=(*state.epochs[:-1], now), why_none="", is_open=False)
+
+
+def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
+    """The state whose current epoch began with a motion that is known only now, from the epoch before or another one.
+
+    Where the epoch that the motion is counted from has no registration, it says nothing.
+    """
+    now = replace(state.now, start=start)
+    state = replace(state, epochs=(*state.epochs[:-1], now), nis=None, used=False)
+    window, layout = state.window, state.layout
+    if window is None or layout is None:
+        return state if state.epoch_pairs else tied(state, setting)
+    state, carried = carried_prior(state, window.state, setting)
+    state = replace(state, carried=carried)
+    return settled(state, window, layout, Change(prior=total_prior(state, window.state, setting)), setting)
