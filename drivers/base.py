@@ -3,18 +3,19 @@
 Conventions for all of them:
 
 - **Time.** Everything that comes in carries a :class:`Stamp`: the device's time and the host's, seconds. Host times are
-  ``time.monotonic()`` (:func:`host_now`). ``fgreg.pairing.DeviceClock`` brings device times onto the host's clock,
-  ``fgreg.pairing.PoseHistory`` and ``scan_at`` interpolate marker poses and stage angles to a laser pulse. Devices
-  without a clock stamp both alike.
+  ``time.monotonic()`` (:func:`host_now`). ``fgreg.model.time_sync.DeviceClock`` brings device times onto the host's
+  clock, ``fgreg.model.time_sync.PoseHistory`` and ``scan_at`` interpolate marker poses and stage angles to a laser
+  pulse. Devices without a clock stamp both alike.
 - **Never wait.** ``poll`` returns what is there, oldest first, or nothing, at once. What was not fetched in time is
   dropped by the driver, oldest first, and counted in ``dropped``: queues do not grow.
 - **Loss.** A device that is gone raises :class:`DeviceLost` from ``poll`` or ``send``, once; after that the driver
   looks for it by itself, ``poll`` returns nothing, and ``connected`` says how things are.
 - **Close.** ``close`` lets go of the device, may be called twice, and never raises.
-- Frames: ``camera`` is the left camera, millimetres and radians (fgreg.frames). Arrays are the receiver's own.
+- Frames: ``camera`` is the left camera, millimetres and radians (fgreg.geometry.transforms). Arrays are the receiver's
+  own.
 
-The stage is different in one point: only the watchdog process of ``fgreg.motion`` may hold a :class:`RotationStage`;
-programs turn it through ``fgreg.motion.link.StageLink``.
+The stage is different in one point: only the watchdog process of ``fgreg.stage`` may hold a :class:`RotationStage`;
+programs turn it through ``fgreg.stage.client.StageLink``.
 """
 
 from __future__ import annotations
@@ -29,23 +30,23 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import FgregError
-from fgreg.frames import FloatArray
-from fgreg.motion.device import RotationStage, StageError, StageLost, StageStatus
-from fgreg.pairing import Stamp
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.time_sync import Stamp
+from fgreg.stage.interface import RotationStage, StageError, StageLost, StageStatus
 
 __all__ = [
     "BmodeFrame",
     "BmodeSource",
-    "Command",
+    "CommandKind",
     "DeviceLost",
     "MotionSample",
     "MotionSource",
     "Operator",
+    "OperatorCommand",
     "PaFrame",
     "PhotoacousticSource",
     "Registration",
     "RotationStage",
-    "Said",
     "StageError",
     "StageLost",
     "StageStatus",
@@ -168,7 +169,7 @@ class Device(Protocol):
         """Let go of the device."""
 
 
-class Said(StrEnum):
+class CommandKind(StrEnum):
     """What an operator can say."""
 
     HOME = "home"
@@ -183,7 +184,7 @@ class Said(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class OperatorCommand:
     """Words of the operator.
 
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
@@ -192,17 +193,17 @@ class Command:
     move again.
     """
 
-    said: Said
+    kind: CommandKind
     corner: tuple[int, int] | None = None
 
 
 class Operator(Device, Protocol):
     """Whoever holds the fibre, and whoever speaks for them: a keyboard, a foot switch, a simulated surgeon."""
 
-    def poll(self) -> Sequence[Command]:
+    def poll(self) -> Sequence[OperatorCommand]:
         """What was said since the last call. Raises DeviceLost."""
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         """Something they should know. ``done``: the present spot needs the fibre no longer; ``wants``: what they are
         asked to say."""
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from fgreg.drivers.base import BmodeFrame, Stamp
-from fgreg.drivers.linked import LinkedDevice
+from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
 from fgreg.errors import InputError, one_line
 

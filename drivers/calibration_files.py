@@ -26,11 +26,11 @@ import numpy as np
 
 from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
-from fgreg.models import CameraModel, StereoRig
+from fgreg.geometry.transforms import FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
+from fgreg.model.session_model import CameraModel, StereoRig
 from fgreg.schema.kinds import Integer, Kind, Matrix, Numbers, Text
 from fgreg.schema.problems import FieldError, Problem, input_error, shown
-from fgreg.session.safe_yaml import load_yaml, read_bounded
+from fgreg.session.yaml_loader import load_yaml, read_bounded
 
 MM_PER = {"m": 1000.0, "mm": 1.0}
 """Units that a calibration's lengths can have."""

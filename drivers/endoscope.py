@@ -24,7 +24,7 @@ import numpy as np
 
 from fgreg.drivers.base import DeviceLost, Stamp, StereoFrame
 from fgreg.drivers.image_folder import FolderCapture
-from fgreg.drivers.interlaced import Fields, Picture, split
+from fgreg.drivers.interlacing import Fields, Picture, split
 from fgreg.drivers.rectification import Rectification
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Origin, Timing, VideoInput
@@ -84,7 +84,7 @@ class EndoscopeConfig:
         layout: where left and right are.
         swap: left and right are the other way round in each frame.
         fields: what to make of interlaced frames; the session's camera is then that of the fields
-            (fgreg.drivers.interlaced.field_rig).
+            (fgreg.drivers.interlacing.field_rig).
         max_gap_s: most time between left and right of two inputs. Default: half a frame period at 30 frames/s.
         by_arrival: match two inputs by their times of arrival even where both have device times on one clock.
         queue: frames that may wait.

@@ -23,7 +23,7 @@ from fgreg.drivers.options import (
     StandInOptions,
     ThorlabsOptions,
 )
-from fgreg.drivers.registry import Surroundings
+from fgreg.drivers.registry import DriverContext
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import (
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
         TransformSink,
     )
     from fgreg.drivers.endoscope import EndoscopeConfig
-    from fgreg.drivers.recorded import Pace
+    from fgreg.drivers.recorded_devices import Pace
     from fgreg.drivers.tcp_link import Endpoint
 
 
 def check_endoscope(options: EndoscopeOptions) -> EndoscopeConfig:
     """The endoscope's configuration. Raises ValueError: values that do not fit together."""
     from fgreg.drivers.endoscope import EndoscopeConfig, InputConfig, Layout
-    from fgreg.drivers.interlaced import Fields
+    from fgreg.drivers.interlacing import Fields
 
     def one(source: str) -> InputConfig:
         return InputConfig(
@@ -66,103 +66,103 @@ def check_endoscope(options: EndoscopeOptions) -> EndoscopeConfig:
     )
 
 
-def endoscope(around: Surroundings, options: EndoscopeOptions) -> StereoCamera:
+def endoscope(context: DriverContext, options: EndoscopeOptions) -> StereoCamera:
     """One or two video inputs."""
     from fgreg.drivers.endoscope import Endoscope
 
-    return Endoscope(check_endoscope(options), around.rectified)
+    return Endoscope(check_endoscope(options), context.rectified)
 
 
 def check_recorded_camera(options: RecordedCameraOptions) -> None:
     """Raises InputError: no recording, or no such images in it."""
-    from fgreg.drivers.recorded import RecordedCamera
+    from fgreg.drivers.recorded_devices import RecordedCamera
 
     RecordedCamera(options.path, options.left, options.right, max_gap_s=options.max_gap_s).close()
 
 
-def recorded_camera(around: Surroundings, options: RecordedCameraOptions) -> StereoCamera:
+def recorded_camera(context: DriverContext, options: RecordedCameraOptions) -> StereoCamera:
     """Images of a ROS 2 recording."""
-    from fgreg.drivers.recorded import RecordedCamera
+    from fgreg.drivers.recorded_devices import RecordedCamera
 
-    pace = _pace(around, options.path, options.speed)
+    pace = _pace(context, options.path, options.speed)
     return RecordedCamera(options.path, options.left, options.right, pace, options.max_gap_s)
 
 
 def check_recorded_motion(options: RecordedMotionOptions) -> None:
     """Raises InputError: no recording, or no such poses in it."""
-    from fgreg.drivers.recorded import RecordedMotion
+    from fgreg.drivers.recorded_devices import RecordedMotion
 
     RecordedMotion(options.path, options.topic, options.tip_T_camera).close()
 
 
-def recorded_motion(around: Surroundings, options: RecordedMotionOptions) -> MotionSource:
+def recorded_motion(context: DriverContext, options: RecordedMotionOptions) -> MotionSource:
     """Poses of a ROS 2 recording."""
-    from fgreg.drivers.recorded import RecordedMotion
+    from fgreg.drivers.recorded_devices import RecordedMotion
 
-    pace = _pace(around, options.path, options.speed)
+    pace = _pace(context, options.path, options.speed)
     return RecordedMotion(options.path, options.topic, options.tip_T_camera, pace)
 
 
-def _pace(around: Surroundings, path: Path, speed: float) -> Pace:
+def _pace(context: DriverContext, path: Path, speed: float) -> Pace:
     """One for all that play a recording, from the first of them on."""
-    from fgreg.drivers.recorded import Pace
+    from fgreg.drivers.recorded_devices import Pace
 
     key = (path.resolve(), speed)
-    if key not in around.paces:
-        around.paces[key] = Pace.of(path, speed)
-    pace: Pace = around.paces[key]
+    if key not in context.paces:
+        context.paces[key] = Pace.of(path, speed)
+    pace: Pace = context.paces[key]
     return pace
 
 
-def simulated_camera(around: Surroundings, _options: NoOptions) -> StereoCamera:
+def simulated_camera(context: DriverContext, _options: NoOptions) -> StereoCamera:
     """The simulated room's endoscope."""
     from fgreg.drivers.simulated import SimulatedCamera
 
-    return SimulatedCamera(_room(around))
+    return SimulatedCamera(_room(context))
 
 
-def simulated_probe(around: Surroundings, _options: NoOptions) -> PhotoacousticSource:
+def simulated_probe(context: DriverContext, _options: NoOptions) -> PhotoacousticSource:
     """The simulated room's laser and ultrasound machine."""
     from fgreg.drivers.simulated import SimulatedProbe
 
-    return SimulatedProbe(_room(around))
+    return SimulatedProbe(_room(context))
 
 
-def simulated_motion(around: Surroundings, _options: NoOptions) -> MotionSource:
+def simulated_motion(context: DriverContext, _options: NoOptions) -> MotionSource:
     """The simulated room's endoscope holder."""
     from fgreg.drivers.simulated import SimulatedMotion
 
-    return SimulatedMotion(_room(around))
+    return SimulatedMotion(_room(context))
 
 
-def simulated_scanner(around: Surroundings, _options: NoOptions) -> BmodeSource:
+def simulated_scanner(context: DriverContext, _options: NoOptions) -> BmodeSource:
     """The simulated room's ultrasound pictures."""
     from fgreg.drivers.simulated import SimulatedScanner
 
-    return SimulatedScanner(_room(around))
+    return SimulatedScanner(_room(context))
 
 
-def simulated_operator(around: Surroundings, _options: NoOptions) -> Operator:
+def simulated_operator(context: DriverContext, _options: NoOptions) -> Operator:
     """The simulated room's surgeon."""
     from fgreg.drivers.simulated import SimulatedOperator
 
-    return SimulatedOperator(_room(around))
+    return SimulatedOperator(_room(context))
 
 
-def _room(around: Surroundings) -> Path:
-    if around.room is None:
+def _room(context: DriverContext) -> Path:
+    if context.room is None:
         raise AssertionError("a device of the simulated room, and no room")
-    return around.room
+    return context.room
 
 
-def igtl_photoacoustic(_around: Surroundings, options: IgtlProbeOptions) -> PhotoacousticSource:
+def igtl_photoacoustic(_context: DriverContext, options: IgtlProbeOptions) -> PhotoacousticSource:
     """Images over OpenIGTLink, one for each laser pulse."""
     from fgreg.drivers.igtl import IgtlPhotoacoustic
 
     return IgtlPhotoacoustic(_endpoint(options), options.device, options.transposed, options.silent_s)
 
 
-def igtl_bmode(_around: Surroundings, options: IgtlBmodeOptions) -> BmodeSource:
+def igtl_bmode(_context: DriverContext, options: IgtlBmodeOptions) -> BmodeSource:
     """B-mode images over OpenIGTLink."""
     from fgreg.drivers.igtl import IgtlBmode
 
@@ -170,7 +170,7 @@ def igtl_bmode(_around: Surroundings, options: IgtlBmodeOptions) -> BmodeSource:
     return IgtlBmode(_endpoint(options), options.device, options.silent_s, origin_mm, options.flip)
 
 
-def bk_bmode(_around: Surroundings, options: BkOptions) -> BmodeSource:
+def bk_bmode(_context: DriverContext, options: BkOptions) -> BmodeSource:
     """Pictures of a BK scanner."""
     from fgreg.drivers.bk_oem import BkOemScanner
     from fgreg.drivers.tcp_link import Endpoint
@@ -178,14 +178,14 @@ def bk_bmode(_around: Surroundings, options: BkOptions) -> BmodeSource:
     return BkOemScanner(Endpoint(options.host, options.port), options.rate_hz, options.silent_s, options.flip)
 
 
-def igtl_motion(_around: Surroundings, options: IgtlMotionOptions) -> MotionSource:
+def igtl_motion(_context: DriverContext, options: IgtlMotionOptions) -> MotionSource:
     """Transforms of the endoscope's holder."""
     from fgreg.drivers.igtl import IgtlMotion
 
     return IgtlMotion(_endpoint(options), options.device, options.inverted, options.silent_s)
 
 
-def igtl_sink(_around: Surroundings, options: IgtlSinkOptions) -> TransformSink:
+def igtl_sink(_context: DriverContext, options: IgtlSinkOptions) -> TransformSink:
     """Whoever takes the registration."""
     from fgreg.drivers.igtl import IgtlTransformSink
     from fgreg.drivers.igtl_registration import DeviceNames
@@ -194,34 +194,34 @@ def igtl_sink(_around: Surroundings, options: IgtlSinkOptions) -> TransformSink:
     return IgtlTransformSink(_endpoint(options), names, options.header_version)
 
 
-def keyboard(around: Surroundings, _options: NoOptions) -> Operator:
+def keyboard(context: DriverContext, _options: NoOptions) -> Operator:
     """Whoever sits at the terminal."""
     from fgreg.drivers.keyboard import KeyboardOperator
 
-    return KeyboardOperator(around.say, corners=around.corners)
+    return KeyboardOperator(context.say, corners=context.corners)
 
 
-def igtl_operator(around: Surroundings, options: IgtlOperatorOptions) -> Operator:
+def igtl_operator(context: DriverContext, options: IgtlOperatorOptions) -> Operator:
     """Texts over OpenIGTLink."""
     from fgreg.drivers.operators import IgtlOperator
 
-    return IgtlOperator(_endpoint(options), options.device, options.answers, around.corners)
+    return IgtlOperator(_endpoint(options), options.device, options.answers, context.corners)
 
 
-def ask_thorlabs(_around: Surroundings, options: ThorlabsOptions) -> str:
+def ask_thorlabs(_context: DriverContext, options: ThorlabsOptions) -> str:
     """What a cube says of itself; nothing moves. Raises StageError: nobody answers, or somebody else."""
-    from fgreg.drivers.cube_identity import identify
+    from fgreg.drivers.thorlabs_identify import identify
     from fgreg.drivers.thorlabs_stage import only_port
 
     return str(identify(options.port or only_port()))
 
 
-def ask_room_stage(around: Surroundings, _options: RoomStageOptions) -> str:
+def ask_room_stage(context: DriverContext, _options: RoomStageOptions) -> str:
     """Where the simulated room's stage stands. Raises StageLost."""
     from fgreg.drivers.simulated import RoomStage
     from fgreg.simulation.config import default_stage
 
-    stage = RoomStage(default_stage(), _room(around))
+    stage = RoomStage(default_stage(), _room(context))
     try:
         status = stage.status()
     finally:
@@ -230,12 +230,12 @@ def ask_room_stage(around: Surroundings, _options: RoomStageOptions) -> str:
     return f"stands at {math.degrees(status.scan_rad):.1f} deg by its own account, {zero}"
 
 
-def ask_stand_in(_around: Surroundings, _options: StandInOptions) -> str:
+def ask_stand_in(_context: DriverContext, _options: StandInOptions) -> str:
     """Nobody is there."""
     return "simulated: nothing turns"
 
 
-def ask_keyboard(_around: Surroundings, _options: NoOptions) -> str:
+def ask_keyboard(_context: DriverContext, _options: NoOptions) -> str:
     """What standard input is; nothing is read. Raises DeviceLost where it is closed."""
     from fgreg.drivers.base import DeviceLost
     from fgreg.drivers.keyboard import standard_input

@@ -26,10 +26,10 @@ from fgreg.drivers.igtl_messages import (
     require_pyigtl,
 )
 from fgreg.drivers.igtl_registration import DeviceNames, registration_messages
-from fgreg.drivers.linked import LinkedDevice
+from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
 from fgreg.errors import InputError
-from fgreg.frames import inverse, is_rigid, make_transform, nearest_rotation
+from fgreg.geometry.transforms import inverse, is_rigid, make_transform, nearest_rotation
 
 SILENT_S = 0.8
 """A stream that stops for this long counts as lost, unless told otherwise: it is said within a second."""

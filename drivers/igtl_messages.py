@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from fgreg.drivers.tcp_link import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 
 PORT = 18944
 """What 3D Slicer and PLUS use unless told otherwise."""

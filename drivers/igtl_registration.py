@@ -37,7 +37,7 @@ from fgreg.drivers.igtl_messages import (
     pack_text,
     pack_transform,
 )
-from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
+from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transform
 
 USABLE = ("ok", "warning")
 TEXT_CHARACTERS = 4000

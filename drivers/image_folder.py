@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fgreg.drivers.frame_files import read_picture
+from fgreg.detection.frame_files import read_picture
 from fgreg.errors import InputError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")

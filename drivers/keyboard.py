@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from fgreg.drivers.base import Command, Said
+from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.drivers.operator_words import asked, understand
 
 MOST_WAITING = 64
@@ -38,7 +38,7 @@ class KeyboardOperator:
     ) -> None:
         self._say, self._corners = say, corners
         self._fd = standard_input() if fd is None else fd
-        self._waiting: deque[Command] = deque()
+        self._waiting: deque[OperatorCommand] = deque()
         self._lock = threading.Lock()
         self._dropped, self._open = 0, self._fd is not None
         self._wake, self._woken = os.pipe()  # ends, in this order: read, write
@@ -61,14 +61,14 @@ class KeyboardOperator:
         """Commands dropped because nobody fetched them in time."""
         return self._dropped
 
-    def poll(self) -> list[Command]:
+    def poll(self) -> list[OperatorCommand]:
         """What was said since the last call."""
         with self._lock:
             commands = list(self._waiting)
             self._waiting.clear()
         return commands
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:  # noqa: ARG002
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """One line."""
         self._say(asked(text, wants))
 
@@ -125,7 +125,7 @@ class KeyboardOperator:
             self._waiting.append(command)
             while len(self._waiting) > MOST_WAITING:
                 # The oldest goes, but never a stop.
-                old = next((c for c in self._waiting if c.said is not Said.STOP), self._waiting[0])
+                old = next((c for c in self._waiting if c.kind is not CommandKind.STOP), self._waiting[0])
                 self._waiting.remove(old)
                 self._dropped += 1
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import re
 
-from fgreg.drivers.base import Command, Said
+from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.errors import one_line
 
 LETTERS = {
-    "h": Said.HOME,
-    "a": Said.AIM,
-    "r": Said.REGISTER,
-    "s": Said.SEARCH,
-    "f": Said.FOLLOW,
-    "n": Said.NEXT,
-    "m": Said.MOVED,
-    "x": Said.STOP,
+    "h": CommandKind.HOME,
+    "a": CommandKind.AIM,
+    "r": CommandKind.REGISTER,
+    "s": CommandKind.SEARCH,
+    "f": CommandKind.FOLLOW,
+    "n": CommandKind.NEXT,
+    "m": CommandKind.MOVED,
+    "x": CommandKind.STOP,
 }
 """One letter for a word. ``s`` is search: stopping has an empty line, and ``x``. ``reset`` has none: a slip of the
 finger must not free a stage that stopped for trouble."""
@@ -27,12 +27,12 @@ EXPECTED = (
 LARGEST_CORNER = 199
 """Of a board, as session.yaml bounds it."""
 
-_WORDS: dict[str, Said] = {**{said.value: said for said in Said}, **LETTERS}
+_WORDS: dict[str, CommandKind] = {**{said.value: said for said in CommandKind}, **LETTERS}
 _NUMBER = re.compile(r"[0-9]{1,3}")
 _STOP = re.compile(r"\bstop\b")
 
 
-def understand(line: str, corners: tuple[int, int] | None = None) -> Command | str:
+def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCommand | str:
     """The command that a line is, or what was expected instead.
 
     A line with the word ``stop`` anywhere is one, as is an empty line: whoever wants the stage to stop need not spell.
@@ -43,18 +43,18 @@ def understand(line: str, corners: tuple[int, int] | None = None) -> Command | s
     """
     words = line.lower().replace(",", " ").split()
     if not words or _STOP.search(line.lower()):
-        return Command(Said.STOP)
+        return OperatorCommand(CommandKind.STOP)
     said = _WORDS.get(words[0])
     if said is None:
         return f"{one_line(repr(line.strip()), 40)} is not understood; say {EXPECTED}"
-    if said is Said.AIM:
+    if said is CommandKind.AIM:
         return _aim(words[1:], corners)
     if len(words) > 1:
         return f"{one_line(repr(line.strip()), 40)} is not understood; {said} takes nothing after it"
-    return Command(said)
+    return OperatorCommand(said)
 
 
-def _aim(words: list[str], corners: tuple[int, int] | None) -> Command | str:
+def _aim(words: list[str], corners: tuple[int, int] | None) -> OperatorCommand | str:
     expected = "aim COLUMN ROW: the inner corner of the board that the beam is on"
     if len(words) != 2 or not all(_NUMBER.fullmatch(word) for word in words):
         return f"an aim is said as {expected}, counted from 0"
@@ -62,10 +62,10 @@ def _aim(words: list[str], corners: tuple[int, int] | None) -> Command | str:
     columns, rows = corners or (LARGEST_CORNER + 1, LARGEST_CORNER + 1)
     if not (column < columns and row < rows):
         return f"there is no corner {column} {row}: expected columns 0 to {columns - 1}, rows 0 to {rows - 1}"
-    return Command(Said.AIM, (column, row))
+    return OperatorCommand(CommandKind.AIM, (column, row))
 
 
-def asked(text: str, wants: Said | None) -> str:
+def asked(text: str, wants: CommandKind | None) -> str:
     """What the operator is told, on one line, with what he is asked to say."""
     if wants is None:
         return one_line(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from fgreg.drivers.base import Command, DeviceLost, Operator, Said
+from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand
 from fgreg.drivers.igtl import IgtlReceiver
 from fgreg.drivers.igtl_messages import Text, check_name, pack_text
 from fgreg.drivers.operator_words import asked, understand
@@ -37,7 +37,7 @@ class IgtlOperator(IgtlReceiver):
         self._answers, self._corners = check_name(answers), corners
         super().__init__(endpoint, [("STRING", check_name(device))])
 
-    def poll(self) -> list[Command]:  # type: ignore[override]
+    def poll(self) -> list[OperatorCommand]:  # type: ignore[override]
         """What was said since the last call. Raises DeviceLost."""
         commands = []
         for message in self._messages():
@@ -51,7 +51,7 @@ class IgtlOperator(IgtlReceiver):
                 commands.append(command)
         return commands
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:  # noqa: ARG002
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """Send it."""
         self._offer(asked(text, wants))
 
@@ -65,7 +65,7 @@ class Operators:
     def __init__(self, operators: Sequence[Operator]) -> None:
         self._operators = tuple(operators)
         self._losses: list[DeviceLost] = []
-        self._held: list[Command] = []
+        self._held: list[OperatorCommand] = []
 
     @property
     def name(self) -> str:
@@ -82,7 +82,7 @@ class Operators:
         """Commands that nobody fetched in time."""
         return sum(operator.dropped for operator in self._operators)
 
-    def poll(self) -> list[Command]:
+    def poll(self) -> list[OperatorCommand]:
         """What was said since the last call, by any of them; a loss is told with nothing of that lost.
 
         Raises:
@@ -100,7 +100,7 @@ class Operators:
             raise self._losses.pop(0)
         return []
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         """All of them."""
         for operator in self._operators:
             operator.tell(text, done=done, wants=wants)

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray
-from fgreg.motion.limits import LIMITS
+from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.files import ExistingPath, exists
 from fgreg.schema.kinds import Integer, JsonSchema, Kind, Number, Text, Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key
+from fgreg.stage.limits import LIMITS
 
 NAME_BYTES = 20
 IGTL_PORT, SINK_PORT, BK_PORT = 18944, 18945, 7915

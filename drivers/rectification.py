@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgreg.drivers.interlaced import Picture
+from fgreg.drivers.interlacing import Picture
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, as_float_array, exp_so3, log_so3, make_transform
-from fgreg.models import CameraModel, StereoRig
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, log_so3, make_transform
+from fgreg.model.session_model import CameraModel, StereoRig
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,7 +44,7 @@ _DISTRIBUTIONS = {"serial": "pyserial"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
+class DriverContext:
     """What drivers are given besides their options.
 
     Attributes:
@@ -70,12 +70,12 @@ class DriverEntry:
         role, name: what a configuration calls it.
         help: one line.
         options: class of its keys (fgreg.drivers.options).
-        factory: ``package.module:function``, called with Surroundings and the options; of a stage, as
-            ``fgreg.motion.watchdog`` calls it.
+        factory: ``package.module:function``, called with DriverContext and the options; of a stage, as
+            ``fgreg.stage.watchdog`` calls it.
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
         check: ``package.module:function``, called with the options: raises InputError, ValueError, opens no device.
-        ask: ``package.module:function``, called with Surroundings and the options: says what is there, or raises; of
+        ask: ``package.module:function``, called with DriverContext and the options: says what is there, or raises; of
             devices that are not to be opened only to see whether they answer.
     """
 
@@ -105,10 +105,10 @@ class DriverEntry:
         if self.check is not None:
             load(self.check)(chosen)
 
-    def open(self, around: Surroundings, chosen: Any) -> Any:
+    def open(self, context: DriverContext, chosen: Any) -> Any:
         """The device; not for stages, which the watchdog opens. Raises what its driver raises."""
         self.require()
-        return load(self.factory)(around, chosen)
+        return load(self.factory)(context, chosen)
 
 
 def installed(extra: str) -> bool:

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.drivers.calibration_files import CameraInfo
-from fgreg.drivers.interlaced import Picture
+from fgreg.drivers.interlacing import Picture
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, as_float_array, make_transform, right_from_parent_covariance
-from fgreg.quaternions import rotation_from_quaternion, turn_about_x
+from fgreg.geometry.quaternions import rotation_from_quaternion, turn_about_x
+from fgreg.geometry.transforms import FloatArray, as_float_array, make_transform, right_from_parent_covariance
 
 IMAGE_TYPES = frozenset({"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
 INFO_TYPES = frozenset({"sensor_msgs/msg/CameraInfo"})

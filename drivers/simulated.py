@@ -25,11 +25,11 @@ import numpy as np
 
 from fgreg.drivers.base import (
     BmodeFrame,
-    Command,
+    CommandKind,
     DeviceLost,
     MotionSample,
+    OperatorCommand,
     PaFrame,
-    Said,
     StereoFrame,
     host_now,
 )
@@ -37,11 +37,11 @@ from fgreg.drivers.simulated_room import simulated
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.errors import FgregError
-from fgreg.frames import as_float_array
-from fgreg.models import StageModel
-from fgreg.motion.device import MAX_CALL_S, StageLost, StageStatus
-from fgreg.pairing import Stamp
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.session_model import StageModel
+from fgreg.model.time_sync import Stamp
 from fgreg.simulation.room import BUMP_EVERY_S
+from fgreg.stage.interface import MAX_CALL_S, StageLost, StageStatus
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 AGAIN_S = 0.2
@@ -237,9 +237,9 @@ def _bmode(header: dict[str, Any], payload: bytearray) -> BmodeFrame:
     return BmodeFrame(stamp, image, header["index"], tuple(header["pixel_mm"]), tuple(header["origin_mm"]))
 
 
-def _command(header: dict[str, Any], _payload: bytearray) -> Command:
+def _command(header: dict[str, Any], _payload: bytearray) -> OperatorCommand:
     corner = header.get("corner")
-    return Command(Said(header["says"]), None if corner is None else (int(corner[0]), int(corner[1])))
+    return OperatorCommand(CommandKind(header["says"]), None if corner is None else (int(corner[0]), int(corner[1])))
 
 
 class SimulatedCamera(_Feed[StereoFrame]):
@@ -270,13 +270,13 @@ class SimulatedScanner(_Feed[BmodeFrame]):
         super().__init__("scanner", path, 2, _bmode, sends=True)
 
 
-class SimulatedOperator(_Feed[Command]):
+class SimulatedOperator(_Feed[OperatorCommand]):
     """The surgeon, who says what he does and goes on when he is told that a spot is done (Operator)."""
 
     def __init__(self, path: Path) -> None:
         super().__init__("operator", path, 64, _command, sends=False)
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:  # noqa: ARG002
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """He goes on to the next spot, and says what he is asked to say."""
         connection = self._connection
         if connection is not None and (done or wants is not None):

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from fgreg.models import StageModel
-from fgreg.motion.device import StageLost, StageStatus
-from fgreg.pairing import Stamp
+from fgreg.model.session_model import StageModel
+from fgreg.model.time_sync import Stamp
+from fgreg.stage.interface import StageLost, StageStatus
 
 _STEP_S = 1e-3
 _STANDS_RAD_S = 1e-9

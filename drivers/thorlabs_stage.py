@@ -14,11 +14,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from fgreg.drivers import apt
+from fgreg.drivers import thorlabs_apt
 from fgreg.errors import MissingExtraError
-from fgreg.models import StageModel
-from fgreg.motion.device import StageError, StageLost, StageStatus
-from fgreg.pairing import Stamp
+from fgreg.model.session_model import StageModel
+from fgreg.model.time_sync import Stamp
+from fgreg.stage.interface import StageError, StageLost, StageStatus
 
 if TYPE_CHECKING:
     import serial
@@ -41,7 +41,7 @@ _VELOCITY_SLACK = 0.02
 
 
 class ThorlabsStage:
-    """See ``fgreg.motion.device.RotationStage``.
+    """See ``fgreg.stage.interface.RotationStage``.
 
     Args:
         model: direction and zero.
@@ -57,10 +57,10 @@ class ThorlabsStage:
     def __init__(self, model: StageModel, port: str, acceleration_rad_s2: float = math.radians(20.0)) -> None:
         self._model, self._name = model, f"stage at {port}"
         self._acceleration = round(acceleration_rad_s2 * ACCELERATION_PER_RAD_S2)
-        self._parser = apt.AptParser()
+        self._parser = thorlabs_apt.AptParser()
         self._lost: str | None = None
-        self._status: apt.CubeStatus | None = None
-        self._home: apt.HomeSettings | None = None
+        self._status: thorlabs_apt.CubeStatus | None = None
+        self._home: thorlabs_apt.HomeSettings | None = None
         self._model_name = ""
         self._heard_s = self._asked_s = -math.inf
         self._before: tuple[float, int] | None = None
@@ -79,23 +79,23 @@ class ThorlabsStage:
         if self._home is None:
             raise StageError(f"{self._name} has not told how it looks for its zero position")
         velocity = min(self._home.velocity, _velocity(speed_rad_s))
-        settings = apt.HomeSettings(self._home.direction, self._home.switch, velocity, self._home.offset)
+        settings = thorlabs_apt.HomeSettings(self._home.direction, self._home.switch, velocity, self._home.offset)
         self._told = None
-        self._write(apt.set_home(settings) + apt.short(apt.MOVE_HOME, apt.CHANNEL))
+        self._write(thorlabs_apt.set_home(settings) + thorlabs_apt.short(thorlabs_apt.MOVE_HOME, thorlabs_apt.CHANNEL))
 
     def move_to(self, scan_rad: float, speed_rad_s: float) -> None:
         """Turn to a plane angle."""
         position = round(self._model.device_from_scan(scan_rad) * COUNTS_PER_RAD)
         self._told = _velocity(speed_rad_s)
         self._write(
-            apt.set_velocity(self._acceleration, self._told)
-            + apt.move_absolute(position)
-            + apt.short(apt.REQ_VELOCITY, apt.CHANNEL)
+            thorlabs_apt.set_velocity(self._acceleration, self._told)
+            + thorlabs_apt.move_absolute(position)
+            + thorlabs_apt.short(thorlabs_apt.REQ_VELOCITY, thorlabs_apt.CHANNEL)
         )
 
     def stop(self) -> None:
         """Stop at once, without a profile."""
-        self._write(apt.short(apt.MOVE_STOP, apt.CHANNEL, apt.STOP_AT_ONCE))
+        self._write(thorlabs_apt.short(thorlabs_apt.MOVE_STOP, thorlabs_apt.CHANNEL, thorlabs_apt.STOP_AT_ONCE))
 
     def status(self) -> StageStatus:
         """The newest that the cube told, with the time at which it came; asks for a newer one."""
@@ -105,7 +105,7 @@ class ThorlabsStage:
             raise self._give_up(f"has said nothing for {LOST_S:.0f} s: is it switched on, is its cable in?")
         if now - self._asked_s > ASK_AGAIN_S or self._heard_s >= self._asked_s:
             self._asked_s = now
-            self._write(apt.short(apt.REQ_STATUS, apt.CHANNEL))
+            self._write(thorlabs_apt.short(thorlabs_apt.REQ_STATUS, thorlabs_apt.CHANNEL))
         return self._as_status()
 
     def close(self) -> None:
@@ -122,13 +122,13 @@ class ThorlabsStage:
         """What the cube wants first, and what has to be known of it."""
         time.sleep(_SETTLE_S)
         self._port.reset_input_buffer()
-        self._write(apt.short(apt.NO_FLASH))
-        self._ask(apt.REQ_INFO, 0, lambda: bool(self._model_name))
+        self._write(thorlabs_apt.short(thorlabs_apt.NO_FLASH))
+        self._ask(thorlabs_apt.REQ_INFO, 0, lambda: bool(self._model_name))
         if not self._model_name.startswith(MODELS):
             raise StageError(f"{self._name} is a {self._model_name!r}, expected one of {', '.join(MODELS)}")
-        self._write(apt.short(apt.SET_ENABLE, apt.CHANNEL, 1))
-        self._ask(apt.REQ_HOME, apt.CHANNEL, lambda: self._home is not None)
-        self._ask(apt.REQ_STATUS, apt.CHANNEL, lambda: self._status is not None)
+        self._write(thorlabs_apt.short(thorlabs_apt.SET_ENABLE, thorlabs_apt.CHANNEL, 1))
+        self._ask(thorlabs_apt.REQ_HOME, thorlabs_apt.CHANNEL, lambda: self._home is not None)
+        self._ask(thorlabs_apt.REQ_STATUS, thorlabs_apt.CHANNEL, lambda: self._status is not None)
 
     def _ask(self, question: int, parameter: int, answered: Callable[[], bool]) -> None:
         until = time.monotonic() + OPEN_S
@@ -139,7 +139,7 @@ class ThorlabsStage:
                 raise self._give_up("does not answer: is it switched on, is it a KDC101 or TDC001?")
             if now - asked > ASK_AGAIN_S:
                 asked = now
-                self._write(apt.short(question, parameter))
+                self._write(thorlabs_apt.short(question, parameter))
             time.sleep(0.002)
             self._read()
 
@@ -159,21 +159,21 @@ class ThorlabsStage:
         for message in self._parser.feed(data):
             self._take(message)
 
-    def _take(self, message: apt.AptMessage) -> None:
+    def _take(self, message: thorlabs_apt.AptMessage) -> None:
         now = time.monotonic()
         match message.id:
-            case apt.GET_STATUS | apt.MOVE_COMPLETED | apt.STOPPED if message.data:
-                status = apt.read_status(message.data)
-                if self._status is not None and (status.bits ^ self._status.bits) & apt.HOMED_BIT:
+            case thorlabs_apt.GET_STATUS | thorlabs_apt.MOVE_COMPLETED | thorlabs_apt.STOPPED if message.data:
+                status = thorlabs_apt.read_status(message.data)
+                if self._status is not None and (status.bits ^ self._status.bits) & thorlabs_apt.HOMED_BIT:
                     self._before, self._velocity = None, 0.0  # the zero was set: the position leaps, the stage does not
                 self._follow(now, status.position)
                 self._status, self._heard_s = status, now
-            case apt.GET_HOME:
-                self._home = apt.read_home(message.data)
-            case apt.GET_INFO:
-                self._model_name = apt.read_model(message.data)
-            case apt.GET_VELOCITY if self._told is not None:
-                _, velocity = apt.read_velocity(message.data)
+            case thorlabs_apt.GET_HOME:
+                self._home = thorlabs_apt.read_home(message.data)
+            case thorlabs_apt.GET_INFO:
+                self._model_name = thorlabs_apt.read_model(message.data)
+            case thorlabs_apt.GET_VELOCITY if self._told is not None:
+                _, velocity = thorlabs_apt.read_velocity(message.data)
                 if velocity > self._told * (1.0 + _VELOCITY_SLACK) + 1.0:
                     turned = math.degrees(velocity / VELOCITY_PER_RAD_S)
                     told = math.degrees(self._told / VELOCITY_PER_RAD_S)
@@ -199,20 +199,20 @@ class ThorlabsStage:
             raise StageError(f"{self._name} has told no status yet")
         bits = self._status.bits
         fault = self._fault
-        if bits & apt.MOTION_ERROR_BIT:
+        if bits & thorlabs_apt.MOTION_ERROR_BIT:
             fault = f"{self._name} reports a motion error: is something in its way?"
-        elif bits & apt.OVERLOAD_BIT:
+        elif bits & thorlabs_apt.OVERLOAD_BIT:
             fault = f"{self._name} reports too much current: is something in its way?"
-        elif not bits & apt.ENABLED_BIT:
+        elif not bits & thorlabs_apt.ENABLED_BIT:
             fault = f"{self._name} has its motor switched off"
-        moving, homing = bool(bits & apt.MOVING_BITS), bool(bits & apt.HOMING_BIT)
+        moving, homing = bool(bits & thorlabs_apt.MOVING_BITS), bool(bits & thorlabs_apt.HOMING_BIT)
         return StageStatus(
             Stamp(self._heard_s, self._heard_s),
             self._model.scan_from_device(self._status.position / COUNTS_PER_RAD),
             self._velocity if moving else 0.0,
             moving,
             homing,
-            bool(bits & apt.HOMED_BIT) and not homing,
+            bool(bits & thorlabs_apt.HOMED_BIT) and not homing,
             fault,
         )
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from fgreg.drivers.base import DeviceLost, Stamp, host_now
-from fgreg.drivers.interlaced import Picture
+from fgreg.drivers.interlacing import Picture
 
 SILENCE_S = 0.7
 """Without a frame for so long a device counts as lost: with the caller's own loop that is told within a second."""

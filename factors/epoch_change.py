@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import gtsam
 
-from fgreg.frames import FloatArray, as_float_array
+from fgreg.geometry.transforms import FloatArray, as_float_array
 
 
 def epoch_change_factor(

@@ -12,7 +12,7 @@ derivative of Log at what it is applied to; (6, 3) marker_bias, its translation 
 moving the observation by -db along the camera's axes is moving the pose by +db.
 
 Without a bias this is GTSAM's native prior on a Pose3 (its Jacobian has been exact since 4.3).
-Source: design.md, section 2; :class:`fgreg.measurements.MarkerObservation`.
+Source: design.md, section 2; :class:`fgreg.model.measurements.MarkerObservation`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 
 from fgreg.factors.adapter import Residual, Row, custom_factor
-from fgreg.frames import FloatArray, as_float_array
+from fgreg.geometry.transforms import FloatArray, as_float_array
 
 
 def residual(

@@ -27,7 +27,7 @@ import numpy as np
 
 from fgreg.factors.adapter import Residual, Row, custom_factor
 from fgreg.factors.point_on_line import COINCIDENCE_SIGMA_MM
-from fgreg.frames import FloatArray, as_float_array
+from fgreg.geometry.transforms import FloatArray, as_float_array
 
 
 def residual(

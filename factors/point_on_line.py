@@ -22,7 +22,7 @@ import math
 import gtsam
 
 from fgreg.factors.adapter import Residual, Row, Rows, custom_factor
-from fgreg.frames import FloatArray, as_float_array
+from fgreg.geometry.transforms import FloatArray, as_float_array
 
 COINCIDENCE_SIGMA_MM = 1e-3
 """Of what coincides by definition (PM and beam, PM and arc): far below any noise, far above rounding."""

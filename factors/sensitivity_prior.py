@@ -8,9 +8,9 @@ Equation (design.md, Geometry). With delta = theta - t, R the probe's radius and
 The window was measured by turning the stage, so it bounds the rotation, not delta: at R = 10 mm, r = 30 mm, 6 deg of
 rotation is 8.0 deg of arc. This prior is what fixes the roll about the TRUS x axis.
 
-Two cases, whose centre, gain and sigma come from :mod:`fgreg.sensitivity`: window only (centre 0, gain 0), and a sweep
-that stopped at its first hit (the offset is then close to the window's near edge, and ``window_edge``, the error of the
-known half width, one unknown of the session, moves it).
+Two cases, whose centre, gain and sigma come from :mod:`fgreg.model.sensitivity`: window only (centre 0, gain 0), and a
+sweep that stopped at its first hit (the offset is then close to the window's near edge, and ``window_edge``, the error
+of the known half width, one unknown of the session, moves it).
 
 Residual: (1,) rad, wrapped to (-pi, pi]. Jacobians, in the order of the keys: (1, 1) theta, (1, 1) window_edge,
 (1, 1) sound_speed_ratio.

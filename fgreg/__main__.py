@@ -1,5 +1,5 @@
 """``python -m fgreg``."""
 
-from fgreg.cli import main
+from fgreg.cli.main import main
 
 main()

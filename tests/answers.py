@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from fgreg.estimate import (
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import (
     AimEstimate,
     EpochEstimate,
     LaserEstimate,
@@ -16,9 +17,8 @@ from fgreg.estimate import (
     TrackEstimate,
     Verdict,
 )
-from fgreg.frames import FloatArray
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
 from tests.forward import Truth
 
 REGISTRATION_COVARIANCE = np.diag(np.square([0.004, 0.003, 0.008, 0.25, 0.2, 0.3]))

@@ -5,16 +5,16 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
-from fgreg.batch import Solution, solve
-from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError, EventRefused
-from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.frames import FloatArray
-from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
-from fgreg.registration import SoundSpeedPrior, register
+from fgreg.registration.register import SoundSpeedPrior, register
+from fgreg.registration.solve import Solution, solve
 
 
 class BatchEngine:

@@ -13,8 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_transform, rotation_to_direction
-from fgreg.measurements import (
+from fgreg.geometry.transforms import (
+    FloatArray,
+    as_float_array,
+    exp_so3,
+    inverse,
+    make_transform,
+    rotation_to_direction,
+)
+from fgreg.model.measurements import (
     Aim,
     EpochStart,
     Look,
@@ -23,7 +30,7 @@ from fgreg.measurements import (
     Pair,
     default_marker_covariance,
 )
-from fgreg.models import (
+from fgreg.model.session_model import (
     NoiseModel,
     ProbeModel,
     SensitivityModel,

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.frames import FloatArray, exp_so3, log_so3, make_transform
-from fgreg.graph.explicit import ExplicitGraph, GraphOptions, build_graph
-from fgreg.graph.explicit_values import SharedValues, laser_chart
+from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform
+from fgreg.graph.gtsam_graph import ExplicitGraph, GraphOptions, build_graph
+from fgreg.graph.gtsam_values import SharedValues, laser_chart
 from tests.forward import Truth, make_measurements, make_session
 
 CASES: dict[str, dict[str, Any]] = {

@@ -20,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.events import AimEvent, PairEvent
-from fgreg.live import EpochFeed, LiveSession, online_engine
-from fgreg.measurements import Aim, Pair
-from fgreg.recognition import EventRecogniser
-from fgreg.session.event_document import event_document, event_line
+from fgreg.detection.events_to_measurements import EventRecogniser
+from fgreg.model.events import AimEvent, PairEvent
+from fgreg.model.measurements import Aim, Pair
+from fgreg.online.live_session import EpochFeed, LiveSession, online_engine
+from fgreg.session.event_writer import event_document, event_line
 from fgreg.session.journal import Journal
-from fgreg.session.reading import read_session
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session

@@ -17,17 +17,17 @@ from unittest import mock
 
 import numpy as np
 
-from fgreg.drivers.base import Said
+from fgreg.drivers.base import CommandKind
 from fgreg.drivers.simulated import RoomProcess, SimulatedMotion
 from fgreg.drivers.simulated_room import FAULTS
-from fgreg.events import NoteEvent
-from fgreg.frames import FloatArray
-from fgreg.models import SessionModel
-from fgreg.operation.loop import IDLE_S
-from fgreg.operation.rooms import room_setup
-from fgreg.operation.start import LiveSetup, Running, running
-from fgreg.operation.status import Devices
-from fgreg.session import append_file
+from fgreg.geometry.transforms import FloatArray
+from fgreg.live.launch import LiveSetup, Running, running
+from fgreg.live.loop import IDLE_S
+from fgreg.live.simulated_room import room_setup
+from fgreg.live.status import Devices
+from fgreg.model.events import NoteEvent
+from fgreg.model.session_model import SessionModel
+from fgreg.session import append_only_file
 from fgreg.simulation.room import room_config
 
 PATIENCE_S = 90.0
@@ -44,7 +44,7 @@ class Listening:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._operator, name)
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         self.told.append((time.monotonic(), text))
         self._operator.tell(text, done=done, wants=wants)
 
@@ -116,7 +116,7 @@ def _pid_of(case: Rig, what: str) -> int:
         assert link is not None
         return link.pid
     if what == "locator":
-        pid = case.session.loop.ears.locator.pid
+        pid = case.session.loop.pulse_locator.locator.pid
         assert pid is not None
         return pid
     (engine,) = [child for child in multiprocessing.active_children() if child.name == "fgreg-engine"]
@@ -144,7 +144,7 @@ def _fill_disk(case: Rig, _what: str) -> Mend:
     def full(_handle: int, _data: bytes) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    patch = mock.patch.object(append_file, "_write", full)
+    patch = mock.patch.object(append_only_file, "_write", full)
     patch.start()
     case.session.recorder.hand_over(NoteEvent(0.0, 0, "written when there is room"))
     return patch.stop
@@ -193,8 +193,8 @@ class Trial:
 
 def trial(case: Rig, fault: Fault, lasts_s: float, *, orders: bool = True, rest_s: float = 2.0) -> Trial:
     """Make a fault where all is well, mend it, and let the session go on: until the next order, and a while more."""
-    found, ears = Trial(), case.session.loop.ears
-    case.run(PATIENCE_S, lambda: not case.session.loop.lost and ears.locator.ready)
+    found, pulse_locator = Trial(), case.session.loop.pulse_locator
+    case.run(PATIENCE_S, lambda: not case.session.loop.lost and pulse_locator.locator.ready)
     before, began = case.counts(), time.monotonic()
     mend = fault.begin(case, fault.what)
     lost, back = f"{fault.role} lost", f"{fault.role} is back"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.frames import (
+from fgreg.geometry.transforms import (
     FloatArray,
     as_float_array,
     exp_so3,
@@ -17,7 +17,7 @@ from fgreg.frames import (
     rotation_to_direction,
     transform_points,
 )
-from fgreg.models import CameraModel, MarkerModel, StereoRig, TagModel
+from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig, TagModel
 from fgreg.simulation.render import Background, Optics, Surface, TagSurface, project_points, render_frame
 
 SIZE = (1280, 720)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from fgreg.frames import FloatArray, exp_so3, make_transform
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
 
 
 def random_pose(rng: np.random.Generator, reach_mm: float = 100.0) -> gtsam.Pose3:

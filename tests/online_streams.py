@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray, inverse
-from fgreg.measurements import EpochStart, Measurements
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray, inverse
+from fgreg.model.measurements import EpochStart, Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineEvent, OnlineRegistration
-from fgreg.posterior import pose_tangent
-from fgreg.registration import Registration, register
+from fgreg.registration.posterior import pose_tangent
+from fgreg.registration.register import Registration, register
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,24 +7,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.drivers.base import Command, Said
+from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, as_float_array, exp_so3, make_transform
-from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track
-from fgreg.models import SessionModel
-from fgreg.motion.limits import MotionKind
-from fgreg.online import OnlineRegistration
-from fgreg.operation.conductor import Conductor, ConductorSettings
-from fgreg.operation.spots import one_spot
-from fgreg.operation.view import (
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
+from fgreg.live.actions import (
     Action,
     Ask,
     Follow,
     Halt,
-    Heard,
-    Known,
+    Inputs,
+    LocatedPulse,
+    RegistrationState,
     Release,
     StageView,
     Sweep,
@@ -32,12 +26,18 @@ from fgreg.operation.view import (
     TakeMove,
     TakePairs,
     Tell,
-    View,
 )
-from fgreg.pairing import PairRefused, PoseHistory, TimedPose
-from fgreg.session.setup import read_setup
+from fgreg.live.merge_looks import one_spot
+from fgreg.live.workflow import Workflow, WorkflowSettings
+from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.time_sync import PairRefused, PoseHistory, TimedPose
+from fgreg.online import OnlineRegistration
+from fgreg.session.setup_reader import read_setup
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room
+from fgreg.stage.limits import MotionKind
 
 SIGMA_RAD, SIGMA_MM = 0.003, np.array([0.05, 0.05, 0.2])
 FRAME_S, PULSE_S = 1.0 / 30.0, 0.1
@@ -77,12 +77,12 @@ class Rehearsal:
         self.model: SessionModel = model
         self.stage = SimulatedStage(self.model.stage, device_rad=math.radians(20.0), clock=lambda: self.now_s)
         self.engine = OnlineRegistration(self.model, SolveConfig())
-        settings = ConductorSettings(aims=self.room.config.aims, hearing_threshold=self.threshold)
-        self.conductor = Conductor(self.model, settings)
+        settings = WorkflowSettings(aims=self.room.config.aims, hearing_threshold=self.threshold)
+        self.workflow = Workflow(self.model, settings)
         self.poses = PoseHistory()
         self.requested: MotionKind | None = None
         self._rng = np.random.default_rng(self.room.config.seed)
-        self._said: list[Command] = []
+        self._said: list[OperatorCommand] = []
         self._aimed_s, self._next_pulse, self._number, self._aims = -math.inf, 0.0, 0, 0
         self._noted_s = -math.inf
 
@@ -111,14 +111,14 @@ class Rehearsal:
         place = room.place
         if place.corner is not None and self._aimed_s < room.arrives_s() < now - 0.5:
             self._aimed_s = now
-            self._said.append(Command(Said.AIM, place.corner))
-        view = View(
+            self._said.append(OperatorCommand(CommandKind.AIM, place.corner))
+        view = Inputs(
             now,
             self.poses,
             StageView(status.scan_rad, status.moving, status.homed, now, self.requested, self.latched),
             tuple(heard),
             tuple(self._said),
-            Known(
+            RegistrationState(
                 estimate.verdict,
                 estimate.reasons,
                 estimate.epoch,
@@ -129,7 +129,7 @@ class Rehearsal:
             self._aims,
         )
         self._said = []
-        for action in self.conductor.step(view):
+        for action in self.workflow.step(view):
             self._do(action)
         resting = now - room.arrives_s()
         answered = answer is not None and answer.stage_rad is not None
@@ -170,7 +170,7 @@ class Rehearsal:
             case Tell():
                 self.told.append((self.now_s, action))
                 if action.wants is not None and self.obliging:
-                    self._said.append(Command(action.wants))
+                    self._said.append(OperatorCommand(action.wants))
                 if action.done:
                     self.room.proceed(self.now_s)
 
@@ -183,7 +183,7 @@ class Rehearsal:
         covariance[:3, :3], covariance[3:, 3:] = SIGMA_RAD**2 * np.eye(3), about
         return TimedPose(t_s, pose, as_float_array(covariance, 6, 6))
 
-    def _pulse(self, t_s: float, moving: bool) -> Heard:
+    def _pulse(self, t_s: float, moving: bool) -> LocatedPulse:
         room, config, rng = self.room, self.room.config.scene, self._rng
         scan = self.stage.model.scan_from_device(self.stage.device_rad)
         source = room.spot_mm(t_s)
@@ -198,14 +198,14 @@ class Rehearsal:
         amplitude = float(config.elevation.amplitude(room.plane_rad(t_s) - scan, width))
         amplitude *= math.exp(0.05 * rng.standard_normal())
         where = None if moving else scan + config.noise.scan_rad * rng.standard_normal()
-        if not self.conductor.listens:  # then nobody looks into it (fgreg.operation.senses)
-            return Heard(t_s, None, marker, unpaired)
+        if not self.workflow.listens:  # then nobody looks into it (fgreg.live.marker_tracker)
+            return LocatedPulse(t_s, None, marker, unpaired)
         if amplitude < self.threshold or t_s >= self.deaf_from_s:
-            return Heard(t_s, where, marker, unpaired)
+            return LocatedPulse(t_s, where, marker, unpaired)
         x = float(source[0]) + config.noise.lateral_mm * rng.standard_normal()
         covariance = np.diag([config.noise.lateral_mm**2, config.noise.range_mm**2])
         distance += config.noise.range_mm * rng.standard_normal()
-        return Heard(t_s, where, marker, unpaired, x, distance, covariance, amplitude)
+        return LocatedPulse(t_s, where, marker, unpaired, x, distance, covariance, amplitude)
 
     def _observation(self, pm: int, pose: TimedPose) -> MarkerObservation:
         """One observation a PM."""
@@ -231,7 +231,7 @@ class Rehearsal:
         self._aims += 1
         self.room.proceed(self.now_s)
 
-    def _pair(self, pm: int, pose: TimedPose, look: Heard) -> None:
+    def _pair(self, pm: int, pose: TimedPose, look: LocatedPulse) -> None:
         assert look.scan_rad is not None
         assert look.x_mm is not None
         assert look.range_mm is not None

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from fgreg.errors import InputError
-from fgreg.session.reading import read_session
+from fgreg.session.session_reader import read_session
 
 ABSENT = object()
 IDENTITY: list[list[float]] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

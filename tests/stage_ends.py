@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fgreg.motion.device import MAX_CALL_S
-from fgreg.motion.watchdog import TICK_S
+from fgreg.stage.interface import MAX_CALL_S
+from fgreg.stage.watchdog import TICK_S
 from tests.stage_main import LIMITS
 from tests.traced_stage import read_trace
 
@@ -56,7 +56,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.
 @contextmanager
 def live_program(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """``fgreg live`` in the simulated room, which homes the stage and searches; its session is in ``folder``."""
-    code = "import sys; from fgreg.cli import main; sys.exit(main())"
+    code = "import sys; from fgreg.cli.main import main; sys.exit(main())"
     words = ["live", "--no-viewer", "--aims", "0", "--bump-every", "inf", "--out", os.fspath(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(

@@ -14,10 +14,10 @@ import threading
 import time
 from pathlib import Path
 
-from fgreg.models import StageModel
-from fgreg.motion.guard import emergency_stop_all
-from fgreg.motion.limits import MotionKind, MotionLimits
-from fgreg.motion.link import StageLink, StageRecord
+from fgreg.model.session_model import StageModel
+from fgreg.stage.client import StageLink, StageRecord
+from fgreg.stage.limits import MotionKind, MotionLimits
+from fgreg.stage.stop_on_exit import emergency_stop_all
 
 STAGE = StageModel(math.radians(2.0), (math.radians(-60.0), math.radians(60.0)))
 LIMITS = MotionLimits.of_session(STAGE, heartbeat_s=0.5, search_speed=math.radians(4.0))

@@ -16,10 +16,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fgreg.errors import InputError
-from fgreg.session import safe_yaml
-from fgreg.session.reading import Session, check_session, read_ground_truth, read_session
-from fgreg.session.results import read_result
-from fgreg.session.safe_yaml import parse_yaml
+from fgreg.session import yaml_loader
+from fgreg.session.result_file import read_result
+from fgreg.session.session_reader import Session, check_session, read_ground_truth, read_session
+from fgreg.session.yaml_loader import parse_yaml
 from tests import session_files
 
 Read = TypeVar("Read")
@@ -207,9 +207,9 @@ def test_the_result_that_is_mutated_is_valid(folder: Path) -> None:
     assert len(read_result(folder / "result.yaml").pairs) == 2
 
 
-@pytest.mark.parametrize("loader", [yaml.SafeLoader, safe_yaml._LOADER])
+@pytest.mark.parametrize("loader", [yaml.SafeLoader, yaml_loader._LOADER])
 def test_any_text_as_yaml(loader: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safe_yaml, "_LOADER", loader)
+    monkeypatch.setattr(yaml_loader, "_LOADER", loader)
 
     @QUICK
     @given(text=st.one_of(st.text(), st.text(alphabet="ab:-[]{}&*!|>?'\"#%@,1 \n\t.e~<=\\")))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fgreg.errors import InputError
-from fgreg.session.reading import check_session, read_session
+from fgreg.session.session_reader import check_session, read_session
 from tests import session_files
 from tests.session_files import ABSENT, change, error_of
 

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from fgreg.errors import InputError
-from fgreg.session import safe_yaml
-from fgreg.session.safe_yaml import load_yaml, parse_yaml
+from fgreg.session import yaml_loader
+from fgreg.session.yaml_loader import load_yaml, parse_yaml
 from tests import session_files
 from tests.session_files import error_of
 
@@ -30,7 +30,7 @@ def refusal(text: str) -> str:
 @pytest.fixture(params=["with libyaml", "pure Python"])
 def _parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.param == "pure Python":
-        monkeypatch.setattr(safe_yaml, "_LOADER", yaml.SafeLoader)
+        monkeypatch.setattr(yaml_loader, "_LOADER", yaml.SafeLoader)
 
 
 @pytest.mark.parametrize(
@@ -166,8 +166,8 @@ def test_plain_values(written: str, value: object) -> None:
 def test_lines_of_keys_and_items() -> None:
     top = parse_yaml("a: 1\n\nb:\n  - 2\n  - {c: 3,\n     d: 4}\n", "f")
     items = top["b"]
-    assert isinstance(items, safe_yaml.YamlSequence)
+    assert isinstance(items, yaml_loader.YamlSequence)
     assert (top.lines, items.lines) == ({"a": 1, "b": 3}, [4, 5])
     inner = items[1]
-    assert isinstance(inner, safe_yaml.YamlMapping)
+    assert isinstance(inner, yaml_loader.YamlMapping)
     assert inner.lines == {"c": 5, "d": 6}

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from baseline_alternating import LinesAndArcs, cost_and_error, register_alternating
 from baseline_point_based import register_points
-
 from fgreg.evaluation.pair_residual import line_to_arc
-from fgreg.frames import FloatArray, exp_so3, make_transform, transform_points
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
 from tests.forward import Truth, make_measurements, random_trus_T_camera
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from fgreg.detection.board import detect_board, find_board_corners, order_corners
-from fgreg.detection.noise import pool_corner_noise
+from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner, board_covariance
-from fgreg.frames import FloatArray, exp_so3, make_transform, transform_points
-from fgreg.models import BoardModel, CharucoModel, StereoRig
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
+from fgreg.model.session_model import BoardModel, CharucoModel, StereoRig
 from fgreg.simulation.render import BoardSurface, PatchSurface
 from tests.marker_scene import LEFT, RIG, Frame, frames_of, left_pixels, pose_error, rotation_error_deg
 

@@ -10,9 +10,9 @@ from scipy.stats import multivariate_normal
 
 from fgreg.camera_moves.bayes_filter import MoveSettings, move_evidence
 from fgreg.camera_moves.whitened import Gaussian, WhitenedPms
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.split_points import MoveScales, default_scales
-from fgreg.robust import JUNK_DENSITY
+from fgreg.registration.outliers import JUNK_DENSITY
 
 SETTINGS = MoveSettings(default_scales())
 ONE_SCALE = MoveScales(np.array([0.02]), np.array([2.0]), np.array([1.0]))

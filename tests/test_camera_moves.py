@@ -9,9 +9,9 @@ import pytest
 
 from fgreg.camera_moves.bayes_filter import move_evidence
 from fgreg.camera_moves.detector import CameraMove, find_camera_move
-from fgreg.config import SolveConfig
-from fgreg.frames import exp_so3, make_transform
-from fgreg.measurements import Measurements
+from fgreg.geometry.transforms import exp_so3, make_transform
+from fgreg.model.measurements import Measurements
+from fgreg.model.solve_config import SolveConfig
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import make_measurements
 

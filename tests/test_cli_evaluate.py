@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fgreg import cli
+from fgreg.cli import main
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
@@ -19,7 +19,7 @@ from fgreg.simulation.write import write_session
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr(sys, "argv", ["fgreg", *arguments])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main.main()
     code = end.value.code
     assert isinstance(code, int)
     return code

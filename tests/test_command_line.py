@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from fgreg import __version__
-from fgreg.cli import main
-from fgreg.session.results import read_result
+from fgreg.cli.main import main
+from fgreg.session.result_file import read_result
 from fgreg.simulation.presets import PRESETS
 
 

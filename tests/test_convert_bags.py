@@ -13,11 +13,11 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from fgreg.cli import app
+from fgreg.cli.main import app
 from fgreg.errors import FgregError
-from fgreg.pipeline import SolveRequest, solve_session
-from fgreg.quaternions import quaternion_from_rotation
-from fgreg.session.reading import read_session
+from fgreg.geometry.quaternions import quaternion_from_rotation
+from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.session.session_reader import read_session
 from tests import bags, session_files
 
 RUNNER = CliRunner()

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from fgreg.cli import app
+from fgreg.cli.main import app
 from fgreg.convert.plus import oriented
 from fgreg.convert.sequence_file import read_sequence
 from fgreg.errors import FgregError, InputError

@@ -14,9 +14,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from fgreg.cli import app
+from fgreg.cli.main import app
 from fgreg.errors import FgregError, InputError
-from fgreg.frames import exp_so3
+from fgreg.geometry.transforms import exp_so3
 from tests import session_files
 
 RUNNER = CliRunner()

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgreg.cli import main
-from fgreg.drivers import cube_identity, endoscope, thorlabs_stage
-from fgreg.drivers.cube_identity import identify
-from fgreg.motion.device import StageError, StageLost
-from fgreg.operation.config import read_config
-from fgreg.operation.inventory import Answer, configured, cubes, extras, video
+from fgreg.cli.main import main
+from fgreg.drivers import endoscope, thorlabs_identify, thorlabs_stage
+from fgreg.drivers.thorlabs_identify import identify
+from fgreg.live.config import read_config
+from fgreg.live.device_check import Answer, configured, cubes, extras, video
+from fgreg.stage.interface import StageError, StageLost
 from tests import live_configs, session_files
 from tests.cube_emulator import CubeEmulator
 from tests.igtl_bytes import image_body, message
@@ -231,7 +231,7 @@ def test_a_missing_library_is_said_with_the_extra_that_brings_it(monkeypatch: py
 def test_who_is_no_cube_or_does_not_answer_is_told(
     trouble: dict[str, Any], error: type[StageError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cube_identity, "ANSWER_S", 0.4)
+    monkeypatch.setattr(thorlabs_identify, "ANSWER_S", 0.4)
     drop = trouble.pop("drop", 0)
     with cube(**trouble) as stage:
         stage.drop = drop

@@ -12,19 +12,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from fgreg.batch import solve
 from fgreg.camera_moves.detector import CameraMove, find_camera_move
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.frames import exp_so3, make_transform
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.graph.split_points import ALARM, GATE, logsumexp, odds_in_epoch
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import OnlineRegistration
-from fgreg.online.detect import events_in_order, find_moves, split_epochs
-from fgreg.registration import register
-from fgreg.targets import tre_mm
-from fgreg.verdict import ABOUT_EVEN, FEW_PMS, unsteady
+from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
+from fgreg.registration.register import register
+from fgreg.registration.solve import solve
+from fgreg.registration.verdict import ABOUT_EVEN, FEW_PMS, unsteady
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
 from tests.online_streams import unreported_move

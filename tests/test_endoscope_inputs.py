@@ -17,7 +17,7 @@ import pytest
 
 from fgreg.drivers.base import DeviceLost, Stamp, StereoCamera, StereoFrame
 from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout, video_devices
-from fgreg.drivers.interlaced import Fields
+from fgreg.drivers.interlacing import Fields
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Grabbed, Timing, VideoInput
 from fgreg.errors import InputError

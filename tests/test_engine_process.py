@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import OnlineRegistration
 from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.events import OnlineEvent

@@ -14,20 +14,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.config import SolveConfig
 from fgreg.errors import FgregError
-from fgreg.estimate import Verdict
-from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent
-from fgreg.live import MOST_DEATHS, LiveSession
-from fgreg.models import SessionModel
+from fgreg.live import recorder as recorder_module
+from fgreg.live.launch import NewestSnapshots
+from fgreg.live.recorder import UNWATCHED, Recorder
+from fgreg.model.estimate import Verdict
+from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import OnlineEvent
-from fgreg.operation import recorder as recorder_module
-from fgreg.operation.recorder import UNWATCHED, Recorder
-from fgreg.operation.start import NewestSnapshots
-from fgreg.registration import SoundSpeedPrior
-from fgreg.session.reading import read_session
+from fgreg.online.live_session import MOST_DEATHS, LiveSession
+from fgreg.registration.register import SoundSpeedPrior
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session

@@ -12,9 +12,9 @@ from fgreg.detection.channels import baseband, prepare_channels
 from fgreg.detection.envelope import locate_in_image
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import NoSignal, PaFind
-from fgreg.detection.wavefront import SEARCH_BANDS
-from fgreg.frames import as_float_array
-from fgreg.models import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.detection.wavefront_search import SEARCH_BANDS
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, simulate_channels, simulate_envelope_image
 
 SHAPE = (300, 256)

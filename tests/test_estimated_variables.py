@@ -8,15 +8,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from fgreg.answer import answer, estimated_radius, estimated_sound_speed, sound_speed_from_residuals
-from fgreg.batch import distance_to_explicit, solve
-from fgreg.cli import app
-from fgreg.config import SolveConfig
+from fgreg.cli.main import app
 from fgreg.errors import InputError
-from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray, inverse, transform_points
-from fgreg.models import NoiseModel, SessionModel
-from fgreg.registration import SoundSpeedPrior, register
+from fgreg.geometry.transforms import FloatArray, inverse, transform_points
+from fgreg.model.estimate import Verdict
+from fgreg.model.session_model import NoiseModel, SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior_mean import (
+    answer,
+    estimated_radius,
+    estimated_sound_speed,
+    sound_speed_from_residuals,
+)
+from fgreg.registration.register import SoundSpeedPrior, register
+from fgreg.registration.solve import distance_to_explicit, solve
 from tests.forward import Truth, make_measurements, make_session
 
 QUIET = NoiseModel(

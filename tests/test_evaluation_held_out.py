@@ -12,8 +12,8 @@ from fgreg.evaluation.export import as_csv, as_dict
 from fgreg.evaluation.resolve import resolve
 from fgreg.evaluation.run import evaluate
 from fgreg.evaluation.summary import curve_of, prediction_of
-from fgreg.frames import exp_so3, make_transform
-from fgreg.targets import beam_error
+from fgreg.geometry.target_error import beam_error
+from fgreg.geometry.transforms import exp_so3, make_transform
 from tests.forward import make_measurements
 
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
 from fgreg.evaluation.influence import influences
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import pose_difference
-from fgreg.registration import register
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.register import register
 from tests.forward import make_measurements
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from fgreg.evaluation.pair_residual import line_to_arc
 from fgreg.evaluation.resolve import pair_residuals
-from fgreg.frames import exp_so3, make_transform
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.graph.shared_state import make_state
-from fgreg.targets import tre_mm
 from tests.forward import make_measurements
 
 

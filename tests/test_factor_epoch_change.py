@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgreg.factors.epoch_change import epoch_change_factor
-from fgreg.frames import exp_so3, inverse, make_transform
+from fgreg.geometry.transforms import exp_so3, inverse, make_transform
 from tests.forward import make_measurements
 from tests.numerical import jacobian_mismatch, random_pose, whitened_error
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from fgreg.factors.marker_pose import marker_pose_factor, residual
-from fgreg.frames import FloatArray, exp_so3, make_transform
-from fgreg.measurements import default_marker_covariance
-from fgreg.models import NoiseModel
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
+from fgreg.model.measurements import default_marker_covariance
+from fgreg.model.session_model import NoiseModel
 from tests.numerical import jacobian_mismatch, random_pose, whitened_error
 
 POSE, BIAS = range(2)

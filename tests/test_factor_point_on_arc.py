@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgreg.factors.point_on_arc import point_on_arc_factor, residual
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from tests.forward import make_measurements
 from tests.numerical import jacobian_mismatch, whitened_error
 

@@ -15,7 +15,7 @@ from fgreg.factors.point_on_line import (
     point_on_line_factor,
     residual,
 )
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from tests.forward import make_measurements
 from tests.numerical import jacobian_mismatch, random_pose
 

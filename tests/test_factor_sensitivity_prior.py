@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgreg.factors.sensitivity_prior import residual, sensitivity_prior_factor
-from fgreg.sensitivity import sensitivity_prior
+from fgreg.model.sensitivity import sensitivity_prior
 from tests.forward import make_measurements, make_session
 from tests.numerical import analytic_jacobian, jacobian_mismatch, numerical_jacobian
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgreg.estimate import Verdict
+from fgreg.model.estimate import Verdict
 from fgreg.online import OnlineRegistration
 from fgreg.online import full_solve as full_solve_module
 from tests.forward import make_measurements

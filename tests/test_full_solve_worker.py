@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult
 from fgreg.online.solver import InProcessSolver, WorkerSolver

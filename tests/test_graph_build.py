@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from fgreg.errors import EstimationError
-from fgreg.graph.explicit import GraphOptions, Variable, build_graph, variable_name
-from fgreg.graph.explicit_values import SharedValues, beam_of_chart, initial_values, laser_chart, read_estimate
-from fgreg.models import NoiseModel
+from fgreg.graph.gtsam_graph import GraphOptions, Variable, build_graph, variable_name
+from fgreg.graph.gtsam_values import SharedValues, beam_of_chart, initial_values, laser_chart, read_estimate
+from fgreg.model.session_model import NoiseModel
 from tests.forward import make_measurements, make_session, random_marker_T_laser, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal
 

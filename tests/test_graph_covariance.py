@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from graph_covariance import GraphCovariance
 
 from fgreg.errors import EstimationError
-from fgreg.graph.explicit import GraphOptions, build_graph, make_ordering
-from fgreg.graph.explicit_solver import optimize
-from fgreg.graph.explicit_values import SharedValues, initial_values, read_estimate
+from fgreg.graph.gtsam_graph import GraphOptions, build_graph, make_ordering
+from fgreg.graph.gtsam_solver import optimize
+from fgreg.graph.gtsam_values import SharedValues, initial_values, read_estimate
+from graph_covariance import GraphCovariance
 from tests.forward import make_measurements
 from tests.graph_cases import CASES, make_case, pose_error
 

@@ -9,12 +9,12 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from graph_covariance import GraphCovariance
 
 from fgreg.factors import marker_pose, point_on_arc, point_on_line, sensitivity_prior
 from fgreg.factors.adapter import Residual, custom_factor
-from fgreg.graph.explicit_solver import optimize
-from fgreg.graph.explicit_values import initial_values
+from fgreg.graph.gtsam_solver import optimize
+from fgreg.graph.gtsam_values import initial_values
+from graph_covariance import GraphCovariance
 from tests.forward import make_session, with_noise
 from tests.graph_cases import make_case
 

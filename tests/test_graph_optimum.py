@@ -11,10 +11,10 @@ import pytest
 from scipy.linalg import logm
 
 from fgreg.factors.adapter import FactorError
-from fgreg.frames import FloatArray, inverse
-from fgreg.graph.explicit import ExplicitGraph
-from fgreg.graph.explicit_solver import optimize
-from fgreg.graph.explicit_values import (
+from fgreg.geometry.transforms import FloatArray, inverse
+from fgreg.graph.gtsam_graph import ExplicitGraph
+from fgreg.graph.gtsam_solver import optimize
+from fgreg.graph.gtsam_values import (
     GraphEstimate,
     SharedValues,
     beam_of_chart,
@@ -23,7 +23,7 @@ from fgreg.graph.explicit_values import (
     made_consistent,
     read_estimate,
 )
-from fgreg.models import NoiseModel
+from fgreg.model.session_model import NoiseModel
 from tests.forward import hear, make_session, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal, perturbed, pose_error
 

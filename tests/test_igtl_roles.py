@@ -29,7 +29,7 @@ from fgreg.drivers.igtl_messages import Status, Text
 from fgreg.drivers.igtl_registration import DeviceNames
 from fgreg.drivers.tcp_link import Endpoint
 from fgreg.errors import InputError
-from fgreg.frames import exp_so3, make_transform
+from fgreg.geometry.transforms import exp_so3, make_transform
 from tests.igtl_bytes import Told, image_body, message, read_matrix, read_messages, transform_body
 from tests.network_peers import collect, hung_up, serve, wait_for
 

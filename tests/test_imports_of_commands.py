@@ -11,8 +11,8 @@ import pytest
 
 SLOW = ("cv2", "rerun", "matplotlib", "scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.ndimage")
 """Libraries that take 50 ms and more, and that few commands use."""
-SOLVER = ("scipy", "gtsam", "poselib", "fgreg.registration", "fgreg.graph", "fgreg.factors")
-OTHER_COMMANDS = ("fgreg.online", "fgreg.live", "fgreg.simulation", "fgreg.evaluation", "fgreg.convert")
+SOLVER = ("scipy", "gtsam", "poselib", "fgreg.registration.register", "fgreg.graph", "fgreg.factors")
+OTHER_COMMANDS = ("fgreg.online", "fgreg.online.live_session", "fgreg.simulation", "fgreg.evaluation", "fgreg.convert")
 DETECTORS = ("cv2", "scipy.fft", "fgreg.drivers", "fgreg.detection.marker", "fgreg.detection.photoacoustic")
 DRAWING = ("rerun", "fgreg.viewer.recording", "fgreg.viewer.shapes")
 PROCESSES = ("multiprocessing", "concurrent.futures.process")
@@ -39,7 +39,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
 
 PROGRAM = """
 import sys
-from fgreg.cli import main
+from fgreg.cli.main import main
 try:
     main()
 finally:
@@ -60,7 +60,7 @@ def test_a_command_loads_nothing_that_it_does_not_use(
     )
     assert done.returncode in (0, 1), done.stderr
     loaded = set(done.stderr.splitlines())
-    assert "fgreg.cli" in loaded
+    assert "fgreg.cli.main" in loaded
     assert sorted(loaded & set(FORBIDDEN[command])) == []
 
 

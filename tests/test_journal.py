@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from fgreg.errors import InputError, JournalError
-from fgreg.events import (
+from fgreg.geometry.transforms import exp_so3, make_transform
+from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
     Event,
@@ -29,11 +30,10 @@ from fgreg.events import (
     TrackEvent,
     TrusRecord,
 )
-from fgreg.frames import exp_so3, make_transform
-from fgreg.session import append_file
-from fgreg.session.event_document import event_document, event_line, writable
+from fgreg.session import append_only_file
+from fgreg.session.event_writer import event_document, event_line, writable
 from fgreg.session.journal import Journal
-from fgreg.session.reading import read_session
+from fgreg.session.session_reader import read_session
 from tests import session_files
 
 
@@ -208,7 +208,7 @@ def test_one_recorder_at_a_time_also_across_processes(folder: Path) -> None:
 
 def failing(name: str, code: int, monkeypatch: pytest.MonkeyPatch, *, written: int | None = None) -> None:
     """Makes one of the system calls fail; of a write, ``written`` bytes go out before it does."""
-    real = getattr(append_file, name)
+    real = getattr(append_only_file, name)
 
     def fail(handle: int, *rest: Any) -> int:
         if written is not None:
@@ -217,7 +217,7 @@ def failing(name: str, code: int, monkeypatch: pytest.MonkeyPatch, *, written: i
                 return written
         raise OSError(code, os.strerror(code))
 
-    monkeypatch.setattr(append_file, name, fail)
+    monkeypatch.setattr(append_only_file, name, fail)
 
 
 FAULTS = [
@@ -298,7 +298,7 @@ def test_a_file_that_is_moved_away_and_back_is_written_to_again(folder: Path) ->
 
 def test_frames_are_on_disk_before_the_event_that_names_them(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[str] = []
-    real_sync, real_write = append_file.sync_path, append_file._write
+    real_sync, real_write = append_only_file.sync_path, append_only_file._write
 
     def sync(path: Path) -> None:
         done.append(f"sync {path.name}")
@@ -309,7 +309,7 @@ def test_frames_are_on_disk_before_the_event_that_names_them(folder: Path, monke
         return real_write(handle, data)
 
     monkeypatch.setattr("fgreg.session.journal.sync_path", sync)
-    monkeypatch.setattr(append_file, "_write", write)
+    monkeypatch.setattr(append_only_file, "_write", write)
     with Journal.open(folder) as journal:
         new = journal.write_frame("frames/new.png", session_files.png(640, 480))
         journal.append(AimEvent(1.0, 0, MarkerRecord(left=new, right=folder / "frames" / "b.png"), corner=(0, 0)))

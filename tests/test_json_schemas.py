@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from fgreg.cli_schema import Document, document_schema
+from fgreg.cli.schema import Document, document_schema
 from fgreg.errors import InputError
-from fgreg.operation.config import read_config
-from fgreg.operation.config_keys import example_config
-from fgreg.session.reading import check_session
-from fgreg.session.results import read_result
+from fgreg.live.config import read_config
+from fgreg.live.config_keys import example_config
+from fgreg.session.result_file import read_result
+from fgreg.session.session_reader import check_session
 from tests import live_configs, session_files
 from tests.session_files import ABSENT, change
 from tests.test_bad_input_anything import QUICK, dumped, mutated, outcome

@@ -14,15 +14,15 @@ import pytest
 from fgreg.drivers import tcp_link
 from fgreg.drivers.bk_oem import BkOemScanner
 from fgreg.drivers.tcp_link import Endpoint
-from fgreg.events import NoteEvent
-from fgreg.models import SessionModel
+from fgreg.live.actions import RegistrationState
+from fgreg.live.loop import LiveLoop
+from fgreg.live.recorder import Recorder, RecorderState
+from fgreg.live.status import Devices
+from fgreg.live.workflow import Workflow, WorkflowSettings
+from fgreg.model.events import NoteEvent
+from fgreg.model.session_model import SessionModel
 from fgreg.online.shared_snapshot import NoSnapshotError, Received
-from fgreg.operation.conductor import Conductor, ConductorSettings
-from fgreg.operation.loop import LiveLoop
-from fgreg.operation.recorder import Recorder, RecorderState
-from fgreg.operation.status import Devices
-from fgreg.operation.view import Known
-from fgreg.session.setup import read_setup
+from fgreg.session.setup_reader import read_setup
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
 from tests.bk_emulator import Scanner, grabbed
@@ -55,7 +55,7 @@ class Quiet:
 class Notes:
     """A recorder that keeps what it is given."""
 
-    state: RecorderState = field(default_factory=lambda: RecorderState(Known()))
+    state: RecorderState = field(default_factory=lambda: RecorderState(RegistrationState()))
     kept: list[NoteEvent] = field(default_factory=list)
 
     def hand_over(self, event: NoteEvent) -> None:
@@ -86,7 +86,7 @@ def live(scanner: Scanner, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Li
         Devices(quiet, quiet, quiet, bmode=device),
         cast("Recorder", notes),
         NothingYet(),
-        Conductor(session, ConductorSettings(hearing_threshold=1.0)),
+        Workflow(session, WorkflowSettings(hearing_threshold=1.0)),
         0.0,
     )
     wait_for(lambda: scanner.grabbing)

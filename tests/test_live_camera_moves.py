@@ -12,30 +12,31 @@ import numpy as np
 import pytest
 import yaml
 
-from fgreg.cli_live import status_line
-from fgreg.config import SolveConfig
-from fgreg.drivers.base import Command, MotionSample, PaFrame, Registration, Said, StereoFrame, host_now
+from fgreg.cli.live import status_line
+from fgreg.drivers.base import CommandKind, MotionSample, OperatorCommand, PaFrame, Registration, StereoFrame, host_now
 from fgreg.errors import EventRefused, FgregError, JournalError
-from fgreg.estimate import Verdict
-from fgreg.events import CameraMovedEvent
-from fgreg.frames import FloatArray, make_transform
-from fgreg.live import LiveSession
-from fgreg.models import SessionModel
-from fgreg.motion.device import StageStatus
-from fgreg.motion.limits import MotionKind
-from fgreg.motion.link import Report, StageView
+from fgreg.geometry.transforms import FloatArray, make_transform
+from fgreg.live.loop import LiveLoop
+from fgreg.live.marker_tracker import MarkerTracker
+from fgreg.live.pulse_locator import PulseLocator
+from fgreg.live.recorder import Recorder
+from fgreg.live.status import Devices
+from fgreg.live.workflow import Workflow, WorkflowSettings
+from fgreg.model.estimate import Verdict
+from fgreg.model.events import CameraMovedEvent
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.time_sync import Stamp, TimedPose
 from fgreg.online.engine import OnlineRegistration
+from fgreg.online.live_session import LiveSession
 from fgreg.online.shared_snapshot import Received
-from fgreg.operation.conductor import Conductor, ConductorSettings
-from fgreg.operation.loop import LiveLoop
-from fgreg.operation.recorder import Recorder
-from fgreg.operation.senses import Ears, Eyes
-from fgreg.operation.status import Devices
-from fgreg.pairing import Stamp, TimedPose
-from fgreg.registration import SoundSpeedPrior
-from fgreg.session.reading import read_session
+from fgreg.registration.register import SoundSpeedPrior
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
+from fgreg.stage.client import Report, StageView
+from fgreg.stage.interface import StageStatus
+from fgreg.stage.limits import MotionKind
 
 MOVED = make_transform(np.eye(3), np.array([6.0, 0.0, 0.0]))
 
@@ -53,7 +54,7 @@ class Device:
         found, self.waiting = self.waiting, []
         return found
 
-    def tell(self, text: str, *, done: bool = False, wants: Said | None = None) -> None:
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         self.told.append(f"{text} {done} {wants}")
 
     def send(self, registration: Registration) -> None:
@@ -105,14 +106,14 @@ class Stand:
         self.recorder = Recorder(session)
         devices: Any = Devices(self.camera, self.probe, self.operator, motion=self.arm, sinks=(self.sink,))
         devices.stage = self.link
-        conductor = Conductor(model, ConductorSettings(aims=0, pms=1, most_pms=1, hearing_threshold=0.1))
+        workflow = Workflow(model, WorkflowSettings(aims=0, pms=1, most_pms=1, hearing_threshold=0.1))
 
         class Reader:
             def read(self) -> Received:
                 return Received(engine.snapshot(), 1, 0.0, 0.0, False)
 
         reader: Any = Reader()
-        self.loop = LiveLoop(model, devices, self.recorder, reader, conductor, host_now() - 1000.0)
+        self.loop = LiveLoop(model, devices, self.recorder, reader, workflow, host_now() - 1000.0)
         self.marker = session.measurements().pairs[-1].marker.camera_T_marker
         self.base_T_camera: FloatArray = np.eye(4)
 
@@ -121,8 +122,8 @@ class Stand:
         end = host_now() + seconds
         while host_now() < end and not until():
             now = host_now()
-            self.loop.eyes.newest = StereoFrame(Stamp(now, now), np.zeros((2, 2), np.uint8), None, 0)
-            self.loop.eyes.poses.add(TimedPose(now, self.marker, 1e-6 * np.eye(6)))
+            self.loop.marker_tracker.newest = StereoFrame(Stamp(now, now), np.zeros((2, 2), np.uint8), None, 0)
+            self.loop.marker_tracker.poses.add(TimedPose(now, self.marker, 1e-6 * np.eye(6)))
             self.arm.waiting.append(MotionSample(Stamp(now, now), self.base_T_camera))
             self.loop.turn()
             time.sleep(0.02)
@@ -180,7 +181,7 @@ def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stan
     assert move.camera_new_T_camera_old is not None
     assert np.allclose(move.camera_new_T_camera_old, np.linalg.inv(MOVED), atol=1e-9)
     assert stand.recorder.state.known.registered
-    assert not stand.recorder.state.unsettled
+    assert not stand.recorder.state.camera_moving
 
 
 def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
@@ -211,12 +212,12 @@ def test_a_move_that_the_operator_tells_holds_until_it_is_in_the_estimate(
         return add(event)
 
     monkeypatch.setattr(stand.session, "add", slowly)
-    stand.operator.waiting.append(Command(Said.MOVED))
+    stand.operator.waiting.append(OperatorCommand(CommandKind.MOVED))
     stand.turn(0.1)
     beats = len(stand.link.beats)
     stand.turn(0.2)
     assert set(stand.link.beats[beats:]) == {None}
-    stand.turn(2.0, lambda: not stand.recorder.state.unsettled)
+    stand.turn(2.0, lambda: not stand.recorder.state.camera_moving)
     assert len(stand.moves()) == 1
 
 
@@ -237,11 +238,11 @@ def test_a_move_that_the_disk_refuses_holds_until_it_is_recorded(stand: Stand, m
     full = refusing_moves(stand, monkeypatch, JournalError("events.jsonl", "no space left", "room for events"))
     stand.base_T_camera = MOVED
     stand.turn(1.5)
-    assert stand.recorder.state.unsettled
+    assert stand.recorder.state.camera_moving
     assert stand.link.beats[-1] is None
     assert "no space left" in stand.recorder.state.trouble
     full[0] = False
-    stand.turn(10.0, lambda: not stand.recorder.state.unsettled)
+    stand.turn(10.0, lambda: not stand.recorder.state.camera_moving)
     (move,) = stand.moves()
     assert move.camera_new_T_camera_old is not None
 
@@ -252,11 +253,11 @@ def test_a_move_that_is_not_taken_in_holds_and_the_next_one_ties_nothing(
     refuses = refusing_moves(stand, monkeypatch, EventRefused("of no use"))
     stand.base_T_camera = MOVED
     stand.turn(1.5)
-    assert stand.recorder.state.unsettled
+    assert stand.recorder.state.camera_moving
     assert stand.link.beats[-1] is None
     refuses[0] = False
     stand.base_T_camera = MOVED @ MOVED
-    stand.turn(10.0, lambda: bool(stand.moves()) and not stand.recorder.state.unsettled)
+    stand.turn(10.0, lambda: bool(stand.moves()) and not stand.recorder.state.camera_moving)
     (move,) = stand.moves()
     assert move.camera_new_T_camera_old is None
     assert stand.recorder.state.known.verdict is Verdict.REFUSED
@@ -264,15 +265,15 @@ def test_a_move_that_is_not_taken_in_holds_and_the_next_one_ties_nothing(
 
 def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
     model = stand.session.journal.model
-    ears, eyes = Ears(model, latency_s=0.01), Eyes(model, latency_s=0.08)
+    pulse_locator, marker_tracker = PulseLocator(model, latency_s=0.01), MarkerTracker(model, latency_s=0.08)
     now = host_now()
     try:
-        ears.listening = False
-        ears.hear([PaFrame(Stamp(now, now), np.zeros((1, 1), np.int16), 0)])
-        (pulse,) = ears.heard(now + 1.0, eyes.poses)
+        pulse_locator.listening = False
+        pulse_locator.hear([PaFrame(Stamp(now, now), np.zeros((1, 1), np.int16), 0)])
+        (pulse,) = pulse_locator.heard(now + 1.0, marker_tracker.poses)
         assert pulse.pulse_s == pytest.approx(now - 0.01)
     finally:
-        ears.close()
+        pulse_locator.close()
     rig = model.camera
     assert rig is not None
     width, height = rig.left.image_size
@@ -284,10 +285,10 @@ def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
             poses.append(pose.t_s)
             return True
 
-    eyes.poses = History()  # type: ignore[assignment]
-    assert eyes.see(StereoFrame(Stamp(now, now), blank, blank, 0)) is None
+    marker_tracker.poses = History()  # type: ignore[assignment]
+    assert marker_tracker.see(StereoFrame(Stamp(now, now), blank, blank, 0)) is None
     assert poses == []
     config = room_config(1)
     left, right = Room(config).pictures(0.0, 0)
-    assert eyes.see(StereoFrame(Stamp(now, now), left, right, 1)) is not None
+    assert marker_tracker.see(StereoFrame(Stamp(now, now), left, right, 1)) is not None
     assert poses == [pytest.approx(now - 0.08)]

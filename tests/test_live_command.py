@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
-from fgreg import cli
-from fgreg.events import StageEvent
-from fgreg.session.reading import read_session
+from fgreg.cli import main
+from fgreg.model.events import StageEvent
+from fgreg.session.session_reader import read_session
 
 PATIENCE_S = 120.0
 
 
 def start(folder: Path, *words: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", "import sys; from fgreg.cli import main; sys.exit(main())", "live"]
+    command = [sys.executable, "-c", "import sys; from fgreg.cli.main import main; sys.exit(main())", "live"]
     return subprocess.Popen(
         [*command, "--out", os.fspath(folder), "--no-viewer", *words],
         stdout=subprocess.PIPE,
@@ -162,7 +162,7 @@ def test_mistakes_are_one_line_and_make_no_session(
     folder = tmp_path / "session"
     monkeypatch.setattr(sys, "argv", ["fgreg", "live", "--no-viewer", "--out", os.fspath(folder), *words])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main.main()
     assert end.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("fgreg: error: ")
@@ -177,7 +177,7 @@ def test_a_folder_with_something_else_is_left_alone(
     (tmp_path / "letter.txt").write_text("dear")
     monkeypatch.setattr(sys, "argv", ["fgreg", "live", "--no-viewer", "--out", os.fspath(tmp_path), "--duration", "1"])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main.main()
     assert end.value.code == 2
     assert "a folder that is not empty" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]

@@ -17,16 +17,16 @@ import pytest
 import yaml
 
 from fgreg.drivers.options import RecordedMotionOptions
-from fgreg.drivers.registry import ENTRIES, Role, Surroundings, load
+from fgreg.drivers.registry import ENTRIES, DriverContext, Role, load
 from fgreg.errors import InputError, MissingExtraError
-from fgreg.motion.limits import MotionLimits
-from fgreg.operation.config import LiveConfig, read_config
-from fgreg.operation.config_keys import RoomOptions, example_config, example_line
-from fgreg.operation.holder import HolderSettings
-from fgreg.pairing import Latencies
-from fgreg.session.safe_yaml import parse_yaml
-from fgreg.session.setup import read_setup
+from fgreg.live.config import LiveConfig, read_config
+from fgreg.live.config_keys import RoomOptions, example_config, example_line
+from fgreg.live.scope_holder import HolderSettings
+from fgreg.model.time_sync import Latencies
+from fgreg.session.setup_reader import read_setup
+from fgreg.session.yaml_loader import parse_yaml
 from fgreg.simulation.room import BUMP_EVERY_S
+from fgreg.stage.limits import MotionLimits
 from tests import live_configs, session_files
 from tests.network_peers import free_port
 from tests.session_files import ABSENT, change
@@ -345,7 +345,7 @@ def test_reading_a_config_imports_no_device_library_and_opens_nothing(tmp_path: 
     script = (
         "import sys, threading\n"
         "from pathlib import Path\n"
-        "from fgreg.operation.config import read_config\n"
+        "from fgreg.live.config import read_config\n"
         f"read_config(Path({str(file)!r}))\n"
         "print([m for m in ('pyigtl', 'serial', 'rosbags', 'rerun') if m in sys.modules], threading.active_count())\n"
     )
@@ -440,12 +440,12 @@ def test_devices_that_play_one_recording_share_its_time(tmp_path: Path) -> None:
     bags = pytest.importorskip("tests.bags")
     path = tmp_path / "bag"
     bags.write_bag(path, [("/ECM/measured_cp", t / 10, bags.pose_stamped(t / 10, (0.0, 0.0, 0.1))) for t in range(5)])
-    around = Surroundings(lambda _: None)
+    context = DriverContext(lambda _: None)
     entry = next(entry for entry in ENTRIES if (entry.role, entry.name) == (Role.MOTION, "recorded"))
     options = RecordedMotionOptions(path=path)
     entry.checked(options)
-    devices = [entry.open(around, options) for _ in range(2)]
-    assert len(around.paces) == 1
+    devices = [entry.open(context, options) for _ in range(2)]
+    assert len(context.paces) == 1
     for device in devices:
         device.close()
     with pytest.raises(InputError, match="no such topic"):

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgreg.errors import InputError
-from fgreg.motion.limits import MotionLimits
-from fgreg.operation.config import LiveConfig, read_config
-from fgreg.operation.config_keys import example_config
+from fgreg.live.config import LiveConfig, read_config
+from fgreg.live.config_keys import example_config
+from fgreg.stage.limits import MotionLimits
 from tests import live_configs
 from tests.test_bad_input_anything import QUICK, damaged, dumped, mutated, outcome
 

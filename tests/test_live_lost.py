@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fgreg.events import NoteEvent
-from fgreg.session.reading import read_session
+from fgreg.model.events import NoteEvent
+from fgreg.session.session_reader import read_session
 from tests.live_rig import STUDIED, Rig, rig, trial
 
 

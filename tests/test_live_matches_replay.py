@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.events import AimEvent, CameraMovedEvent, PairEvent
-from fgreg.live import LiveSession
+from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import OnlineRegistration
-from fgreg.posterior import pose_tangent
-from fgreg.replay import ReplayRequest, replay_session
-from fgreg.session.reading import read_session
+from fgreg.online.live_session import LiveSession
+from fgreg.pipeline.replay import ReplayRequest, replay_session
+from fgreg.registration.posterior import pose_tangent
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.batch import solve
-from fgreg.config import SolveConfig
+from fgreg.detection.events_to_measurements import recognise
 from fgreg.errors import EventRefused, InputError, JournalError
-from fgreg.events import (
+from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
     Event,
@@ -24,11 +23,12 @@ from fgreg.events import (
     RefusedEvent,
     TrackEvent,
 )
-from fgreg.live import LiveSession
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.recognition import recognise
-from fgreg.session import append_file
-from fgreg.session.reading import read_session
+from fgreg.online.live_session import LiveSession
+from fgreg.registration.solve import solve
+from fgreg.session import append_only_file
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
@@ -205,7 +205,7 @@ def test_a_refusal_that_finds_the_disk_full_is_recorded_when_there_is_room(
     with LiveSession.open(folder, make_engine=BatchEngine) as live:
         assert isinstance(live._engine, BatchEngine)
         live._engine.refuse_t = {events[0].t}
-        real, calls = append_file._write, 0
+        real, calls = append_only_file._write, 0
 
         def once(handle: int, data: bytes) -> int:
             nonlocal calls
@@ -215,7 +215,7 @@ def test_a_refusal_that_finds_the_disk_full_is_recorded_when_there_is_room(
             return real(handle, data)
 
         with monkeypatch.context() as broken:
-            broken.setattr(append_file, "_write", once)
+            broken.setattr(append_only_file, "_write", once)
             with pytest.raises(EventRefused):
                 feed(live, events[:1])
         assert live.journal.lines == 1

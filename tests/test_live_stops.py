@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fgreg.session.reading import read_session
+from fgreg.session.session_reader import read_session
 from tests.stage_ends import SIGNALS, live_stopped_after
 
 

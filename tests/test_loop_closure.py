@@ -9,11 +9,11 @@ import pytest
 
 from fgreg.camera_moves.detector import CameraMove, LoopClosure, MoveCase, find_camera_move
 from fgreg.camera_moves.loop_closure import LoopClosureSettings, back_to
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray, exp_so3, make_transform
-from fgreg.measurements import EpochStart
-from fgreg.models import SessionModel
-from fgreg.registration import pack_session, register
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
+from fgreg.model.measurements import EpochStart
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.register import pack_session, register
 from tests.camera_move_cases import everything_about, move_case, moved_session
 
 CONFIG = SolveConfig()

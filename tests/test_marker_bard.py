@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.marker import detect_marker
-from fgreg.detection.noise import pool_corner_noise
 from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
-from fgreg.frames import as_float_array, log_so3, make_transform
-from fgreg.models import CameraModel, MarkerModel, StereoRig, TagModel
+from fgreg.geometry.transforms import as_float_array, log_so3, make_transform
+from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig, TagModel
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bard_aruco"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the real frames are not here")

@@ -9,8 +9,8 @@ import pytest
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import dictionary_named, find_tags
-from fgreg.frames import FloatArray, as_float_array, exp_so3, make_transform
-from fgreg.models import MarkerModel, StereoRig, TagModel
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
+from fgreg.model.session_model import MarkerModel, StereoRig, TagModel
 from fgreg.simulation.render import Optics, TagSurface, render_frame
 from tests.marker_scene import (
     LEFT,

@@ -15,8 +15,8 @@ from fgreg.detection.camera import (
     pixels_from_ideal,
     project,
 )
-from fgreg.frames import as_float_array
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.session_model import CameraModel
 from tests.marker_scene import LEFT
 
 

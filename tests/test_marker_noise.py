@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from fgreg.detection.noise import CornerNoise, detection_scale, fit_covariance, pool_corner_noise
-from fgreg.frames import FloatArray
+from fgreg.detection.corner_noise import CornerNoise, detection_scale, fit_covariance, pool_corner_noise
+from fgreg.geometry.transforms import FloatArray
 
 
 @dataclass

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.marker import detect_marker
-from fgreg.detection.noise import pool_corner_noise
-from fgreg.detection.pose import CornerSet, common_covariance, corner_residuals, fit_pose
+from fgreg.detection.pose_least_squares import CornerSet, common_covariance, corner_residuals, fit_pose
 from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
-from fgreg.frames import FloatArray, exp_so3, make_transform, transform_points
-from fgreg.models import StereoRig
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
+from fgreg.model.session_model import StereoRig
 from tests.marker_scene import (
     LEFT,
     ONE_TAG,

@@ -12,16 +12,16 @@ import pytest
 
 from fgreg.camera_moves import detector as detector_module
 from fgreg.camera_moves.bayes_filter import move_evidence
-from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
-from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray, exp_so3, make_transform
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import CameraMoved, OnlineRegistration, StaticTags
 from fgreg.online import full_solve as full_solve_module
-from fgreg.online.detect import events_in_order, find_moves, split_epochs
-from fgreg.targets import tre_mm
+from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
 from tests.forward import Truth, make_measurements
 from tests.online_streams import first, restored, sigmas_between, unreported_move
 

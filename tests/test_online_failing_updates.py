@@ -17,9 +17,9 @@ import fgreg.smoother.marginal_prior as prior_module
 import fgreg.smoother.updates as updates_module
 from fgreg.errors import EventRefused
 from fgreg.factors.adapter import FactorError
-from fgreg.frames import as_float_array
-from fgreg.measurements import Aim, Measurements, Pair
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.measurements import Aim, Measurements, Pair
+from fgreg.model.session_model import SessionModel
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags
 from fgreg.online.estimate import gaussian_tre
 from fgreg.smoother.updates import LEAVE, MOST

@@ -8,16 +8,16 @@ import gtsam
 import numpy as np
 import pytest
 
-from fgreg.batch import solve
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.frames import as_float_array
-from fgreg.models import NoiseModel
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.estimate import Verdict
+from fgreg.model.session_model import NoiseModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.online.engine import NOT_SOLVED, is_due
 from fgreg.online.estimate import gaussian_quantile_mm, gaussian_tre
 from fgreg.online.full_solve import FullSolveCase, result_of
-from fgreg.registration import register
+from fgreg.registration.register import register
+from fgreg.registration.solve import solve
 from fgreg.smoother.isam_window import free_number
 from fgreg.smoother.updates import LEAVE, MOST
 from tests.forward import make_measurements, make_session

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.config import SolveConfig
 from fgreg.graph.packing import pack
-from fgreg.measurements import Measurements, Pair
+from fgreg.model.measurements import Measurements, Pair
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import OnlineRegistration
-from fgreg.registration import register, register_near
-from fgreg.robust import limits_among
+from fgreg.registration.outliers import limits_among
+from fgreg.registration.register import register, register_near
 from fgreg.smoother.updates import LEAVE, MOST
 from tests.forward import make_measurements
 from tests.online_streams import batch, first, restored, sigmas_apart

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.batch import solve
-from fgreg.config import SolveConfig
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import CameraMoved, OnlineRegistration
+from fgreg.registration.solve import solve
 from fgreg.tracking import track
 from tests.forward import make_measurements
 from tests.online_streams import restored

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgreg.drivers.base import Command, DeviceLost, Operator, Said
+from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand
 from fgreg.drivers.keyboard import MAX_LINE_BYTES, MOST_WAITING, KeyboardOperator
 from fgreg.drivers.operator_words import EXPECTED, LETTERS, asked, understand
 from fgreg.drivers.operators import IgtlOperator, Operators
@@ -25,25 +25,25 @@ from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
 
 
-@pytest.mark.parametrize("said", [said for said in Said if said not in (Said.AIM, Said.RESET)])
-def test_each_word_and_its_letter_are_understood_in_any_case(said: Said) -> None:
+@pytest.mark.parametrize("said", [said for said in CommandKind if said not in (CommandKind.AIM, CommandKind.RESET)])
+def test_each_word_and_its_letter_are_understood_in_any_case(said: CommandKind) -> None:
     letter = next(letter for letter, meant in LETTERS.items() if meant is said)
     for line in (said.value, said.value.upper(), letter, f"  {letter} \r"):
-        assert understand(line) == Command(said)
+        assert understand(line) == OperatorCommand(said)
 
 
 def test_a_reset_has_to_be_said_in_full() -> None:
-    assert understand(" Reset ") == Command(Said.RESET)
-    assert Said.RESET not in LETTERS.values()
+    assert understand(" Reset ") == OperatorCommand(CommandKind.RESET)
+    assert CommandKind.RESET not in LETTERS.values()
     assert isinstance(understand("res"), str)
     assert isinstance(understand("reset the stage"), str)
-    assert understand("reset, no: stop") == Command(Said.STOP)
-    assert asked("the stage is latched", Said.RESET) == "the stage is latched: say reset"
+    assert understand("reset, no: stop") == OperatorCommand(CommandKind.STOP)
+    assert asked("the stage is latched", CommandKind.RESET) == "the stage is latched: say reset"
 
 
 @pytest.mark.parametrize("line", ["aim 3 2", "a 3 2", "aim 3,2", "AIM 3, 2"])
 def test_an_aim_names_its_corner(line: str) -> None:
-    assert understand(line, (9, 6)) == Command(Said.AIM, (3, 2))
+    assert understand(line, (9, 6)) == OperatorCommand(CommandKind.AIM, (3, 2))
 
 
 @pytest.mark.parametrize(
@@ -70,14 +70,14 @@ def test_what_is_not_understood_is_answered_with_what_is_expected(line: str, tol
 
 @pytest.mark.parametrize("line", ["", "   ", "\r", "stop", "STOP!", "x", "please stop", "stop the stage, now"])
 def test_a_stop_need_not_be_spelt(line: str) -> None:
-    assert understand(line) == Command(Said.STOP)
+    assert understand(line) == OperatorCommand(CommandKind.STOP)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(line=st.text(max_size=60))
 def test_any_line_is_a_command_or_a_printable_answer(line: str) -> None:
     found = understand(line, (9, 6))
-    assert isinstance(found, Command) or (found.isprintable() and len(found) < 250)
+    assert isinstance(found, OperatorCommand) or (found.isprintable() and len(found) < 250)
 
 
 class Typed:
@@ -114,15 +114,20 @@ def test_lines_come_as_commands_in_order_however_they_are_cut(typed: Typed) -> N
     for piece in (b"ho", b"me\naim 3", b" 2\nregi", b"ster\n\n", b"s\n"):
         typed.type(piece)
         time.sleep(0.01)
-    said = [Command(Said.HOME), Command(Said.AIM, (3, 2)), Command(Said.REGISTER), Command(Said.STOP)]
-    assert collect(operator.poll, 5) == [*said, Command(Said.SEARCH)]
+    said = [
+        OperatorCommand(CommandKind.HOME),
+        OperatorCommand(CommandKind.AIM, (3, 2)),
+        OperatorCommand(CommandKind.REGISTER),
+        OperatorCommand(CommandKind.STOP),
+    ]
+    assert collect(operator.poll, 5) == [*said, OperatorCommand(CommandKind.SEARCH)]
     assert operator.poll() == []
     assert (operator.connected, operator.dropped, typed.told) == (True, 0, [])
 
 
 def test_unknown_words_are_answered_and_the_next_line_works(typed: Typed) -> None:
     typed.type(b"aim 9 9\ngo\n\xff\xfe\nnext\n")
-    assert collect(typed.operator.poll, 1) == [Command(Said.NEXT)]
+    assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.NEXT)]
     assert len(typed.told) == 3
     assert "columns 0 to 8" in typed.told[0]
     assert "'go' is not understood" in typed.told[1]
@@ -131,7 +136,7 @@ def test_unknown_words_are_answered_and_the_next_line_works(typed: Typed) -> Non
 def test_the_end_of_the_input_is_no_loss_and_its_last_line_counts(typed: Typed) -> None:
     typed.type(b"moved\nstop")
     typed.hang_up()
-    assert collect(typed.operator.poll, 2) == [Command(Said.MOVED), Command(Said.STOP)]
+    assert collect(typed.operator.poll, 2) == [OperatorCommand(CommandKind.MOVED), OperatorCommand(CommandKind.STOP)]
     wait_for(lambda: not typed.operator.connected)
     assert typed.operator.poll() == []  # an end is no empty line
     assert typed.told == []
@@ -141,7 +146,7 @@ def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -
     for _ in range(20):
         typed.type(b"a" * MAX_LINE_BYTES)
     typed.type(b"\nfollow\n")
-    assert collect(typed.operator.poll, 1) == [Command(Said.FOLLOW)]
+    assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.FOLLOW)]
     assert typed.told == [f"a line of more than {MAX_LINE_BYTES} characters is not understood"]
 
 
@@ -150,11 +155,11 @@ def test_where_nobody_fetches_the_oldest_go_but_never_a_stop(typed: Typed) -> No
     wait_for(lambda: typed.operator.dropped == 12)
     commands = typed.operator.poll()
     assert len(commands) == MOST_WAITING
-    assert (commands[0], commands[-1]) == (Command(Said.STOP), Command(Said.HOME))
+    assert (commands[0], commands[-1]) == (OperatorCommand(CommandKind.STOP), OperatorCommand(CommandKind.HOME))
 
 
 def test_what_is_told_is_one_line_with_the_word_that_is_wanted(typed: Typed) -> None:
-    typed.operator.tell("the stage has to find\nits zero", wants=Said.HOME)
+    typed.operator.tell("the stage has to find\nits zero", wants=CommandKind.HOME)
     typed.operator.tell("registered", done=True)
     assert typed.told == ["the stage has to find\\nits zero: say home (h)", "registered"]
 
@@ -173,7 +178,7 @@ def test_a_terminal_is_read_until_it_hangs_up_and_that_is_the_end_of_the_input()
     operator = KeyboardOperator(lambda _: None, theirs)
     try:
         os.write(ours, b"home\n")  # not this program's own terminal, but one that can be read
-        assert collect(operator.poll, 1) == [Command(Said.HOME)]
+        assert collect(operator.poll, 1) == [OperatorCommand(CommandKind.HOME)]
         assert operator.connected
         os.close(ours)
         wait_for(lambda: not operator.connected)
@@ -243,13 +248,17 @@ def test_texts_of_a_device_are_commands_and_others_are_not(switch: tuple[IgtlOpe
     operator, peer = switch
     peer.sendall(words("search") + words("stop", "Someone") + words("aim 1 5") + words("stop"))
     found = collect(operator.poll, 3)
-    assert found == [Command(Said.SEARCH), Command(Said.AIM, (1, 5)), Command(Said.STOP)]
+    assert found == [
+        OperatorCommand(CommandKind.SEARCH),
+        OperatorCommand(CommandKind.AIM, (1, 5)),
+        OperatorCommand(CommandKind.STOP),
+    ]
 
 
 def test_a_peer_is_told_and_answered(switch: tuple[IgtlOperator, socket.socket]) -> None:
     operator, peer = switch
     wait_for(lambda: operator.connected)
-    operator.tell("the stage is ready to follow the beam", wants=Said.FOLLOW)
+    operator.tell("the stage is ready to follow the beam", wants=CommandKind.FOLLOW)
     assert told(peer) == "the stage is ready to follow the beam: say follow (f)"
     peer.sendall(words("go"))
     wait_for(lambda: operator.poll() or operator.rejected)
@@ -266,7 +275,7 @@ def test_a_switch_that_is_unplugged_is_lost_once_and_back(switch: tuple[IgtlOper
     assert operator.poll() == []
     with socket.create_connection(("127.0.0.1", operator.endpoint.port), timeout=5.0) as again:
         again.sendall(words("home"))
-        assert collect(operator.poll, 1) == [Command(Said.HOME)]
+        assert collect(operator.poll, 1) == [OperatorCommand(CommandKind.HOME)]
 
 
 def test_several_operators_are_one_and_a_loss_keeps_nobodys_stop_back(
@@ -277,7 +286,7 @@ def test_several_operators_are_one_and_a_loss_keeps_nobodys_stop_back(
     wait_for(lambda: both.connected)
     typed.type(b"home\n")
     peer.sendall(words("search"))
-    assert {command.said for command in collect(both.poll, 2)} == {Said.HOME, Said.SEARCH}
+    assert {command.kind for command in collect(both.poll, 2)} == {CommandKind.HOME, CommandKind.SEARCH}
     both.tell("registered")
     assert told(peer) == "registered"
     assert typed.told == ["registered"]
@@ -285,7 +294,7 @@ def test_several_operators_are_one_and_a_loss_keeps_nobodys_stop_back(
     wait_for(lambda: not foot.connected)
     typed.type(b"\n")
     wait_for(lambda: typed.operator._waiting)
-    assert both.poll() == [Command(Said.STOP)]
+    assert both.poll() == [OperatorCommand(CommandKind.STOP)]
     with pytest.raises(DeviceLost, match="operator"):
         both.poll()
     assert both.poll() == []

@@ -9,8 +9,8 @@ import pytest
 
 from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import PaFind, pool_sound_speed_ratio
-from fgreg.frames import as_float_array
-from fgreg.models import ChannelModel, ProbeModel, SensitivityModel
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.session_model import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, simulate_channels
 
 

@@ -7,15 +7,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from credible_region import ellipsoid_contains
 
-from fgreg.answer import answer
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray
+from credible_region import ellipsoid_contains
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state, step_between
-from fgreg.posterior import (
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior import (
     Mode,
     Posterior,
     gaussian_posterior,
@@ -28,7 +27,8 @@ from fgreg.posterior import (
     target_errors,
     weighted_quantile,
 )
-from fgreg.registration import register
+from fgreg.registration.posterior_mean import answer
+from fgreg.registration.register import register
 from tests.forward import make_measurements
 
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from fgreg.frames import as_float_array, exp_so3
-from fgreg.quaternions import quaternion_from_rotation, rotation_from_quaternion, turn_about_x
+from fgreg.geometry.quaternions import quaternion_from_rotation, rotation_from_quaternion, turn_about_x
+from fgreg.geometry.transforms import as_float_array, exp_so3
 
 
 def test_a_turn_about_x_by_hand() -> None:

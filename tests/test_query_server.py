@@ -17,6 +17,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from fgreg.model.estimate import TrackEstimate
+from fgreg.model.measurements import Track
+from fgreg.online.shared_snapshot import SharedSnapshot
+from fgreg.online.snapshot_record import Layout
+from fgreg.tracking import Snapshot, track
 from query_codec import (
     QueryError,
     decode_answer,
@@ -26,12 +32,6 @@ from query_codec import (
     encode_query,
 )
 from query_server import QueryClient, QueryServer
-
-from fgreg.estimate import TrackEstimate
-from fgreg.measurements import Track
-from fgreg.online.queries import Layout
-from fgreg.online.shared_snapshot import SharedSnapshot
-from fgreg.tracking import Snapshot, track
 from tests.forward import make_measurements, make_session
 from tests.track_cases import held_out, plain_snapshot, query_of, solved
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from fgreg.events import AimEvent, NoteEvent, PairEvent
-from fgreg.live import LiveSession
-from fgreg.operation.recorder import Recorder
-from fgreg.session.reading import read_session
+from fgreg.live.recorder import Recorder
+from fgreg.model.events import AimEvent, NoteEvent, PairEvent
+from fgreg.online.live_session import LiveSession
+from fgreg.session.session_reader import read_session
 from tests.batch_engine import BatchEngine
 from tests.test_journal import failing
 
@@ -45,14 +45,14 @@ def test_with_a_full_disk_events_wait_and_are_recorded_when_there_is_room(
             for event in events[3:]:
                 recorder.hand_over(event)
             recorder.hand_over(NoteEvent(events[-1].t, 0, "recording lost"))
-            wait_for(lambda: recorder.state.stuck)
+            wait_for(lambda: recorder.state.blocked)
             time.sleep(0.5)
-            assert "No space left" in recorder.state.stuck
+            assert "No space left" in recorder.state.blocked
             assert recorder.state.waiting == len(events) - 3 + 1
             assert recorder.state.aims == 3
         wait_for(lambda: not recorder.state.waiting)
         recorder.close()
-        assert recorder.state.stuck == ""
+        assert recorder.state.blocked == ""
         assert len(live.measurements().aims) == len(events)
     assert [event.t for event in read_session(pose_session).events] == [*(e.t for e in events), events[-1].t]
 
@@ -70,4 +70,4 @@ def test_a_recorder_ends_although_the_disk_stays_full_and_says_what_it_could_not
         recorder.close()
         assert time.monotonic() - began < 30.0
         assert recorder.state.waiting == 3
-        assert "No space left" in recorder.state.stuck
+        assert "No space left" in recorder.state.blocked

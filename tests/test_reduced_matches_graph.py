@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from graph_covariance import GraphCovariance
 
-from fgreg.frames import FloatArray
-from fgreg.graph.explicit import ExplicitGraph, GraphOptions, build_graph
-from fgreg.graph.explicit_solver import GraphOptimum
-from fgreg.graph.explicit_solver import optimize as optimize_graph
-from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.gtsam_graph import ExplicitGraph, GraphOptions, build_graph
+from fgreg.graph.gtsam_solver import GraphOptimum
+from fgreg.graph.gtsam_solver import optimize as optimize_graph
+from fgreg.graph.gtsam_values import SharedValues, initial_values, read_shared
 from fgreg.graph.packing import PackedProblem, pack
-from fgreg.graph.reduced import contributions, evaluate, log_posterior, refine
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import contributions, evaluate, log_posterior, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state, pose_difference
-from fgreg.models import NoiseModel
+from fgreg.model.session_model import NoiseModel
+from graph_covariance import GraphCovariance
 from tests.forward import make_measurements, make_session
 
 CASES: dict[str, dict[str, Any]] = {

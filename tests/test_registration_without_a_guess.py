@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgreg.batch import solve
-from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.estimate import Verdict
-from fgreg.frames import inverse, transform_points
+from fgreg.geometry.transforms import inverse, transform_points
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state
-from fgreg.registration import calibrate_beam, register, search_epoch, targets_moved
+from fgreg.model.estimate import Verdict
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.register import calibrate_beam, register, search_epoch, targets_moved
+from fgreg.registration.solve import solve
 from tests.forward import make_measurements
 
 

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 import fgreg.smoother.updates as updates_module
-from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused, JournalError
-from fgreg.events import AimEvent, CameraMovedEvent, PairEvent, RefusedEvent
-from fgreg.frames import make_transform
-from fgreg.live import LiveSession
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import make_transform
+from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent, RefusedEvent
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import CameraMoved, OnlineEstimate, OnlineEvent, OnlineRegistration
-from fgreg.registration import SoundSpeedPrior
-from fgreg.session.reading import check_session, read_session
+from fgreg.online.live_session import LiveSession
+from fgreg.registration.register import SoundSpeedPrior
+from fgreg.session.session_reader import check_session, read_session
 from tests.forward import make_measurements
 from tests.online_streams import events, first, restored, sigmas_between, unreported_move
-from tests.test_epoch_tied_to_an_earlier import there_and_back
+from tests.test_motion_prior_between_epochs import there_and_back
 
 SIGMAS = 0.05
 """Between the registration before and after."""

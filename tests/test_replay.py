@@ -11,18 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg import cli
-from fgreg.config import SolveConfig
+from fgreg.cli import main
 from fgreg.errors import EventRefused, InputError
-from fgreg.events import PairEvent, TrackEvent
-from fgreg.live import Engine, MakeEngine, online_engine
-from fgreg.models import NoiseModel
+from fgreg.model.events import PairEvent, TrackEvent
+from fgreg.model.session_model import NoiseModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import OnlineEvent
-from fgreg.pipeline import SolveRequest, solve_session
-from fgreg.replay import ReplayRequest, ReplayStep, quantiles, replay_session
-from fgreg.session.reading import read_session
-from fgreg.session.results import read_result
+from fgreg.online.live_session import Engine, MakeEngine, online_engine
+from fgreg.pipeline.replay import ReplayRequest, ReplayStep, quantiles, replay_session
+from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.session.result_file import read_result
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
@@ -54,10 +54,10 @@ def short(_short: Path, tmp_path: Path) -> Path:
 
 
 def run(monkeypatch: pytest.MonkeyPatch, make_engine: MakeEngine, *words: str | Path) -> int:
-    monkeypatch.setattr("fgreg.replay.online_engine", make_engine)
+    monkeypatch.setattr("fgreg.pipeline.replay.online_engine", make_engine)
     monkeypatch.setattr(sys, "argv", ["fgreg", "replay", *(str(word) for word in words)])
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        main.main()
     code = end.value.code
     assert isinstance(code, int)
     return code

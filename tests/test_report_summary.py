@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fgreg.estimate import AimEstimate, LaserEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
-from fgreg.frames import exp_so3, make_transform
-from fgreg.models import SessionModel, StageModel
-from fgreg.report import (
+from fgreg.cli.report import (
     DetectionFigures,
     SummaryExtras,
     TruthFigures,
@@ -24,6 +21,9 @@ from fgreg.report import (
     print_summary,
     summary_dict,
 )
+from fgreg.geometry.transforms import exp_so3, make_transform
+from fgreg.model.estimate import AimEstimate, LaserEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
+from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.viewer.result import measured_pairs
 from tests.answers import answer_from_truth, random_covariance
 from tests.forward import make_measurements, make_session

@@ -14,7 +14,8 @@ import yaml
 from numpy.testing import assert_allclose
 
 from fgreg.errors import InputError
-from fgreg.estimate import (
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
+from fgreg.model.estimate import (
     AimEstimate,
     EpochEstimate,
     LaserEstimate,
@@ -26,10 +27,9 @@ from fgreg.estimate import (
     TrackEstimate,
     Verdict,
 )
-from fgreg.frames import FloatArray, exp_so3, make_transform
-from fgreg.models import SessionModel
-from fgreg.session.reading import read_session
-from fgreg.session.results import read_result, remove_result, write_result
+from fgreg.model.session_model import SessionModel
+from fgreg.session.result_file import read_result, remove_result, write_result
+from fgreg.session.session_reader import read_session
 from tests import session_files
 
 

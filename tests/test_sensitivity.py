@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fgreg.measurements import Look
-from fgreg.sensitivity import (
+from fgreg.model.measurements import Look
+from fgreg.model.sensitivity import (
     amplitude_table,
     arc_of_rotation,
     interval_moments,

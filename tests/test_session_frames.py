@@ -11,7 +11,7 @@ import pytest
 from numpy.lib import format as npy_format
 
 from fgreg.errors import InputError
-from fgreg.session.reading import check_session, read_session
+from fgreg.session.session_reader import check_session, read_session
 from tests import session_files
 
 

@@ -12,9 +12,9 @@ import yaml
 from numpy.testing import assert_allclose
 
 from fgreg.errors import InputError
-from fgreg.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent, StageEvent, TrackEvent
-from fgreg.models import NoiseModel, default_targets_mm
-from fgreg.session.reading import read_ground_truth, read_session
+from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent, StageEvent, TrackEvent
+from fgreg.model.session_model import NoiseModel, default_targets_mm
+from fgreg.session.session_reader import read_ground_truth, read_session
 from tests import session_files
 
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.estimate import Verdict
-from fgreg.measurements import MarkerObservation, Track
-from fgreg.online.queries import EPOCHS_KEPT, Layout
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
+from fgreg.online.snapshot_record import EPOCHS_KEPT, Layout
 from fgreg.tracking import EpochSnapshot, track
 from fgreg.tracking.snapshot import SHARED
 from tests.forward import make_measurements, make_session

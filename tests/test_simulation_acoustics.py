@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.signal import hilbert
 
-from fgreg.frames import FloatArray
-from fgreg.models import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import (
     Elevation,
     Hearing,

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fgreg.frames import FloatArray, exp_so3, make_transform, transform_points
-from fgreg.models import BoardModel, CameraModel, CharucoModel
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
+from fgreg.model.session_model import BoardModel, CameraModel, CharucoModel
 from fgreg.simulation.config import default_rig
 from fgreg.simulation.render import (
     Background,

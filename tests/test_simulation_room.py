@@ -11,7 +11,7 @@ import pytest
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import MarkerFit, PaFind
-from fgreg.frames import is_rigid
+from fgreg.geometry.transforms import is_rigid
 from fgreg.simulation.room import BUMP_S, Room, room_config
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import fgreg.simulation
-from fgreg.frames import FloatArray, log_so3
-from fgreg.models import NoiseModel, SensitivityModel, StageModel
+from fgreg.geometry.transforms import FloatArray, log_so3
+from fgreg.model.session_model import NoiseModel, SensitivityModel, StageModel
 from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import SimulatedSession, simulate
@@ -404,7 +404,7 @@ def test_geometry_out_of_sight_or_out_of_reach_is_refused() -> None:
 
 
 def test_simulation_shares_no_code_with_the_estimator() -> None:
-    allowed = {"fgreg.errors", "fgreg.events", "fgreg.frames", "fgreg.models"}
+    allowed = {"fgreg.errors", "fgreg.model.events", "fgreg.geometry.transforms", "fgreg.model.session_model"}
     for source in Path(fgreg.simulation.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(source.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []

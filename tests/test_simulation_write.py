@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from fgreg.errors import InputError
-from fgreg.models import MarkerModel, TagModel
+from fgreg.model.session_model import MarkerModel, TagModel
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import encoded, write_session

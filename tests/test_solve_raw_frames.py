@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from fgreg.errors import InputError
-from fgreg.estimate import Verdict
-from fgreg.pipeline import SolveRequest, solve_session
+from fgreg.model.estimate import Verdict
+from fgreg.pipeline.solve import SolveRequest, solve_session
 
 
 def _events(folder: Path) -> list[dict[str, object]]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from fgreg.drivers.base import Command, Said
-from fgreg.operation.conductor import ASK_AGAIN_S
-from fgreg.operation.view import Ask, Release, Sweep, Tell
+from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.live.actions import Ask, Release, Sweep, Tell
+from fgreg.live.workflow import ASK_AGAIN_S
 from fgreg.simulation.room import Room, room_config
 from tests.rehearsal import Rehearsal
 
@@ -16,7 +16,7 @@ def rehearsal(*, obliging: bool) -> Rehearsal:
 
 
 def asked_for_resets(session: Rehearsal) -> list[tuple[float, Tell]]:
-    return [(t, tell) for t, tell in session.told if tell.wants is Said.RESET]
+    return [(t, tell) for t, tell in session.told if tell.wants is CommandKind.RESET]
 
 
 def test_why_it_is_latched_is_told_at_once_and_again() -> None:
@@ -45,23 +45,23 @@ def test_after_the_reset_a_new_request_is_asked_for_at_once() -> None:
     session.run(1.0)
     assert session.asked[before:] == []
     told = len(session.told)
-    session._said.append(Command(Said.RESET))
+    session._said.append(OperatorCommand(CommandKind.RESET))
     session.run(0.1)
     assert [action for _, action in session.asked[before:]] == [Release()]
     news = [tell for _, tell in session.told[told:]]
     assert any("free again" in tell.text for tell in news)
-    assert [tell.wants for tell in news if tell.wants is not None] == [Said.SEARCH]
+    assert [tell.wants for tell in news if tell.wants is not None] == [CommandKind.SEARCH]
     session.run(3.0)
     assert not any(isinstance(action, Sweep) for _, action in session.asked[before:])
     session.obliging = True
-    session._said.append(Command(Said.SEARCH))
+    session._said.append(OperatorCommand(CommandKind.SEARCH))
     session.run(5.0)
     assert any(isinstance(action, Sweep) for _, action in session.asked[before:])
 
 
 def test_a_reset_where_nothing_is_latched_is_explained() -> None:
     session = rehearsal(obliging=False)
-    session._said.append(Command(Said.RESET))
+    session._said.append(OperatorCommand(CommandKind.RESET))
     session.run(0.1)
     assert any("no reset: the stage is not latched" in tell.text for _, tell in session.told)
     assert not any(isinstance(action, Ask | Release) for _, action in session.asked)

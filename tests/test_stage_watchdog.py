@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from fgreg.motion.device import StageError, StageLost
-from fgreg.motion.limits import MotionKind
-from fgreg.motion.link import Report, StageLink, StageRecord
-from fgreg.pairing import scan_at
-from fgreg.session.event_document import event_document
+from fgreg.model.time_sync import scan_at
+from fgreg.session.event_writer import event_document
+from fgreg.stage.client import Report, StageLink, StageRecord
+from fgreg.stage.interface import StageError, StageLost
+from fgreg.stage.limits import MotionKind
 from tests.stage_ends import DEADLINE_S, is_gone, main_program, stopped_after, wait_until
 from tests.stage_main import LIMITS, STAGE, beat_for
 from tests.traced_stage import read_trace

@@ -16,7 +16,7 @@ from fgreg.camera_moves.static_tags import (
     tag_motion,
     watch_tags,
 )
-from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform
+from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform
 
 SIGMA = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.8])
 COVARIANCE = np.diag(SIGMA**2)

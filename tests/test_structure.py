@@ -1,10 +1,32 @@
-"""The tool that counts layers and import circles."""
+"""The package's layout: few layers, no import circles, next to nothing beside the packages."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from structure import measure
+import pytest
+
+from structure import Structure, measure
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def structure() -> Structure:
+    return measure(CHECKOUT)
+
+
+def test_no_files_import_each_other_in_a_circle(structure: Structure) -> None:
+    assert structure.file_circles == ()
+    assert structure.package_circles == ()
+
+
+def test_layers_are_at_most_twelve(structure: Structure) -> None:
+    assert structure.layers <= 12
+
+
+def test_modules_beside_the_packages_are_few(structure: Structure) -> None:
+    assert set(structure.flat) <= {"__init__", "__main__", "api", "errors", "version"}
 
 
 def test_a_circle_is_found(tmp_path: Path) -> None:

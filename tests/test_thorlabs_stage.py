@@ -16,13 +16,13 @@ import thorlabs_apt_protocol as library
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgreg.drivers import apt
+from fgreg.drivers import thorlabs_apt
 from fgreg.drivers.thorlabs_stage import LOST_S, ThorlabsStage, open_stage
 from fgreg.errors import MissingExtraError
-from fgreg.models import StageModel
-from fgreg.motion.device import MAX_CALL_S, RotationStage, StageError, StageLost, StageStatus
-from fgreg.motion.limits import MotionKind, MotionLimits
-from fgreg.motion.link import Report, StageLink, StageRecord
+from fgreg.model.session_model import StageModel
+from fgreg.stage.client import Report, StageLink, StageRecord
+from fgreg.stage.interface import MAX_CALL_S, RotationStage, StageError, StageLost, StageStatus
+from fgreg.stage.limits import MotionKind, MotionLimits
 from tests.cube_emulator import CubeEmulator
 
 # The other way round, zero at 10 deg.
@@ -277,14 +277,14 @@ def test_parser_understands_what_the_library_does_whatever_comes_before() -> Non
     @settings(max_examples=150, derandomize=True, deadline=None)
     @given(st.lists(st.binary(max_size=9), max_size=4), st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1))
     def check(noise: list[bytes], position: int, bits: int) -> None:
-        parser = apt.AptParser()
+        parser = thorlabs_apt.AptParser()
         for part in noise:
             parser.feed(part)
         data = position.to_bytes(4, "little", signed=True) + bytes(4) + bits.to_bytes(4, "little")
         message = b"\x91\x04\x0e\x00\x81\x50\x01\x00" + data
-        read = [found for found in parser.feed(message * 8) if found.id == apt.GET_STATUS]
+        read = [found for found in parser.feed(message * 8) if found.id == thorlabs_apt.GET_STATUS]
         assert len(read) >= 1  # noise may swallow some, never all
-        assert apt.read_status(read[-1].data) == apt.CubeStatus(position, bits)
+        assert thorlabs_apt.read_status(read[-1].data) == thorlabs_apt.CubeStatus(position, bits)
 
     check()
 
@@ -292,18 +292,20 @@ def test_parser_understands_what_the_library_does_whatever_comes_before() -> Non
 @pytest.mark.parametrize("lost", range(1, 14))
 def test_status_whose_end_was_lost_does_not_swallow_the_next(lost: int) -> None:
     message = b"\x91\x04\x0e\x00\x81\x50\x01\x00" + bytes([10, 11, 12, 0, 14, 15, 16, 17, 0, 4, 0, 128])
-    parser = apt.AptParser()
+    parser = thorlabs_apt.AptParser()
     found = parser.feed(message + message[:-lost] + message)
-    assert [apt.read_status(each.data) for each in found] == [apt.CubeStatus(0x000C0B0A, 0x80000400)] * 2
+    assert [thorlabs_apt.read_status(each.data) for each in found] == [
+        thorlabs_apt.CubeStatus(0x000C0B0A, 0x80000400)
+    ] * 2
 
 
 def test_orders_are_packed_as_the_library_packs_them() -> None:
     to = {"dest": 0x50, "source": 0x01}
-    assert apt.move_absolute(-77) == library.mot_move_absolute(**to, chan_ident=1, position=-77)
-    assert apt.set_velocity(3, 4) == library.mot_set_velparams(
+    assert thorlabs_apt.move_absolute(-77) == library.mot_move_absolute(**to, chan_ident=1, position=-77)
+    assert thorlabs_apt.set_velocity(3, 4) == library.mot_set_velparams(
         **to, chan_ident=1, min_velocity=0, acceleration=3, max_velocity=4
     )
-    assert apt.short(apt.MOVE_STOP, 1, 1) == library.mot_move_stop(**to, chan_ident=1, stop_mode=1)
-    assert apt.set_home(apt.HomeSettings(2, 1, 9, -5)) == library.mot_set_homeparams(
+    assert thorlabs_apt.short(thorlabs_apt.MOVE_STOP, 1, 1) == library.mot_move_stop(**to, chan_ident=1, stop_mode=1)
+    assert thorlabs_apt.set_home(thorlabs_apt.HomeSettings(2, 1, 9, -5)) == library.mot_set_homeparams(
         **to, chan_ident=1, home_dir=2, limit_switch=1, home_velocity=9, offset_distance=-5
     )

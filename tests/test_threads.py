@@ -8,9 +8,8 @@ import sys
 
 import pytest
 
-from fgreg import cli
-from fgreg.operation.interpreter import SWITCH_S, undisturbed
-from fgreg.workers.threads import NAMES, one_thread_each
+from fgreg.cli import main
+from fgreg.workers.threads import NAMES, SWITCH_S, one_thread_each, undisturbed
 
 
 def test_processes_get_one_thread_each_unless_the_user_has_said_how_many(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -26,9 +25,9 @@ def test_commands_run_with_one_thread_for_linear_algebra(monkeypatch: pytest.Mon
     for name in NAMES:
         monkeypatch.delenv(name, raising=False)
     seen: list[str | None] = []
-    monkeypatch.setattr(cli, "app", lambda **_: seen.extend(os.environ.get(name) for name in NAMES))
+    monkeypatch.setattr(main, "app", lambda **_: seen.extend(os.environ.get(name) for name in NAMES))
     with pytest.raises(SystemExit) as ended:
-        cli.main()
+        main.main()
     assert ended.value.code == 0
     assert seen == ["1"] * len(NAMES)
     assert [os.environ.get(name) for name in NAMES] == [None] * len(NAMES)

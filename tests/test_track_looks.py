@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgreg.config import SolveConfig
-from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.measurements import Track
+from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.measurements import Track
+from fgreg.model.solve_config import SolveConfig
 from fgreg.tracking import make_snapshot, track
 from tests import tracking_reference
 from tests.forward import make_measurements, make_session

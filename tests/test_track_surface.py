@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray
-from fgreg.surface import TissueSurface, fit_surface
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import TissueSurface, fit_surface
 from fgreg.tracking import track
 from tests import tracking_reference
 from tests.test_tracking import surface_case

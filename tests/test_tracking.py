@@ -8,10 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from fgreg.batch import Solution, solve
-from fgreg.config import SolveConfig
-from fgreg.estimate import TrackEstimate
-from fgreg.frames import (
+from fgreg.geometry.transforms import (
     FloatArray,
     as_float_array,
     exp_so3,
@@ -20,9 +17,12 @@ from fgreg.frames import (
     rotation_to_direction,
     transform_points,
 )
-from fgreg.measurements import Look, MarkerObservation, Track, default_marker_covariance
-from fgreg.models import SessionModel
-from fgreg.surface import fit_surface
+from fgreg.model.estimate import TrackEstimate
+from fgreg.model.measurements import Look, MarkerObservation, Track, default_marker_covariance
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import fit_surface
+from fgreg.registration.solve import Solution, solve
 from fgreg.tracking import track
 from tests.forward import Truth, hear, make_measurements
 

@@ -10,23 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.cli import main
-from fgreg.config import SolveConfig
-from fgreg.events import AimEvent, CameraMovedEvent, PairEvent
-from fgreg.frames import FloatArray, make_transform
-from fgreg.live import LiveSession
-from fgreg.measurements import EpochStart, Measurements, Pair
-from fgreg.models import SessionModel
-from fgreg.online.detect import DetectedMove, find_moves, renumbered, split_epochs
+from fgreg.cli.main import main
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray, make_transform
+from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
+from fgreg.model.measurements import EpochStart, Measurements, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
-from fgreg.registration import SoundSpeedPrior, register
-from fgreg.replay import ReplayRequest, replay_session
-from fgreg.session.reading import read_session
-from fgreg.session.results import read_result
+from fgreg.online.live_session import LiveSession
+from fgreg.online.recorded_moves import DetectedMove, find_moves, renumbered, split_epochs
+from fgreg.pipeline.replay import ReplayRequest, replay_session
+from fgreg.registration.register import SoundSpeedPrior, register
+from fgreg.session.result_file import read_result
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
-from fgreg.targets import tre_mm
 from tests.forward import make_measurements
 from tests.online_streams import sigmas_between, unreported_move
 

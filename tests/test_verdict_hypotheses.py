@@ -7,13 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.answer import sound_speed_from_residuals
-from fgreg.batch import solve
-from fgreg.config import SolveConfig
-from fgreg.estimate import PredictedTre, Verdict
-from fgreg.frames import as_float_array, exp_so3, make_transform
-from fgreg.registration import Registration, register
-from fgreg.verdict import Causes, Condition, accuracy, causes_of_error, sound_speed_condition, understated_noise
+from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
+from fgreg.model.estimate import PredictedTre, Verdict
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior_mean import sound_speed_from_residuals
+from fgreg.registration.register import Registration, register
+from fgreg.registration.solve import solve
+from fgreg.registration.verdict import (
+    Causes,
+    Condition,
+    accuracy,
+    causes_of_error,
+    sound_speed_condition,
+    understated_noise,
+)
 from tests.forward import make_measurements
 
 

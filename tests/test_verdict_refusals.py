@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.batch import Solution, solve
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.frames import as_float_array, inverse, make_transform, rotation_to_direction, transform_points
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import as_float_array, inverse, make_transform, rotation_to_direction, transform_points
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.solve import Solution, solve
 from tests.forward import Truth, make_measurements
 
 

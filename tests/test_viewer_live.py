@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fgreg.cli_live import status_panel
+from fgreg.cli.live import status_panel
 from fgreg.drivers.base import BmodeFrame, Stamp
-from fgreg.estimate import PredictedTre, TrackEstimate, Verdict
-from fgreg.measurements import MarkerObservation, Track
+from fgreg.live.actions import RegistrationState, StageView
+from fgreg.live.recorder import RecorderState
+from fgreg.live.status import Figures, Status
+from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
+from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.operation.recorder import RecorderState
-from fgreg.operation.status import Figures, Status
-from fgreg.operation.view import Known, StageView
 from fgreg.viewer.live import Moment
-from fgreg.viewer.now import Now
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.shapes import CANVAS, canvas
+from fgreg.viewer.status_line import Now
 from tests.recordings import Row, read_recording, transform_of, views
 from tests.test_viewer_recording import make_model
 
@@ -132,7 +132,7 @@ def test_the_last_picture_says_that_the_session_is_over(tmp_path: Path) -> None:
 
 
 def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[str, ...] = ()) -> Status:
-    known = Known(verdict or Verdict.REFUSED, reasons, 1, 12, verdict is not None)
+    known = RegistrationState(verdict or Verdict.REFUSED, reasons, 1, 12, verdict is not None)
     estimate = OnlineEstimate(
         1.0, 1, None, None, PredictedTre(1.0, 1.5, 1.87), None, False, known.verdict, reasons, 12, None, True
     )
@@ -148,7 +148,7 @@ def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[s
     [
         (status(Verdict.OK), ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8°", "news [red]"]),
         (
-            replace(status(Verdict.OK), answer=None, void="the camera is moving"),
+            replace(status(Verdict.OK), answer=None, invalid="the camera is moving"),
             ["REFUSED", "not known yet", "the camera is moving"],
         ),
         (status(None, ("camera", "stage")), ["none yet", "camera, stage", "get the camera and the stage back", "LOST"]),

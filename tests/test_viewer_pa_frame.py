@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgreg.frames import FloatArray
-from fgreg.models import ChannelModel, ImageModel, ProbeModel
-from fgreg.viewer.pa import PaPicture, pa_picture, texture
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel
+from fgreg.viewer.pa_frame import PaPicture, pa_picture, texture
 from tests.forward import make_session
 
 

@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 
 from fgreg.errors import InputError
-from fgreg.estimate import SessionEstimate, TrackEstimate, Verdict
-from fgreg.frames import as_float_array, inverse
-from fgreg.measurements import Measurements, Track
-from fgreg.models import (
+from fgreg.geometry.transforms import as_float_array, inverse
+from fgreg.model.estimate import SessionEstimate, TrackEstimate, Verdict
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import (
     CameraModel,
     ChannelModel,
     MarkerModel,

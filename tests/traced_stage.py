@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fgreg.drivers.simulated_stage import SimulatedStage
-from fgreg.models import StageModel
-from fgreg.motion.device import StageError, StageLost, StageStatus
+from fgreg.model.session_model import StageModel
+from fgreg.stage.interface import StageError, StageLost, StageStatus
 
 
 class TracedStage(SimulatedStage):

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.batch import Solution, solve
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.measurements import Measurements, Pair, Track
-from fgreg.models import SessionModel
-from fgreg.posterior import Posterior
-from fgreg.surface import TissueSurface
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import Measurements, Pair, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import TissueSurface
+from fgreg.registration.posterior import Posterior
+from fgreg.registration.solve import Solution, solve
 from fgreg.tracking import EpochSnapshot, Snapshot
 from fgreg.tracking.snapshot import SHARED
 

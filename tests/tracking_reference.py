@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.estimate import TrackEstimate
-from fgreg.frames import FloatArray, exp_so3
+from fgreg.geometry.transforms import FloatArray, exp_so3
+from fgreg.graph.expectation_propagation import propagate, settle
 from fgreg.graph.packing import Anchor, PackedProblem
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
-from fgreg.graph.sites import propagate, settle
-from fgreg.measurements import EpochStart, Measurements, Pair, Track
-from fgreg.models import SessionModel
-from fgreg.registration import pack_session
-from fgreg.surface import GRAZING, LONGEST_MM, REACH_MM, TissueSurface
+from fgreg.model.estimate import TrackEstimate
+from fgreg.model.measurements import EpochStart, Measurements, Pair, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import GRAZING, LONGEST_MM, REACH_MM, TissueSurface
+from fgreg.registration.register import pack_session
 from tests.forward import Truth
 from tests.track_cases import Solved
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.frames import FloatArray, exp_so3
+from fgreg.geometry.transforms import FloatArray, exp_so3
 
 INNER_STEPS = 10
 """Gradient steps on one set of variables before it is the other's turn."""

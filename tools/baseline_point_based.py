@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fgreg.frames import FloatArray, make_transform, nearest_rotation
+from fgreg.geometry.transforms import FloatArray, make_transform, nearest_rotation
 
 
 def register_points(camera_p: FloatArray, trus_p: FloatArray) -> FloatArray:

@@ -18,10 +18,10 @@ import numpy as np
 
 from fgreg.drivers.base import DeviceLost, host_now
 from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout
-from fgreg.drivers.interlaced import Fields, split
+from fgreg.drivers.interlacing import Fields, split
 from fgreg.drivers.rectification import rectification
-from fgreg.frames import as_float_array, exp_so3, make_transform
-from fgreg.models import CameraModel, StereoRig
+from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
+from fgreg.model.session_model import CameraModel, StereoRig
 
 SIZE, FPS, POLL_S = (1280, 720), 30.0, 0.002
 

@@ -22,17 +22,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from graph_covariance import GraphCovariance
-
 from fgreg.factors.epoch_change import epoch_change_factor
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
-from fgreg.frames import exp_so3, make_transform
-from fgreg.graph.explicit import GraphOptions, build_graph
-from fgreg.graph.explicit_solver import optimize
-from fgreg.graph.explicit_values import SharedValues, initial_values
+from fgreg.geometry.transforms import exp_so3, make_transform
+from fgreg.graph.gtsam_graph import GraphOptions, build_graph
+from fgreg.graph.gtsam_solver import optimize
+from fgreg.graph.gtsam_values import SharedValues, initial_values
+from graph_covariance import GraphCovariance
 from tests.forward import make_measurements
 
 

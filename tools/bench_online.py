@@ -25,9 +25,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_transform
-from fgreg.measurements import Aim, Look, MarkerObservation, Pair, Track, default_marker_covariance
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, make_transform
+from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track, default_marker_covariance
+from fgreg.model.session_model import SessionModel
 from fgreg.online import CameraMoved, OnlineRegistration
 from fgreg.smoother.updates import MOST
 

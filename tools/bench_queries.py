@@ -36,18 +36,17 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from query_codec import QueryError
-from query_server import QueryAddress, QueryClient, QueryServer
-
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online import OnlineRegistration
-from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
+from fgreg.online.snapshot_record import Layout
 from fgreg.online.solver import Where
 from fgreg.tracking import Snapshot, track
+from query_codec import QueryError
+from query_server import QueryAddress, QueryClient, QueryServer
 from tests.forward import make_measurements, make_session
 from tests.test_tracking import surface_case
 from tests.track_cases import held_out, query_of, solved, solved_of

@@ -24,12 +24,12 @@ sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 
-from fgreg.events import AimEvent, CameraMovedEvent, PairEvent
-from fgreg.live import LiveSession
-from fgreg.operation.start import OneProcess
-from fgreg.posterior import pose_tangent
+from fgreg.live.launch import OneProcess
+from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
+from fgreg.online.live_session import LiveSession
+from fgreg.registration.posterior import pose_tangent
 from fgreg.session.journal import Journal
-from fgreg.session.reading import read_session
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session

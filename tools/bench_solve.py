@@ -17,14 +17,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fgreg.answer import answer
-from fgreg.batch import distance_to_explicit, solve
-from fgreg.config import SolveConfig
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
-from fgreg.recognition import recognise
-from fgreg.registration import register
-from fgreg.session.reading import read_session
+from fgreg.detection.events_to_measurements import recognise
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior_mean import answer
+from fgreg.registration.register import register
+from fgreg.registration.solve import distance_to_explicit, solve
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session

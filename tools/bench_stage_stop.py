@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
-from fgreg.motion.device import MAX_CALL_S
-from fgreg.motion.watchdog import TICK_S
+from fgreg.stage.interface import MAX_CALL_S
+from fgreg.stage.watchdog import TICK_S
 from tests.stage_ends import SIGNALS, live_stopped_after, main_program, stopped_after
 from tests.stage_main import LIMITS
 

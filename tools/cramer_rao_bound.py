@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray, as_float_array, inverse, transform_points
+from fgreg.geometry.transforms import FloatArray, as_float_array, inverse, transform_points
 from fgreg.graph.packing import pack
-from fgreg.graph.reduced import evaluate
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import evaluate
 from fgreg.graph.shared_state import make_state
-from fgreg.measurements import Aim, Look, MarkerObservation, Measurements
-from fgreg.models import SessionModel
+from fgreg.model.measurements import Aim, Look, MarkerObservation, Measurements
+from fgreg.model.session_model import SessionModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray
-from fgreg.graph.reduced import evaluate, log_posterior, refine
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.reduced_graph import evaluate, log_posterior, refine
 from fgreg.graph.shared_state import SharedState, step_between
-from fgreg.posterior import (
+from fgreg.registration.posterior import (
     QUANTILE,
     Mode,
     Posterior,

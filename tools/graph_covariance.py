@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray
-from fgreg.graph.explicit import ExplicitGraph, make_ordering
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.gtsam_graph import ExplicitGraph, make_ordering
 
 _LEAST_EIGENVALUE = 1e-12
 """Of the information's correlation matrix: below, a combination of shared variables counts as undetermined."""

@@ -25,25 +25,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from load_player import playing
-from load_watch import GROWS_FROM_MIN, Made, Processes, Watch
-from played_room import FRAME_RATE, Making, make_pictures
 
 from fgreg.drivers.simulated import RoomProcess
 from fgreg.drivers.simulated_room import CAMERA_CLOCK_S, PROBE_CLOCK_S
-from fgreg.events import CameraMovedEvent, PairEvent
-from fgreg.operation.painter import painted
-from fgreg.operation.rooms import room_setup
-from fgreg.operation.start import running
-from fgreg.session.reading import read_session
+from fgreg.live.launch import running
+from fgreg.live.simulated_room import room_setup
+from fgreg.live.viewer_feed import viewer_feed
+from fgreg.model.events import CameraMovedEvent, PairEvent
+from fgreg.session.session_reader import read_session
 from fgreg.simulation.room import room_config
 from fgreg.workers.threads import NAMES
+from load_player import playing
+from load_watch import GROWS_FROM_MIN, Made, Processes, Watch
+from played_room import FRAME_RATE, Making, make_pictures
 
 STAY_S = 12.0
 """The surgeon stays at a spot for so long, while the stage follows."""
 P50_MS, P99_MS = 40.0, 100.0
 RECORDER_WAITS, PULSES_WAIT = 12, 30
-"""Events of some spots; pulses of the time that one is waited for (fgreg.operation.senses)."""
+"""Events of some spots; pulses of the time that one is waited for (fgreg.live.marker_tracker)."""
 GROWTH_MB = 20.0
 """More than this from minute 4 to the end is growth: a process's memory wanders by some MB."""
 
@@ -55,14 +55,14 @@ def measure(options: argparse.Namespace, making: Making, folder: Path) -> dict[s
     session_folder = folder / "session"
     with ExitStack() as stack:
         room = stack.enter_context(RoomProcess(run=play))
-        painter = stack.enter_context(painted(options.rrd, "load", live=False, say=print))
-        with running(room_setup(room.path, making.config), session_folder, None, painter.taken) as session:
-            painter.session(session.model)
+        feed = stack.enter_context(viewer_feed(options.rrd, "load", live=False, say=print))
+        with running(room_setup(room.path, making.config), session_folder, None, feed.taken) as session:
+            feed.session(session.model)
             processes, watch = Processes(), Watch(session)
             until = time.monotonic() + options.seconds
 
             def on_status(status: Any) -> None:
-                painter.status(status)
+                feed.status(status)
                 watch.see(status)
                 processes.see(status.now_s)
 
@@ -97,7 +97,7 @@ def _player(player: dict[str, Any]) -> dict[str, Any]:
 
 def _recorded(folder: Path) -> dict[str, Any]:
     """What is on disk, and what ``fgreg check`` says of it."""
-    program = "import sys; from fgreg.cli import main; sys.exit(main())"
+    program = "import sys; from fgreg.cli.main import main; sys.exit(main())"
     check = subprocess.run([sys.executable, "-c", program, "check", str(folder)], capture_output=True, text=True)
     counted = Counter(type(event) for event in read_session(folder).events)
     return {

@@ -8,10 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from played_room import Making, PlayedRoom
-
 from fgreg.drivers.simulated_room import RoomServer, serving
 from fgreg.workers.worker_process import Work
+from played_room import Making, PlayedRoom
 
 
 class Player(RoomServer):

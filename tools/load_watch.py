@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fgreg.drivers.base import StereoCamera, StereoFrame
-from fgreg.events import PairEvent
-from fgreg.frames import FloatArray
-from fgreg.operation.start import Running
-from fgreg.operation.status import Status
+from fgreg.geometry.transforms import FloatArray
+from fgreg.live.launch import Running
+from fgreg.live.status import Status
+from fgreg.model.events import PairEvent
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 BUSY_S = 1.0
@@ -150,10 +150,10 @@ class Watch:
         self._last: Status | None = None
         self._end: dict[str, int] = {}
         loop, recorder = session.loop, session.recorder
-        loop.ears.heard = _counted(loop.ears.heard, self._heard)  # type: ignore[method-assign]
-        loop.ears.hear = _counted(loop.ears.hear, self._hear)  # type: ignore[method-assign]
+        loop.pulse_locator.heard = _counted(loop.pulse_locator.heard, self._heard)  # type: ignore[method-assign]
+        loop.pulse_locator.hear = _counted(loop.pulse_locator.hear, self._hear)  # type: ignore[method-assign]
         recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
-        loop.eyes.see = self._timed(loop.eyes.see, "look")  # type: ignore[method-assign]
+        loop.marker_tracker.see = self._timed(loop.marker_tracker.see, "look")  # type: ignore[method-assign]
         loop.turn = self._timed(loop.turn, "turn")  # type: ignore[method-assign]
         loop._steering.order = self._timed(loop._steering.order, "order")  # type: ignore[method-assign]
 
@@ -193,7 +193,7 @@ class Watch:
         devices = self._session.loop._devices
         self._last_queues = {
             "recorder": status.recorder.waiting,
-            "pulses": self._session.loop.ears.waiting,
+            "pulses": self._session.loop.pulse_locator.waiting,
             "camera": len(devices.camera._waiting),  # type: ignore[attr-defined]
             "probe": len(devices.probe._waiting),  # type: ignore[attr-defined]
         }
@@ -219,8 +219,8 @@ class Watch:
             "pulses_received": figures.pulses,
             "pulses_dropped": devices.probe.dropped,
             "pulses_handed_on": self._handed_on,
-            "pulses_passed_over": loop.ears.passed_over,
-            "pulses_waiting": loop.ears.waiting,
+            "pulses_passed_over": loop.pulse_locator.passed_over,
+            "pulses_waiting": loop.pulse_locator.waiting,
             "pairs_handed_over": self._pairs,
             "orders": figures.orders,
         }
@@ -381,7 +381,7 @@ def _name(pid: int) -> str:
         shown = Path(f"/proc/{pid}/comm").read_text(encoding="utf-8").strip()
     except OSError:
         return "ended"
-    for part, name in (("fgreg.motion.watchdog", "watchdog"), ("resource_tracker", TRACKER)):
+    for part, name in (("fgreg.stage.watchdog", "watchdog"), ("resource_tracker", TRACKER)):
         if part in words:
             return name
     return shown.removeprefix("fgreg-")

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fgreg.convert.mapping import MAPPING
-from fgreg.estimate import RESULT
-from fgreg.events import EVENTS, MarkerRecord, TrusRecord
-from fgreg.models import SESSION
+from fgreg.model.estimate import RESULT
+from fgreg.model.events import EVENTS, MarkerRecord, TrusRecord
+from fgreg.model.session_model import SESSION
 from fgreg.schema.kinds import Converted, Kind, ListOf
 from fgreg.schema.record import Field, Record, record
 from fgreg.schema.yaml_writer import one_line_yaml

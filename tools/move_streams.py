@@ -14,15 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray, exp_so3, inverse, make_transform
-from fgreg.graph.reduced import evaluate, refine
+from fgreg.geometry.target_error import target_jacobians
+from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.shared_state import SharedState, make_state
-from fgreg.measurements import Aim, EpochStart, Measurements
-from fgreg.models import SessionModel
-from fgreg.registration import pack_session
-from fgreg.targets import target_jacobians
+from fgreg.model.measurements import Aim, EpochStart, Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.register import pack_session
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 

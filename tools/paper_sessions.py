@@ -11,34 +11,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from baseline_alternating import LinesAndArcs, register_alternating
 from baseline_point_based import register_points
 from cramer_rao_bound import FullTruth, beam_covariance, truth_covariance
-
-from fgreg.answer import answer
-from fgreg.batch import track_snapshot
-from fgreg.config import SolveConfig
+from fgreg.detection.events_to_measurements import recognise
 from fgreg.errors import EstimationError
 from fgreg.evaluation.pair_residual import line_to_arc
 from fgreg.evaluation.resolve import pair_residuals, predict
-from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, make_transform, transform_points
+from fgreg.geometry.target_error import expected_tre_mm, tre_mm
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, make_transform, transform_points
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state, nominal_frame
-from fgreg.initialization import beam_starts
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
-from fgreg.readout import read_laser
-from fgreg.recognition import recognise
-from fgreg.registration import calibrate_beam, register
-from fgreg.sensitivity import rotation_of_arc
-from fgreg.session.reading import read_session
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.sensitivity import rotation_of_arc
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.initialization import beam_starts
+from fgreg.registration.posterior_mean import answer
+from fgreg.registration.readout import read_laser
+from fgreg.registration.register import calibrate_beam, register
+from fgreg.registration.solve import track_snapshot
+from fgreg.session.session_reader import read_session
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
-from fgreg.targets import expected_tre_mm, tre_mm
 from fgreg.tracking import track
 
 HELD = 10

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.simulation.render import UInt8Image
 from fgreg.simulation.room import BUMP_S, Place, Room, RoomConfig, Travel, travel_s
 

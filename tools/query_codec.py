@@ -7,9 +7,9 @@ import struct
 
 import numpy as np
 
-from fgreg.estimate import TrackEstimate
-from fgreg.frames import FloatArray
-from fgreg.measurements import Look, MarkerObservation, Track
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import TrackEstimate
+from fgreg.model.measurements import Look, MarkerObservation, Track
 
 MOST_LOOKS = 1000
 _HEAD = struct.Struct("<dqddqq")

@@ -22,13 +22,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
-
-from fgreg.estimate import TrackEstimate
-from fgreg.measurements import Track
+from fgreg.model.estimate import TrackEstimate
+from fgreg.model.measurements import Track
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
 from fgreg.tracking import track
 from fgreg.workers.worker_process import Work, WorkerProcess
+from query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
 
 START_S = 30.0
 """How long the process may take to start."""

@@ -32,6 +32,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from fgreg.geometry.transforms import FloatArray
+from fgreg.simulation.presets import PRESETS
 from paper_sessions import (
     Job,
     Row,
@@ -44,9 +47,6 @@ from paper_sessions import (
     timing,
     tracking,
 )
-
-from fgreg.frames import FloatArray
-from fgreg.simulation.presets import PRESETS
 
 PUBLISHED_CALIBRATION = {5: 2.12, 10: 1.71, 20: 1.39, 30: 1.30, 40: 1.18}
 PUBLISHED_DEVIATION = {0: 1.51, 5: 1.62, 10: 1.96, 15: 1.98, 20: 2.21}

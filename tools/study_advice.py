@@ -1,9 +1,10 @@
 """What following the advice is worth: simulated surgeons who take their next shots as advised, or at random.
 
-Every session starts with 4 random pairs. Two surgeons go on to 10: one takes the best of `fgreg.advice`'s candidates,
-the other any one of the same candidates. Both miss alike: the beam passes the spot by --aim-mm and leans off the
-direction by --lean-deg. The tissue, the probe, the stage and all noise are the forward model's; where a beam ends is
-found by following it to the tissue. A shot that ends outside the probe's field is taken again.
+Every session starts with 4 random pairs. Two surgeons go on to 10: one takes the best of
+`fgreg.registration.next_shot`'s candidates, the other any one of the same candidates. Both miss alike: the beam passes
+the spot by --aim-mm and leans off the direction by --lean-deg. The tissue, the probe, the stage and all noise are the
+forward model's; where a beam ends is found by following it to the tissue. A shot that ends outside the probe's field is
+taken again.
 
 Printed: root mean square TRE over sessions and targets at every number of pairs, both arms, and the ratio at 10
 (target: at most 0.80).
@@ -24,22 +25,22 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.advice import advise
-from fgreg.config import SolveConfig
+from fgreg.detection.events_to_measurements import recognise
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, as_float_array, exp_so3, make_transform
-from fgreg.measurements import Look, MarkerObservation, Measurements, Pair, default_marker_covariance
-from fgreg.models import SessionModel
-from fgreg.recognition import recognise
-from fgreg.registration import Registration, register
-from fgreg.session.reading import read_session
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
+from fgreg.model.measurements import Look, MarkerObservation, Measurements, Pair, default_marker_covariance
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.next_shot import advise
+from fgreg.registration.register import Registration, register
+from fgreg.session.session_reader import read_session
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.scene import Scene
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
-from fgreg.targets import tre_mm
 
 FIRST, LAST = 4, 10
 TRIES = 100

@@ -33,17 +33,17 @@ from dataclasses import asdict, dataclass
 from itertools import repeat
 
 import numpy as np
-from credible_region import credible_region, ellipsoid_contains
 from scipy.stats import chi2, norm
 
-from fgreg.answer import Answer, answer
-from fgreg.config import SolveConfig
+from credible_region import credible_region, ellipsoid_contains
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, inverse, transform_points
+from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.graph.reduced_blocks import look_block
-from fgreg.models import NoiseModel
-from fgreg.posterior import pose_tangent, target_errors, weighted_quantile
-from fgreg.registration import register
+from fgreg.model.session_model import NoiseModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior import pose_tangent, target_errors, weighted_quantile
+from fgreg.registration.posterior_mean import Answer, answer
+from fgreg.registration.register import register
 
 sys.path.insert(0, os.fspath(__import__("pathlib").Path(__file__).resolve().parent.parent))
 from tests.forward import make_measurements, make_session

@@ -23,12 +23,12 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from move_streams import CONFIG, bump_of, shift_of, two_epochs
 
-from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import Verdict
 from fgreg.online import OnlineEstimate, OnlineRegistration
-from fgreg.targets import tre_mm
+from move_streams import CONFIG, bump_of, shift_of, two_epochs
 
 AFTER = 20
 LOOKED_AT = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)

@@ -27,16 +27,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.answer import answer
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray, as_float_array, exp_so3, inverse, transform_points
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, transform_points
 from fgreg.graph.packing import pack
-from fgreg.graph.reduced import contributions, refine
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import contributions, refine
 from fgreg.graph.shared_state import make_state
-from fgreg.measurements import Aim, Measurements, Pair
-from fgreg.models import SessionModel
-from fgreg.registration import Registration, register
+from fgreg.model.measurements import Aim, Measurements, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior_mean import answer
+from fgreg.registration.register import Registration, register
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from tests.forward import Truth, make_measurements

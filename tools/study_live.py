@@ -27,24 +27,24 @@ sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 
-from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
-from fgreg.estimate import EpochEstimate, TrackEstimate, Verdict
-from fgreg.events import AimEvent, CameraMovedEvent, MarkerRecord, PairEvent, TrusRecord
-from fgreg.frames import FloatArray, log_so3
-from fgreg.live import LiveSession
-from fgreg.measurements import Aim, Measurements, Pair, Track
+from fgreg.geometry.transforms import FloatArray, log_so3
+from fgreg.live.launch import NewestSnapshots, OneProcess, make_folder, running, setup_text
+from fgreg.live.recorder import Recorded
+from fgreg.live.room_truth import write_room_truth
+from fgreg.live.simulated_room import simulated_room
+from fgreg.model.estimate import EpochEstimate, TrackEstimate, Verdict
+from fgreg.model.events import AimEvent, CameraMovedEvent, MarkerRecord, PairEvent, TrusRecord
+from fgreg.model.measurements import Aim, Measurements, Pair, Track
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.operation.recorder import Recorded
-from fgreg.operation.room_truth import write_room_truth
-from fgreg.operation.rooms import simulated_room
-from fgreg.operation.start import NewestSnapshots, OneProcess, make_folder, running, setup_text
-from fgreg.pipeline import SolveRequest, solve_session
-from fgreg.posterior import pose_tangent
-from fgreg.replay import ReplayRequest, ReplayStep, replay_session
-from fgreg.session.reading import read_session
-from fgreg.session.safe_yaml import load_yaml
+from fgreg.online.live_session import LiveSession
+from fgreg.pipeline.replay import ReplayRequest, ReplayStep, replay_session
+from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.registration.posterior import pose_tangent
+from fgreg.session.session_reader import read_session
+from fgreg.session.yaml_loader import load_yaml
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
 from fgreg.tracking import track

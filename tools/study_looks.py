@@ -27,16 +27,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.answer import Answer, answer, sound_speed_from_residuals
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray, inverse, transform_points
+from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.graph.shared_state import make_state
-from fgreg.measurements import Measurements, Pair, Track
-from fgreg.models import SessionModel
-from fgreg.posterior import target_errors
-from fgreg.registration import SoundSpeedPrior, register
+from fgreg.model.measurements import Measurements, Pair, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.posterior import target_errors
+from fgreg.registration.posterior_mean import Answer, answer, sound_speed_from_residuals
+from fgreg.registration.register import SoundSpeedPrior, register
+from fgreg.registration.verdict import sound_speed_condition
 from fgreg.tracking import make_snapshot, track
-from fgreg.verdict import sound_speed_condition
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from tests.forward import Truth, make_measurements, make_session

@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
-from fgreg.events import NoteEvent
-from fgreg.session.reading import read_session
+from fgreg.model.events import NoteEvent
+from fgreg.session.session_reader import read_session
 from tests.live_rig import STUDIED, Trial, rig, trial
 
 TOLD_S = 1.0

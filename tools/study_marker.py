@@ -29,10 +29,10 @@ import cv2
 import numpy as np
 
 from fgreg.detection.board import detect_board
+from fgreg.detection.corner_noise import CornerNoise, pool_corner_noise
 from fgreg.detection.marker import detect_marker
-from fgreg.detection.noise import CornerNoise, pool_corner_noise
 from fgreg.detection.results import MarkerFit, NotFound, board_corner, board_covariance, marker_covariance
-from fgreg.frames import (
+from fgreg.geometry.transforms import (
     FloatArray,
     as_float_array,
     exp_so3,
@@ -42,7 +42,7 @@ from fgreg.frames import (
     rotation_to_direction,
     transform_points,
 )
-from fgreg.models import BoardModel, CameraModel, CharucoModel, MarkerModel, StereoRig, TagModel
+from fgreg.model.session_model import BoardModel, CameraModel, CharucoModel, MarkerModel, StereoRig, TagModel
 from fgreg.simulation.render import Background, BoardSurface, Optics, TagSurface, project_points, render_frame
 
 SIZE = (1280, 720)

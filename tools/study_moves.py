@@ -24,20 +24,20 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+
+from fgreg.geometry.transforms import FloatArray, inverse
+from fgreg.graph.pm_selection import select_pms
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import log_posterior, refine
+from fgreg.graph.shared_state import make_state
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.online import OnlineRegistration
+from fgreg.online.events import DetectedMove
+from fgreg.online.recorded_moves import events_in_order
+from fgreg.registration.register import pack_session
 from move_streams import CONFIG, shift_of, two_epochs
 from study_junk import KINDS, spoil
-
-from fgreg.frames import FloatArray, inverse
-from fgreg.graph.pm_selection import select_pms
-from fgreg.graph.reduced import log_posterior, refine
-from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.shared_state import make_state
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
-from fgreg.online import OnlineRegistration
-from fgreg.online.detect import events_in_order
-from fgreg.online.events import DetectedMove
-from fgreg.registration import pack_session
 from tests.forward import Truth, make_measurements
 
 STEADY = 15

@@ -24,9 +24,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, as_float_array, exp_so3
-from fgreg.measurements import Measurements, Pair
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3
+from fgreg.model.measurements import Measurements, Pair
+from fgreg.model.session_model import SessionModel
 from fgreg.online import OnlineRegistration
 from tests.forward import make_measurements
 from tests.online_streams import batch, events, first, sigmas_apart

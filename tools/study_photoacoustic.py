@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.arrival import fit_wavefront
 from fgreg.detection.channels import prepare_channels
 from fgreg.detection.envelope import locate_in_image
 from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import NoSignal, PaFind, pool_sound_speed_ratio
-from fgreg.frames import FloatArray, as_float_array
-from fgreg.models import ChannelModel, ImageModel, ProbeModel, SensitivityModel
+from fgreg.detection.wavefront_fit import fit_wavefront
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, noise_channels, simulate_channels, simulate_envelope_image
 
 ASSUMED_M_S = 1540.0

@@ -19,14 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.frames import inverse, transform_points
-from fgreg.graph.explicit import GraphOptions, build_graph
-from fgreg.graph.explicit_solver import optimize
-from fgreg.graph.explicit_values import SharedValues, initial_values, read_shared
-from fgreg.models import NoiseModel
-from fgreg.pipeline import SolveReport, SolveRequest, solve_session
+from fgreg.geometry.transforms import inverse, transform_points
+from fgreg.graph.gtsam_graph import GraphOptions, build_graph
+from fgreg.graph.gtsam_solver import optimize
+from fgreg.graph.gtsam_values import SharedValues, initial_values, read_shared
+from fgreg.model.estimate import Verdict
+from fgreg.model.session_model import NoiseModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.pipeline.solve import SolveReport, SolveRequest, solve_session
 from fgreg.simulation.config import Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate

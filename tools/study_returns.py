@@ -24,17 +24,17 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from move_streams import CONFIG, ideal_covariance, ideal_tre, many_aims, shift_of, two_epochs
 
 from fgreg.camera_moves.static_tags import TagFrame, TagSettings, TagWatch, watch_tags
 from fgreg.errors import EstimationError
-from fgreg.frames import FloatArray, exp_so3, make_transform
-from fgreg.measurements import EpochStart, Measurements
-from fgreg.models import SessionModel
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
+from fgreg.model.measurements import EpochStart, Measurements
+from fgreg.model.session_model import SessionModel
 from fgreg.online import OnlineRegistration
-from fgreg.online.detect import events_in_order
-from fgreg.registration import register
-from fgreg.targets import tre_mm
+from fgreg.online.recorded_moves import events_in_order
+from fgreg.registration.register import register
+from move_streams import CONFIG, ideal_covariance, ideal_tre, many_aims, shift_of, two_epochs
 from tests.forward import Truth
 
 AFTER = 30

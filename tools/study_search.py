@@ -33,8 +33,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
-from fgreg.frames import as_float_array
-from fgreg.models import SensitivityModel
+from fgreg.geometry.transforms import as_float_array
+from fgreg.model.session_model import SensitivityModel
 from fgreg.search.hearing import HearingModel
 from fgreg.search.planner import Found, Prediction, SearchPlanner, SearchSettings, Turn
 from fgreg.simulation.acoustics import Elevation

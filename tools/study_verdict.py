@@ -37,19 +37,27 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.batch import solve
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray, as_float_array, exp_so3, hat, inverse, make_transform, transform_points
+from fgreg.detection.events_to_measurements import recognise
+from fgreg.geometry.transforms import (
+    FloatArray,
+    as_float_array,
+    exp_so3,
+    hat,
+    inverse,
+    make_transform,
+    transform_points,
+)
 from fgreg.graph.packing import pack
-from fgreg.graph.reduced import evaluate, refine
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.shared_state import make_state
-from fgreg.measurements import MarkerObservation, Measurements
-from fgreg.models import NoiseModel, SessionModel
-from fgreg.recognition import recognise
+from fgreg.model.estimate import Verdict
+from fgreg.model.measurements import MarkerObservation, Measurements
+from fgreg.model.session_model import NoiseModel, SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.solve import solve
 from fgreg.session.ground_truth import GroundTruth
-from fgreg.session.reading import read_ground_truth, read_session
+from fgreg.session.session_reader import read_ground_truth, read_session
 from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import FIRST_HIT
 from fgreg.simulation.simulate import simulate

@@ -8,9 +8,9 @@ Kalman filter runs through them. Hypotheses:
 - moved at a split point: the registration is ``trus_T_camera * Exp(xi)`` from that PM on, xi about the camera with a
   zero-mean prior that mixes scales, from a nudge to a camera put back anywhere.
 
-Under each of them any PM may be an outlier: then it has a constant density (fgreg.robust.JUNK_DENSITY). So one gross
-outlier is an outlier, and several in a row that agree on one moved registration are a move. The likeliest few sequences
-of labels (inlier or outlier, PM by PM) are carried along: a Gaussian sum, cut down to its heaviest terms.
+Under each of them any PM may be an outlier: then it has a constant density (fgreg.registration.outliers.JUNK_DENSITY).
+So one gross outlier is an outlier, and several in a row that agree on one moved registration are a move. The likeliest
+few sequences of labels (inlier or outlier, PM by PM) are carried along: a Gaussian sum, cut down to its heaviest terms.
 
 Large moves are not linear: moved hypotheses are linearised again about the registrations they lead to.
 """
@@ -24,12 +24,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgreg.camera_moves.whitened import POSE, Gaussian, WhitenedPms, WindowRows, linearise
-from fgreg.frames import BoolArray, FloatArray, IntArray
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.split_points import ALARM, MoveScales, default_scales, logsumexp
-from fgreg.robust import JUNK_DENSITY
-from fgreg.sensitivity import interval_moments, log_interval
+from fgreg.model.sensitivity import interval_moments, log_interval
+from fgreg.registration.outliers import JUNK_DENSITY
 
 BRANCHES = 4
 """Sequences of labels carried along per hypothesis."""

@@ -31,16 +31,16 @@ from fgreg.camera_moves.loop_closure import (
     log_bayes_of_same_place,
 )
 from fgreg.camera_moves.whitened import POSE, gaussian_of, linearise, settled_private
-from fgreg.config import SolveConfig
-from fgreg.frames import BoolArray, FloatArray, IntArray
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Contributions, contributions
+from fgreg.graph.reduced_graph import Contributions, contributions
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.split_points import GATE, log_move_odds, logsumexp
-from fgreg.measurements import Aim, EpochStart, Measurements, Pair
-from fgreg.models import SessionModel
-from fgreg.registration import SoundSpeedPrior, pack_session
-from fgreg.robust import pm_limits
+from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.outliers import pm_limits
+from fgreg.registration.register import SoundSpeedPrior, pack_session
 
 if TYPE_CHECKING:
     from fgreg.smoother.shared_variables import Quadratic

@@ -15,7 +15,7 @@ import numpy as np
 from fgreg.camera_moves.bayes_filter import MoveSettings, Relinearise, move_evidence
 from fgreg.camera_moves.whitened import POSE, Gaussian, WhitenedPms
 from fgreg.graph.split_points import MoveScales
-from fgreg.measurements import EpochStart
+from fgreg.model.measurements import EpochStart
 
 MIN_LOOKS, MOST_LOOKS = 8, 30
 """Looks of the current epoch between which a loop is closed: then it knows its registration as well by itself."""

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri
 
-from fgreg.frames import BoolArray, FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
-from fgreg.measurements import POSE_FLOOR, usable_covariance
+from fgreg.geometry.transforms import BoolArray, FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
+from fgreg.model.measurements import POSE_FLOOR, usable_covariance
 
 TAG_P = 1e-3
 """A tag that fits a common motion worse than this goes its own way."""

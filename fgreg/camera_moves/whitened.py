@@ -1,6 +1,6 @@
 """PMs as whitened linear equations on the shared variables, and the Gaussian of those variables.
 
-With everything private eliminated (fgreg.graph.reduced) a PM adds ``cost + 2 g' d + d' H d`` at a step d from the
+With everything private eliminated (fgreg.graph.reduced_graph) a PM adds ``cost + 2 g' d + d' H d`` at a step d from the
 linearisation point, and H has the rank of the equations it leaves over (two for one look). So that is
 ``|residual + jacobian d|^2 + rest`` with few rows, which is what a Kalman filter takes one by one.
 """
@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import BoolArray, FloatArray, IntArray
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Contributions, contributions, evaluate, refine
 from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times
+from fgreg.graph.reduced_graph import Contributions, contributions, evaluate, refine
 from fgreg.graph.shared_state import SharedState, step_between
-from fgreg.graph.windows import LEAST_PRECISION
-from fgreg.robust import pm_degrees_of_freedom
+from fgreg.graph.window_likelihood import LEAST_PRECISION
+from fgreg.registration.outliers import pm_degrees_of_freedom
 
 POSE = slice(0, 6)
 """Columns of the registration: problems here are of one epoch."""

@@ -28,9 +28,8 @@ import numpy.typing as npt
 
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
+from fgreg.detection.frame_files import png_bytes
 from fgreg.drivers.calibration_files import rig_of_infos
-from fgreg.drivers.frame_files import png_bytes
-from fgreg.drivers.recordings import Recording
 from fgreg.drivers.ros_messages import (
     ARRAY_TYPES,
     IMAGE_TYPES,
@@ -47,10 +46,11 @@ from fgreg.drivers.ros_messages import (
     scan_deg_of,
     stamp_ns,
 )
+from fgreg.drivers.ros_recordings import Recording
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, inverse, log_so3
-from fgreg.models import StereoRig
-from fgreg.pairing import PairRefused, TimedPose, interpolate, pose_at
+from fgreg.geometry.transforms import FloatArray, inverse, log_so3
+from fgreg.model.session_model import StereoRig
+from fgreg.model.time_sync import PairRefused, TimedPose, interpolate, pose_at
 
 MARK_GAP_S = 1.0
 """A mark belongs to a look that is at most so far away: people press a key when they have heard it."""

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fgreg.frames import FloatArray
-from fgreg.models import StereoRig
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import StereoRig
 
 Document = dict[str, Any]
 
 
 @dataclass(slots=True)
 class Draft:
-    """One event: the object of its line (fgreg.session.event_document), and where it came from, for messages."""
+    """One event: the object of its line (fgreg.session.event_writer), and where it came from, for messages."""
 
     document: Document
     where: str

@@ -24,9 +24,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from fgreg.errors import InputError, one_line
-from fgreg.estimate import SessionEstimate, Verdict
-from fgreg.frames import FloatArray, inverse
-from fgreg.quaternions import quaternion_from_rotation
+from fgreg.geometry.quaternions import quaternion_from_rotation
+from fgreg.geometry.transforms import FloatArray, inverse
+from fgreg.model.estimate import SessionEstimate, Verdict
 from fgreg.version import __version__
 
 JSON_FORMAT = "fgreg-transform/1"

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fgreg.errors import InputError
-from fgreg.session.reading import SETUP_FILE
+from fgreg.session.session_reader import SETUP_FILE
 
 _SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml", "result.yaml"})
 

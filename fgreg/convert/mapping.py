@@ -23,12 +23,12 @@ from typing import Annotated
 
 import numpy as np
 
-from fgreg.events import TrusRecord
-from fgreg.frames import FloatArray, as_float_array
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.events import TrusRecord
 from fgreg.schema.kinds import Converted, Covariance, Integer, JsonSchema, Kind, ListOf, Number, Text, Transform
 from fgreg.schema.problems import FieldError, input_error, shown
 from fgreg.schema.record import Field, Key, Section, record
-from fgreg.session.safe_yaml import load_yaml
+from fgreg.session.yaml_loader import load_yaml
 
 MAPPING_FORMAT = "fgreg-mapping/1"
 

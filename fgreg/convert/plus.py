@@ -20,9 +20,9 @@ from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.sequence_file import SequenceFile, read_sequence
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, is_rigid
-from fgreg.pairing import PairRefused
-from fgreg.quaternions import turn_about_x
+from fgreg.geometry.quaternions import turn_about_x
+from fgreg.geometry.transforms import FloatArray, is_rigid
+from fgreg.model.time_sync import PairRefused
 from fgreg.schema.problems import shown
 
 _DEFAULTS = {

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fgreg.errors import InputError
 from fgreg.schema.problems import shown
-from fgreg.session.safe_yaml import read_bounded
+from fgreg.session.yaml_loader import read_bounded
 
 _TYPES = {"UCHAR": "u1", "CHAR": "i1", "USHORT": "u2", "SHORT": "i2", "UINT": "u4", "INT": "i4", "FLOAT": "f4"}
 _TYPES |= {"DOUBLE": "f8"}

@@ -13,14 +13,14 @@ import numpy as np
 
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import COLUMNS, LOOK, Column, RecordingMapping
-from fgreg.drivers.frame_files import png_bytes, read_picture
+from fgreg.detection.frame_files import png_bytes, read_picture
 from fgreg.errors import InputError
-from fgreg.frames import FloatArray, exp_so3, is_rigid, make_transform
-from fgreg.quaternions import rotation_from_quaternion
+from fgreg.geometry.quaternions import rotation_from_quaternion
+from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transform
 from fgreg.schema.files import FrameName
 from fgreg.schema.kinds import Number
 from fgreg.schema.problems import shown
-from fgreg.session.safe_yaml import read_bounded
+from fgreg.session.yaml_loader import read_bounded
 
 _MAX_BYTES = 256_000_000
 _DELIMITERS = (",", ";", "\t")

@@ -9,14 +9,14 @@ from pathlib import Path
 from fgreg.convert.drafts import Draft, Imported
 from fgreg.convert.files import whole_folder
 from fgreg.errors import InputError, one_line
-from fgreg.models import STEREO_RIG, StereoRig
+from fgreg.model.session_model import STEREO_RIG, StereoRig
 from fgreg.schema.yaml_writer import one_line_yaml
-from fgreg.session.event_document import event_line
-from fgreg.session.event_log import frames_of, read_line
-from fgreg.session.frames_named import FrameUse, check_frames
-from fgreg.session.reading import EVENTS_FILE, SETUP_FILE, check_session
-from fgreg.session.safe_yaml import load_yaml, read_bounded
-from fgreg.session.setup import Setup, read_setup
+from fgreg.session.event_reader import frames_of, read_line
+from fgreg.session.event_writer import event_line
+from fgreg.session.frame_files import FrameUse, check_frames
+from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, check_session
+from fgreg.session.setup_reader import Setup, read_setup
+from fgreg.session.yaml_loader import load_yaml, read_bounded
 
 _MAX_SETUP = 4_000_000
 

@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, robust_pose
 from fgreg.detection.camera import focal_px, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.corners import grey, refine_subpixel
 from fgreg.detection.edges import MIN_CONTRAST, Image
-from fgreg.detection.joint import VIEW_NAMES, choose_pose, robust_pose
-from fgreg.detection.pose import CornerSet, join
+from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import BoardFit, NotFound
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
-from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.models import BoardModel, CameraModel, StereoRig
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
+from fgreg.model.session_model import BoardModel, CameraModel, StereoRig
 
 CORNER_SIGMA_PX = 0.03
 """Of a refined inner corner. Four squares meet there: the picture is symmetric, so blur does not bias it."""

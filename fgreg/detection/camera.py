@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgreg.frames import FloatArray
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import CameraModel
 
 UNDISTORT_ITERATIONS = 20
 UNDISTORT_TOLERANCE = 1e-9

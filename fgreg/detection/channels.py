@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy import fft as scipy_fft
 
 from fgreg.errors import EstimationError
-from fgreg.frames import BoolArray
-from fgreg.models import ChannelModel
+from fgreg.geometry.transforms import BoolArray
+from fgreg.model.session_model import ChannelModel
 
 Complex64Array = npt.NDArray[np.complex64]
 Float32Array = npt.NDArray[np.float32]

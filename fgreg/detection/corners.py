@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from fgreg.detection.camera import ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.edges import MIN_CONTRAST, Image, fit_edges, segment_frames
-from fgreg.frames import BoolArray, FloatArray
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.model.session_model import CameraModel
 
 CORNER_FLOOR_PX = 0.003
 """Added to the sigma of corners from edges: independent errors that averaging along an edge does not remove."""

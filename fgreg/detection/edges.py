@@ -27,8 +27,8 @@ from fgreg.detection.camera import (
     focal_px,
     pixels_from_ideal,
 )
-from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
+from fgreg.model.session_model import CameraModel
 
 Image = npt.NDArray[np.uint8]
 

@@ -1,7 +1,8 @@
 """Pose of the fibre's marker from one or two frames, with covariance; refused where the frames cannot tell it.
 
 Tags are found in each view (tags.py), their corners refined by their edges (corners.py), and one pose is fitted to all
-corners of both views (joint.py) from every planar hypothesis. A flat body in one view has a second pose that may fit
+corners of both views (body_pose.py) from every planar hypothesis. A flat body in one view has a second pose that may
+fit
 as well: that is reported, not guessed.
 """
 
@@ -12,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, without_strays
 from fgreg.detection.camera import focal_px
 from fgreg.detection.corners import grey, square_corners
 from fgreg.detection.edges import Image
-from fgreg.detection.joint import VIEW_NAMES, choose_pose, without_strays
-from fgreg.detection.pose import CornerSet, join
+from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import FoundTag, find_tags, tag_cells
-from fgreg.frames import FloatArray
-from fgreg.models import CameraModel, MarkerModel, StereoRig
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig
 
 LARGE_WIDTH_PX = 1000
 """From this width on a single tag is looked for at half the resolution first."""

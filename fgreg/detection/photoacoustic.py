@@ -1,8 +1,8 @@
 """Where the photoacoustic source is: from channel data, or from an envelope image (envelope.py).
 
-Channel data hold one-way travel times. A wavefront is looked for by delay and sum over the image plane (wavefront.py)
-and, where there is one, fitted for x, range and the ratio of sound speeds (arrival.py). A frame without a source is
-answered with :class:`NoSignal`, not with a point.
+Channel data hold one-way travel times. A wavefront is looked for by delay and sum over the image plane
+(wavefront_search.py) and, where there is one, fitted for x, range and the ratio of sound speeds (wavefront_fit.py). A
+frame without a source is answered with :class:`NoSignal`, not with a point.
 
 The ratio of sound speeds is always fitted along. Fixing it at 1 gains little (tools/study_photoacoustic.py has the
 figures), while a speed 2 % off would then move the range without a word.
@@ -16,13 +16,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.arrival import WavefrontFit, fit_wavefront, path_mm
 from fgreg.detection.channels import check_frame, prepare_channels
 from fgreg.detection.results import NoSignal, PaFind
-from fgreg.detection.wavefront import COARSE_RANGE_MM, MAX_TANGENT, RATIOS, SIDELOBES_MM, find_peaks, search_nearby
+from fgreg.detection.wavefront_fit import WavefrontFit, fit_wavefront, path_mm
+from fgreg.detection.wavefront_search import (
+    COARSE_RANGE_MM,
+    MAX_TANGENT,
+    RATIOS,
+    SIDELOBES_MM,
+    find_peaks,
+    search_nearby,
+)
 from fgreg.errors import EstimationError
-from fgreg.frames import BoolArray, FloatArray
-from fgreg.models import ProbeModel
+from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.model.session_model import ProbeModel
 
 FALSE_ALARMS = 2e-4
 """Share of frames of noise in which a source may be found by mistake."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgreg.detection.noise import CornerNoise, fit_covariance
-from fgreg.frames import FloatArray, hat
-from fgreg.models import BoardModel
+from fgreg.detection.corner_noise import CornerNoise, fit_covariance
+from fgreg.geometry.transforms import FloatArray, hat
+from fgreg.model.session_model import BoardModel
 
 
 @dataclass(frozen=True, slots=True)

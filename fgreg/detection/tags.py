@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.edges import Image
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 
 BORDER_PX = 12
 """The image is continued by so much: a tag whose quiet zone the image's edge cuts off is still a closed square."""

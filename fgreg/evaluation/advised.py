@@ -10,9 +10,9 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from fgreg.advice import Advice, AdvisedShot
 from fgreg.evaluation.export import plain
 from fgreg.evaluation.tables import number
+from fgreg.registration.next_shot import Advice, AdvisedShot
 
 UPRIGHT_DEG = 1.0
 """Leans below this are not worth a word."""

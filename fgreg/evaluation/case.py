@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.frames import FloatArray
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.frames import FloatArray
-from fgreg.graph.reduced import pm_contributions
-from fgreg.registration import Registration
-from fgreg.targets import expected_tre_mm, moved_mm
+from fgreg.geometry.target_error import expected_tre_mm, moved_mm
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.reduced_graph import pm_contributions
+from fgreg.registration.register import Registration
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 
 HALF_ARC_RAD = math.pi / 2.0
 """The arc that is searched reaches this far to either side of the image plane."""

@@ -12,7 +12,7 @@ from scipy.special import chdtri, gammaln, xlogy
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.evaluation.run import SessionEvaluation
 from fgreg.evaluation.summary import all_tre_mm, pooled_curve
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.answer import answer
 from fgreg.errors import EstimationError
 from fgreg.evaluation.case import Case, EvaluationConfig
 from fgreg.evaluation.pair_residual import line_to_arc
-from fgreg.frames import FloatArray
+from fgreg.geometry.target_error import expected_tre_mm, tre_mm
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.packing import pack
-from fgreg.graph.reduced import pm_contributions, refine
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Measurements, Pair
-from fgreg.registration import Registration, register
-from fgreg.targets import expected_tre_mm, tre_mm
+from fgreg.model.measurements import Measurements, Pair
+from fgreg.registration.posterior_mean import answer
+from fgreg.registration.register import Registration, register
 
 REFINEMENTS = 5
 

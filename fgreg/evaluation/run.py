@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 
-from fgreg.batch import solve
-from fgreg.estimate import PredictedTre, Verdict
 from fgreg.evaluation.case import (
     Case,
     EvaluationConfig,
@@ -23,10 +21,12 @@ from fgreg.evaluation.case import (
 )
 from fgreg.evaluation.influence import Influence, influences
 from fgreg.evaluation.resolve import Resolved, resolve
-from fgreg.frames import FloatArray
-from fgreg.sensitivity import wrap_angle
-from fgreg.targets import beam_error, tre_mm
-from fgreg.verdict import Condition
+from fgreg.geometry.target_error import beam_error, tre_mm
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import PredictedTre, Verdict
+from fgreg.model.sensitivity import wrap_angle
+from fgreg.registration.solve import solve
+from fgreg.registration.verdict import Condition
 from fgreg.workers.threads import one_thread_each
 
 Progress = Callable[[str, int, int], None]

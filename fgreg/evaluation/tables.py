@@ -10,7 +10,6 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from fgreg.estimate import Verdict
 from fgreg.evaluation.run import SessionEvaluation
 from fgreg.evaluation.summary import (
     CurvePoint,
@@ -22,6 +21,7 @@ from fgreg.evaluation.summary import (
     prediction_of,
     spread_of,
 )
+from fgreg.model.estimate import Verdict
 
 MOST_ROWS = 40
 MOST_INFLUENCES = 4

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
+from fgreg.geometry.transforms import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import (
+from fgreg.model.measurements import (
     FLOOR_MM,
     POSE_FLOOR,
     EpochStart,
@@ -24,8 +24,8 @@ from fgreg.measurements import (
     Pair,
     usable_covariance,
 )
-from fgreg.models import SensitivityModel, SessionModel
-from fgreg.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
+from fgreg.model.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
+from fgreg.model.session_model import SensitivityModel, SessionModel
 
 LINE_SIGMA_MM = 1e-3
 """Width of the beam itself: point on line is an equality; this keeps its covariance invertible (as in the factors)."""

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.frames import BoolArray, IntArray
+from fgreg.geometry.transforms import BoolArray, IntArray
 from fgreg.graph.packing import BeamArrays, LookArrays, PackedProblem, RotationShapes
 from fgreg.graph.reduced_blocks import PrivateState
-from fgreg.sensitivity import WindowShapes
+from fgreg.model.sensitivity import WindowShapes
 
 
 def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:

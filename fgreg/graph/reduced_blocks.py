@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.frames import FloatArray, IntArray, exp_so3, make_transform
+from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, make_transform
 from fgreg.graph.packing import LINE_SIGMA_MM, BeamArrays, PackedProblem
 from fgreg.graph.shared_state import SharedState
-from fgreg.sensitivity import arc_of_rotation
+from fgreg.model.sensitivity import arc_of_rotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

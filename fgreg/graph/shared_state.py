@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.frames import FloatArray, exp_so3, log_so3, make_transform, rotation_to_direction
+from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform, rotation_to_direction
 from fgreg.graph.columns import Columns
 
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import pm_contributions
+from fgreg.graph.reduced_graph import pm_contributions
 from fgreg.graph.reduced_solver import Optimum
 
 GATE = 2.5

@@ -20,33 +20,33 @@ from types import TracebackType
 import gtsam
 import numpy as np
 
-from fgreg.batch import Solution, solve
 from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase, find_camera_move
 from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
 from fgreg.camera_moves.static_tags import TagSettings
-from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused
-from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.frames import FloatArray, make_transform, rotation_to_direction
+from fgreg.geometry.transforms import FloatArray, make_transform, rotation_to_direction
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Aim, EpochStart, Measurements, Pair, Track
-from fgreg.models import SessionModel
-from fgreg.online.checks import check
+from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import TissueSurface
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
+from fgreg.online.event_checks import check
 from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
 from fgreg.online.solver import Where, make_solver
-from fgreg.online.tag_guard import TagGuard, TagsMoved, TagsRest, guarded
-from fgreg.online.tracking import online_snapshot
-from fgreg.registration import EpochSearch, Minimum, SoundSpeedPrior
+from fgreg.online.tag_check import TagGuard, TagsMoved, TagsRest, guarded
+from fgreg.online.tracking_snapshot import online_snapshot
+from fgreg.registration.register import EpochSearch, Minimum, SoundSpeedPrior
+from fgreg.registration.solve import Solution, solve
+from fgreg.registration.verdict import accuracy
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
 from fgreg.smoother.shared_variables import POSE, Quadratic
 from fgreg.smoother.state import Epoch, State, looks_by_pm, make_setting
 from fgreg.smoother.updates import FIRST_PAIRS, with_aim, with_motion, with_move, with_pair
-from fgreg.surface import TissueSurface
 from fgreg.tracking import Snapshot, track
-from fgreg.verdict import accuracy
 
 NOT_SOLVED = "this camera epoch has not been through the full solve yet: take the estimate as preliminary"
 NO_REGISTRATION = "no registration of this camera epoch"

@@ -17,18 +17,18 @@ from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
-from fgreg.config import SolveConfig
 from fgreg.errors import EventRefused, FgregError
-from fgreg.estimate import TrackEstimate
-from fgreg.frames import FloatArray
-from fgreg.measurements import Measurements, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import TrackEstimate
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
-from fgreg.online.queries import Layout
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
-from fgreg.registration import SoundSpeedPrior
+from fgreg.online.snapshot_record import Layout
+from fgreg.registration.register import SoundSpeedPrior
 from fgreg.tracking import track
 from fgreg.workers.worker_process import NICENESS
 
@@ -45,7 +45,7 @@ class EngineGone(FgregError):  # noqa: N818
 
 
 class EngineProcess:
-    """The engine as :class:`fgreg.live.LiveSession` takes it. Use it as a context manager, or close it.
+    """The engine as :class:`fgreg.online.live_session.LiveSession` takes it. Use it as a context manager, or close it.
 
     Calls wait for the process; they may come from several threads, one after another.
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
-from fgreg.estimate import PredictedTre, Verdict
-from fgreg.frames import FloatArray
-from fgreg.targets import target_jacobians
+from fgreg.geometry.target_error import target_jacobians
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import PredictedTre, Verdict
 
 QUANTILE = 0.95
 _FREEDOM = np.linspace(1.0, 3.0, 4001)
@@ -32,7 +32,7 @@ class OnlineEstimate:
         used: whether the pair just added counts in the estimate.
         verdict, reasons: as of a solve; at most a warning until this epoch was judged by the full solve.
         pairs: looks of this epoch that count.
-        optimum_trus_T_camera: (4, 4) the graph's optimum, comparable with :mod:`fgreg.registration`.
+        optimum_trus_T_camera: (4, 4) the graph's optimum, comparable with :mod:`fgreg.registration.register`.
         settled: judged by the full solve with exactly these measurements.
     """
 
@@ -66,7 +66,7 @@ def gaussian_quantile_mm(covariance: FloatArray) -> FloatArray:
 
 
 def gaussian_tre(covariance: FloatArray, trus_T_camera: FloatArray, targets_mm: FloatArray) -> PredictedTre:
-    """Predicted target registration error of a Gaussian (definitions: :class:`fgreg.estimate.PredictedTre`).
+    """Predicted target registration error of a Gaussian (definitions: :class:`fgreg.model.estimate.PredictedTre`).
 
     Args:
         covariance: (6, 6), right tangent of ``trus_T_camera`` (4, 4).

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from fgreg.frames import FloatArray
-from fgreg.measurements import Aim, Pair
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.measurements import Aim, Pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)

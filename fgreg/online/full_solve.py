@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.batch import Solution, solve
 from fgreg.camera_moves.detector import CameraMove, LoopClosure, MoveCase, find_camera_move
-from fgreg.config import SolveConfig
 from fgreg.errors import EstimationError
-from fgreg.estimate import PredictedTre, Verdict
-from fgreg.frames import FloatArray
-from fgreg.measurements import Measurements
-from fgreg.models import SessionModel
-from fgreg.posterior import pose_tangent
-from fgreg.registration import EpochSearch, Registration, SoundSpeedPrior, register
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import PredictedTre, Verdict
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import TissueSurface
+from fgreg.registration.posterior import pose_tangent
+from fgreg.registration.register import EpochSearch, Registration, SoundSpeedPrior, register
+from fgreg.registration.solve import Solution, solve
 from fgreg.smoother.initialise import Initial, initial_of
-from fgreg.surface import TissueSurface
 
 
 @dataclass(frozen=True, slots=True, eq=False)

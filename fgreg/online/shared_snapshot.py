@@ -27,8 +27,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fgreg.frames import IntArray
-from fgreg.online.queries import Layout, SnapshotDecoder, encode_snapshot
+from fgreg.geometry.transforms import IntArray
+from fgreg.online.snapshot_record import Layout, SnapshotDecoder, encode_snapshot
 from fgreg.tracking import Snapshot
 
 MAGIC: Final = 0x6667726567_01

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import partial
 from typing import Literal, Protocol
 
-from fgreg.config import SolveConfig
-from fgreg.models import SessionModel
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, full_solve
-from fgreg.registration import SoundSpeedPrior
+from fgreg.registration.register import SoundSpeedPrior
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 Where = Literal["in_process", "worker"]

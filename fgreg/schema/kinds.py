@@ -15,7 +15,14 @@ from typing import Any
 import numpy as np
 
 from fgreg.errors import InputError
-from fgreg.frames import RIGID_TOLERANCE, FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
+from fgreg.geometry.transforms import (
+    RIGID_TOLERANCE,
+    FloatArray,
+    as_float_array,
+    is_rigid,
+    make_transform,
+    nearest_rotation,
+)
 from fgreg.schema.problems import FieldError, Problem, nearest, shown
 
 MAX_TRANSLATION_MM = 2000.0

@@ -69,7 +69,7 @@ def place_text(path: Path, file: str, root: object = None, line: int | None = No
     Args:
         path: from the top of the document.
         file: how messages name the file.
-        root: the document, whose mappings and lists know their lines (fgreg.session.safe_yaml).
+        root: the document, whose mappings and lists know their lines (fgreg.session.yaml_loader).
         line: of a file with one document per line, which line; shown first.
     """
     where = path_text(path)

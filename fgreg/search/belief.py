@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from scipy.special import ndtr
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.search.hearing import HearingModel
 
 GRID_RAD = math.radians(0.1)

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from fgreg.frames import FloatArray
-from fgreg.models import SensitivityModel
-from fgreg.sensitivity import AMPLITUDE_SIGMA, amplitude_curve
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.sensitivity import AMPLITUDE_SIGMA, amplitude_curve
+from fgreg.model.session_model import SensitivityModel
 
 ASSUMED_SIGMA = 0.15
 """Relative noise where the session has no curve, and a bell that is down to a half at the window's edge stands in."""

@@ -17,7 +17,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.search.belief import Belief
 from fgreg.search.hearing import HearingModel
 

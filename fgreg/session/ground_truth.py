@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.kinds import POINT_MM, SCAN_DEG, SECONDS, JsonSchema, Kind, ListOf, Transform, in_radians
 from fgreg.schema.problems import FieldError, Problem, shown
 from fgreg.schema.record import Key, record

@@ -1,8 +1,8 @@
 """The journal of a session while it is recorded: every event on disk before anybody is told that it is taken in.
 
-What is written is what :func:`fgreg.session.reading.read_session` reads back: each line is read by the same code before
-it goes out, and :meth:`Journal.append` hands back the event as it was read. Work on with that one, and a session that
-is opened again goes on from the very same numbers.
+What is written is what :func:`fgreg.session.session_reader.read_session` reads back: each line is read by the same code
+before it goes out, and :meth:`Journal.append` hands back the event as it was read. Work on with that one, and a session
+that is opened again goes on from the very same numbers.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from types import TracebackType
 from typing import Self
 
 from fgreg.errors import InputError, JournalError
-from fgreg.events import Event
-from fgreg.models import SessionModel
+from fgreg.model.events import Event
+from fgreg.model.session_model import SessionModel
 from fgreg.schema.files import FrameKind, FrameName
 from fgreg.schema.problems import FieldError, input_error
-from fgreg.session.append_file import AppendFile, sync_path
-from fgreg.session.event_document import event_document, event_line, type_of
-from fgreg.session.event_log import frames_of, read_line
-from fgreg.session.frames_named import check_frames
-from fgreg.session.reading import EVENTS_FILE, SETUP_FILE, Session, read_session
-from fgreg.session.safe_yaml import load_yaml
-from fgreg.session.setup import Setup, read_setup
+from fgreg.session.append_only_file import AppendFile, sync_path
+from fgreg.session.event_reader import frames_of, read_line
+from fgreg.session.event_writer import event_document, event_line, type_of
+from fgreg.session.frame_files import check_frames
+from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session
+from fgreg.session.setup_reader import Setup, read_setup
+from fgreg.session.yaml_loader import load_yaml
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.frames import FloatArray
-from fgreg.models import ChannelModel, ProbeModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import ChannelModel, ProbeModel
 
 ChannelArray = npt.NDArray[np.float32]
 

@@ -8,8 +8,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from fgreg.frames import FloatArray, as_float_array
-from fgreg.models import (
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.session_model import (
     BoardModel,
     CameraModel,
     ChannelModel,

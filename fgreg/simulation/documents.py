@@ -1,4 +1,4 @@
-"""A configuration as the content of ``session.yaml``, which fgreg.models describes; numbers rounded to read well."""
+"""A configuration as the content of ``session.yaml`` (see fgreg.model.session_model), with numbers rounded."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.frames import FloatArray, as_float_array
-from fgreg.models import SESSION, SessionModel
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.session_model import SESSION, SessionModel
 from fgreg.simulation.config import SimulationConfig
 
 DECIMALS = 9

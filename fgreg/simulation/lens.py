@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgreg.frames import FloatArray
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import CameraModel
 
 
 def project_points(camera: CameraModel, camera_p_mm: FloatArray) -> FloatArray:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.frames import FloatArray, make_transform, transform_points
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import FloatArray, make_transform, transform_points
+from fgreg.model.session_model import CameraModel
 from fgreg.simulation.acoustics import Hearing, quantised, simulate_channels
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.render import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fgreg.models import BoardModel, ChannelModel, CharucoModel, NoiseModel
+from fgreg.model.session_model import BoardModel, ChannelModel, CharucoModel, NoiseModel
 from fgreg.simulation.config import SimulationConfig, Sweep, default_probe, default_rig
 
 _CHANNELS = ChannelModel(sampling_mhz=40.0, t0_us=13.0, pulse_delay_us=0.4)

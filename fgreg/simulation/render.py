@@ -15,8 +15,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.frames import FloatArray
-from fgreg.models import CameraModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import CameraModel
 from fgreg.simulation.lens import project_points, undistorted_rays
 from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Sheet, Surface, TagSurface
 from fgreg.simulation.textures import BLACK, WHITE, Float32Array

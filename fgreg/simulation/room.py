@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.frames import FloatArray, exp_so3, inverse, log_so3, make_transform, transform_points
-from fgreg.models import ChannelModel, NoiseModel
+from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform, transform_points
+from fgreg.model.session_model import ChannelModel, NoiseModel
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, default_probe, default_rig
 from fgreg.simulation.pictures import LookPicture, ShotPicture

@@ -8,8 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgreg.frames import BoolArray, FloatArray, IntArray, exp_so3, inverse, make_transform, transform_points
-from fgreg.models import CameraModel, StereoRig, TagModel
+from fgreg.geometry.transforms import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    exp_so3,
+    inverse,
+    make_transform,
+    transform_points,
+)
+from fgreg.model.session_model import CameraModel, StereoRig, TagModel
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.render import project_points
 

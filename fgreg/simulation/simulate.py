@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.events import (
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, exp_so3, inverse, make_transform
+from fgreg.model.events import (
     EVENTS,
     AimEvent,
     CameraMovedEvent,
@@ -25,7 +26,6 @@ from fgreg.events import (
     TrackEvent,
     TrusRecord,
 )
-from fgreg.frames import BoolArray, FloatArray, IntArray, exp_so3, inverse, make_transform
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.documents import degrees, round_array, rows, session_document

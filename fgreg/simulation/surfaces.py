@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
-from fgreg.frames import FloatArray
-from fgreg.models import BoardModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import BoardModel
 from fgreg.simulation.textures import CellTexture, board_texture, plain_texture, tag_texture
 
 

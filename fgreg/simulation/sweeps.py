@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import BoolArray, FloatArray, IntArray
-from fgreg.models import SensitivityModel, StageModel
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
+from fgreg.model.session_model import SensitivityModel, StageModel
 from fgreg.simulation.config import SimulationConfig, Sweep
 
 

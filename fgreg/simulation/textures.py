@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.models import BoardModel
+from fgreg.model.session_model import BoardModel
 
 Float32Array = npt.NDArray[np.float32]
 LabelArray = npt.NDArray[np.uint8]

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Measurements
-from fgreg.registration import Registration
+from fgreg.model.measurements import Measurements
+from fgreg.registration.register import Registration
 from fgreg.smoother.innovation import sigma_distance
 from fgreg.smoother.isam_window import Change, Group, Window, free_number, open_window, prepare
 from fgreg.smoother.marginal_prior import one_epoch

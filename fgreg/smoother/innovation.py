@@ -9,14 +9,14 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 from scipy.special import chdtri
 
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Parts, contributions, refine
 from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import Parts, contributions, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Aim, EpochStart, Measurements
-from fgreg.robust import AIM_LIMIT, WANDERING_CHI2, WANDERS_MM, innovations_of, junk_p_of, limits_among
+from fgreg.model.measurements import Aim, EpochStart, Measurements
+from fgreg.registration.outliers import AIM_LIMIT, WANDERING_CHI2, WANDERS_MM, innovations_of, junk_p_of, limits_among
 from fgreg.smoother.isam_window import Prepared, Window
 from fgreg.smoother.shared_variables import Quadratic, small_step
 from fgreg.smoother.state import Setting, State, pairs_of_epoch
@@ -35,7 +35,7 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 
 
 def limit_of(degrees_of_freedom: int, inliers: int, count: int) -> float:
-    """Chi square beyond which a PM is an outlier, as in fgreg.robust, where ``inliers`` of ``count`` count, it too."""
+    """Chi square beyond which a PM is an outlier, where ``inliers`` of ``count`` are inliers, the PM among them."""
     return float(chdtri(max(degrees_of_freedom, 1), junk_p_of(inliers, count)))
 
 

@@ -1,6 +1,6 @@
 """The active window: recent pairs as factors in iSAM2, and one marginal prior of everything older.
 
-All variables of a recent pair are in the graph as they are in the reference (fgreg.graph.explicit): its marker pose,
+All variables of a recent pair are in the graph as they are in the reference (fgreg.graph.gtsam_graph): its marker pose,
 PM, lambda and theta' are *variables*, nothing is eliminated by hand. Two facts of GTSAM's Python wrapper rule how iSAM2
 is used here:
 
@@ -24,13 +24,13 @@ from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import point_on_line_factor
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
-from fgreg.frames import FloatArray
-from fgreg.graph.explicit import Variable, make_ordering
-from fgreg.graph.explicit_values import beam_of_chart
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.gtsam_graph import Variable, make_ordering
+from fgreg.graph.gtsam_values import beam_of_chart
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
-from fgreg.models import SessionModel
-from fgreg.sensitivity import arc_of_rotation, sensitivity_priors
+from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
+from fgreg.model.sensitivity import arc_of_rotation, sensitivity_priors
+from fgreg.model.session_model import SessionModel
 from fgreg.smoother.shared_variables import Layout, Quadratic, finite, marginal_prior_factor, number_at
 
 THRESHOLDS: dict[Variable, tuple[float, ...]] = {
@@ -309,7 +309,7 @@ class Window:
 
 
 def empty_isam() -> gtsam.ISAM2:
-    """iSAM2 that eliminates by QR (see fgreg.graph.explicit_solver) and re-linearises by the thresholds above."""
+    """iSAM2 that eliminates by QR (see fgreg.graph.gtsam_solver) and re-linearises by the thresholds above."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1

@@ -1,6 +1,6 @@
 """The marginal prior: what all shots outside the active window say about the shared variables of the current epoch.
 
-It is made by the reduced graph (fgreg.graph.reduced), where each shot's own variables are eliminated already. The
+It is made by the reduced graph (fgreg.graph.reduced_graph), where each shot's own variables are eliminated already. The
 registrations of earlier epochs are eliminated here by the Schur complement.
 """
 
@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.frames import FloatArray, inverse
+from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced import Evaluation, evaluate, refine
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
+from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import EpochStart
+from fgreg.model.measurements import EpochStart
 from fgreg.smoother.shared_variables import Quadratic, small_step
 
 PRIVATE_ROUNDS = 3

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from fgreg.factors.adapter import Residual, custom_factor
-from fgreg.frames import FloatArray, exp_so3, hat, log_so3
+from fgreg.geometry.transforms import FloatArray, exp_so3, hat, log_so3
 from fgreg.graph.columns import Columns
-from fgreg.graph.explicit import Variable
-from fgreg.graph.explicit_values import laser_chart
+from fgreg.graph.gtsam_graph import Variable
+from fgreg.graph.gtsam_values import laser_chart
 from fgreg.graph.shared_state import SharedState, nominal_frame, step_between
 
 POSE = slice(0, 6)

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.epochs import restrict_epochs
-from fgreg.frames import FloatArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Aim, EpochStart, Measurements, Pair
-from fgreg.models import SessionModel
-from fgreg.registration import SoundSpeedPrior, pack_session
+from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.epochs import restrict_epochs
+from fgreg.registration.register import SoundSpeedPrior, pack_session
 from fgreg.smoother.isam_window import Window
 from fgreg.smoother.marginal_prior import marginal_prior, one_epoch, with_registrations
 from fgreg.smoother.shared_variables import Layout, Quadratic

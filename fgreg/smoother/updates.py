@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fgreg.graph.shared_state import SharedState
-from fgreg.measurements import Aim, EpochStart, Pair
+from fgreg.model.measurements import Aim, EpochStart, Pair
 from fgreg.smoother.innovation import aim_fits, innovation, limit_of, sigma_distance
 from fgreg.smoother.isam_window import Change, Group, Window, free_number, open_window, prepare, updated
 from fgreg.smoother.marginal_prior import carried_over, has_moved

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.estimate import TrackEstimate, Verdict
-from fgreg.frames import FloatArray, exp_so3, parent_from_right_covariance
+from fgreg.geometry.transforms import FloatArray, exp_so3, parent_from_right_covariance
+from fgreg.graph.expectation_propagation import inverse_hessian, settle
 from fgreg.graph.packing import Anchor, PackedProblem, pack_pairs
-from fgreg.graph.reduced import evaluate, refine
 from fgreg.graph.reduced_blocks import initial_private, times
+from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.graph.sites import inverse_hessian, settle
-from fgreg.measurements import POSE_FLOOR, MarkerObservation, Pair, Track, usable_covariance
-from fgreg.sensitivity import wrap_angle
-from fgreg.surface import GRAZING
+from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.measurements import POSE_FLOOR, MarkerObservation, Pair, Track, usable_covariance
+from fgreg.model.sensitivity import wrap_angle
+from fgreg.model.tissue_surface import GRAZING
 from fgreg.tracking.snapshot import SHARED, EpochSnapshot, Snapshot
 
 SAMPLES = 1000

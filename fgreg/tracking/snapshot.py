@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.config import SolveConfig
-from fgreg.estimate import Verdict
-from fgreg.frames import FloatArray, IntArray
+from fgreg.geometry.transforms import FloatArray, IntArray
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import SharedState
-from fgreg.models import SensitivityModel, SessionModel, StageModel
-from fgreg.surface import TissueSurface
+from fgreg.model.estimate import Verdict
+from fgreg.model.session_model import SensitivityModel, SessionModel, StageModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import TissueSurface
 
 EDGE, BIAS, SPEED, RADIUS, SHARED = 10, 11, 14, 15, 16
 """Where window edge (rad), marker bias (3, mm), sound speed ratio and probe radius (mm) sit in the covariance of one

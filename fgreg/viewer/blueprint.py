@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fgreg.estimate import Verdict
+from fgreg.model.estimate import Verdict
 from fgreg.viewer.scene import Eye
 
 if TYPE_CHECKING:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.estimate import PredictedTre, TrackEstimate, Verdict
-from fgreg.frames import FloatArray
-from fgreg.measurements import Aim, Look, Pair, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
+from fgreg.model.measurements import Aim, Look, Pair, Track
+from fgreg.model.session_model import SessionModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
-from fgreg.viewer.now import Now, goal_line, now_markdown
+from fgreg.viewer.status_line import Now, goal_line, now_markdown
 
 LARGEST_PLOTTED_MM = 30.0
 """A predicted error beyond this says no more than that nothing is known yet."""

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from fgreg.estimate import SessionEstimate
-    from fgreg.frames import FloatArray
-    from fgreg.measurements import Measurements, Track
-    from fgreg.models import ProbeModel, SessionModel
-    from fgreg.viewer.now import BmodePicture
+    from fgreg.geometry.transforms import FloatArray
+    from fgreg.model.estimate import SessionEstimate
+    from fgreg.model.measurements import Measurements, Track
+    from fgreg.model.session_model import ProbeModel, SessionModel
     from fgreg.viewer.recording import Moment, Truth, Viewer
     from fgreg.viewer.scene import ShotKind
     from fgreg.viewer.shapes import Image8
+    from fgreg.viewer.status_line import BmodePicture
 
 
 class NullViewer:

@@ -27,19 +27,19 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
-from fgreg.estimate import SessionEstimate, Verdict
-from fgreg.frames import FloatArray, exp_so3
-from fgreg.measurements import Measurements, Track
-from fgreg.models import ProbeModel, SessionModel
+from fgreg.geometry.transforms import FloatArray, exp_so3
+from fgreg.model.estimate import SessionEstimate, Verdict
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import ProbeModel, SessionModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LivePainter, Moment
-from fgreg.viewer.now import BmodePicture
-from fgreg.viewer.pa import pa_picture, texture
+from fgreg.viewer.pa_frame import pa_picture, texture
 from fgreg.viewer.result import ResultPainter, Truth
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.shapes import Image8
+from fgreg.viewer.status_line import BmodePicture
 
 LARGEST_TEXTURE = 160
 """Larger side of a B-mode picture on the image plane, pixels."""

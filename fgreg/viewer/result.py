@@ -9,13 +9,13 @@ from typing import Protocol
 
 import numpy as np
 
-from fgreg.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
-from fgreg.frames import FloatArray, inverse, log_so3, transform_points
-from fgreg.measurements import Look, MarkerObservation, Measurements, Pair, Track
-from fgreg.models import SessionModel
+from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
+from fgreg.model.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
+from fgreg.model.measurements import Look, MarkerObservation, Measurements, Pair, Track
+from fgreg.model.session_model import SessionModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
-from fgreg.viewer.text import summary_markdown
+from fgreg.viewer.summary_page import summary_markdown
 
 FAR_MM = 1000.0
 """A camera farther from the probe than this is not what the opening picture is fitted to."""

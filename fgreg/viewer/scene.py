@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from fgreg.estimate import SessionEstimate
-from fgreg.frames import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
-from fgreg.measurements import Look
-from fgreg.models import CameraModel, MarkerModel, ProbeModel
-from fgreg.sensitivity import arc_of_rotation
+from fgreg.geometry.transforms import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
+from fgreg.model.estimate import SessionEstimate
+from fgreg.model.measurements import Look
+from fgreg.model.sensitivity import arc_of_rotation
+from fgreg.model.session_model import CameraModel, MarkerModel, ProbeModel
 
 ShotKind = Literal["aim", "pair", "track"]
 CHI2_95_3 = 7.814728

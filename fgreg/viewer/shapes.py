@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.frames import FloatArray, inverse
-from fgreg.models import CameraModel, SessionModel
-from fgreg.viewer.pa import PaPicture
+from fgreg.geometry.transforms import FloatArray, inverse
+from fgreg.model.session_model import CameraModel, SessionModel
+from fgreg.viewer.pa_frame import PaPicture
 from fgreg.viewer.scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
 
 if TYPE_CHECKING:

@@ -1,0 +1,80 @@
+"""Who a Thorlabs cube is: two questions that change nothing. The motor is not even switched on."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+from fgreg.drivers import thorlabs_apt
+from fgreg.drivers.thorlabs_stage import ASK_AGAIN_S, COUNTS_PER_RAD, MODELS, open_port
+from fgreg.stage.interface import StageError, StageLost
+
+ANSWER_S = 1.0
+"""How long a cube may take for both answers."""
+
+
+_QUESTIONS = {
+    thorlabs_apt.GET_INFO: thorlabs_apt.short(thorlabs_apt.REQ_INFO),
+    thorlabs_apt.GET_STATUS: thorlabs_apt.short(thorlabs_apt.REQ_STATUS, thorlabs_apt.CHANNEL),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CubeIdentity:
+    """What a cube says of itself: model, serial number, device angle (deg, from where it was switched on unless
+    ``homed``)."""
+
+    port: str
+    model: str
+    serial: int
+    device_deg: float
+    homed: bool
+
+    def __str__(self) -> str:
+        zero = "knows its zero position" if self.homed else "has to find its zero position"
+        return f"{self.model} no. {self.serial} at {self.port}, {self.device_deg:.1f} deg, {zero}"
+
+
+def identify(port: str) -> CubeIdentity:
+    """Ask the cube at a serial port.
+
+    Raises:
+        StageLost: the port cannot be opened (somebody else has it), or nobody answers there.
+        StageError: somebody else answers.
+        MissingExtraError: pyserial is not installed.
+    """
+    line = open_port(port)
+    try:
+        line.reset_input_buffer()
+        line.write(thorlabs_apt.short(thorlabs_apt.NO_FLASH))
+        told: dict[int, bytes] = {}
+        parser = thorlabs_apt.AptParser()
+        until, asked = time.monotonic() + ANSWER_S, -math.inf
+        while not told.keys() >= _QUESTIONS.keys():
+            now = time.monotonic()
+            if now > until:
+                raise StageLost(f"stage at {port} does not answer: is it switched on, is it a KDC101 or TDC001?")
+            if now - asked > ASK_AGAIN_S:
+                asked = now
+                for answer, question in _QUESTIONS.items():
+                    if answer not in told:  # the others get in the way of lost replies
+                        line.write(question)
+            time.sleep(0.002)
+            told |= {message.id: message.data for message in parser.feed(line.read(4096))}
+    except OSError as error:
+        raise StageLost(f"stage at {port} is gone: {error}") from error
+    finally:
+        line.close()
+    model = thorlabs_apt.read_model(told[thorlabs_apt.GET_INFO])
+    if not model.startswith(MODELS):
+        raise StageError(f"stage at {port} is a {model!r}, expected one of {', '.join(MODELS)}")
+    status = thorlabs_apt.read_status(told[thorlabs_apt.GET_STATUS])
+    angle = math.degrees(status.position / COUNTS_PER_RAD)
+    return CubeIdentity(
+        port,
+        model,
+        thorlabs_apt.read_serial(told[thorlabs_apt.GET_INFO]),
+        angle,
+        bool(status.bits & thorlabs_apt.HOMED_BIT),
+    )

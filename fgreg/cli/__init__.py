@@ -1,0 +1,1 @@
+"""The commands, and their text in the terminal."""

@@ -1,0 +1,185 @@
+"""The command ``fgreg convert``."""
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fgreg.errors import InputError
+
+if TYPE_CHECKING:
+    from fgreg.convert.drafts import Imported
+    from fgreg.convert.mapping import RecordingMapping
+
+_HELP = """Recordings into sessions, and results into files that other programs read.
+
+\b
+A recording, with the session.yaml that says how things were set up:
+  fgreg convert shots.csv   OUT --setup session.yaml   CSV: one row, one event
+  fgreg convert bag/        OUT --setup session.yaml   ROS 2: rosbag2 folder, .mcap, .db3
+  fgreg convert scan.mha    OUT --setup session.yaml   PLUS sequence (.mha, .mhd)
+\b
+A result (a session's folder, or its result.yaml), by the ending of OUT:
+  fgreg convert SESSION registration.xml    PLUS: <Transform From="Camera" To="Trus">, mm
+  fgreg convert SESSION registration.yaml   ROS 2: TransformStamped trus -> camera, m
+  fgreg convert SESSION registration.tfm    3D Slicer: linear transform CameraToTrus
+  fgreg convert SESSION registration.json   all of it: covariance, verdict, reasons
+\b
+Where session.yaml has no camera, --calibration FILE brings it: ROS camera_info (left
+and right: give the option twice), OpenCV FileStorage, Kalibr camchain. A ROS 2
+recording with camera_info topics needs none.
+\b
+Columns, topics and fields have usual names: a CSV has t, type (pair where absent),
+pm, scan_deg, x_mm, range_mm or frame, sweep, camera_T_marker (16 numbers) or
+marker_x_mm ... marker_qw, or left and right (pictures); sessions/README.md lists all.
+Others are named in a mapping (--map):
+  format: fgreg-mapping/1
+  columns: {t: time_s, scan_deg: {column: angle_rad, scale: 57.29577951}}
+  topics: {marker: /marker/pose, scan: /stage/joint_states, frame: /probe/channels}
+  fields: {marker: NeedleToCameraTransform, scan: StageAngle}
+\b
+What lacks its marker or stage angle is left out and told. A result with the verdict
+refused is exported with --force only, and the file says so.
+"""
+
+
+def add_convert(app: typer.Typer) -> None:
+    """Register the command."""
+
+    @app.command(help=_HELP)
+    def convert(
+        source: Annotated[Path, typer.Argument(metavar="SOURCE", help="A recording, or a result.")],
+        out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the new session, or file to write.")],
+        setup: Annotated[
+            Path | None, typer.Option("--setup", metavar="FILE", help="session.yaml of a new session (or its folder).")
+        ] = None,
+        mapping: Annotated[
+            Path | None, typer.Option("--map", metavar="FILE", help="What is what in the recording.")
+        ] = None,
+        calibration: Annotated[
+            list[Path] | None,
+            typer.Option("--calibration", metavar="FILE", help="The endoscope's, where session.yaml has no camera."),
+        ] = None,
+        unit: Annotated[
+            str | None, typer.Option("--calibration-unit", metavar="m|mm", help="Of the calibration's lengths.")
+        ] = None,
+        rectified: Annotated[
+            bool, typer.Option("--rectified", help="The pictures were rectified with this calibration.")
+        ] = False,
+        epoch: Annotated[int | None, typer.Option("--epoch", help="Of a result; default: the last one.")] = None,
+        force: Annotated[
+            bool, typer.Option("--force", help="Export a result that is refused, marked as such.")
+        ] = False,
+        overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under OUT.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
+    ) -> None:
+        result = _result_file(source)
+        if result is not None:
+            unused = {"--setup": setup, "--map": mapping, "--calibration": calibration or None}
+            _refuse(unused, "a result", "a recording")
+            line = _export(result, out, epoch, force, overwrite)
+            if not quiet:
+                typer.echo(line)
+            return
+        _refuse({"--epoch": epoch, "--force": force or None}, "a recording", "a result")
+        if setup is None:
+            raise InputError("--setup", "nothing", "the session.yaml that says how things were set up")
+        _import(source, out, setup, mapping, calibration or [], unit, rectified, overwrite, quiet)
+
+
+def _refuse(options: Mapping[str, object], given: str, of: str) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(name, f"it with {given}", f"it with {of} only")
+
+
+def _result_file(source: Path) -> Path | None:
+    """The result that a source is or has, or None where it is a recording.
+
+    Raises:
+        InputError: neither.
+    """
+    from fgreg.drivers.ros_recordings import is_recording
+
+    if source.is_dir():
+        if is_recording(source):
+            return None
+        result = source / "result.yaml"
+        if result.is_file():
+            return result
+        if (source / "session.yaml").is_file():
+            raise InputError(str(source), "a session without result.yaml", "a solved one: fgreg solve first")
+        raise InputError(str(source), "a folder of another kind", "a rosbag2 folder, or a session with its result")
+    if not source.exists():
+        raise InputError(str(source), "nothing", "a recording (.csv, .mcap, .db3, .mha, rosbag2 folder) or a result")
+    return source if source.suffix.lower() in (".yaml", ".yml") else None
+
+
+def _export(result: Path, out: Path, epoch: int | None, force: bool, overwrite: bool) -> str:
+    from fgreg.convert.export import WRITERS, registration_of
+    from fgreg.convert.files import write_whole
+    from fgreg.session.result_file import read_result
+
+    writer = WRITERS.get(out.suffix.lower())
+    if writer is None:
+        raise InputError(str(out), f"a name that ends in {out.suffix or 'nothing'}", "one in " + ", ".join(WRITERS))
+    registration = registration_of(read_result(result), result, epoch=epoch, force=force)
+    write_whole(out, writer(registration), overwrite=overwrite)
+    marked = ", REFUSED and marked as such" if registration.refused else ""
+    return f"{out}: epoch {registration.epoch} of {registration.session}, verdict {registration.verdict}{marked}"
+
+
+def _import(
+    source: Path,
+    out: Path,
+    setup: Path,
+    mapping: Path | None,
+    calibration: list[Path],
+    unit: str | None,
+    rectified: bool,
+    overwrite: bool,
+    quiet: bool,
+) -> None:
+    from fgreg.convert.mapping import RecordingMapping, read_mapping
+    from fgreg.convert.write import write_session
+    from fgreg.drivers.calibration_files import read_calibration
+    from fgreg.session.yaml_loader import load_yaml
+
+    rig = None
+    if calibration:
+        file = setup / "session.yaml" if setup.is_dir() else setup
+        if "camera" in load_yaml(file, str(file)):
+            raise InputError("--calibration", f"it, and a camera in {file.name}", "one of the two")
+        found = read_calibration(calibration, unit=unit, rectified=rectified)
+        rig = found.rig
+        for warning in found.warnings:
+            sys.stderr.write(f"fgreg: warning: {warning}\n")
+    elif rectified or unit is not None:
+        raise InputError("--rectified" if rectified else "--calibration-unit", "it alone", "it with --calibration")
+    imported = _read(source, RecordingMapping() if mapping is None else read_mapping(mapping))
+    written = write_session(imported, setup, out, rig=rig, overwrite=overwrite)
+    for warning in [*written.left_out[:10], *written.warnings]:
+        sys.stderr.write(f"fgreg: warning: {warning}\n")
+    if len(written.left_out) > 10:
+        sys.stderr.write(f"fgreg: warning: {len(written.left_out) - 10} more left out; events.jsonl begins with why\n")
+    if not quiet:
+        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(written.events.items()))
+        typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {out}")
+
+
+def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
+    from fgreg.convert.bag import read_bag
+    from fgreg.convert.plus import read_plus
+    from fgreg.convert.table import read_table
+    from fgreg.drivers.ros_recordings import is_recording
+
+    suffix = source.suffix.lower()
+    if is_recording(source):
+        return read_bag(source, mapping)
+    if suffix in (".csv", ".tsv", ".txt"):
+        return read_table(source, mapping)
+    if suffix in (".mha", ".mhd"):
+        return read_plus(source, mapping)
+    raise InputError(str(source), f"a file that ends in {suffix or 'nothing'}", ".csv, .mcap, .db3, .mha or .mhd")

@@ -1,0 +1,195 @@
+"""The commands ``fgreg evaluate`` and ``fgreg advise``."""
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fgreg.errors import InputError
+
+if TYPE_CHECKING:
+    from fgreg.evaluation.case import Case
+    from fgreg.registration.verdict import Condition
+
+Progress = Callable[[str, int, int], None]
+ProgressBar = Callable[[bool], AbstractContextManager[Progress]]
+EXIT_REFUSED = 1
+
+
+def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
+    """Register the commands of this module; ``progress_bar(quiet)`` shows progress on standard error."""
+
+    @app.command()
+    def evaluate(
+        sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions.")],
+        folds: Annotated[int, typer.Option("--folds", help="Folds of the cross-validation; 0: none.")] = 5,
+        one_by_one: Annotated[
+            bool, typer.Option("--leave-one-out/--no-leave-one-out", help="Also leave out each PM by itself.")
+        ] = True,
+        subsets: Annotated[
+            int, typer.Option("--subsets", help="Most subsets of each number of pairs; 0: no such curve.")
+        ] = 20,
+        sizes: Annotated[
+            str | None, typer.Option("--sizes", metavar="N,N,...", help="Numbers of pairs, such as 4,6,10.")
+        ] = None,
+        seed: Annotated[int, typer.Option("--seed", help="Of folds and subsets; same seed, same figures.")] = 1,
+        jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes. Default: one per core.")] = None,
+        csv: Annotated[
+            Path | None, typer.Option("--csv", metavar="FILE", help="Also write all figures, one a line.")
+        ] = None,
+        plots: Annotated[
+            Path | None, typer.Option("--plots", metavar="DIR", help="Also write plots into this folder.")
+        ] = None,
+        plot_format: Annotated[str, typer.Option("--plot-format", help="png or svg.")] = "png",
+        as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and no tables.")] = False,
+    ) -> None:
+        """How good is it: errors against the truth, held-out pairs, number of pairs, influence of each.
+
+        Solves each SESSION again and again from parts of its pairs. With a ground_truth.yaml: TRE, tracking and beam
+        errors. Without: what the pairs say about each other; the pair residual (the publication's Eq. 12) is not a
+        TRE. Exit status 1 where a verdict is refused.
+        """
+        from fgreg.evaluation.case import EvaluationConfig
+        from fgreg.evaluation.export import as_csv, as_dict
+        from fgreg.evaluation.plots import FORMATS, new_figure, save_plots
+        from fgreg.evaluation.run import evaluate as run
+        from fgreg.evaluation.tables import print_evaluation
+        from fgreg.model.estimate import Verdict
+
+        for option, value, least in (("--folds", folds, 0), ("--subsets", subsets, 0), ("--seed", seed, 0)):
+            if value < least:
+                raise InputError(option, str(value), f"a number >= {least}")
+        if folds == 1:
+            raise InputError("--folds", "1", "0 or at least 2")
+        if jobs is not None and jobs < 1:
+            raise InputError("--jobs", str(jobs), "a number >= 1")
+        if plot_format not in FORMATS:
+            raise InputError("--plot-format", plot_format, "one of " + ", ".join(FORMATS))
+        if plots is not None:
+            new_figure()  # a missing library is told before the work, not after
+        config = EvaluationConfig(
+            folds=folds,
+            leave_one_out=one_by_one,
+            curve=subsets > 0,
+            sizes=_sizes(sizes),
+            subsets=max(subsets, 1),
+            seed=seed,
+        )
+        with progress_bar(quiet or as_json) as progress:
+            read = [read_case(folder, progress) for folder in sessions]
+            cases, conditions = named_apart([case for case, _ in read], sessions), [found for _, found in read]
+            found = run(cases, config, jobs=jobs or _cores(), progress=progress, conditions=conditions)
+        if csv is not None:
+            write_text(csv, as_csv(found), "--csv")
+        written = save_plots(found, plots, plot_format) if plots is not None else []
+        if as_json:
+            typer.echo(json.dumps(as_dict(found), indent=2))
+        elif not quiet:
+            print_evaluation(found)
+            for path in [*([csv] if csv is not None else []), *written]:
+                typer.echo(f"written: {path}")
+        if any(item.whole.verdict is Verdict.REFUSED for item in found):
+            raise typer.Exit(EXIT_REFUSED)
+
+    @app.command()
+    def advise(
+        session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session so far.")],
+        count: Annotated[int, typer.Option("--count", "-n", help="How many shots to list.")] = 5,
+        as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    ) -> None:
+        """Where the next shot helps most: spots and beam directions, ranked by the predicted TRE after them.
+
+        Reads what has been taken so far; at least 4 pairs. The last camera epoch counts. Exit status 1 where there is
+        no registration to advise on.
+        """
+        from fgreg.errors import EstimationError
+        from fgreg.evaluation.advised import advice_dict, print_advice
+        from fgreg.model.solve_config import SolveConfig
+        from fgreg.registration.next_shot import advise as run
+        from fgreg.registration.register import register
+
+        if count < 1:
+            raise InputError("--count", str(count), "a number >= 1")
+        with progress_bar(quiet or as_json) as progress:
+            case, _ = read_case(session, progress)
+            try:
+                advice = run(register(case.measurements, case.model, SolveConfig()), count=count)
+            except EstimationError as error:
+                if as_json:
+                    typer.echo(json.dumps({"session": case.name, "shots": [], "notes": [str(error)]}, indent=2))
+                else:
+                    sys.stderr.write(f"fgreg: no advice: {error}\n")
+                raise typer.Exit(EXIT_REFUSED) from error
+        if as_json:
+            typer.echo(json.dumps(advice_dict(case.name, advice), indent=2))
+        else:
+            print_advice(case.name, advice)
+
+
+def _sizes(text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    try:
+        sizes = tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError("--sizes", text, "numbers of pairs, such as 4,6,10") from error
+    if min(sizes) < 3:
+        raise InputError("--sizes", text, "numbers of pairs of at least 3")
+    return sizes
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def named_apart(cases: "list[Case]", folders: list[Path]) -> "list[Case]":
+    """Sessions of the same name are called by their folders."""
+    names = [case.name for case in cases]
+    return [
+        replace(case, name=str(folder)) if names.count(case.name) > 1 else case
+        for case, folder in zip(cases, folders, strict=True)
+    ]
+
+
+def write_text(path: Path, text: str, option: str) -> None:
+    """Write a file that the user asked for.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(option, f"{path}: {error.strerror}", "a file that can be written") from error
+
+
+def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]":
+    """A session with its frames recognised (once) and its truth, and what the frames say against it."""
+    from fgreg.detection.events_to_measurements import recognise
+    from fgreg.evaluation.case import Case, Truth
+    from fgreg.model.solve_config import SolveConfig
+    from fgreg.pipeline.solve import detection_conditions
+    from fgreg.session.session_reader import read_ground_truth, read_session
+
+    session = read_session(folder)
+    known = read_ground_truth(folder)
+    for warning in session.warnings:
+        sys.stderr.write(f"fgreg: warning: {warning}\n")
+    step = f"looking at frames of {session.model.name}"
+    recognised = recognise(session.events, session.model, progress=lambda done, total: progress(step, done, total))
+    truth = None
+    if known is not None:
+        stage = {round(track.t, 6): track.stage_rad for track in known.tracks}
+        answers = tuple(stage.get(round(track.t, 6)) for track in recognised.tracks)
+        truth = Truth(known.trus_T_camera, known.marker_T_laser, answers)
+    case = Case(session.model.name, session.model, recognised.measurements, recognised.tracks, truth)
+    return case, detection_conditions(recognised, SolveConfig())

@@ -1,0 +1,339 @@
+"""The command ``fgreg live``."""
+
+import json
+import math
+import signal
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from fgreg.cli.options import LimitOption, solve_config
+from fgreg.errors import InputError
+
+if TYPE_CHECKING:
+    from fgreg.live.launch import LiveSetup, Running
+    from fgreg.live.status import Figures, Status
+    from fgreg.model.session_model import StageModel
+    from fgreg.model.solve_config import SolveConfig
+    from fgreg.pipeline.solve import SolveReport
+
+MakeExtras = Callable[["SolveReport"], Any]
+EXIT_REFUSED = 1
+IN_CONFIG = {
+    "seed": "room.seed",
+    "aims": "settings.aims",
+    "bumps": "room.bump_every_s",
+    "width": "room.width",
+    "limit_mm": "settings.limit_mm",
+}
+"""Parameters of the command, and where a CONFIG.yaml has them."""
+SHOW_S = 0.25
+SLOW_MS = 250.0
+"""From a frame to its angle: beyond this the stage lags behind the beam, and its watchdog may miss the heartbeat."""
+MOST_REASONS, REASON_WIDTH = 2, 170
+"""Of the verdict, in the panel: it has to fit a small terminal."""
+
+
+def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
+    """Register the command; ``make_extras`` gives what a summary tells besides the estimate."""
+
+    @app.command()
+    def live(
+        context: typer.Context,
+        config: Annotated[
+            Path | None,
+            typer.Argument(metavar="[CONFIG]", help="A driver per role (CONFIG.yaml). Default: a simulated room."),
+        ] = None,
+        out: Annotated[
+            Path | None,
+            typer.Option(
+                "--out",
+                metavar="FOLDER",
+                help="The session to record: a new folder, or one to go on with. Default: fgreg-live-DATE-TIME here.",
+            ),
+        ] = None,
+        duration: Annotated[
+            float | None, typer.Option("--duration", metavar="S", help="End after so many seconds. Default: at Ctrl-C.")
+        ] = None,
+        no_viewer: Annotated[
+            bool,
+            typer.Option(
+                "--no-viewer", help="Show the session in the terminal only, not in Rerun: where there is no screen."
+            ),
+        ] = False,
+        rrd: Annotated[
+            Path | None,
+            typer.Option("--rrd", metavar="FILE", help="Record what a viewer would show."),
+        ] = None,
+        seed: Annotated[int, typer.Option("--seed", help="Of all that is random in the simulated room.")] = 1,
+        aims: Annotated[int, typer.Option("--aims", help="Calibration shots in the simulated room.")] = 8,
+        bumps: Annotated[
+            float,
+            typer.Option("--bump-every", metavar="S", help="Mean time between moves of the simulated camera."),
+        ] = 240.0,
+        width: Annotated[
+            int,
+            typer.Option(
+                "--width", metavar="PX", help="Of the simulated camera's images; below 640 boards may not be found."
+            ),
+        ] = 640,
+        limit_mm: LimitOption = 3.0,
+        example_config: Annotated[
+            bool, typer.Option("--example-config", help="Print a CONFIG.yaml with every driver and key, explained.")
+        ] = False,
+        as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document at the end.")] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
+    ) -> None:
+        """Register while it happens: devices in, registration and stage angle out, everything recorded.
+
+        Without CONFIG a simulated operating room runs: a surgeon calibrates the fibre at a board, points at tissue, the
+        stage searches the sound, the registration forms, and the stage follows the beam. Now and then somebody bumps
+        into the camera. With CONFIG your devices are used, each by the driver that it names.
+
+        Devices that disappear are told within a second and used again when they are back. A stage that stopped for
+        trouble is latched: it says why, and moves again after `reset` and a new request.
+
+        \b
+          fgreg live --aims 6 --duration 120 --no-viewer  the room, in the terminal
+          fgreg live --rrd session.rrd             in Rerun's viewer, and recorded
+          fgreg live --example-config > room.yaml  a CONFIG with every key to choose
+          fgreg devices room.yaml                  which of its devices answer
+          fgreg live room.yaml --out SESSION       a session with your devices
+
+        Ctrl-C ends it: the stage stops first, the session in FOLDER is complete and solved once more as a whole.
+        Replay it: fgreg replay FOLDER. Exit status 1 where the verdict is refused.
+        """
+        if example_config:
+            from fgreg.live.config_keys import example_config as example
+
+            typer.echo(example(), nl=False)
+            return
+        from fgreg.cli.report import print_summary, summary_dict
+        from fgreg.live.launch import default_folder
+        from fgreg.model.estimate import Verdict
+        from fgreg.pipeline.solve import SolveRequest, solve_session
+
+        if duration is not None and not 0 < duration < math.inf:
+            raise InputError("--duration", str(duration), "seconds > 0")
+        if config is not None:
+            _alone(context)
+        settings = solve_config(limit_mm, "")
+        folder = default_folder() if out is None else out
+        silent = as_json or quiet
+        with ExitStack() as stack:
+            viewer = not (no_viewer or silent)
+            seen = viewer or rrd is not None
+            if config is None:
+                setup = _room(stack, seed, aims, bumps, width, seen=seen)
+            else:
+                setup, settings = _configured(stack, config, silent=silent, seen=seen)
+            figures = _conduct(setup, folder, settings, duration, rrd, viewer=viewer, silent=silent)
+        report = solve_session(SolveRequest(folder, None, None), settings, None)
+        extras = make_extras(report)
+        if as_json:
+            document = summary_dict(report.session.model, report.estimate, extras)
+            typer.echo(json.dumps({**document, "live": figures_dict(figures)}, indent=2))
+        elif not quiet:
+            print_summary(report.session.model, report.estimate, extras)
+            typer.echo(figures_line(figures))
+        if report.estimate.verdict is Verdict.REFUSED:
+            raise typer.Exit(EXIT_REFUSED)
+
+
+def _alone(context: typer.Context) -> None:
+    """With a CONFIG.yaml, options that it has keys for would go unheard. Raises InputError."""
+    for name, key in IN_CONFIG.items():
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + {"bumps": "bump-every"}.get(name, name.replace("_", "-"))
+            raise InputError(option, "it, and a CONFIG.yaml", f"{key} in the CONFIG.yaml instead")
+
+
+def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px: int, *, seen: bool) -> "LiveSetup":
+    from fgreg.live.simulated_room import simulated_room
+
+    if not 0 <= seed < 2**31:
+        raise InputError("--seed", str(seed), "0 to 2147483647")
+    if not 160 <= width_px <= 1920:
+        raise InputError("--width", str(width_px), "160 to 1920")
+    if not 0 <= aims <= 100:
+        raise InputError("--aims", str(aims), "0 to 100")
+    if not bump_every_s >= 1:
+        raise InputError("--bump-every", str(bump_every_s), "1 s or more, or inf")
+    return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
+
+
+def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> "tuple[LiveSetup, SolveConfig]":
+    from fgreg.live.config import read_config
+
+    found = read_config(path)
+    for warning in found.warnings:
+        sys.stderr.write(f"fgreg: warning: {warning}\n")
+    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo, seen=seen), found.solve
+
+
+def _conduct(
+    setup: "LiveSetup",
+    folder: Path,
+    config: "SolveConfig",
+    duration_s: float | None,
+    rrd: Path | None,
+    *,
+    viewer: bool,
+    silent: bool,
+) -> "Figures":
+    from fgreg.live.launch import running
+    from fgreg.live.viewer_feed import viewer_feed
+    from fgreg.stage.stop_on_exit import emergency_stop_all
+
+    ended = False
+
+    def end(_number: int, _frame: object) -> None:
+        nonlocal ended
+        ended = True
+        emergency_stop_all()  # the loop ends after its turn; the stage does not wait for that
+
+    with _display(silent) as (say, show), viewer_feed(rrd, folder.name, live=viewer, say=say) as feed:
+        before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+        try:
+            with running(setup, folder, config, feed.taken, say) as session:
+                feed.session(session.model)
+                until = math.inf if duration_s is None else time.monotonic() + duration_s
+                shown = -math.inf
+
+                def on_status(status: "Status") -> None:
+                    nonlocal shown
+                    feed.status(status)
+                    if status.now_s - shown > SHOW_S:
+                        shown = status.now_s
+                        show(session, status)
+
+                say(f"recording to {folder}")
+                try:
+                    session.loop.run(lambda: not ended and time.monotonic() < until, on_status)
+                except KeyboardInterrupt:
+                    say("ending")
+                return session.loop.figures
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def figures_dict(figures: "Figures") -> dict[str, Any]:
+    """What the loop measured of itself."""
+    import numpy as np
+
+    latency = np.array(figures.latency_ms)
+    quantiles = np.percentile(latency, (50, 99, 100)) if latency.size else (math.nan,) * 3
+    return {
+        "frames": figures.frames,
+        "skipped": figures.skipped,
+        "marker_found": figures.found,
+        "pulses": figures.pulses,
+        "stage_orders": figures.orders,
+        "latency_ms": dict(zip(("p50", "p99", "max"), (round(float(q), 2) for q in quantiles), strict=True)),
+    }
+
+
+def figures_line(figures: "Figures") -> str:
+    """The same on one line."""
+    found = figures_dict(figures)
+    latency = found["latency_ms"]
+    return (
+        f"Live: {found['frames']} frames looked into, {found['skipped']} skipped, {found['pulses']} pulses, "
+        f"{found['stage_orders']} orders to the stage; from frame to angle: median {latency['p50']:.0f}, "
+        f"99 % {latency['p99']:.0f}, longest {latency['max']:.0f} ms"
+    )
+
+
+Say = Callable[[str], None]
+Show = Callable[["Running", "Status"], None]
+
+
+@contextmanager
+def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
+    """A panel that changes on a terminal, else a line whenever something new is told."""
+    if silent:
+        yield lambda _text: None, lambda _session, _status: None
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(highlight=False, emoji=False)
+    if not sys.stdout.isatty():
+        last: list[str] = [""]
+
+        def line(_session: "Running", status: "Status") -> None:
+            if status.text != last[0]:
+                last[0] = status.text
+                console.print(status_line(status), soft_wrap=True)
+
+        yield lambda text: console.print(text, style="dim"), line
+        return
+    with Live(console=console, refresh_per_second=4, transient=True) as area:
+
+        def panel(session: "Running", status: "Status") -> None:
+            area.update(status_panel(session.loop.figures, session.model.stage, status))
+
+        yield lambda text: console.print(text, style="dim"), panel
+
+
+def status_line(status: "Status") -> str:
+    """One line: how far, the estimate, what was told last."""
+    known = status.recorder.known
+    lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
+    verdict = status.verdict.value if known.registered else "no registration"
+    state = f"epoch {known.epoch}, {known.pairs} looks, {verdict}"
+    return f"{status.stage:<11} {state:<36} {status.text}{lost}"
+
+
+def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> Any:
+    """The session as a panel: what has to be seen at a glance first, the same as in the viewer."""
+    from rich.panel import Panel
+    from rich.table import Table
+    from rich.text import Text
+
+    from fgreg.cli.report import STYLES
+    from fgreg.live.viewer_feed import now_of
+    from fgreg.viewer.status_line import error_line, next_line, stage_line
+
+    state, now = status.recorder, now_of(status, stage)
+    known, estimate = state.known, state.estimate
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+
+    def row(title: str, text: str, style: str = "") -> None:
+        table.add_row(title, Text(text, style=style))  # what devices say is no markup
+
+    if known.registered:
+        row("registration", status.verdict.value.upper(), STYLES[status.verdict])
+        tre = None if estimate is None or status.invalid else estimate.predicted_tre
+        row("predicted error", f"{error_line(tre)} (95 %, worst target)")
+    else:
+        row("registration", "none yet")
+    for reason in status.reasons[:MOST_REASONS]:
+        row("", textwrap.shorten(reason, REASON_WIDTH, placeholder=" ..."))
+    if status.lost:
+        row("LOST", ", ".join(status.lost), "bold white on red")
+    if state.trouble:
+        row("trouble", state.trouble, "red")
+    row("next", next_line(now), "bold")
+    row("stage", stage_line(now, stage))
+    if now.news != now.task:
+        row("told last", now.news)
+    row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it")
+    latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
+    slow = bool(figures.latency_ms) and figures.latency_ms[-1] > SLOW_MS
+    seen = f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}"
+    row("camera", seen + (": this machine cannot keep up" if slow else ""), "yellow" if slow else "")
+    if figures.pictures:
+        row("B-mode", f"{figures.pictures} pictures, {figures.unshown} left out for newer ones")
+    row("recorded", f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting")
+    return Panel(table, title="fgreg live", subtitle="Ctrl-C ends the session", expand=True)

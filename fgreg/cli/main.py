@@ -1,0 +1,287 @@
+"""The command line: ``fgreg solve``, ``check``, ``simulate``; others are in fgreg.cli_*.
+
+Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
+starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command
+that needs them. The annotations of the command modules are objects, not strings (no ``from __future__``): Typer would
+evaluate each string twice, a tenth of ``fgreg --help``.
+"""
+
+import gc
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from fgreg.cli.convert import add_convert
+from fgreg.cli.devices import add_devices
+from fgreg.cli.evaluate import add_commands
+from fgreg.cli.live import add_live
+from fgreg.cli.options import EstimateOption, LimitOption, solve_config
+from fgreg.cli.replay import add_replay
+from fgreg.cli.schema import add_schema
+from fgreg.errors import FgregError, InputError
+from fgreg.version import __version__
+from fgreg.workers.threads import one_thread_each
+
+if TYPE_CHECKING:
+    from fgreg.pipeline.solve import SolveReport
+
+EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+GARBAGE_THRESHOLD = 50_000
+"""New objects between two looks for garbage: imports leave none, and 700 would cost a short command a twentieth."""
+
+app = typer.Typer(
+    name="fgreg",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Register a stereo endoscope to a rotating transrectal ultrasound probe by photoacoustic markers.\n\n"
+    "A session is a folder with session.yaml, events.jsonl and frames/ (sessions/README.md describes it). Try: "
+    "fgreg simulate demo --preset phantom && fgreg solve demo --rrd demo.rrd",
+)
+
+UsageError: type[Exception] = cast("type[Exception]", typer.BadParameter.__mro__[1])
+"""What typer raises for wrong words on the command line; it has no public name in all its versions."""
+
+SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and no summary.")]
+
+
+def main() -> None:
+    """Entry point: known errors become one line and exit status 2."""
+    gc.set_threshold(GARBAGE_THRESHOLD)
+    try:
+        with one_thread_each():  # what is worked on at once is frames, solves or devices, never a matrix
+            status = app(standalone_mode=False)
+    except FgregError as error:
+        _fail(str(error))
+    except typer.Abort:
+        sys.exit(EXIT_INTERRUPTED)
+    except UsageError as error:
+        _fail(str(getattr(error, "format_message", error.__str__)()))
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of our output left; say nothing more, not even at interpreter exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(EXIT_REFUSED)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _fail(message: str) -> None:
+    line = " ".join(message.split())
+    sys.stderr.write(f"fgreg: error: {line}\n")
+    sys.exit(EXIT_BAD_INPUT)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"fgreg {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _top(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options before the command."""
+
+
+def _no_progress(_step: str, _done: int, _total: int) -> None:
+    """Says nothing."""
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Progress on standard error: a bar on a terminal, nothing elsewhere."""
+    if quiet or not sys.stderr.isatty():
+        yield _no_progress
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = bar.add_task(step, total=total)
+            bar.update(tasks[step], completed=done, total=total)
+
+        yield report
+
+
+@app.command()
+def solve(
+    session: SessionArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Result file. Default: SESSION/result.yaml.")
+    ] = None,
+    rrd: Annotated[
+        Path | None,
+        typer.Option("--rrd", metavar="FILE", help="Also write a Rerun recording; open it with: rerun FILE."),
+    ] = None,
+    limit_mm: LimitOption = 3.0,
+    redetect: Annotated[
+        bool, typer.Option("--redetect", help="Detect in the frames even where events bring poses.")
+    ] = False,
+    estimate: EstimateOption = "",
+    detect_moves: Annotated[
+        bool, typer.Option("--detect-moves", help="Find camera moves that nobody told, by the pairs.")
+    ] = False,
+    as_json: JsonOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Calibrate the fibre, register camera to TRUS, answer the session's tracking queries.
+
+    Reads SESSION, looks at its frames, writes result.yaml and prints a summary: verdict first, with what to do where it
+    is not ok. No initial guess is needed. Exit status 1 where the verdict is refused.
+    """
+    from fgreg.model.estimate import Verdict
+    from fgreg.pipeline.solve import SolveRequest, solve_session
+
+    config = solve_config(limit_mm, estimate)
+    with _progress(quiet or as_json) as progress:
+        report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves), config, progress)
+    if as_json or not quiet:
+        _show(report, as_json)
+    if report.estimate.verdict is Verdict.REFUSED:
+        raise typer.Exit(EXIT_REFUSED)
+
+
+def _show(report: "SolveReport", as_json: bool) -> None:
+    """The summary of a solve, with what the reader warned of."""
+    from fgreg.cli.report import print_summary, summary_dict
+
+    extras = _summary_extras(report)
+    if as_json:
+        typer.echo(json.dumps(summary_dict(report.session.model, report.estimate, extras), indent=2))
+    else:
+        for warning in report.session.warnings:
+            sys.stderr.write(f"fgreg: warning: {warning}\n")
+        print_summary(report.session.model, report.estimate, extras)
+
+
+def _summary_extras(report: "SolveReport") -> Any:
+    """What the summary tells besides the estimate."""
+    from fgreg.cli.report import DetectionFigures, SummaryExtras, TruthFigures
+    from fgreg.detection.results import MarkerFit, PaFind
+    from fgreg.model.events import PairEvent
+
+    recognised, errors = report.recognised, report.errors
+    looks = dict(zip(recognised.pair_events, (pair.look for pair in recognised.measurements.pairs), strict=True))
+    pair_events = [index for index, event in enumerate(report.session.events) if isinstance(event, PairEvent)]
+    detections = None
+    if recognised.markers or recognised.finds:
+        detections = DetectionFigures(
+            markers_found=sum(isinstance(fit, MarkerFit) for fit in recognised.markers.values()),
+            markers_total=len(recognised.markers),
+            sources_found=sum(isinstance(find, PaFind) for find in recognised.finds.values()),
+            sources_total=len(recognised.finds),
+        )
+    truth = None
+    if errors is not None:
+        truth = TruthFigures(
+            tre_mean_mm=tuple(None if tre is None else float(tre.mean()) for tre in errors.tre_mm),
+            tre_worst_mm=tuple(None if tre is None else float(tre.max()) for tre in errors.tre_mm),
+            track_error_rad=errors.track_rad,
+        )
+    return SummaryExtras(
+        rrd=report.rrd_path,
+        result=report.result_path,
+        elapsed_s=report.elapsed_s,
+        detections=detections,
+        looks=tuple(looks.get(index) for index in pair_events),
+        truth=truth,
+    )
+
+
+@app.command()
+def check(session: SessionArgument, as_json: JsonOption = False) -> None:
+    """Check a session's files and report all problems at once.
+
+    Looks at session.yaml, events.jsonl, ground_truth.yaml and the headers of all frames. Exit status 2 where there are
+    problems; warnings alone are 0.
+    """
+    from fgreg.session.session_reader import check_session
+
+    problems, warnings = check_session(session)
+    if as_json:
+        found = [{"where": p.where, "found": p.found, "expected": p.expected} for p in problems]
+        typer.echo(json.dumps({"session": str(session), "problems": found, "warnings": warnings}, indent=2))
+    else:
+        for problem in problems:
+            sys.stderr.write(f"fgreg: error: {' '.join(str(problem).split())}\n")
+        for warning in warnings:
+            sys.stderr.write(f"fgreg: warning: {warning}\n")
+        if not problems:
+            typer.echo(f"{session}: no problems" + (f", {len(warnings)} warnings" if warnings else ""))
+    if problems:
+        raise typer.Exit(EXIT_BAD_INPUT)
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to write; new or empty.")] = None,
+    preset: Annotated[str, typer.Option("--preset", help="What to simulate; --list names them.")] = "phantom",
+    seed: Annotated[int, typer.Option("--seed", help="Same seed, same session, byte by byte.")] = 1,
+    pairs: Annotated[int | None, typer.Option("--pairs", help="Number of photoacoustic markers.")] = None,
+    aims: Annotated[int | None, typer.Option("--aims", help="Number of calibration shots.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is there.")] = False,
+    list_presets: Annotated[bool, typer.Option("--list", help="List the presets and end.")] = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Write a simulated session with its ground truth: poses only, or raw stereo and channel data frames.
+
+    The forward model shares no code with the estimator.
+    """
+    from dataclasses import replace
+
+    from fgreg.simulation.presets import PRESETS
+    from fgreg.simulation.simulate import simulate as run
+    from fgreg.simulation.write import write_session
+
+    if list_presets:
+        for name, config in PRESETS.items():
+            kind = "raw frames" if config.frames else "poses"
+            typer.echo(f"{name:12s} {config.aims} aims, {config.pairs} PMs, sweeps {config.sweep.value}, {kind}")
+        return
+    if out is None:
+        raise InputError("OUT", "nothing", "the folder to write")
+    if preset not in PRESETS:
+        raise InputError("--preset", preset, "one of " + ", ".join(PRESETS))
+    config = PRESETS[preset]
+    for key, value in (("pairs", pairs), ("aims", aims)):
+        if value is not None:
+            if value < 0:
+                raise InputError(f"--{key}", str(value), "a number >= 0")
+            config = replace(config, **{key: value})  # type: ignore[arg-type]
+    if seed < 0:
+        raise InputError("--seed", str(seed), "a number >= 0")
+    with _progress(quiet) as progress:
+        simulated = run(config, seed)
+        write_session(simulated, out, overwrite, lambda done, total: progress("rendering", done, total))
+    if not quiet:
+        typer.echo(f"{out}: {config.aims} aims, {config.pairs} PMs, {len(simulated.frames)} frames, seed {seed}")
+
+
+add_commands(app, _progress)
+add_live(app, _summary_extras)
+add_replay(app, _summary_extras)
+add_convert(app)
+add_devices(app)
+add_schema(app)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""What several commands take: options, and the settings that they make."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fgreg.errors import InputError
+
+if TYPE_CHECKING:
+    from fgreg.model.solve_config import SolveConfig
+
+LimitOption = Annotated[
+    float,
+    typer.Option("--limit-mm", help="Predicted error (95 %) at the worst target up to which the verdict is ok."),
+]
+EstimateOption = Annotated[
+    str,
+    typer.Option(
+        "--estimate",
+        metavar="NAMES",
+        help="Estimate these too, with the values in session.yaml as priors: sound_speed, probe_radius, or both with a "
+        "comma between.",
+    ),
+]
+OnlineEstimateOption = Annotated[
+    str,
+    typer.Option(
+        "--estimate", metavar="NAMES", help="Estimate this too, with the value in session.yaml as prior: sound_speed."
+    ),
+]
+
+
+def solve_config(
+    limit_mm: float, estimate: str, known: tuple[str, ...] = ("sound_speed", "probe_radius")
+) -> "SolveConfig":
+    """The settings that the options ask for; ``known``: what this command can estimate besides.
+
+    Raises:
+        InputError: an option that is not one of them, or a limit that is none.
+    """
+    from fgreg.model.solve_config import SolveConfig
+
+    wanted = {name.strip() for name in estimate.split(",") if name.strip()}
+    if not wanted <= set(known):
+        expected = known[0] if len(known) == 1 else f"{', '.join(known)}, or both with a comma between"
+        raise InputError("--estimate", estimate, expected)
+    try:
+        return SolveConfig(
+            limit_mm=limit_mm,
+            estimate_sound_speed="sound_speed" in wanted,
+            estimate_radius="probe_radius" in wanted,
+        )
+    except ValueError as error:
+        raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error

@@ -1,0 +1,470 @@
+"""The summary of a solved session: for people in a terminal, and as plain data for programs.
+
+For people: verdict first, then reasons, registration, laser line, pairs, tracks, and where the files are. Everything is
+ASCII but the names that users chose, and fits 80 columns. For programs: the same names and units as ``result.yaml``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from fgreg.geometry.transforms import FloatArray, log_so3
+from fgreg.model.estimate import (
+    AimEstimate,
+    EpochEstimate,
+    LaserEstimate,
+    PairEstimate,
+    SessionEstimate,
+    Timing,
+    Verdict,
+)
+from fgreg.model.measurements import Look
+from fgreg.model.session_model import SessionModel
+
+STYLES = {Verdict.OK: "bold green", Verdict.WARNING: "bold yellow", Verdict.REFUSED: "bold red"}
+MEANINGS = {
+    Verdict.OK: "the registration may be used",
+    Verdict.WARNING: "the registration may be used, but a condition was missed",
+    Verdict.REFUSED: "no transform below may be used",
+}
+MOST_ROWS = 40
+"""Longer tables are cut to the looks that are not used and those with the largest NIS."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionFigures:
+    """How many of the frames that were looked at gave something."""
+
+    markers_found: int
+    markers_total: int
+    sources_found: int
+    sources_total: int
+
+
+@dataclass(frozen=True, slots=True)
+class TruthFigures:
+    """Errors against a known truth, one entry per epoch (or track); None where there is no answer or no truth.
+
+    Attributes:
+        tre_mean_mm, tre_worst_mm: target registration error over the session's targets, per epoch.
+        track_error_rad: answer less truth, per track.
+    """
+
+    tre_mean_mm: tuple[float | None, ...] = ()
+    tre_worst_mm: tuple[float | None, ...] = ()
+    track_error_rad: tuple[float | None, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SummaryExtras:
+    """What a summary tells besides the estimate.
+
+    Attributes:
+        rrd, result: files written.
+        elapsed_s: time the solve took.
+        detections: where frames were looked at.
+        looks: the measured look behind each of ``estimate.pairs`` (None: nothing was measured), for scan and range.
+        truth: where it is known.
+    """
+
+    rrd: Path | None = None
+    result: Path | None = None
+    elapsed_s: float | None = None
+    detections: DetectionFigures | None = None
+    looks: tuple[Look | None, ...] = ()
+    truth: TruthFigures | None = None
+
+
+def pm_rotation_sigma_rad(trus_p_pm_mm: FloatArray, covariance: FloatArray) -> float:
+    """Sigma of the stage angle at which a PM is in the plane, ``atan2(p_y, p_z)``, from the PM's (3, 3) covariance."""
+    y, z = float(trus_p_pm_mm[1]), float(trus_p_pm_mm[2])
+    gradient = np.array([0.0, z, -y]) / (y * y + z * z)
+    return math.sqrt(max(0.0, float(gradient @ covariance @ gradient)))
+
+
+def laser_sigmas(laser: LaserEstimate) -> tuple[float, float]:
+    """Largest sigma of the beam's direction (rad) and of its place across itself, at the laser frame's origin (mm)."""
+    direction = np.linalg.eigvalsh(laser.covariance[:2, :2])[-1]
+    place = np.linalg.eigvalsh(laser.covariance[3:5, 3:5])[-1]
+    return math.sqrt(max(0.0, float(direction))), math.sqrt(max(0.0, float(place)))
+
+
+def print_summary(
+    model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras, console: Console | None = None
+) -> None:
+    """Print the summary; in colour on a terminal, plain 80 columns elsewhere."""
+    console = console or Console(highlight=False, emoji=False)
+    summary = render_summary(model, estimate, extra)
+    if console.is_terminal:
+        console.print(summary, crop=False)
+        return
+    with console.capture() as capture:
+        console.print(summary, crop=False)
+    # Tables pad their lines; what goes to a file or a pipe should not end in blanks.
+    console.file.write("".join(line.rstrip() + "\n" for line in capture.get().splitlines()))
+
+
+def render_summary(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras) -> RenderableType:
+    """The summary as one rich renderable; print it with ``crop=False`` so that long paths stay whole."""
+    truth = extra.truth or TruthFigures()
+    parts: list[RenderableType] = [_verdict(estimate)]
+    parts += [_bullet(reason) for reason in estimate.reasons]
+    for epoch in estimate.epochs:
+        refused = Verdict.REFUSED in (estimate.verdict, epoch.verdict)
+        parts += ["", *_epoch(epoch, model, truth, several=len(estimate.epochs) > 1, refused=refused)]
+    if estimate.laser is not None:
+        parts += ["", *_laser(estimate.laser)]
+    if estimate.pairs:
+        parts += ["", *_pairs(model, estimate, extra)]
+    if estimate.tracks:
+        parts += ["", *_tracks(estimate, truth)]
+    closing = [*_aims(estimate.aims), *_timing(estimate.timing), *_closing(extra)]
+    if closing:
+        parts += ["", *closing]
+    return Group(*(Text(part) if isinstance(part, str) else part for part in parts))
+
+
+# ---- pieces ----
+
+
+def _clean(text: str) -> str:
+    """Text from a file without what could steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def _verdict(estimate: SessionEstimate) -> Text:
+    word = Text(f" {estimate.verdict.value.upper()} ", style=f"{STYLES[estimate.verdict]} reverse")
+    return Text.assemble(word, " ", (_clean(estimate.session), "bold"), f": {MEANINGS[estimate.verdict]}")
+
+
+def _bullet(text: str) -> RenderableType:
+    """A list entry whose further lines stand under its first word."""
+    grid = Table.grid(padding=(0, 1, 0, 0))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    grid.add_row("  -", Text(_clean(text)))
+    return grid
+
+
+def _heading(text: str) -> Text:
+    return Text(text, style="bold")
+
+
+def _timing(timing: Timing | None) -> Iterator[str]:
+    if timing is None:
+        return
+    for name, found in (("Taking in an event", timing.add), ("Answering a query", timing.track)):
+        if found is not None:
+            yield f"{name}: median {found.p50:.2f}, 99 % {found.p99:.2f}, longest {found.max:.2f} ms"
+
+
+def _vector(values: Sequence[float] | FloatArray, decimals: int) -> str:
+    return "(" + ", ".join(f"{float(value):.{decimals}f}" for value in values) + ")"
+
+
+def _number(value: float | None, decimals: int) -> str:
+    if value is None:
+        return "-"
+    if not math.isfinite(value):
+        return "inf" if value > 0 else "?"
+    return f"{value:.{decimals}f}"
+
+
+def _in_degrees(value_rad: float | None, decimals: int = 1) -> str:
+    return _number(None if value_rad is None else math.degrees(value_rad), decimals)
+
+
+def _epoch(
+    epoch: EpochEstimate, model: SessionModel, truth: TruthFigures, *, several: bool, refused: bool
+) -> Iterator[RenderableType]:
+    where = f", camera epoch {epoch.index} (from {epoch.start_s:.1f} s)" if several else ""
+    title = _heading(f"Registration trus_T_camera{where}, {epoch.pairs} pairs: ")
+    yield title.append(epoch.verdict.value, style=STYLES[epoch.verdict])
+    if epoch.trus_T_camera is None:
+        yield "  none could be computed"
+        return
+    if refused:
+        yield Text("  best estimate, for inspection only: not to be used", style=STYLES[Verdict.REFUSED])
+    vector = log_so3(epoch.trus_T_camera[:3, :3])
+    angle = float(np.linalg.norm(vector))
+    axis = vector / angle if angle > 1e-12 else np.array([1.0, 0.0, 0.0])
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_row("  translation", f"{_vector(epoch.trus_T_camera[:3, 3], 2)} mm")
+    grid.add_row("  rotation", f"{math.degrees(angle):.2f} deg about {_vector(axis, 4)}")
+    if epoch.covariance is not None:
+        sigma = np.sqrt(np.clip(np.diag(epoch.covariance), 0.0, None))
+        turn, shift = _vector(np.degrees(sigma[:3]), 2), _vector(sigma[3:], 2)
+        grid.add_row("  sigma", f"{shift} mm, {turn} deg, camera axes")
+    tre = epoch.predicted_tre
+    if tre is not None:
+        figures = f"mean {_number(tre.mean_mm, 2)}, 95 % {_number(tre.p95_mm, 2)}, worst {_number(tre.worst_mm, 2)} mm"
+        grid.add_row("  predicted TRE", f"{figures} over {len(model.targets_mm)} targets")
+    mean, worst = _entry(truth.tre_mean_mm, epoch.index), _entry(truth.tre_worst_mm, epoch.index)
+    if mean is not None or worst is not None:
+        grid.add_row("  true TRE", f"mean {_number(mean, 2)}, worst {_number(worst, 2)} mm (against the ground truth)")
+    yield grid
+    for row in epoch.trus_T_camera:
+        yield "    " + "".join(f"{value:13.6f}" for value in row)
+
+
+def _entry(values: Sequence[float | None], index: int) -> float | None:
+    return values[index] if index < len(values) else None
+
+
+def _laser(laser: LaserEstimate) -> Iterator[RenderableType]:
+    direction_rad, place_mm = laser_sigmas(laser)
+    yield _heading("Laser line in the marker frame")
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_row("  origin", f"{_vector(laser.marker_T_laser[:3, 3], 2)} mm, sigma {place_mm:.2f} mm across the beam")
+    grid.add_row(
+        "  direction", f"{_vector(laser.marker_T_laser[:3, 2], 4)}, sigma {math.degrees(direction_rad):.2f} deg"
+    )
+    yield grid
+
+
+def _table(*columns: tuple[str, str]) -> Table:
+    """A table without frame: titles and units in two lines, figures to the right."""
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    for title, unit in columns:
+        table.add_column(f"{title}\n{unit}", justify="right", no_wrap=True)
+    return table
+
+
+def _pairs(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras) -> Iterator[RenderableType]:
+    pairs = estimate.pairs
+    shown = _rows_shown(pairs)
+    used = sum(pair.used for pair in pairs)
+    cut = "" if len(shown) == len(pairs) else f"; the {len(shown)} not used or of largest NIS:"
+    yield _heading(f"Pairs: {used} of {len(pairs)} looks used{cut}")
+    several = len(estimate.epochs) > 1
+    table = _table(
+        ("PM", ""),
+        *([("epoch", "")] if several else []),
+        ("used", ""),
+        ("scan", "deg"),
+        ("rotation", "deg"),
+        ("lambda", "mm"),
+        ("range", "mm"),
+        ("residual", "mm"),
+        ("NIS", ""),
+    )
+    for position in shown:
+        pair = pairs[position]
+        look = extra.looks[position] if position < len(extra.looks) else None
+        turn = _in_degrees(pair.rotation_rad)
+        if pair.rotation_rad is not None and pair.trus_p_pm_mm is not None and pair.covariance is not None:
+            turn += f" +- {_in_degrees(pm_rotation_sigma_rad(pair.trus_p_pm_mm, pair.covariance))}"
+        table.add_row(
+            str(pair.pm),
+            *([str(pair.epoch)] if several else []),
+            "yes" if pair.used else "NO",
+            "-" if look is None else _in_degrees(model.stage.device_from_scan(look.scan_rad)),
+            turn,
+            _number(pair.lambda_mm, 1),
+            "-" if look is None else _number(look.range_mm, 1),
+            _number(pair.residual_mm, 3),
+            _number(pair.nis, 1),
+            style=None if pair.used else "red",
+        )
+    yield Padding(table, (0, 0, 0, 2))
+    yield from (
+        _bullet(f"PM {pairs[position].pm}, {pairs[position].t:.1f} s, not used: {pairs[position].reason}")
+        for position in shown
+        if not pairs[position].used
+    )
+
+
+def _rows_shown(pairs: Sequence[PairEstimate]) -> list[int]:
+    """Positions of the looks to list, in event order."""
+    if len(pairs) <= MOST_ROWS:
+        return list(range(len(pairs)))
+
+    def weight(position: int) -> tuple[bool, float]:
+        nis = pairs[position].nis
+        return pairs[position].used, -(0.0 if nis is None else nis)
+
+    return sorted(sorted(range(len(pairs)), key=weight)[:MOST_ROWS])
+
+
+def _tracks(estimate: SessionEstimate, truth: TruthFigures) -> Iterator[RenderableType]:
+    tracks = estimate.tracks
+    answered = sum(track.stage_rad is not None for track in tracks)
+    yield _heading(f"Tracks: {answered} of {len(tracks)} answered")
+    known = any(error is not None for error in truth.track_error_rad)
+    table = _table(
+        ("time", "s"),
+        ("turn stage to", "deg"),
+        ("sigma", "deg"),
+        ("lambda", "mm"),
+        *([("error", "deg")] if known else []),
+    )
+    for position, track in enumerate(tracks[:MOST_ROWS]):
+        table.add_row(
+            f"{track.t:.1f}",
+            _in_degrees(track.stage_rad),
+            _in_degrees(track.sigma_rad),
+            _number(track.lambda_mm, 1),
+            *([_in_degrees(_entry(truth.track_error_rad, position), 2)] if known else []),
+            style=None if track.stage_rad is not None else "red",
+        )
+    yield Padding(table, (0, 0, 0, 2))
+    if len(tracks) > MOST_ROWS:
+        yield f"  and {len(tracks) - MOST_ROWS} more"
+    yield from (_bullet(f"{track.t:.1f} s: {track.reason}") for track in tracks[:MOST_ROWS] if track.stage_rad is None)
+
+
+def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
+    if not aims:
+        return
+    residuals = [aim.residual_mm for aim in aims if aim.used and aim.residual_mm is not None]
+    text = f"Calibration shots: {sum(aim.used for aim in aims)} of {len(aims)} used"
+    if residuals:
+        text += (
+            f", spot to beam {math.sqrt(float(np.mean(np.square(residuals)))):.2f} mm rms, {max(residuals):.2f} worst"
+        )
+    yield text
+    yield from (_bullet(f"{aim.t:.1f} s, not used: {aim.reason}") for aim in aims if not aim.used)
+
+
+def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:
+    found = extra.detections
+    if found is not None:
+        yield (
+            f"Detection: marker in {found.markers_found} of {found.markers_total} shots, "
+            f"source in {found.sources_found} of {found.sources_total} frames"
+        )
+    if extra.elapsed_s is not None:
+        yield f"Solved in {extra.elapsed_s:.1f} s"
+    # Paths are not wrapped: they are there to be copied.
+    for title, path in (("Result", extra.result), ("Recording", extra.rrd)):
+        if path is not None:
+            yield Text(f"{title:<9}  {_clean(str(path))}", no_wrap=True, overflow="ignore")
+    if extra.rrd is not None:
+        yield Text(f"           (open it with: rerun {_clean(str(extra.rrd))})", no_wrap=True, overflow="ignore")
+
+
+# ---- for programs ----
+
+
+def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras) -> dict[str, Any]:
+    """The answer as plain types, with the names and units of ``result.yaml``; figures that are not finite are None.
+
+    Besides those: ``aims``, ``targets``, each look's ``t``, ``scan_deg``, ``x_mm`` and ``range_mm``, and where there
+    are any ``truth``, ``detections``, ``elapsed_s`` and ``files``.
+    """
+    laser = estimate.laser
+    out: dict[str, Any] = {
+        "session": estimate.session,
+        "verdict": estimate.verdict.value,
+        "reasons": list(estimate.reasons),
+        "laser": None
+        if laser is None
+        else {"marker_T_laser": _rows(laser.marker_T_laser), "covariance": _rows(laser.covariance)},
+        "epochs": [_epoch_dict(epoch) for epoch in estimate.epochs],
+        "pairs": [
+            _pair_dict(pair, model, extra.looks[i] if i < len(extra.looks) else None)
+            for i, pair in enumerate(estimate.pairs)
+        ],
+        "tracks": [
+            {
+                "t": track.t,
+                "stage_deg": _degrees(track.stage_rad),
+                "sigma_deg": _degrees(track.sigma_rad),
+                "lambda_mm": _plain(track.lambda_mm),
+                "causal": track.causal,
+                "reason": track.reason,
+            }
+            for track in estimate.tracks
+        ],
+        "aims": [
+            {
+                "t": aim.t,
+                "used": aim.used,
+                "reason": aim.reason,
+                "lambda_mm": _plain(aim.lambda_mm),
+                "residual_mm": _plain(aim.residual_mm),
+                "nis": _plain(aim.nis),
+            }
+            for aim in estimate.aims
+        ],
+        "targets": len(model.targets_mm),
+    }
+    if estimate.timing is not None:
+        out["timing_ms"] = asdict(estimate.timing)
+    if extra.truth is not None:
+        out["truth"] = {
+            "tre_mean_mm": [_plain(value) for value in extra.truth.tre_mean_mm],
+            "tre_worst_mm": [_plain(value) for value in extra.truth.tre_worst_mm],
+            "track_error_deg": [_degrees(value) for value in extra.truth.track_error_rad],
+        }
+    if extra.detections is not None:
+        found = extra.detections
+        out["detections"] = {
+            "markers_found": found.markers_found,
+            "markers_total": found.markers_total,
+            "sources_found": found.sources_found,
+            "sources_total": found.sources_total,
+        }
+    if extra.elapsed_s is not None:
+        out["elapsed_s"] = extra.elapsed_s
+    files = {name: str(path) for name, path in (("result", extra.result), ("rrd", extra.rrd)) if path is not None}
+    if files:
+        out["files"] = files
+    return out
+
+
+def _epoch_dict(epoch: EpochEstimate) -> dict[str, Any]:
+    tre = epoch.predicted_tre
+    return {
+        "index": epoch.index,
+        "start_s": epoch.start_s,
+        "trus_T_camera": _rows(epoch.trus_T_camera),
+        "covariance": _rows(epoch.covariance),
+        "pairs": epoch.pairs,
+        "verdict": epoch.verdict.value,
+        "predicted_tre_mm": None
+        if tre is None
+        else {"mean": _plain(tre.mean_mm), "p95": _plain(tre.p95_mm), "worst": _plain(tre.worst_mm)},
+    }
+
+
+def _pair_dict(pair: PairEstimate, model: SessionModel, look: Look | None) -> dict[str, Any]:
+    return {
+        "t": pair.t,
+        "pm": pair.pm,
+        "epoch": pair.epoch,
+        "used": pair.used,
+        "reason": pair.reason,
+        "scan_deg": None if look is None else _degrees(model.stage.device_from_scan(look.scan_rad)),
+        "x_mm": None if look is None else _plain(look.x_mm),
+        "range_mm": None if look is None else _plain(look.range_mm),
+        "lambda_mm": _plain(pair.lambda_mm),
+        "theta_deg": _degrees(pair.theta_rad),
+        "rotation_deg": _degrees(pair.rotation_rad),
+        "trus_p_pm_mm": None if pair.trus_p_pm_mm is None else [_plain(value) for value in pair.trus_p_pm_mm],
+        "covariance": _rows(pair.covariance),
+        "residual_mm": _plain(pair.residual_mm),
+        "nis": _plain(pair.nis),
+    }
+
+
+def _rows(matrix: FloatArray | None) -> list[list[float | None]] | None:
+    return None if matrix is None else [[_plain(value) for value in row] for row in matrix]
+
+
+def _plain(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def _degrees(value_rad: float | None) -> float | None:
+    return _plain(None if value_rad is None else math.degrees(value_rad))

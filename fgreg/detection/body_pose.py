@@ -1,0 +1,186 @@
+"""One pose from all corners of a body: hypotheses, strays, the choice between two planar poses, or why not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgreg.detection.pose_least_squares import (
+    CornerSet,
+    PoseFit,
+    common_covariance,
+    corner_residuals,
+    fit_pose,
+    fit_with_excess,
+    pose_hypotheses,
+    whitener,
+)
+from fgreg.detection.results import NotFound, RigidFit
+from fgreg.geometry.transforms import FloatArray
+
+VIEW_NAMES = ("left", "right")
+MAX_RMS_PX = 4.0
+"""Residual beyond which the corners do not belong to one body as modelled."""
+OTHER_POSE_RAD = 0.02
+"""Minima closer than this are one pose."""
+AMBIGUITY_SIGMA_PX = 0.15
+"""Corner noise against which two hypotheses are told apart: more than what is measured, for what is not modelled (a
+tag that is not quite flat, a lens not quite as calibrated)."""
+STRAY_PX, STRAY_START_PX = 2.0, 15.0
+"""RMS of a tag beyond which it is not part of the body: at the pose fitted, and at the pose of another tag."""
+AMBIGUITY_CHI2 = 25.0
+"""Difference in chi-square at that noise (or at the residuals', where they are larger) below which a pose is ambiguous:
+odds of 2.7e5 to 1."""
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> float:
+    """Angle (rad) between the rotations of two poses (4, 4)."""
+    return float(np.arccos(np.clip(0.5 * (np.sum(a[:3, :3] * b[:3, :3]) - 1.0), -1.0, 1.0)))
+
+
+def rms_px(residual_px: FloatArray) -> float:
+    """Root mean square length of residuals (n, 2)."""
+    return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1))))
+
+
+def _ranked_hypotheses(corners: CornerSet) -> list[FloatArray]:
+    """Starting poses, the likeliest first."""
+    white = whitener(corners.covariance)
+    ranked: list[tuple[float, FloatArray]] = []
+    for pose in pose_hypotheses(corners):
+        residual, _, in_front = corner_residuals(corners, pose)
+        if in_front:
+            # Capped, so that one bad tag does not decide which hypothesis is tried first.
+            size = np.sum((white @ residual.ravel()).reshape(-1, 2) ** 2, axis=1)
+            ranked.append((float(np.minimum(size, 4.0 * np.median(size) + 1e-12).sum()), pose))
+    return [pose for _, pose in sorted(ranked, key=lambda item: item[0])]
+
+
+def best_poses(corners: CornerSet) -> list[PoseFit]:
+    """Up to two distinct minima of the joint fit, best first, from all planar hypotheses."""
+    fits: list[PoseFit] = []
+    tried: list[FloatArray] = []
+    for pose in _ranked_hypotheses(corners):
+        if any(angle_between(pose, other) < 0.1 for other in tried):
+            continue
+        tried.append(pose)
+        fit = fit_pose(corners, pose)
+        if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
+            fits.append(fit)
+        if len(tried) >= 4:
+            break
+    if fits:
+        # Where the perspective is weak the other hypothesis mirrors the tilt; a solver may have given only one.
+        fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body))
+        if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
+            fits.append(fit)
+    return sorted(fits, key=lambda fit: fit.cost)[:2]
+
+
+def _mirrored(corners: CornerSet, camera_T_body: FloatArray) -> FloatArray:
+    """The same place with the body plane's normal mirrored at the line of sight."""
+    points = corners.body_p_mm - corners.body_p_mm.mean(axis=0)
+    normal = np.linalg.svd(points)[2][2]
+    centre = camera_T_body[:3, :3] @ corners.body_p_mm.mean(axis=0) + camera_T_body[:3, 3]
+    sight = centre / np.linalg.norm(centre)
+    out = camera_T_body.copy()
+    # Half a turn about the sight mirrors the tilt and turns the body round; half a turn about its normal undoes that.
+    out[:3, :3] = _half_turn(sight) @ camera_T_body[:3, :3] @ _half_turn(normal)
+    out[:3, 3] = centre - out[:3, :3] @ corners.body_p_mm.mean(axis=0)
+    return out
+
+
+def _half_turn(axis: FloatArray) -> FloatArray:
+    return 2.0 * np.outer(axis, axis) - np.eye(3)
+
+
+def robust_pose(corners: CornerSet) -> PoseFit | None:
+    """One minimum, from the likeliest hypothesis, with corners that do not fit weighing less."""
+    ranked = _ranked_hypotheses(corners)
+    return fit_pose(corners, ranked[0], huber=3.0) if ranked else None
+
+
+def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, list[str]]:
+    """Drop tags that do not fit the body where most of them do (a tag read wrongly, or one that came off).
+
+    Two ways to a pose that strays do not spoil: a robust fit to all corners, good where tags are many and small; and
+    the hypothesis of one tag that most others agree with, good where they are few and large. The one with which more
+    tags agree decides.
+
+    Args:
+        names: of each group, for the reasons.
+
+    Returns:
+        the corners kept, and what was left out.
+    """
+    groups = np.unique(corners.group)
+    if len(groups) < 3:
+        return corners, []
+    forgiving = corners.with_excess(AMBIGUITY_SIGMA_PX**2)
+    robust = robust_pose(forgiving)
+    if robust is not None and (_agreement(corners, robust.camera_T_body)[0] <= STRAY_PX).all():
+        return corners, []
+    poses = [] if robust is None else [robust.camera_T_body]
+    ranked = sorted(pose_hypotheses(corners), key=lambda pose: float(_agreement(corners, pose)[1]))
+    for pose in ranked[:3]:
+        agreed = np.isin(corners.group, groups[_agreement(corners, pose)[0] < STRAY_START_PX])
+        fit = fit_pose(forgiving.subset(agreed), pose) if agreed.sum() >= 4 else None
+        poses += [] if fit is None else [fit.camera_T_body]
+    if not poses:
+        return corners, []
+    rms, _ = min((_agreement(corners, pose) for pose in poses), key=lambda item: item[1])
+    stray = rms > max(5.0 * float(np.median(rms)), STRAY_PX)
+    if not stray.any() or (~stray).sum() < 2:
+        return corners, []
+    kept = corners.subset(~np.isin(corners.group, groups[stray]))
+    return kept, [f"{names[int(g)]} is {r:.1f} px off the body" for g, r in zip(groups[stray], rms[stray], strict=True)]
+
+
+def _agreement(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArray, float]:
+    """RMS (px) of each group at a pose, and their sum with each capped: small where many groups agree."""
+    residual, _, in_front = corner_residuals(corners, camera_T_body)
+    rms = np.array([rms_px(residual[corners.group == g]) for g in np.unique(corners.group)])
+    return rms, float(np.minimum(rms, STRAY_START_PX).sum()) if in_front else np.inf
+
+
+def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit | NotFound:
+    """The pose of a body, from the better of its planar hypotheses where they can be told apart.
+
+    Args:
+        what: the body's name for the reasons, e.g. ``marker``.
+        left_out: passed on.
+    """
+    if len(corners.view) < 4:
+        return NotFound(f"{what}: only {len(corners.view)} corners seen, at least 4 are needed")
+    # Hypotheses are weighed at a noise that forgives what is not modelled; the chosen one is then fitted at its own.
+    hypotheses = best_poses(corners.with_excess(AMBIGUITY_SIGMA_PX**2))
+    chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
+    if chosen is None:
+        return NotFound(f"{what}: no pose fits the corners seen")
+    corners, best = chosen
+    rms = rms_px(best.residual_px)
+    views = tuple(VIEW_NAMES[v] for v in np.unique(corners.view))
+    if rms > MAX_RMS_PX:
+        cause = "the two views or the model" if len(views) == 2 else "the model"
+        return NotFound(f"{what}: corners {rms:.1f} px off the best pose; {cause} cannot be right")
+    dof = 2 * len(corners.view) - 6
+    ratio = np.inf
+    if len(hypotheses) == 2:
+        first, second = hypotheses
+        ratio = rms_px(second.residual_px) / max(rms_px(first.residual_px), 1e-9)
+        if second.cost - first.cost < AMBIGUITY_CHI2 * max(1.0, first.cost / max(dof, 1)):
+            kind = "ambiguous single view" if len(views) == 1 else "ambiguous"
+            apart = np.degrees(angle_between(first.camera_T_body, second.camera_T_body))
+            return NotFound(f"{what}: {kind}: a second pose {apart:.0f} deg away fits only {ratio:.1f} times worse")
+    return RigidFit(
+        camera_T_body=best.camera_T_body,
+        information=best.information,
+        common_covariance=common_covariance(corners, best),
+        cost=best.cost,
+        dof=dof,
+        corners=len(corners.view),
+        views=views,
+        rms_px=rms,
+        residual_sum_px2=float(np.sum(best.residual_px**2)),
+        second_ratio=float(ratio),
+        left_out=tuple(left_out),
+    )

@@ -1,0 +1,373 @@
+"""Recorded events to measurements: frames are looked at, defaults of the noise filled in, epochs and shots numbered.
+
+A shot whose marker or PM is not found is no error: it gets a reason and is left out. The corner noise is pooled over
+the session before any covariance is formed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.detection.corner_noise import CornerNoise, Misfit, Weighed, pool_corner_noise
+from fgreg.detection.results import (
+    BoardFit,
+    FrameResults,
+    MarkerFit,
+    NoSignal,
+    NotFound,
+    PaFind,
+    board_corner,
+    marker_covariance,
+)
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.events import (
+    AimEvent,
+    CameraMovedEvent,
+    Event,
+    MarkerRecord,
+    PairEvent,
+    TrackEvent,
+    TrusRecord,
+    looks_of,
+    needs_frames,
+    needs_marker_frames,
+    refused_lines,
+)
+from fgreg.model.measurements import (
+    Aim,
+    EpochStart,
+    Look,
+    MarkerObservation,
+    Measurements,
+    Pair,
+    Track,
+    default_marker_covariance,
+)
+from fgreg.model.session_model import SessionModel
+
+Progress = Callable[[int, int], None]
+"""Called with frames done and frames in all."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recognised:
+    """What the session's events say, and what became of each.
+
+    Attributes:
+        measurements: aims, pairs and epochs that can be used.
+        tracks: queries whose marker was found.
+        aim_events, pair_events, track_events: index into the session's events of each aim, pair, track.
+        unused: reason, by event index, for every aim, pair or track left out; unused_aims: those that are aims.
+        markers: what was detected for each event whose marker came from frames.
+        boards: likewise of the board.
+        finds: what was located in each PA frame, by (event index, look).
+        marker_noise, board_noise: pooled corner noise.
+        epoch_of: camera epoch of every event.
+    """
+
+    measurements: Measurements
+    tracks: tuple[Track, ...]
+    aim_events: tuple[int, ...]
+    pair_events: tuple[int, ...]
+    track_events: tuple[int, ...]
+    unused: dict[int, str]
+    unused_aims: tuple[int, ...]
+    markers: dict[int, MarkerFit | NotFound]
+    boards: dict[int, BoardFit | NotFound]
+    finds: dict[tuple[int, int], PaFind | NoSignal]
+    marker_noise: CornerNoise
+    board_noise: CornerNoise
+    epoch_of: tuple[int, ...]
+
+
+def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
+    """Equal for the same frames, or the same matrix."""
+    if needs_marker_frames(record, redetect=redetect) or record.camera_T_marker is None:
+        return record.left, record.right
+    return record.camera_T_marker.tobytes()
+
+
+def recognise(
+    events: Sequence[Event], model: SessionModel, *, redetect: bool = False, progress: Progress | None = None
+) -> Recognised:
+    """Turn a session's events into measurements.
+
+    Args:
+        events: as read.
+        model: the session's set-up.
+        redetect: look at the frames even where a pose is recorded.
+        progress: called as frames are done.
+
+    Raises:
+        InputError: a frame that is missing or not what it should be.
+    """
+    found = _detect(events, model, redetect, progress)
+    marker_fits = [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
+    board_fits = [fit for fit in found.boards.values() if isinstance(fit, BoardFit)]
+    builder = _Builder(
+        model,
+        found,
+        pool_corner_noise(fit.pose for fit in marker_fits),
+        pool_corner_noise(fit.pose for fit in board_fits),
+        redetect,
+    )
+    starts, epoch_of = number_epochs(events)
+    refused = refused_lines(events)
+    for index, event in enumerate(events):
+        if event.line not in refused:
+            builder.add(index, event, epoch_of[index])
+        elif isinstance(event, AimEvent | PairEvent | TrackEvent):
+            builder.unused[index] = f"it was refused when it was taken: {refused[event.line]}"
+    return Recognised(
+        measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts),
+        tracks=tuple(builder.tracks),
+        aim_events=tuple(builder.aim_events),
+        pair_events=tuple(builder.pair_events),
+        track_events=tuple(builder.track_events),
+        unused=builder.unused,
+        unused_aims=tuple(i for i in sorted(builder.unused) if isinstance(events[i], AimEvent)),
+        markers=found.markers,
+        boards=found.boards,
+        finds=found.finds,
+        marker_noise=builder.marker_noise,
+        board_noise=builder.board_noise,
+        epoch_of=epoch_of,
+    )
+
+
+def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tuple[int, ...]]:
+    """Camera epochs, and the epoch of every event.
+
+    An epoch starts with its ``camera_moved`` (unless that was refused); where the program found the move out by itself,
+    with the first event at or after ``since_t``.
+    """
+    refused = refused_lines(events)
+    first = events[0].t if events else 0.0
+    starts = [EpochStart(min(0.0, first))]
+    places: list[int] = []
+    for index, event in enumerate(events):
+        if not isinstance(event, CameraMovedEvent) or event.line in refused:
+            continue
+        since = event.since_t if event.detected and event.since_t is not None else event.t
+        back = [i for i in range(index) if events[i].t >= since]
+        places.append(max(back[0] if back else index, places[-1] if places else 0))
+        starts.append(EpochStart(since, event.camera_new_T_camera_old, event.covariance))
+    epoch_of = tuple(sum(place <= index for place in places) for index in range(len(events)))
+    return tuple(starts), epoch_of
+
+
+def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progress: Progress | None) -> FrameResults:
+    if not any(needs_frames(event, redetect=redetect) for event in events):
+        return FrameResults()
+    from fgreg.detection.event_frames import detect_in_frames  # loads OpenCV, which poses and points do without
+
+    return detect_in_frames(events, model, redetect=redetect, progress=progress)
+
+
+class _Builder:
+    """Collects measurements event by event."""
+
+    def __init__(
+        self,
+        model: SessionModel,
+        found: FrameResults,
+        marker_noise: CornerNoise,
+        board_noise: CornerNoise,
+        redetect: bool,
+    ) -> None:
+        self.model, self.found, self.redetect = model, found, redetect
+        self.marker_noise, self.board_noise = marker_noise, board_noise
+        self.aims: list[Aim] = []
+        self.pairs: list[Pair] = []
+        self.tracks: list[Track] = []
+        self.aim_events: list[int] = []
+        self.pair_events: list[int] = []
+        self.track_events: list[int] = []
+        self.unused: dict[int, str] = {}
+        self.ids: dict[object, int] = {}
+        self.next_id = 0
+
+    def add(self, index: int, event: Event, epoch: int) -> None:
+        """Turn one event into a measurement, or note why not."""
+        if not isinstance(event, AimEvent | PairEvent | TrackEvent):
+            return
+        marker = self._marker(index, event)
+        if isinstance(marker, str):
+            self.unused[index] = marker
+            return
+        if isinstance(event, AimEvent):
+            spot = self._spot(index, event)
+            if isinstance(spot, str):
+                self.unused[index] = spot
+                return
+            self.aims.append(Aim(event.t, marker, *spot))
+            self.aim_events.append(index)
+            return
+        looks: list[Look] = []
+        for number, record in enumerate(looks_of(event)):
+            look = self._look(index, number, record)
+            if isinstance(look, str):
+                self.unused[index] = look
+            else:
+                looks.append(look)
+        if isinstance(event, PairEvent):
+            if looks:
+                self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0]))
+                self.pair_events.append(index)
+            return
+        if event.looks and not looks:
+            return  # heard nothing: the reason is noted
+        self.unused.pop(index, None)  # one look heard is enough for a query
+        scan = None if event.scan_deg is None else self.model.stage.scan_from_device(math.radians(event.scan_deg))
+        self.tracks.append(Track(event.t, epoch, marker, tuple(looks), scan))
+        self.track_events.append(index)
+
+    def _marker(self, index: int, event: AimEvent | PairEvent | TrackEvent) -> MarkerObservation | str:
+        record = event.marker
+        if needs_marker_frames(record, redetect=self.redetect):
+            fit = self.found.markers[index]
+            if isinstance(fit, NotFound):
+                return fit.reason
+            transform, covariance = fit.camera_T_marker, marker_covariance(fit, self.marker_noise)
+        else:
+            if record.camera_T_marker is None:
+                raise AssertionError("a marker is a pose or frames")
+            transform = record.camera_T_marker
+            covariance = (
+                default_marker_covariance(transform, self.model.noise)
+                if record.covariance is None
+                else record.covariance
+            )
+        key = _marker_key(record, redetect=self.redetect)
+        if key not in self.ids:
+            self.ids[key] = self.next_id
+            self.next_id += 1
+        number = self.ids[key]
+        return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number)
+
+    def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray] | str:
+        """The aimed-at spot (3,) in camera axes and its covariance (3, 3): where the corner is, and where the laser."""
+        laser = np.diag(np.square(self.model.noise.aim_mm))
+        if event.camera_p_spot_mm is not None:
+            return event.camera_p_spot_mm, laser if event.covariance is None else event.covariance
+        fit = self.found.boards[index]
+        if isinstance(fit, NotFound):
+            return fit.reason
+        if event.corner is None:
+            raise AssertionError("an aim has a spot or a corner")
+        spot, covariance = board_corner(fit, event.corner[0], event.corner[1], self.board_noise)
+        camera_R_board = fit.camera_T_board[:3, :3]
+        return spot, covariance + camera_R_board @ laser @ camera_R_board.T
+
+    def _look(self, index: int, number: int, record: TrusRecord) -> Look | str:
+        noise, stage = self.model.noise, self.model.stage
+        covariance = record.covariance
+        x_mm, range_mm, amplitude = record.x_mm, record.range_mm, record.amplitude
+        if x_mm is None or range_mm is None:
+            find = self.found.finds[index, number]
+            if isinstance(find, NoSignal):
+                return find.reason
+            x_mm, range_mm = find.x_mm, find.range_mm
+            covariance = find.covariance if covariance is None else covariance
+            amplitude = find.amplitude if amplitude is None else amplitude
+        if covariance is None:
+            covariance = np.diag([noise.lateral_mm**2, noise.range_mm**2])
+        return Look(
+            scan_rad=stage.scan_from_device(math.radians(record.scan_deg)),
+            scan_sigma_rad=noise.scan_rad,
+            x_mm=x_mm,
+            range_mm=range_mm,
+            covariance=as_float_array(covariance, 2, 2),
+            sweep=stage.direction * record.sweep,
+            amplitude=amplitude,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recollection:
+    """What an :class:`EventRecogniser` remembers of the events before, but for which marker got which number.
+
+    Attributes:
+        markers, boards: what detections left, in order.
+        next_id: the next new marker's number.
+    """
+
+    markers: tuple[Misfit, ...] = ()
+    boards: tuple[Misfit, ...] = ()
+    next_id: int = 0
+
+
+class EventRecogniser:
+    """Recognises events one after another, as they come: corner noise is pooled over the frames so far.
+
+    What it makes of an event depends on the aims and pairs before it that were taken in, and on nothing else, so that
+    the same events give the same measurements however often a session is interrupted.
+    """
+
+    def __init__(self, model: SessionModel) -> None:
+        nothing = pool_corner_noise(())
+        self._builder = _Builder(model, FrameResults(), nothing, nothing, redetect=False)
+        self._markers: list[Misfit] = []
+        self._boards: list[Misfit] = []
+        self._before = (0, 0)
+
+    def add(self, event: AimEvent | PairEvent | TrackEvent, epoch: int) -> Aim | Pair | Track | str:
+        """The event as a measurement in camera epoch ``epoch``, or why there is none. A query leaves no trace.
+
+        Raises:
+            InputError: a frame that is missing or not what it should be.
+        """
+        builder = self._builder
+        found = builder.found = _detect([event], builder.model, redetect=False, progress=None)
+        self._before = len(self._markers), len(self._boards)
+        self._markers += [_misfit(fit.pose) for fit in found.markers.values() if isinstance(fit, MarkerFit)]
+        self._boards += [_misfit(fit.pose) for fit in found.boards.values() if isinstance(fit, BoardFit)]
+        if found.markers or found.boards:
+            self._pool()
+        builder.add(0, event, epoch)
+        made: list[Aim | Pair | Track] = [*builder.aims, *builder.pairs, *builder.tracks]
+        reason = builder.unused.get(0, "")
+        for shots in (builder.aims, builder.pairs, builder.tracks):
+            shots.clear()
+        for numbers in (builder.aim_events, builder.pair_events, builder.track_events):
+            numbers.clear()
+        builder.unused.clear()
+        if isinstance(event, TrackEvent):
+            self.take_back()
+        return made[0] if made else reason
+
+    def take_back(self) -> None:
+        """Forget the last event: it was not taken in, and will not be there when the session is opened again."""
+        if self._before != (len(self._markers), len(self._boards)):
+            del self._markers[self._before[0] :], self._boards[self._before[1] :]
+            self._pool()
+
+    def recollection(self) -> Recollection:
+        """What this recogniser goes by for the events to come."""
+        return Recollection(tuple(self._markers), tuple(self._boards), self._builder.next_id)
+
+    def recollect(self, markers: Iterable[tuple[MarkerRecord, int]], recollection: Recollection) -> None:
+        """Go on as the recogniser that gave these markers these numbers.
+
+        Raises:
+            ValueError: a number that had not been given out.
+        """
+        for record, number in markers:
+            if not 0 <= number < recollection.next_id:
+                raise ValueError(f"marker {number} of {recollection.next_id}")
+            self._builder.ids[_marker_key(record, redetect=False)] = number
+        self._builder.next_id = recollection.next_id
+        self._markers, self._boards = list(recollection.markers), list(recollection.boards)
+        self._pool()
+
+    def _pool(self) -> None:
+        self._builder.marker_noise = pool_corner_noise(self._markers)
+        self._builder.board_noise = pool_corner_noise(self._boards)
+
+
+def _misfit(fit: Weighed) -> Misfit:
+    return Misfit(float(fit.cost), int(fit.dof))

@@ -1,0 +1,57 @@
+"""One camera's pictures one after another: the marker is looked for where it was, and everywhere now and then."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.detection.marker import ViewCorners, Window, view_corners
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.session_model import CameraModel, MarkerModel
+
+EVERYWHERE = 10
+"""One picture in so many is looked into as a whole: a tag of the same id elsewhere makes both of no use."""
+MARGIN, MARGIN_PX = 0.5, 24.0
+"""The marker is looked for within its last outline and so much of its size, and so many pixels, beside it."""
+
+
+class MarkerRoi:
+    """State of one view.
+
+    Args:
+        camera, view, view_T_camera, marker: as of :func:`fgreg.detection.marker.view_corners`.
+    """
+
+    def __init__(self, camera: CameraModel, view: int, view_T_camera: FloatArray, marker: MarkerModel) -> None:
+        self._camera, self._view, self._view_T_camera, self._marker = camera, view, view_T_camera, marker
+        self._last: ViewCorners | None = None
+        self._since = 0
+
+    def see(self, image: npt.NDArray[np.generic]) -> ViewCorners:
+        """The body's corners in the next picture: those that are found in the whole of it."""
+        last, found = self._last, None
+        if last is not None and self._since < EVERYWHERE:
+            self._since += 1
+            found = self._look(image, window_about(last.outlines_px, (image.shape[0], image.shape[1])))
+            if found.corners is None or len(found.outlines_px) < len(last.outlines_px):
+                found = None
+        if found is None:
+            self._since = 0
+            found = self._look(image, None)
+        self._last = found if found.corners is not None else None
+        return found
+
+    def _look(self, image: npt.NDArray[np.generic], near: Window | None) -> ViewCorners:
+        return view_corners(image, self._camera, self._view, self._view_T_camera, self._marker, near=near)
+
+
+def window_about(outlines_px: FloatArray, shape: tuple[int, int]) -> Window:
+    """Where to look in a picture of this shape (h, w); begins at even pixels, as halved pictures do."""
+    low, high = outlines_px.min(axis=0), outlines_px.max(axis=0)
+    margin = MARGIN * float((high - low).max()) + MARGIN_PX
+    left, top = (2 * int(max(0.0, value - margin) // 2) for value in low)
+    right, bottom = (int(np.ceil(value + margin)) + 1 for value in high)
+    return left, min(right, shape[1]), top, min(bottom, shape[0])
+
+
+__all__ = ["MarkerRoi", "window_about"]

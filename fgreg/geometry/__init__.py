@@ -1,0 +1,1 @@
+"""Rigid transforms, quaternions, and errors at target points."""

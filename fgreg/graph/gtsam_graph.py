@@ -1,0 +1,322 @@
+"""The explicit graph of a session: every variable and factor of design.md, section 2, as they stand there.
+
+This is the reference. The reduced problem, with everything private eliminated in closed form, has to reach the same
+optimum and is what bulk work uses. Solving is in
+gtsam_solver.py, starting values and reading back in gtsam_values.py.
+
+Shots: a *shot* is one marker observation of one spot. Aims come first, one shot each; then the pairs' shots, one per PM
+and marker observation: looks at a PM that share an observation share the shot (its pose counts once), looks with
+observations of their own have shots of their own. All shots and looks of a PM share its point. A pair not to be used
+is left out of the measurements by the caller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import gtsam
+import numpy as np
+
+from fgreg.errors import EstimationError
+from fgreg.factors.epoch_change import epoch_change_factor
+from fgreg.factors.marker_pose import marker_pose_factor
+from fgreg.factors.point_on_arc import point_on_arc_factor
+from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
+from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
+from fgreg.geometry.transforms import FloatArray
+from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Measurements, usable_covariance
+from fgreg.model.sensitivity import sensitivity_priors
+from fgreg.model.session_model import SessionModel
+
+
+class Variable(Enum):
+    """The variables of the graph, by design.md's names; the value is the letter of the GTSAM symbol."""
+
+    trus_T_camera = "T"
+    marker_laser = "B"
+    camera_T_marker = "M"
+    trus_p_pm = "P"
+    camera_p_spot = "S"
+    lam = "L"
+    theta = "H"
+    sound_speed_ratio = "C"
+    window_edge = "W"
+    marker_bias = "O"
+
+    def key(self, index: int = 0) -> int:
+        """The GTSAM key of the variable with this index."""
+        return int(gtsam.symbol(self.value, index))
+
+
+def variable_name(key: int) -> str:
+    """A key as design.md writes it, e.g. ``theta[3]``."""
+    symbol = gtsam.Symbol(key)
+    return f"{Variable(chr(symbol.chr())).name}[{symbol.index()}]"
+
+
+@dataclass(frozen=True, slots=True)
+class AimKeys:
+    """The private variables of one calibration shot."""
+
+    camera_T_marker: int
+    lam: int
+    camera_p_spot: int
+
+
+@dataclass(frozen=True, slots=True)
+class ShotKeys:
+    """The private variables of one shot at a PM, and the first of the pairs that it serves."""
+
+    camera_T_marker: int
+    lam: int
+    trus_p_pm: int
+    trus_T_camera: int
+    pair: int
+
+
+@dataclass(frozen=True, slots=True)
+class GraphKeys:
+    """Where each variable of a session is found.
+
+    Attributes:
+        trus_T_camera: one per epoch.
+        marker_laser: the beam's chart.
+        window_edge, marker_bias, sound_speed_ratio: None where they are not variables.
+        aims: one per aim.
+        shots: one per PM and marker observation.
+        pair_shot: per pair, its place in ``shots``.
+        theta: one per pair.
+        trus_p_pm: by PM.
+    """
+
+    trus_T_camera: tuple[int, ...]
+    marker_laser: int
+    window_edge: int | None
+    marker_bias: int | None
+    sound_speed_ratio: int | None
+    aims: tuple[AimKeys, ...]
+    shots: tuple[ShotKeys, ...]
+    pair_shot: tuple[int, ...]
+    theta: tuple[int, ...]
+    trus_p_pm: dict[int, int]
+
+    @property
+    def shared(self) -> tuple[int, ...]:
+        """The shared variables: ``trus_T_camera`` per epoch, ``marker_laser``, then those there are of the others."""
+        others = (self.window_edge, self.marker_bias, self.sound_speed_ratio)
+        return (*self.trus_T_camera, self.marker_laser, *(key for key in others if key is not None))
+
+    @property
+    def lam(self) -> tuple[int, ...]:
+        """Distances along the beam, of the aims and then of the shots."""
+        return (*(aim.lam for aim in self.aims), *(shot.lam for shot in self.shots))
+
+    @property
+    def camera_T_marker(self) -> tuple[int, ...]:
+        """Marker poses, of the aims and then of the shots."""
+        return (*(aim.camera_T_marker for aim in self.aims), *(shot.camera_T_marker for shot in self.shots))
+
+    @property
+    def private(self) -> tuple[int, ...]:
+        """All others, in the order in which they are eliminated: points, distances and angles, marker poses."""
+        points = (*(aim.camera_p_spot for aim in self.aims), *self.trus_p_pm.values())
+        return (*points, *self.lam, *self.theta, *self.camera_T_marker)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphOptions:
+    """What the graph is to hold beside the measurements.
+
+    Attributes:
+        marker_T_nominal: (4, 4) fixed frame of the beam's chart; None: the session's initial ``marker_T_laser``, else
+            the marker's own frame. The beam has to be within some 60 deg of its z axis.
+        sound_speed_sigma: prior sigma of ``sound_speed_ratio``, None where it is not a variable.
+        sound_speed_mean: its prior mean.
+        unknown_motion_sigma: sigmas (rad, mm) of a camera motion of which nothing is known, about no motion: too wide
+            to matter where there are pairs, and keeps an epoch without any from being singular. None: no factor.
+    """
+
+    marker_T_nominal: FloatArray | None = None
+    sound_speed_sigma: float | None = None
+    sound_speed_mean: float = 1.0
+    unknown_motion_sigma: tuple[float, float] | None = (3.0, 1000.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExplicitGraph:
+    """The graph of a session, its keys, and an elimination order: private variables first, shared ones last.
+
+    ``shared`` and ``private`` are the keys that some factor touches, in that order.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    keys: GraphKeys
+    shared: tuple[int, ...]
+    private: tuple[int, ...]
+    measurements: Measurements
+    session: SessionModel
+    marker_T_nominal: FloatArray
+
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """Private variables first, shared ones last."""
+        return make_ordering((*self.private, *self.shared))
+
+
+def make_ordering(keys: Sequence[int]) -> gtsam.Ordering:
+    """Keys as GTSAM's ordering."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
+def _make_keys(measurements: Measurements, *, edge: bool, bias: bool, sound_speed: bool) -> GraphKeys:
+    aims = tuple(
+        AimKeys(Variable.camera_T_marker.key(i), Variable.lam.key(i), Variable.camera_p_spot.key(i))
+        for i in range(len(measurements.aims))
+    )
+    points: dict[int, int] = {}
+    places: dict[tuple[int, int], int] = {}
+    shots: list[ShotKeys] = []
+    pair_shot: list[int] = []
+    for index, pair in enumerate(measurements.pairs):
+        if not 0 <= pair.epoch < len(measurements.epochs):
+            raise EstimationError(f"pair {index} is in epoch {pair.epoch}, of {len(measurements.epochs)}")
+        # A PM's number may be anything; its variable's index counts the PMs as they come.
+        point = points.setdefault(pair.pm, Variable.trus_p_pm.key(len(points)))
+        place = places.setdefault((pair.pm, pair.marker.id), len(shots))
+        if place == len(shots):
+            i = len(aims) + place
+            registration = Variable.trus_T_camera.key(pair.epoch)
+            shots.append(ShotKeys(Variable.camera_T_marker.key(i), Variable.lam.key(i), point, registration, index))
+        pair_shot.append(place)
+    return GraphKeys(
+        trus_T_camera=tuple(Variable.trus_T_camera.key(k) for k in range(len(measurements.epochs))),
+        marker_laser=Variable.marker_laser.key(),
+        window_edge=Variable.window_edge.key() if edge else None,
+        marker_bias=Variable.marker_bias.key() if bias else None,
+        sound_speed_ratio=Variable.sound_speed_ratio.key() if sound_speed else None,
+        aims=aims,
+        shots=tuple(shots),
+        pair_shot=tuple(pair_shot),
+        theta=tuple(Variable.theta.key(i) for i in range(len(measurements.pairs))),
+        trus_p_pm=points,
+    )
+
+
+def build_graph(
+    measurements: Measurements, session: SessionModel, options: GraphOptions | None = None
+) -> ExplicitGraph:
+    """The graph of all measurements of a session.
+
+    ``marker_bias`` is a variable where the session's noise has one, ``window_edge`` where a sweep that stopped at its
+    first hit depends on it.
+
+    Args:
+        measurements: what to use; unused pairs left out.
+        session: probe, stage step and noise.
+        options: the defaults of :class:`GraphOptions` where absent.
+
+    Raises:
+        EstimationError: a pair in an epoch that is not there.
+    """
+    options = options or GraphOptions()
+    nominal = options.marker_T_nominal
+    if nominal is None:
+        nominal = session.initial_marker_T_laser if session.initial_marker_T_laser is not None else np.eye(4)
+    probe, noise = session.probe, session.noise
+    looks = [pair.look for pair in measurements.pairs]
+    priors = sensitivity_priors(looks, probe.sensitivity, session.stage.step_rad)
+    edge_sigma = probe.sensitivity.edge_sigma_rad
+    keys = _make_keys(
+        measurements,
+        edge=edge_sigma > 0.0 and bool((priors.edge_gain != 0.0).any()),
+        bias=noise.marker_bias_mm > 0.0,
+        sound_speed=options.sound_speed_sigma is not None,
+    )
+    graph = gtsam.NonlinearFactorGraph()
+    _add_shared_priors(graph, keys, session, options)
+    _add_epoch_changes(graph, keys, measurements, options)
+    for aim, own in zip(measurements.aims, keys.aims, strict=True):
+        covariance = usable_covariance(aim.marker.covariance, POSE_FLOOR)
+        graph.add(marker_pose_factor(own.camera_T_marker, aim.marker.camera_T_marker, covariance, keys.marker_bias))
+        graph.add(aim_point_on_line_factor(own.camera_T_marker, keys.marker_laser, own.lam, own.camera_p_spot, nominal))
+        spot_noise = gtsam.noiseModel.Gaussian.Covariance(usable_covariance(aim.covariance, (FLOOR_MM,) * 3))
+        graph.add(gtsam.PriorFactorPoint3(own.camera_p_spot, aim.camera_p_spot_mm, spot_noise))
+    for shot in keys.shots:
+        marker = measurements.pairs[shot.pair].marker
+        covariance = usable_covariance(marker.covariance, POSE_FLOOR)
+        graph.add(marker_pose_factor(shot.camera_T_marker, marker.camera_T_marker, covariance, keys.marker_bias))
+        graph.add(
+            point_on_line_factor(
+                shot.trus_T_camera, shot.camera_T_marker, keys.marker_laser, shot.lam, shot.trus_p_pm, nominal
+            )
+        )
+    for index, look in enumerate(looks):
+        graph.add(
+            point_on_arc_factor(
+                keys.shots[keys.pair_shot[index]].trus_p_pm,
+                keys.theta[index],
+                look.scan_rad,
+                look.x_mm,
+                look.range_mm,
+                usable_covariance(look.covariance, (FLOOR_MM,) * 2),
+                probe.radius_mm,
+                keys.sound_speed_ratio,
+            )
+        )
+        gain = float(priors.edge_gain[index])
+        graph.add(
+            sensitivity_prior_factor(
+                keys.theta[index],
+                look.scan_rad,
+                look.range_mm,
+                probe.radius_mm,
+                float(priors.centre_rad[index]),
+                gain,
+                float(priors.sigma_rad[index]),
+                keys.window_edge if gain else None,
+                keys.sound_speed_ratio,
+            )
+        )
+    there = set(graph.keyVector())
+    return ExplicitGraph(
+        graph=graph,
+        keys=keys,
+        shared=tuple(key for key in keys.shared if key in there),
+        private=tuple(key for key in keys.private if key in there),
+        measurements=measurements,
+        session=session,
+        marker_T_nominal=nominal,
+    )
+
+
+def _add_shared_priors(
+    graph: gtsam.NonlinearFactorGraph, keys: GraphKeys, session: SessionModel, options: GraphOptions
+) -> None:
+    if keys.window_edge is not None:
+        edge_noise = gtsam.noiseModel.Isotropic.Sigma(1, session.probe.sensitivity.edge_sigma_rad)
+        graph.add(gtsam.PriorFactorDouble(keys.window_edge, 0.0, edge_noise))
+    if keys.marker_bias is not None:
+        bias_noise = gtsam.noiseModel.Isotropic.Sigma(3, session.noise.marker_bias_mm)
+        graph.add(gtsam.PriorFactorVector(keys.marker_bias, np.zeros(3), bias_noise))
+    if keys.sound_speed_ratio is not None and options.sound_speed_sigma is not None:
+        ratio_noise = gtsam.noiseModel.Isotropic.Sigma(1, options.sound_speed_sigma)
+        graph.add(gtsam.PriorFactorDouble(keys.sound_speed_ratio, options.sound_speed_mean, ratio_noise))
+
+
+def _add_epoch_changes(
+    graph: gtsam.NonlinearFactorGraph, keys: GraphKeys, measurements: Measurements, options: GraphOptions
+) -> None:
+    for k, epoch in enumerate(measurements.epochs[1:], 1):
+        motion, covariance = epoch.camera_new_T_camera_old, epoch.covariance
+        if motion is None or covariance is None:
+            if options.unknown_motion_sigma is None:
+                continue
+            rad, mm = options.unknown_motion_sigma
+            motion, covariance = np.eye(4), np.diag([rad**2] * 3 + [mm**2] * 3)
+        covariance = usable_covariance(covariance, POSE_FLOOR)
+        graph.add(epoch_change_factor(keys.trus_T_camera[epoch.old(k)], keys.trus_T_camera[k], motion, covariance))

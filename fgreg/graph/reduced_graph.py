@@ -1,0 +1,489 @@
+"""The graph with everything private eliminated in closed form, for many hypotheses at once.
+
+Private to a PM are its point, lambda and theta' of each look, and the marker pose of each beam. Given the shared
+variables (registration, beam, window edge, ...) they enter through small blocks:
+
+- point on line, lambda free: two residuals across the beam, ``N' (trus_p_pm - beam)``. The marker pose's error
+  (w, n) has a Gaussian prior and enters linearly around its current estimate, so eliminating it leaves the same
+  residual, shifted, with covariance ``J Sigma J'`` (the update of an iterated Kalman filter). The estimate is
+  refreshed at every evaluation, so the fixed point is the optimum of the explicit graph, not of a linearised one.
+- point on arc, theta' free, and the sensitivity prior: three residuals (x, range, rotation offset) in the point.
+- the point itself: a 3 x 3 Schur complement.
+
+What is left is a normal system on the shared variables, dense and small, built by vectorised numpy: linear in the
+number of pairs, and with a leading dimension S so that all starts (or posterior samples) go in one call. Costs are
+chi squares (twice the negative log of the density). Same optimum as fgreg.graph, which is the reference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.geometry.transforms import FloatArray, hat, log_so3
+from fgreg.graph.packing import BeamArrays, EpochLink, PackedProblem
+from fgreg.graph.reduced_blocks import (
+    Chart,
+    Groups,
+    PrivateState,
+    Whitening,
+    along_beam,
+    cross,
+    initial_private,
+    inner,
+    inverse3,
+    line_block,
+    look_columns,
+    look_rows,
+    outer,
+    times,
+    transposed,
+)
+from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.window_likelihood import log_shape_ratios
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """The reduced problem at a state.
+
+    Attributes:
+        cost: (S,) chi square, private variables at their (linearised) optimum.
+        gradient: (S, D), hessian: (S, D, D): of half the cost.
+        private: private variables after this evaluation's refinement, at the *same* shared variables.
+        point_gain: (S, J, 3, D): how the PMs move with the shared variables.
+        point_covariance: (S, J, 3, 3): of the PMs given the shared variables.
+        pm_weight: (S, J), aim_weight: (S, A): with which they count. aim_cost: (S, A) chi square of each.
+        lambda_mm: (S, B). aim_lambda_mm: (S, A). look_residual: (S, L, 3) over (x mm, range mm, rotation rad).
+        aim_residual: (S, A, 2) mm, along x and y of the beam chart's nominal frame.
+    """
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+    private: PrivateState
+    point_gain: FloatArray
+    point_covariance: FloatArray
+    pm_weight: FloatArray
+    aim_weight: FloatArray
+    aim_cost: FloatArray
+    lambda_mm: FloatArray
+    look_residual: FloatArray
+    aim_residual: FloatArray
+    aim_lambda_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """Residuals in units of their standard deviations, and the normal equations of the PMs, at one linearisation point.
+
+    S is the last dimension. Lines are the beams of the PMs, then those of the aims (n = B + A).
+
+    Attributes:
+        line: (n, 4, 2, S) residual and derivative by the point, camera axes, of points ``camera_p`` (n, 3, S).
+        laser_p: (n, 3, S) those points in the chart's nominal frame. whitening: of the lines.
+        beam_by_point: (B, 3, 2, S) derivative by the PM, TRUS axes.
+        look: (L, 3, 4 + K, S) residual, derivatives by the PM and by the variables of ``look_columns``; ``look_raw``
+            the same in mm and rad.
+        aim_residual_mm: (A, 2, S) in the chart's coordinates.
+        point_step: (J, 3, S), point_covariance: (J, 3, 3, S).
+        pm_cost: (J, S), aim_cost: (A, S), prior_cost: (S,).
+    """
+
+    beams: Groups
+    looks: Groups
+    line: FloatArray
+    camera_p: FloatArray
+    laser_p: FloatArray
+    whitening: Whitening
+    beam_by_point: FloatArray
+    look: FloatArray
+    look_raw: FloatArray
+    aim_residual_mm: FloatArray
+    point_covariance: FloatArray
+    point_step: FloatArray
+    pm_cost: FloatArray
+    aim_cost: FloatArray
+    prior_cost: FloatArray
+    private: PrivateState
+
+    @property
+    def cost(self) -> FloatArray:
+        """(S,) chi square of everything."""
+        return np.asarray(self.pm_cost.sum(axis=0) + self.aim_cost.sum(axis=0) + self.prior_cost)
+
+
+def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -> _System:
+    pms, count = len(problem.pms), len(problem.beam_pm)
+    chart = Chart.of(state)
+    beams, looks = Groups.of(problem.beam_pm, pms), Groups.of(problem.look_pm, pms)
+    points, shift = inner(private.trus_p_pm), inner(private.aim_shift)
+    rotation, translation = inner(state.rotation), inner(state.translation_mm)
+    if len(rotation) > 1:
+        rotation, translation = rotation[problem.beam_epoch], translation[problem.beam_epoch]
+    camera_p = np.einsum("nijs,nis->njs", rotation, beams.spread(points) - translation)
+    markers, error = problem.beams, inner(private.beam_error)
+    if len(shift):
+        camera_p = np.concatenate([camera_p, problem.aim_spot_mm[..., None] + shift])
+        markers, error = _joined(markers, problem.aims), np.concatenate([error, inner(private.aim_error)])
+    block = line_block(markers, error, chart, camera_p)
+    # What the spot of an aim is off its measured place is eliminated like the marker's error.
+    by_spot = block.rows[count:, 1:]
+    spot_spread = _times_each(problem.aim_spot_covariance, by_spot)
+    if len(shift):
+        block.rows[count:, 0] -= np.einsum("niks,nis->nks", by_spot, shift)
+        for place, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+            block.covariance[count:, place] += np.einsum("nks,nks->ns", by_spot[:, :, i], spot_spread[:, :, j])
+    whitening = Whitening.of(block.covariance)
+    line = whitening.rows(block.rows)
+    by_point = np.einsum("nijs,njks->niks", rotation, line[:count, 1:])
+
+    look_raw = look_rows(problem, state, looks.spread(points))
+    look = _times_each(_look_root(problem.looks.weight), look_raw)
+    look_by_point, look_residual = look[:, :, 1:4], look[:, :, 0]
+
+    h_pp = beams.sum(np.einsum("niks,njks->nijs", by_point, by_point))
+    h_pp = h_pp + looks.sum(np.einsum("nkis,nkjs->nijs", look_by_point, look_by_point))
+    b_p = beams.sum(np.einsum("niks,nks->nis", by_point, line[:count, 0]))
+    b_p = b_p + looks.sum(np.einsum("nkis,nks->nis", look_by_point, look_residual))
+    point_covariance = inverse3(h_pp)
+    point_step = -np.einsum("nijs,njs->nis", point_covariance, b_p)
+    line_cost = np.einsum("nis,nis->ns", line[:, 0], line[:, 0])
+    pm_cost = beams.sum(line_cost[:count]) + looks.sum(np.einsum("nks,nks->ns", look_residual, look_residual))
+    pm_cost = pm_cost + np.einsum("nis,nis->ns", b_p, point_step)
+
+    # The private variables' optimum at these shared ones, as linearised here.
+    updated = line[:, 0].copy()
+    updated[:count] += np.einsum("niks,nis->nks", by_point, beams.spread(point_step))
+    back = whitening.back(updated)
+    error = -np.einsum("niks,nks->nis", block.spread, back)
+    refined = PrivateState(
+        trus_p_pm=outer(points + point_step),
+        beam_error=outer(error[:count]),
+        aim_error=outer(error[count:]),
+        aim_shift=outer(-np.einsum("niks,nks->nis", spot_spread, back[count:])),
+    )
+    return _System(
+        beams=beams,
+        looks=looks,
+        line=line,
+        camera_p=camera_p,
+        laser_p=block.laser_p,
+        whitening=whitening,
+        beam_by_point=by_point,
+        look=look,
+        look_raw=look_raw,
+        aim_residual_mm=block.rows[count:, 0],
+        point_covariance=point_covariance,
+        point_step=point_step,
+        pm_cost=pm_cost,
+        aim_cost=line_cost[count:],
+        prior_cost=_prior_cost(problem, state),
+        private=refined,
+    )
+
+
+def _joined(first: BeamArrays, second: BeamArrays) -> BeamArrays:
+    return BeamArrays(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in BeamArrays.__slots__))
+
+
+def _times_each(matrix: FloatArray, values: FloatArray) -> FloatArray:
+    """Products (n, i, ..., S) of matrices (n, i, j) with values (n, j, ..., S): the same one for all hypotheses."""
+    flat = values.reshape(*values.shape[:2], math.prod(values.shape[2:]))
+    return np.asarray((matrix @ flat).reshape(len(matrix), matrix.shape[1], *values.shape[2:]))
+
+
+def _look_root(weight: FloatArray) -> FloatArray:
+    """U (L, 3, 3) with ``U' U`` the weights, which couple x and range only."""
+    root = np.zeros_like(weight)
+    root[:, 0, 0] = np.sqrt(weight[:, 0, 0])
+    root[:, 0, 1] = weight[:, 0, 1] / root[:, 0, 0]
+    root[:, 1, 1] = np.sqrt(weight[:, 1, 1] - root[:, 0, 1] ** 2)
+    root[:, 2, 2] = np.sqrt(weight[:, 2, 2])
+    return root
+
+
+def refine(problem: PackedProblem, state: SharedState, private: PrivateState) -> tuple[FloatArray, PrivateState]:
+    """One step of the private variables at fixed shared ones: the cost (S,) and the private variables after it."""
+    system = _system(problem, state, private)
+    return system.cost, system.private
+
+
+def private_at(problem: PackedProblem, state: SharedState) -> PrivateState:
+    """The private variables at shared ones, from the arcs.
+
+    On the way from a far start a PM may end up on the far side of its arc, where it seems to fit.
+    """
+    private = initial_private(problem, state)
+    for _ in range(3):
+        _, private = refine(problem, state, private)
+    return private
+
+
+def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
+    """Log density (S,) of the shared variables, up to a constant.
+
+    Private variables: at their optimum, ``-cost / 2``. Not integrated out with flat priors, which would multiply the
+    density by the volume they are free in, and so by how steeply beams happen to cross arcs: as in straight line fits
+    with errors in both coordinates that estimate is inconsistent (Neyman and Scott, 1948; Kendall and Stuart, vol. 2,
+    ch. 29), the one with the private variables at their optimum is not. Where the problem keeps the windows' own
+    shapes, the PMs' rotations are integrated over them (fgreg.graph.window_likelihood). Where it doubts PMs, each is
+    either good,
+    or junk of the density given: the sum of both.
+    """
+    system = _system(problem, state, private)
+    pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost.T
+    if problem.log_junk is not None:
+        pms = np.logaddexp(pms, problem.log_junk)
+    return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=0) + system.prior_cost))
+
+
+def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
+    """(S, J) log of what the windows' own shapes make of the Gaussian stand-ins' density of each PM."""
+    if problem.shapes is None:
+        return np.zeros((state.count, len(problem.pms)))
+    by_point = system.look_raw[:, 2, 1:4]
+    offset = system.look_raw[:, 2, 0] + np.einsum("nis,nis->ns", by_point, system.looks.spread(system.point_step))
+    spread = np.einsum("nijs,njs->nis", system.looks.spread(system.point_covariance), by_point)
+    variance = np.einsum("nis,nis->ns", by_point, spread)
+    return log_shape_ratios(problem, state.edge_rad, offset.T, variance.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SharedDerivatives:
+    """Derivatives of all residuals by the shared variables, in units of standard deviations.
+
+    ``line`` (S, B + A, 2, D); ``h_ps`` (S, J, 3, D) of the PMs' normal equations, ``point_gain`` (S, J, 3, D) how the
+    PMs move with the shared variables.
+    """
+
+    line: FloatArray
+    h_ps: FloatArray
+    point_gain: FloatArray
+
+
+def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _System) -> _SharedDerivatives:
+    columns, pms = problem.columns, len(problem.beam_pm)
+    by_camera = system.line[:, 1:]
+    lines = len(by_camera)
+    line = np.zeros((state.count, lines, 2, columns.size))
+    pose = np.empty((pms, 6, 2, state.count))
+    pose[:, :3] = cross(by_camera[:pms], system.camera_p[:pms, :, None])
+    np.negative(by_camera[:pms], out=pose[:, 3:])
+    pose = pose.transpose(3, 0, 2, 1)
+    for epoch in range(columns.epochs):
+        mine = np.flatnonzero(problem.beam_epoch == epoch) if columns.epochs > 1 else slice(0, pms)
+        line[:, mine, :, 6 * epoch : 6 * epoch + 6] = pose[:, mine]
+    chart = np.zeros((lines, 4, 2, state.count))
+    chart[:, 0, 0] = chart[:, 1, 1] = -1.0
+    chart[:, 2, 0] = chart[:, 3, 1] = -system.laser_p[:, 2]
+    line[..., columns.beam : columns.beam + 4] = system.whitening.rows(chart).transpose(3, 0, 2, 1)
+    if columns.bias is not None:
+        line[..., columns.bias : columns.bias + 3] = by_camera.transpose(3, 0, 2, 1)
+    h_ps = _summed(system.beams, outer(system.beam_by_point) @ line[:, :pms])
+    by_look = np.einsum("nkis,nkjs->nijs", system.look[:, :, 1:4], system.look[:, :, 4:])
+    h_ps[..., look_columns(problem)] += outer(system.looks.sum(by_look))
+    return _SharedDerivatives(line, h_ps, -outer(system.point_covariance) @ h_ps)
+
+
+def _summed(groups: Groups, values: FloatArray) -> FloatArray:
+    """(S, n, ...) to (S, count, ...)."""
+    return groups.sum(values.swapaxes(0, 1)).swapaxes(0, 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contributions:
+    """What n parts add to the reduced problem: cost (S, n), gradient (S, n, D), hessian (S, n, D, D)."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """The reduced problem at S hypotheses, taken apart: what each PM, each aim and the priors (n = 1) add.
+
+    ``private`` and ``point_gain`` are as in :class:`Evaluation`.
+    """
+
+    pm: Contributions
+    aim: Contributions
+    prior: Contributions
+    private: PrivateState
+    point_gain: FloatArray
+
+
+def contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Parts:
+    """:func:`evaluate`, but not summed: the terms of the sum."""
+    size, pms = problem.columns.size, len(problem.beam_pm)
+    system = _system(problem, state, private)
+    by = _shared_derivatives(problem, state, system)
+    look, columns = system.look, np.array(look_columns(problem))
+    line_t, residual = transposed(by.line), outer(system.line[:, 0])
+    line_hessian, line_gradient = line_t @ by.line, times(line_t, residual)
+    hessian = _summed(system.beams, line_hessian[:, :pms]) + transposed(by.h_ps) @ by.point_gain
+    gradient = _summed(system.beams, line_gradient[:, :pms]) + times(transposed(by.h_ps), outer(system.point_step))
+    look_hessian = np.einsum("nkis,nkjs->nijs", look[:, :, 4:], look[:, :, 4:])
+    hessian[..., columns[:, None], columns] += outer(system.looks.sum(look_hessian))
+    look_gradient = np.einsum("nkis,nks->nis", look[:, :, 4:], look[:, :, 0])
+    gradient[..., columns] += outer(system.looks.sum(look_gradient))
+    prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
+    _add_priors(problem, state, prior_gradient, prior_hessian)
+    return Parts(
+        pm=Contributions(outer(system.pm_cost), gradient, hessian),
+        aim=Contributions(outer(system.aim_cost), line_gradient[:, pms:], line_hessian[:, pms:]),
+        prior=Contributions(system.prior_cost[:, None], prior_gradient[:, None], prior_hessian[:, None]),
+        private=system.private,
+        point_gain=by.point_gain,
+    )
+
+
+def pm_contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Contributions:
+    """What each PM adds, for a state of one hypothesis: cost (J,), gradient (J, D), hessian (J, D, D)."""
+    parts = contributions(problem, state, private).pm
+    return Contributions(parts.cost[0], parts.gradient[0], parts.hessian[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Costs:
+    """Chi squares of S hypotheses: of each PM (S, J), each aim (S, A), the priors (S,).
+
+    ``moved_mm`` (S, J): how far each PM moved when the private variables were refined.
+    """
+
+    pm: FloatArray
+    aim: FloatArray
+    prior: FloatArray
+    moved_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weights:
+    """How a loss counts: weights of the PMs (S, J) and aims (S, A), and the cost (S,) as it is by that loss."""
+
+    pm: FloatArray
+    aim: FloatArray
+    cost: FloatArray
+
+
+Loss = Callable[[Costs], Weights]
+
+
+def least_squares(costs: Costs) -> Weights:
+    """The loss under which everything counts in full."""
+    total = costs.pm.sum(axis=1) + costs.aim.sum(axis=1) + costs.prior
+    return Weights(np.ones_like(costs.pm), np.ones_like(costs.aim), total)
+
+
+def evaluate(
+    problem: PackedProblem, state: SharedState, private: PrivateState, loss: Loss = least_squares
+) -> Evaluation:
+    """Cost, gradient and Gauss-Newton Hessian on the shared variables, private ones eliminated.
+
+    Args:
+        problem: the packed measurements.
+        state: S hypotheses.
+        private: where the private variables are linearised; refined once here (returned in ``private``).
+        loss: of each PM's and aim's chi square.
+    """
+    system = _system(problem, state, private)
+    by = _shared_derivatives(problem, state, system)
+    moved_mm = np.sqrt(np.einsum("nis,nis->ns", system.point_step, system.point_step))
+    weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(moved_mm)))
+    look, columns, pms = system.look, np.array(look_columns(problem)), len(problem.beam_pm)
+    line, h_ps, look_t = by.line, by.h_ps, look[:, :, 4:]
+    if loss is not least_squares:
+        line = line * np.concatenate([weights.pm[:, problem.beam_pm], weights.aim], axis=1)[..., None, None]
+        h_ps = h_ps * weights.pm[..., None, None]
+        look_t = look_t * inner(weights.pm)[problem.look_pm, None, None]
+    hessian = _stacked(line, by.line) + _stacked(h_ps, by.point_gain)
+    hessian[:, columns[:, None], columns] += np.einsum("nkis,nkjs->sij", look_t, look[:, :, 4:])
+    gradient = _stacked(line, outer(system.line[:, 0])[..., None])
+    gradient = (gradient + _stacked(h_ps, outer(system.point_step)[..., None]))[..., 0]
+    gradient[:, columns] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
+    _add_priors(problem, state, gradient, hessian)
+    lambda_mm = outer(along_beam(state, system.laser_p))
+    return Evaluation(
+        cost=weights.cost,
+        gradient=gradient,
+        hessian=hessian,
+        private=system.private,
+        point_gain=by.point_gain,
+        point_covariance=outer(system.point_covariance),
+        pm_weight=weights.pm,
+        aim_weight=weights.aim,
+        aim_cost=outer(system.aim_cost),
+        lambda_mm=lambda_mm[:, :pms],
+        look_residual=outer(system.look_raw[:, :, 0]),
+        aim_residual=outer(system.aim_residual_mm),
+        aim_lambda_mm=lambda_mm[:, pms:],
+    )
+
+
+def _stacked(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Sum over entries and rows of left' right, (S, n, k, a) and (S, n, k, b): one matrix product a hypothesis."""
+    count, rows = left.shape[0], left.shape[1] * left.shape[2]
+    return np.asarray(transposed(left.reshape(count, rows, left.shape[3])) @ right.reshape(count, rows, right.shape[3]))
+
+
+def _prior_deviation(problem: PackedProblem, state: SharedState) -> FloatArray:
+    """(S, D) shared variables less their prior means, zero where there is no prior."""
+    columns = problem.columns
+    deviation = np.zeros((state.count, columns.size))
+    deviation[:, columns.edge] = state.edge_rad
+    if columns.bias is not None:
+        deviation[:, columns.bias : columns.bias + 3] = state.bias_mm
+    if columns.sound_speed is not None:
+        deviation[:, columns.sound_speed] = state.sound_speed_ratio - problem.sound_speed_mean
+    if columns.radius is not None:
+        deviation[:, columns.radius] = state.radius_mm - problem.radius_mm
+    return deviation
+
+
+def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
+    cost = np.sum(problem.prior_information * _prior_deviation(problem, state) ** 2, axis=1)
+    for link in problem.links:
+        residual, _ = _link_residual(link, state)
+        cost = cost + np.sum(residual * (residual @ link.information), axis=1)
+    if problem.anchor is not None:
+        step = step_between(problem.anchor.state, state, problem.columns)
+        cost = cost + np.sum(step * (step @ problem.anchor.information), axis=1)
+    return np.asarray(cost)
+
+
+def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray, hessian: FloatArray) -> None:
+    """Gaussian priors of the shared variables and links between epochs, added in place."""
+    gradient += problem.prior_information * _prior_deviation(problem, state)
+    diagonal = np.arange(problem.columns.size)
+    hessian[:, diagonal, diagonal] += problem.prior_information
+    for link in problem.links:
+        residual, jacobian = _link_residual(link, state)
+        weighted = link.information @ jacobian
+        columns = np.r_[6 * link.old : 6 * link.old + 6, 6 * link.new : 6 * link.new + 6]
+        hessian[:, columns[:, None], columns] += transposed(jacobian) @ weighted
+        gradient[:, columns] += times(transposed(weighted), residual)
+    if problem.anchor is not None:
+        hessian += problem.anchor.information
+        gradient += step_between(problem.anchor.state, state, problem.columns) @ problem.anchor.information
+
+
+def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:
+    """Error (S, 6) on the right of ``old_T_new`` in ``new = old * old_T_new``, and its derivative (S, 6, 12)."""
+    old, new, new_R_old = link.old, link.new, link.old_T_new[:3, :3].T
+    back = transposed(state.rotation[:, old])
+    relative_R = back @ state.rotation[:, new]
+    relative_t = times(back, state.translation_mm[:, new] - state.translation_mm[:, old])
+    turn = log_so3(new_R_old @ relative_R)
+    residual = np.concatenate([turn, times(new_R_old, relative_t - link.old_T_new[:3, 3])], axis=1)
+    by_turn = np.eye(3) + 0.5 * hat(turn)  # inverse right Jacobian of SO(3), to first order in the error
+    jacobian = np.zeros((state.count, 6, 12))
+    jacobian[:, :3, :3] = -by_turn @ transposed(relative_R)
+    jacobian[:, 3:, :3] = new_R_old @ hat(relative_t)
+    jacobian[:, 3:, 3:6] = -new_R_old
+    jacobian[:, :3, 6:9] = by_turn
+    jacobian[:, 3:, 9:] = new_R_old @ relative_R
+    return residual, jacobian

@@ -1,0 +1,242 @@
+"""Everything that a live session needs, put together and taken apart again: folder, engine, devices, stage, loop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from fgreg.drivers.base import host_now
+from fgreg.errors import FgregError, InputError
+from fgreg.live.loop import LiveLoop
+from fgreg.live.recorder import OnTaken, Recorder
+from fgreg.live.scope_holder import HolderSettings
+from fgreg.live.status import Devices
+from fgreg.live.workflow import Workflow, WorkflowSettings
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.time_sync import Latencies
+from fgreg.online.engine_process import EngineProcess
+from fgreg.online.live_session import Engine, LiveSession
+from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
+from fgreg.registration.register import SoundSpeedPrior
+from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE
+from fgreg.stage.client import StageLink, StageRecord
+from fgreg.stage.limits import MotionLimits
+from fgreg.stage.reconnect import ReconnectingStage
+from fgreg.stage.stop_on_exit import emergency_stop_all
+from fgreg.workers.threads import undisturbed
+
+WATCHDOG_LOG = "stage-orders.log"
+
+
+OpenDevices = Callable[[ExitStack, SessionModel], Devices]
+"""Opens the devices but the stage; what it opens is closed with the stack."""
+
+
+TellTruth = Callable[[Path, float, float], None]
+"""Writes a session's ground truth, from its folder, the host time of session time 0, and the session time after which
+its events are this run's."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StageSetup:
+    """The stage's driver (``package.module:factory``), its options, and limits beyond the session's."""
+
+    driver: str
+    options: Mapping[str, Any]
+    limits: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveSetup:
+    """A session to be conducted.
+
+    Attributes:
+        setup: the content of its ``session.yaml``, as text.
+        open_devices: all but the stage.
+        stage: None where there is none: then nothing turns.
+        settings: of the workflow.
+        holder: how far the endoscope's holder is to be believed, where there is one.
+        latencies: of the devices.
+        tell_truth: called when all is recorded, where somebody knows the truth.
+    """
+
+    setup: str
+    open_devices: OpenDevices
+    stage: StageSetup | None
+    settings: WorkflowSettings
+    holder: HolderSettings = field(default_factory=HolderSettings)
+    latencies: Latencies = field(default_factory=Latencies)
+    tell_truth: TellTruth | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Running:
+    """A session under way."""
+
+    folder: Path
+    model: SessionModel
+    loop: LiveLoop
+    recorder: Recorder
+    session: LiveSession
+
+
+class OneProcess:
+    """Makes engines, each a process; the one before is ended."""
+
+    def __init__(self) -> None:
+        self._engine: EngineProcess | None = None
+
+    def __call__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
+        self.close()
+        self._engine = EngineProcess(model, config, prior)
+        return self._engine
+
+    def close(self) -> None:
+        """End the last one."""
+        if self._engine is not None:
+            self._engine.close()
+
+
+class NewestSnapshots:
+    """The snapshots of a session's engine, whichever process that is by now; for one thread.
+
+    While a new process takes in what is recorded, those of the one before stand.
+    """
+
+    def __init__(self, session: LiveSession) -> None:
+        self._session = session
+        self._engine: Engine | None = None
+        self._reader: SnapshotReader | None = None
+
+    def read(self) -> Received:
+        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.read`; closed also where the process was killed."""
+        engine = self._session.engine
+        if engine is not self._engine and isinstance(engine, EngineProcess):
+            with suppress(FileNotFoundError):  # that one has ended as well
+                self._reader = engine.reader()
+            self._engine = engine
+        if self._reader is None:
+            raise NoSnapshotError("the registration's process has ended")
+        received = self._reader.read()
+        alive = isinstance(self._engine, EngineProcess) and self._engine.alive
+        return received if alive else replace(received, closed=True)
+
+
+def make_folder(folder: Path, setup: str) -> None:
+    """A new session's folder with its ``session.yaml``; an existing session goes on if that is the same.
+
+    Raises:
+        InputError: the folder holds something else, or cannot be made.
+    """
+    path = folder / SETUP_FILE
+    try:
+        if path.is_file():
+            if path.read_text(encoding="utf-8") != setup:
+                raise InputError(str(path), "another set-up", f"the same as now, or a new folder for {EVENTS_FILE}")
+            return
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            found = "a folder that is not empty" if folder.is_dir() else "a file"
+            raise InputError(str(folder), found, "a new or empty folder, or a session")
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(setup, encoding="utf-8")
+    except OSError as error:
+        raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from None
+
+
+def setup_text(document: Mapping[str, Any]) -> str:
+    """A ``session.yaml`` of a mapping."""
+    return str(yaml.safe_dump(dict(document), sort_keys=False, width=200, default_flow_style=None))
+
+
+@contextmanager
+def running(
+    live: LiveSetup,
+    folder: Path,
+    config: SolveConfig | None = None,
+    on_taken: OnTaken | None = None,
+    say: Callable[[str], None] = lambda _text: None,
+) -> Iterator[Running]:
+    """A session with everything started; all is ended when the block is left, the stage first.
+
+    Args:
+        live: what to conduct.
+        folder: of the session; made where it is not there.
+        config: of the estimate.
+        on_taken: called after each event that was taken in, on the recorder's thread.
+        say: told what is being started.
+
+    Raises:
+        InputError: bad input.
+        FgregError: something did not start.
+    """
+    make_folder(folder, live.setup)
+    with ExitStack() as stack:
+        say("starting the registration")
+        make_engine = OneProcess()
+        stack.callback(make_engine.close)  # after the recorder, whichever process is there then
+        session = stack.enter_context(LiveSession.open(folder, config, make_engine, late=True))
+        model = session.journal.model
+        last_t = session.journal.last_t
+        start_s = host_now() - (0.0 if last_t is None else max(last_t, 0.0) + 1.0)
+        stack.callback(_tell_truth, live.tell_truth, folder, start_s, -1.0 if last_t is None else last_t, say)
+        say("opening the devices")
+        devices = live.open_devices(stack, model)
+        if live.stage is not None:
+            say("starting the stage's watchdog")
+            devices.stage = stack.enter_context(_open_stage(live.stage, model, session, start_s, folder))
+        recorder = Recorder(session, on_taken)
+        stack.callback(_end_recording, recorder, say)
+        taken = session.measurements()
+        workflow = Workflow(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
+        snapshots = NewestSnapshots(session)
+        loop = LiveLoop(model, devices, recorder, snapshots, workflow, start_s, live.holder, live.latencies)
+        stack.callback(loop.close)
+        stack.enter_context(undisturbed())
+        try:
+            yield Running(folder, model, loop, recorder, session)
+        except BaseException:
+            emergency_stop_all()
+            raise
+        finally:
+            if devices.stage is not None:
+                devices.stage.close()  # first of all; the rest follows in the stack's order
+
+
+def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:
+    recorder.close()
+    if recorder.state.waiting:
+        say(f"the last {recorder.state.waiting} events could not be recorded: {recorder.state.blocked}")
+
+
+def _tell_truth(
+    tell: TellTruth | None, folder: Path, start_s: float, begin_t: float, say: Callable[[str], None]
+) -> None:
+    """The session is what it is without."""
+    if tell is not None:
+        try:
+            tell(folder, start_s, begin_t)
+        except FgregError as error:
+            say(f"no ground truth: {error}")
+
+
+def _open_stage(
+    stage: StageSetup, model: SessionModel, session: LiveSession, start_s: float, folder: Path
+) -> ReconnectingStage:
+    def log(record: StageRecord) -> None:
+        t = max(0.0, record.host_s - start_s)
+        session.journal.append(record.event(t, model.stage), durable=False, late=True)
+
+    limits = MotionLimits.of_session(model.stage, **stage.limits)
+    return ReconnectingStage(lambda: StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG))
+
+
+def default_folder() -> Path:
+    """A new folder in the working directory, named by the time."""
+    return Path(time.strftime("fgreg-live-%Y%m%d-%H%M%S"))

@@ -1,0 +1,413 @@
+"""The live loop: frames and pulses in, events and orders out, once per frame.
+
+One turn: the newest frame -> the marker's pose -> where to turn (from the shared snapshot, which never waits) -> what
+the workflow asks for -> the stage's watchdog, the recorder, the operator. All devices are polled; none can hold it up.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from typing import Protocol
+
+import numpy as np
+
+from fgreg.detection.board import detect_board
+from fgreg.detection.corner_noise import pool_corner_noise
+from fgreg.detection.results import BoardFit, NotFound, board_corner
+from fgreg.drivers.base import BmodeFrame, DeviceLost, OperatorCommand, Registration, StereoFrame, host_now
+from fgreg.live.actions import (
+    Action,
+    Ask,
+    Follow,
+    Halt,
+    Inputs,
+    LocatedPulse,
+    Release,
+    Sweep,
+    TakeAim,
+    TakeMove,
+    TakePairs,
+    Tell,
+)
+from fgreg.live.device_health import Health, Pictures, Source
+from fgreg.live.marker_tracker import MarkerTracker
+from fgreg.live.merge_looks import one_spot
+from fgreg.live.pulse_locator import PulseLocator
+from fgreg.live.recorder import Recorder
+from fgreg.live.scope_holder import Holder, HolderSettings
+from fgreg.live.stage_commands import Steering
+from fgreg.live.status import Devices, Figures, Status
+from fgreg.live.workflow import Workflow
+from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord
+from fgreg.model.measurements import MarkerObservation, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.time_sync import Latencies, TimedPose
+from fgreg.online.shared_snapshot import NoSnapshotError, Received
+from fgreg.tracking import Snapshot, track
+
+IDLE_S = 0.002
+"""Between looks for a frame."""
+STEP_S = 0.02
+"""Without frames the rest goes on at this pace."""
+SEND_S = 0.2
+"""Between sendings of the registration where nothing has changed."""
+STALE_S = 3.0
+"""An engine that has not stirred for so long hangs: nobody would notice that the camera moves. The first pairs of an
+epoch may take it a second on a busy machine."""
+SENDERS = ("camera", "probe", "motion", "bmode")
+"""They send by themselves."""
+
+
+class Snapshots(Protocol):
+    """Where the estimate's snapshots come from."""
+
+    def read(self) -> Received:
+        """The latest; ``closed`` where there will be no more. Raises NoSnapshotError where there is none yet."""
+
+
+class LiveLoop:
+    """Conducts a session with devices.
+
+    Args:
+        model: of the session.
+        devices: connected; closed by whoever made them.
+        recorder: of the session.
+        reader: of the estimate's snapshots.
+        workflow: what happens next.
+        start_s: host time of session time 0.
+        holder: how far the endoscope's holder is to be believed, where there is one (``devices.motion``).
+        latencies: of the devices.
+    """
+
+    def __init__(
+        self,
+        model: SessionModel,
+        devices: Devices,
+        recorder: Recorder,
+        reader: Snapshots,
+        workflow: Workflow,
+        start_s: float,
+        holder: HolderSettings | None = None,
+        latencies: Latencies | None = None,
+    ) -> None:
+        self._model, self._devices, self._recorder, self._reader = model, devices, recorder, reader
+        self._workflow, self._start_s = workflow, start_s
+        latencies = latencies or Latencies()
+        self.marker_tracker, self.pulse_locator = (
+            MarkerTracker(model, latencies.camera_s),
+            PulseLocator(model, latencies.pulse_s),
+        )
+        self._holder = Holder(holder or HolderSettings(), latencies.holder_s)
+        self._unsettled_s: float | None = None
+        self.figures = Figures()
+        self._began_s = host_now()
+        self._health, self._pictures = Health(), Pictures()
+        self._sources = {
+            role: Source(device, self._began_s, sends=role in SENDERS) for role, device in devices.roles().items()
+        }
+        self._steering = Steering(devices.stage, self._health, lambda text: self._news(Tell(text)), self._began_s)
+        self._commands: list[OperatorCommand] = []
+        self._text, self._task, self._number = "", "", 0
+        self._bmode: BmodeFrame | None = None
+        self._unshown = 0
+        self._sent_s, self._stepped_s = -math.inf, -math.inf
+        self._snapshot: Snapshot | None = None
+        self._answer: TrackEstimate | None = None
+        self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
+
+    def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
+        """While ``going``."""
+        while going():
+            if not self.turn():
+                time.sleep(IDLE_S)
+            if on_status is not None:
+                on_status(self.status())
+
+    def turn(self) -> bool:
+        """One turn; whether there was anything to do."""
+        frames = self._sources["camera"].poll()
+        now = host_now()
+        if not frames and now - self._stepped_s < STEP_S:
+            return False
+        before = self.marker_tracker.newest
+        pose = self._look(frames)
+        self._listen()
+        self._show()
+        self._follow_camera()
+        if (plane := self._steering.listen()) is not None:
+            self.pulse_locator.plane(plane.at_s, plane.scan_rad, plane.moving)
+        self._answer = self._where_to(pose)
+        self._stepped_s = now
+        newest, verdict = self.marker_tracker.poses.newest(), self._verdict()
+        self._steering.beat(None if newest is None else newest.t_s, None if verdict is None else verdict.value)
+        for action in self._workflow.step(self._view(now)):
+            self._do(action)
+        self._take_aim()
+        if self.marker_tracker.newest is not before:  # it was looked into
+            self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
+        self._send(now)
+        self._look_after(host_now())
+        return True
+
+    @property
+    def lost(self) -> Mapping[str, str]:
+        """Why devices are lost, by role."""
+        return self._health.lost
+
+    def status(self) -> Status:
+        """The session now."""
+        return Status(
+            now := host_now(),
+            self._t(now),
+            self._workflow.stage,
+            self._text,
+            self._task,
+            self._recorder.state,
+            self._answer,
+            self._steering.view,
+            self._steering.latched,
+            tuple(self._health.lost),
+            self.marker_tracker.poses.newest(),
+            self.marker_tracker.newest,
+            self._bmode,
+            self._invalid(),
+        )
+
+    def close(self) -> None:
+        """End what the loop has started itself."""
+        self.marker_tracker.close()
+        self.pulse_locator.close()
+
+    # --- in ---------------------------------------------------------------------------------------------------------
+
+    def _look(self, frames: Sequence[StereoFrame]) -> TimedPose | None:
+        if not frames:
+            return None
+        new = self._pictures.is_new(frames[-1], host_now())
+        self.figures.frames += new
+        self.figures.skipped += len(frames) - new
+        if not new:
+            return None
+        pose = self.marker_tracker.see(frames[-1])
+        self.figures.found += pose is not None
+        return pose
+
+    def _listen(self) -> None:
+        self.pulse_locator.listening = self._workflow.listens
+        pulses = self._sources["probe"].poll()
+        self.figures.pulses += len(pulses)
+        self.pulse_locator.hear(pulses)
+        self._commands += self._sources["operator"].poll()
+
+    def _show(self) -> None:
+        """The newest B-mode picture; nothing is measured in it."""
+        device = self._devices.bmode
+        if device is None:
+            return
+        pictures = self._sources["bmode"].poll()
+        if pictures:
+            self.figures.pictures += len(pictures)
+            self._unshown += len(pictures) - 1
+            self._bmode = pictures[-1]
+        elif not device.connected:
+            self._bmode = None  # an old picture must not look like a new one
+        self.figures.unshown = self._unshown + device.dropped
+
+    def _follow_camera(self) -> None:
+        """Whether the camera is where the registration has it, by its holder's account and by what is recorded."""
+        if self._devices.motion is not None:
+            move = self._holder.take(self._sources["motion"].poll(), host_now())
+            if move is not None:
+                self._recorder.hand_over(
+                    CameraMovedEvent(self._t(host_now()), 0, move.camera_new_T_camera_old, move.covariance)
+                )
+                self.marker_tracker.poses.clear()  # those of before are another frame's
+        since_s = self._holder.moving_since_s
+        if since_s is None and self._recorder.state.camera_moving:
+            since_s = host_now() if self._unsettled_s is None else self._unsettled_s
+        if since_s is not None and self._unsettled_s is None:
+            self._tell(Tell("the camera moves: nothing holds until it rests and is registered again"))
+        self._unsettled_s = since_s
+
+    def _where_to(self, pose: TimedPose | None) -> TrackEstimate | None:
+        """Where to turn for a new pose, else for the last one as long as that is new enough to matter."""
+        try:
+            received = self._reader.read()
+        except NoSnapshotError:
+            return None
+        self._snapshot = received.snapshot
+        stale = received.silent_s > STALE_S or received.closed
+        self._health.found("registration", "its process has ended or hangs" if stale else "")
+        if stale or self._unsettled_s is not None:
+            return None
+        if pose is None:
+            newest = self.marker_tracker.poses.newest()
+            return self._answer if newest is not None and host_now() - newest.t_s < 0.2 else None
+        if self._snapshot is None or not self._snapshot.epochs:
+            return None
+        self._number += 1
+        plane = self._steering.view
+        query = Track(
+            self._t(pose.t_s),
+            self._snapshot.epochs[-1].number,
+            MarkerObservation(pose.parent_T_child, pose.covariance, self._number),
+            (),
+            0.0 if plane is None else plane.scan_rad,
+        )
+        return track(query, self._snapshot)
+
+    def _view(self, now: float) -> Inputs:
+        commands, self._commands = tuple(self._commands), []
+        state = self._recorder.state
+        return Inputs(
+            now,
+            self.marker_tracker.poses,
+            self._steering.view,
+            self.pulse_locator.heard(now, self.marker_tracker.poses),
+            commands,
+            state.known,
+            self._answer,
+            state.aims,
+            self._unsettled_s,
+        )
+
+    # --- out --------------------------------------------------------------------------------------------------------
+
+    def _t(self, host_s: float) -> float:
+        """Session time."""
+        return max(0.0, host_s - self._start_s)
+
+    def _verdict(self) -> Verdict | None:
+        """Of the registration that holds now; None where there is none."""
+        known = self._recorder.state.known
+        return known.verdict if known.registered and not self._invalid() else None
+
+    def _invalid(self) -> str:
+        """Why what is known of the registration holds no more; empty where it does."""
+        if (lost := self._health.lost.get("registration")) is not None:
+            return f"the registration is lost: {lost}"
+        return "" if self._unsettled_s is None else "the camera is moving, or its move is not in the estimate yet"
+
+    def _do(self, action: Action) -> None:
+        match action:
+            case Ask() | Sweep() | Follow() | Halt() | Release():
+                self.figures.orders += self._steering.order(action)
+            case TakeAim(corner):
+                self._aim(corner)
+            case TakePairs(pm, looks):
+                spot = one_spot(looks)
+                for look in spot.looks:
+                    self._pair(pm, spot.marker, look)
+            case TakeMove():
+                self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
+            case Tell():
+                self._tell(action)
+
+    def _tell(self, tell: Tell) -> None:
+        self._task = tell.text
+        self._news(tell)
+
+    def _news(self, tell: Tell) -> None:
+        """What asks nothing of the operator, so that what was asked before still holds."""
+        self._text = tell.text
+        self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
+
+    def _aim(self, corner: tuple[int, int]) -> None:
+        """A calibration shot from the newest frame: marker and board in the same picture."""
+        frame, pose, rig, board = (
+            self.marker_tracker.newest,
+            self.marker_tracker.poses.newest(),
+            self._model.camera,
+            self._model.board,
+        )
+        if frame is None or pose is None or self.marker_tracker.missing:
+            self._tell(Tell(f"no aim: the marker is not seen ({self.marker_tracker.missing or 'no frame'})"))
+            return
+        if rig is None or board is None:
+            self._tell(Tell("no aim: session.yaml has no board"))
+            return
+        if self._aiming is None:  # else one is being looked at
+            found = self.pulse_locator.locator.run(detect_board, frame.left, frame.right, rig, board)
+            self._aiming = (corner, pose, found)
+
+    def _take_aim(self) -> None:
+        """The calibration shot whose board was being looked for, once it is found."""
+        if self._aiming is None or not self._aiming[2].done():
+            return
+        (corner, pose, found), self._aiming = self._aiming, None
+        board = self._model.board
+        try:
+            fit = found.result()
+        except Exception as error:  # of one picture: the next one may be as it should
+            self._tell(Tell(f"no aim: {error}"))
+            return
+        if board is None or not (0 <= corner[0] < board.columns and 0 <= corner[1] < board.rows):
+            self._tell(Tell(f"no aim: the board has no inner corner {corner[0]}, {corner[1]}"))
+            return
+        if not isinstance(fit, BoardFit):
+            self._tell(Tell(f"no aim: {fit.reason}"))
+            return
+        spot, covariance = board_corner(fit, corner[0], corner[1], pool_corner_noise([fit.pose]))
+        turn = fit.camera_T_board[:3, :3]
+        covariance = covariance + turn @ np.diag(np.square(self._model.noise.aim_mm)) @ turn.T
+        marker = MarkerRecord(pose.parent_T_child, pose.covariance)
+        self._recorder.hand_over(AimEvent(self._t(pose.t_s), 0, marker, spot, covariance))
+        self._tell(Tell(f"aim at corner {corner[0]}, {corner[1]} taken", done=True))
+
+    def _pair(self, pm: int, pose: TimedPose, look: LocatedPulse) -> None:
+        if look.scan_rad is None:
+            raise AssertionError("a look that cannot be paired")
+        device = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
+        trus = TrusRecord(device, look.x_mm, look.range_mm, covariance=look.covariance, amplitude=look.amplitude)
+        marker = MarkerRecord(pose.parent_T_child, pose.covariance)
+        self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))
+
+    def _send(self, now: float) -> None:
+        """The registration, to whoever wants it."""
+        if not self._devices.sinks or now - self._sent_s < SEND_S:
+            return
+        self._sent_s = now
+        estimate, newest = self._recorder.state.estimate, self.marker_tracker.poses.newest()
+        stamp = None if self.marker_tracker.newest is None else self.marker_tracker.newest.stamp
+        if estimate is None or stamp is None or newest is None:
+            return
+        invalid = self._invalid()
+        refused = estimate.verdict is Verdict.REFUSED or bool(invalid)
+        answer = None if refused else self._answer
+        stage_rad = None if answer is None else answer.stage_rad
+        registration = Registration(
+            stamp,
+            (Verdict.REFUSED if refused else estimate.verdict).value,
+            None if refused else estimate.trus_T_camera,
+            None if refused else estimate.covariance,
+            None if stage_rad is None else self._model.stage.scan_from_device(stage_rad),
+            None if answer is None else answer.sigma_rad,
+            (invalid,) if invalid else estimate.reasons,
+            stage_rad,
+        )
+        for number, sink in enumerate(self._devices.sinks):
+            try:
+                sink.send(registration)
+            except DeviceLost as error:
+                self._sources[f"sink {number + 1}"].failed(str(error))
+
+    def _look_after(self, now: float) -> None:
+        """What was lost and what is back, told and noted."""
+        health, state, steering = self._health, self._recorder.state, self._steering
+        for role, source in self._sources.items():
+            trouble = source.trouble(now)
+            health.found(role, trouble or (self._pictures.trouble(now) if role == "camera" else ""))
+        health.found("locator", self.pulse_locator.trouble)
+        if "recording" in health.lost and not (state.blocked or state.waiting):
+            steering.unwritten = ""  # the note of it has been written
+        health.found("recording", state.blocked or steering.unwritten)
+        for text in health.news():
+            self._note(text)
+
+    def _note(self, text: str) -> None:
+        self._news(Tell(text))
+        self._recorder.hand_over(NoteEvent(self._t(host_now()), 0, text))

@@ -1,0 +1,71 @@
+"""Marker poses from the camera's frames, on the host's clock.
+
+The marker is looked for in the newest frame only; older ones are dropped and counted.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from fgreg.detection.corner_noise import CornerNoise, pool_corner_noise
+from fgreg.detection.marker import ViewCorners, marker_from_views
+from fgreg.detection.marker_roi import MarkerRoi
+from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
+from fgreg.drivers.base import StereoFrame
+from fgreg.live.right_view_worker import RightViewWorker, right_roi
+from fgreg.model.session_model import SessionModel
+from fgreg.model.time_sync import DeviceClock, PoseHistory, TimedPose
+
+POOL_EVERY, POOL_OVER = 15, 60
+"""The corner noise is pooled anew after so many markers found, over so many."""
+
+
+class MarkerTracker:
+    """Marker poses from frames."""
+
+    def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
+        if model.camera is None or model.marker is None:
+            raise ValueError("the session has no camera or no marker")
+        self._rig, self._marker = model.camera, model.marker
+        rig = self._rig
+        self._left = MarkerRoi(rig.left, 0, np.eye(4), self._marker)
+        self._right = None if rig.right is None else right_roi(rig, self._marker)
+        self._second = RightViewWorker(rig, self._marker)
+        self._clock = DeviceClock(latency_s)
+        self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
+        self._noise: CornerNoise = pool_corner_noise(())
+        self._found = 0
+        self.poses = PoseHistory()
+        self.missing = ""
+        self.newest: StereoFrame | None = None
+
+    def see(self, frame: StereoFrame) -> TimedPose | None:
+        """The marker's pose at the frame's exposure; None, and ``missing`` says why, where it is not found."""
+        t_s = self._clock.host_time(frame.stamp)
+        fit = self._detect(frame)
+        self.newest = frame
+        if isinstance(fit, NotFound):
+            self.missing = fit.reason
+            return None
+        self.missing = ""
+        self._fits.append(fit)
+        if self._found % POOL_EVERY == 0:
+            self._noise = pool_corner_noise(f.pose for f in self._fits)
+        self._found += 1
+        pose = TimedPose(t_s, fit.camera_T_marker, marker_covariance(fit, self._noise))
+        return pose if self.poses.add(pose) else None
+
+    def _detect(self, frame: StereoFrame) -> MarkerFit | NotFound:
+        """As :func:`fgreg.detection.marker.detect_marker`, both views at once where that is possible."""
+        right: ViewCorners | None = None
+        helped = frame.right is not None and self._right is not None and self._second.look(frame.right)
+        left = self._left.see(frame.left)
+        if frame.right is not None and self._right is not None:
+            right = (self._second.seen() if helped else None) or self._right.see(frame.right)
+        return marker_from_views(left, right, self._marker)
+
+    def close(self) -> None:
+        """End the right view's process."""
+        self._second.close()

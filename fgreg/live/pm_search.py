@@ -1,0 +1,91 @@
+"""The search for one PM while its fibre is held: positions of the planner, pulses at each, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.geometry.transforms import FloatArray
+from fgreg.live.actions import LocatedPulse, StageView
+from fgreg.model.session_model import SessionModel
+from fgreg.search.planner import Found, NotFound, SearchPlanner, Turn
+
+ARRIVED_RAD = 0.004
+"""So near to its goal the stage has arrived."""
+QUIET_S = 0.03
+"""A pulse counts once the stage has stood for so long."""
+PATIENCE_S = 3.0
+"""A stage that stands elsewhere for so long, or a laser that has not pulsed, ends the search."""
+MOST_LOOKS = 4
+
+
+@dataclass(slots=True, eq=False)
+class PmSearch:
+    """One search.
+
+    Attributes:
+        planner: what is known.
+        held: the marker's pose at the beginning.
+        cold: whether the whole field is searched.
+        looks: pulses at which something was heard.
+        listens: whether the next pulse counts: the stage stands where it was to go.
+    """
+
+    planner: SearchPlanner
+    held: FloatArray
+    cold: bool
+    threshold: float
+    started_s: float
+    looks: list[LocatedPulse]
+    listens: bool = False
+    _goal: Turn | None = None
+    _waits_s: float = 0.0
+    _stood_s: float | None = None
+
+    def step(self, now_s: float, stage: StageView, heard: tuple[LocatedPulse, ...]) -> Turn | Found | NotFound | None:
+        """A new position to turn to, or how it ended; None: wait."""
+        if self._goal is not None:
+            there = not stage.moving and abs(stage.scan_rad - self._goal.scan_rad) < ARRIVED_RAD
+            if stage.moving or (there and self._stood_s is None):
+                self._waits_s = now_s
+            self._stood_s = (self._stood_s or stage.at_s) if there else None
+            self.listens = self._stood_s is not None and now_s > self._stood_s + QUIET_S
+            pulse = None if self._stood_s is None else _first_after(self._stood_s + QUIET_S, heard)
+            if pulse is None or pulse.scan_rad is None:
+                if now_s - self._waits_s < PATIENCE_S:
+                    return None
+                what = "no laser pulse" if there else "the stage has not arrived"
+                return NotFound(f"{what} within {PATIENCE_S:.0f} s", len(self.looks))
+            loud = pulse.amplitude is not None and pulse.amplitude >= self.threshold
+            self.planner.listened(pulse.scan_rad, pulse.amplitude if loud else None)
+            if loud:
+                self.looks.append(pulse)
+            self._goal = None
+        step = self.planner.next()
+        if isinstance(step, Turn):
+            self._goal, self._waits_s, self._stood_s, self.listens = step, now_s, None, False
+        return step
+
+    def kept(self, found: Found, model: SessionModel) -> tuple[LocatedPulse, ...]:
+        """The looks that are certainly within the sensitivity window, those that say most about the angle."""
+        table = model.probe.sensitivity
+        inside = []
+        for look in self.looks:
+            if look.scan_rad is None or look.range_mm is None:
+                continue
+            width = float(np.interp(look.range_mm, table.depth_mm, table.half_width_rad))
+            if abs(look.scan_rad - found.scan_rad) < width - 2.0 * found.sigma_rad:
+                inside.append(look)
+        if len(inside) <= MOST_LOOKS:
+            return tuple(inside)
+        # Of many the outermost to either side, then the loudest: flanks tell the angle, peaks the rest.
+        by_side = sorted(inside, key=lambda look: look.scan_rad or 0.0)
+        chosen = [by_side[0], by_side[-1]]
+        rest = sorted(by_side[1:-1], key=lambda look: -(look.amplitude or 0.0))
+        chosen += rest[: MOST_LOOKS - 2]
+        return tuple(sorted(chosen, key=lambda look: look.pulse_s))
+
+
+def _first_after(t_s: float, heard: tuple[LocatedPulse, ...]) -> LocatedPulse | None:
+    return next((pulse for pulse in heard if pulse.scan_rad is not None and pulse.pulse_s > t_s), None)

@@ -1,0 +1,177 @@
+"""What the endoscope's holder says of the camera's moves: that one goes on, and how far it went once it is over.
+
+While the camera moves no registration holds. A move is measured between two rests, each the mean of its samples, so
+that the noise of single samples and the way in between do not count. Pure state: samples in, moves out.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+
+from fgreg.drivers.base import MotionSample
+from fgreg.geometry.transforms import FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform, transform_points
+from fgreg.model.time_sync import DeviceClock
+from fgreg.schema.kinds import Number
+from fgreg.schema.record import Key
+
+REST_S = 0.4
+"""At rest means for so long."""
+FEWEST = 4
+"""And in so many samples."""
+SILENT_S = 2.0
+"""A holder that was silent for so long may have been switched off and on, and then counts from elsewhere."""
+SEEN_MM = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0], [40.0, 0.0, 100.0], [0.0, 40.0, 100.0]])
+"""Camera points, (4, 3), by whose displacement a move is judged: about where tissue is."""
+
+
+@dataclass(frozen=True, slots=True)
+class HolderSettings:
+    """How far the holder is to be believed; sigmas of each axis."""
+
+    sigma_mm: Annotated[
+        float,
+        Key("of a move, by motion's account", Number(0.0, 100.0, above=True, unit="mm"), name="holder_sigma_mm"),
+    ] = 2.0
+    sigma_rad: Annotated[
+        float,
+        Key(
+            "the same, of its rotation",
+            Number(0.0, 30.0, above=True, unit="deg", degrees=True),
+            name="holder_sigma_deg",
+        ),
+    ] = math.radians(1.0)
+    least_mm: Annotated[
+        float,
+        Key("a smaller shift of the view is none", Number(0.0, 10.0, above=True, unit="mm"), name="holder_least_mm"),
+    ] = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_mm", "sigma_rad", "least_mm"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}, expected a number > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HolderMove:
+    """A move that is over: began at ``since_s`` or just before, host time.
+
+    ``camera_new_T_camera_old`` (4, 4) with its covariance (6, 6), right tangent; None where the holder was silent
+    meanwhile, and so cannot tell.
+    """
+
+    since_s: float
+    camera_new_T_camera_old: FloatArray | None
+    covariance: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rest:
+    base_T_camera: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class Holder:
+    """See the module.
+
+    Attributes:
+        latency_s: of its messages (fgreg.model.time_sync.Latencies).
+        moving_since_s: host time at which the move under way was noticed; None at rest.
+    """
+
+    settings: HolderSettings
+    latency_s: float = 0.0
+    moving_since_s: float | None = None
+    _clock: DeviceClock = field(init=False)
+    _recent: list[tuple[float, MotionSample]] = field(default_factory=list)
+    _rest: _Rest | None = None
+    _newest_s: float = -math.inf
+    _silent: bool = False
+
+    def __post_init__(self) -> None:
+        self._clock = DeviceClock(self.latency_s)
+
+    def take(self, samples: Sequence[MotionSample], now_s: float) -> HolderMove | None:
+        """Take in what came; the move that has just ended, if one has."""
+        for sample in samples:
+            t_s = self._clock.host_time(sample.stamp)
+            if t_s <= self._newest_s:
+                continue
+            if t_s - self._newest_s > SILENT_S:
+                self._recent.clear()
+                self._silent = self._rest is not None
+            self._newest_s = t_s
+            self._recent = [(t, kept) for t, kept in self._recent if t > t_s - REST_S]
+            self._recent.append((t_s, sample))
+            if self._rest is not None and self.moving_since_s is None and self._away(sample.base_T_camera) > 1.0:
+                self.moving_since_s = t_s
+        if samples:
+            return self._settle()
+        if self.moving_since_s is not None and now_s - self._newest_s > SILENT_S:
+            return self._end(None)  # it fell silent on the way: the camera is somewhere else, nobody knows where
+        return None
+
+    def _away(self, base_T_camera: FloatArray) -> float:
+        """How far from the rest, as a share of what counts as a move."""
+        return 0.0 if self._rest is None else self._shift_mm(self._rest.base_T_camera, base_T_camera)
+
+    def _shift_mm(self, before: FloatArray, after: FloatArray) -> float:
+        """Largest displacement of what is seen, as a share of the least that counts."""
+        shift = transform_points(inverse(after) @ before, SEEN_MM) - SEEN_MM
+        return float(np.linalg.norm(shift, axis=1).max()) / self.settings.least_mm
+
+    def _settle(self) -> HolderMove | None:
+        """Whether the camera rests; what that ends."""
+        times = [t for t, _ in self._recent]
+        if len(times) < FEWEST or times[-1] - times[0] < 0.75 * REST_S:
+            return None
+        rest = _mean_rest([sample for _, sample in self._recent])
+        if any(self._shift_mm(rest.base_T_camera, sample.base_T_camera) > 0.5 for _, sample in self._recent):
+            return None
+        if self._rest is None:
+            self._rest = rest
+            return None
+        if self.moving_since_s is None:
+            self._silent = False
+            return None
+        if self._away(rest.base_T_camera) <= 1.0:  # there and back, or a sample that was wrong
+            self.moving_since_s, self._silent = None, False
+            return None
+        return self._end(None if self._silent else rest)
+
+    def _end(self, rest: _Rest | None) -> HolderMove:
+        before, since_s = self._rest, self.moving_since_s
+        if before is None or since_s is None:
+            raise AssertionError("no move is under way")
+        self.moving_since_s, self._silent, self._rest = None, False, rest
+        if rest is None:
+            return HolderMove(since_s, None, None)
+        return HolderMove(since_s, *_move(before, rest, self.settings))
+
+
+def _mean_rest(samples: Sequence[MotionSample]) -> _Rest:
+    """The mean of samples at rest; one covariance: what a holder does not know is much the same in all."""
+    first = samples[0].base_T_camera[:3, :3]
+    turns = np.array([log_so3(first.T @ sample.base_T_camera[:3, :3]) for sample in samples])
+    middle = np.mean([sample.base_T_camera[:3, 3] for sample in samples], axis=0)
+    covariance = samples[-1].covariance
+    return _Rest(
+        make_transform(first @ exp_so3(turns.mean(axis=0)), middle),
+        np.zeros((6, 6)) if covariance is None else covariance,
+    )
+
+
+def _move(before: _Rest, after: _Rest, settings: HolderSettings) -> tuple[FloatArray, FloatArray]:
+    """``inv(base_T_new) base_T_old`` and its covariance: of either rest, and what is stated of the move.
+
+    A right perturbation of the new pose is one by ``-Ad(inv(new_T_old))`` of the product.
+    """
+    new_T_old = np.asarray(inverse(after.base_T_camera) @ before.base_T_camera)
+    carried = adjoint(np.asarray(inverse(new_T_old)))
+    stated = np.diag(np.repeat([settings.sigma_rad**2, settings.sigma_mm**2], 3))
+    covariance = before.covariance + carried @ after.covariance @ carried.T + stated
+    return new_T_old, np.asarray(0.5 * (covariance + covariance.T))

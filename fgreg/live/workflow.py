@@ -1,0 +1,360 @@
+"""What happens next, and what the stage is asked for: calibration shots, searches for PMs, following the beam.
+
+No devices, no clock of its own, no estimate: :meth:`Workflow.step` gets a view of the moment and returns what it asks
+for. Whether the stage may really turn is decided elsewhere (fgreg.stage): here is only what would be useful.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.geometry.transforms import FloatArray
+from fgreg.live.actions import (
+    Action,
+    Ask,
+    Follow,
+    Halt,
+    Inputs,
+    LocatedPulse,
+    RegistrationState,
+    Release,
+    StageView,
+    Sweep,
+    TakeAim,
+    TakeMove,
+    TakePairs,
+    Tell,
+)
+from fgreg.live.hold_still import held_pose, moved_mm, turned_rad
+from fgreg.live.pm_search import PmSearch
+from fgreg.model.estimate import Verdict
+from fgreg.model.session_model import SessionModel
+from fgreg.schema.kinds import Integer, Number
+from fgreg.schema.problems import FieldError
+from fgreg.schema.record import Key
+from fgreg.search.hearing import HearingModel
+from fgreg.search.planner import Found, NotFound, Prediction, SearchPlanner, Turn
+from fgreg.stage.limits import MotionKind
+
+SLIP_MM, SLIP_RAD = 1.2, 0.03
+"""A fibre that leaves its pose by more than this during a search has moved: what was heard belongs to no one spot."""
+ANOTHER_MM, ANOTHER_RAD = 3.0, 0.06
+"""A new PM wants the fibre to be held so far from where the last one was taken."""
+WORTH_PREDICTING_RAD = math.radians(8.0)
+"""A prediction less certain than this is no better than a sweep."""
+CHECK_RAD = math.radians(2.0)
+"""While the stage follows, a PM heard with the plane so near to the answer becomes a pair."""
+CHECK_S = 0.3
+"""And so often it is listened for."""
+ASK_AGAIN_S = 10.0
+PATIENCE_S = 6.0
+"""A spot at which nothing happens for so long is not worth waiting at."""
+DEAF = 8
+"""Pulses in a row that are not heard where they should be before the operator is told."""
+
+
+def _why(known: RegistrationState) -> str:
+    """The first reason for a refusal."""
+    return known.reasons[0] if known.reasons else "no registration"
+
+
+class Stage(StrEnum):
+    """How far the session has come."""
+
+    AIMING = "calibrating"
+    COLLECTING = "registering"
+    FOLLOWING = "following"
+
+
+@dataclass(frozen=True, slots=True)
+class WorkflowSettings:
+    """What is wanted. The operator can end the calibration earlier."""
+
+    aims: Annotated[int, Key("calibration shots", Integer(0, 1000))] = 8
+    pms: Annotated[int, Key("PMs of an epoch after which the stage may follow", Integer(1, 1000))] = 8
+    most_pms: Annotated[int, Key("the same where the verdict is a warning", Integer(1, 1000))] = 15
+    hearing_threshold: Annotated[
+        float,
+        Key(
+            "least amplitude that counts as heard, in the source's unit",
+            Number(0.0, 1e12, above=True),
+            default="required, but in the simulated room",
+            example="20.0",
+        ),
+    ] = 0.0
+    follow: Annotated[bool, Key("whether the stage follows the beam at all")] = True
+
+    def __post_init__(self) -> None:
+        if self.aims < 0 or not 1 <= self.pms <= self.most_pms:
+            raise ValueError("aims has to be 0 or more, pms from 1 to most_pms")
+        if not (math.isfinite(self.hearing_threshold) and self.hearing_threshold > 0):
+            found = "nothing" if self.hearing_threshold == 0.0 else str(self.hearing_threshold)
+            raise FieldError.of(found, "a number > 0", "hearing_threshold")
+
+
+class Workflow:
+    """Conducts one session.
+
+    Args:
+        model: its set-up.
+        settings: what is wanted.
+        next_pm: number of the next PM: beyond those of a session that goes on.
+
+    Attributes:
+        stage: how far the session has come.
+    """
+
+    def __init__(self, model: SessionModel, settings: WorkflowSettings, next_pm: int = 0) -> None:
+        self._model, self._settings, self._next_pm = model, settings, next_pm
+        self._hearing = HearingModel.of_session(
+            model.probe.sensitivity, settings.hearing_threshold, scan_sigma_rad=model.noise.scan_rad
+        )
+        low, high = (model.stage.scan_from_device(angle) for angle in model.stage.limits_device_rad)
+        self._field = (min(low, high), max(low, high))
+        self.stage = Stage.AIMING if settings.aims else Stage.COLLECTING
+        self._search: PmSearch | None = None
+        self._done_at: FloatArray | None = None
+        self._pms, self._epoch = 0, 0
+        self._told_refused = 0
+        self._deaf = 0
+        self._wanted: CommandKind | None = None
+        self._latched = ""
+        self._wanted_s = -math.inf
+        self._waits_s = -math.inf
+        self._checks, self._checked_s = False, -math.inf
+        self._not_before_s = -math.inf  # pulses of before are another epoch's
+
+    @property
+    def listens(self) -> bool:
+        """Whether it is of any use now to know what is heard: locating a source takes a processor's time."""
+        return self._checks if self._search is None else self._search.listens
+
+    def step(self, view: Inputs) -> tuple[Action, ...]:
+        """What to do now."""
+        out: list[Action] = []
+        self._checks = False
+        for command in view.commands:
+            out += self._obey(command, view)
+        latched = view.stage is not None and self._is_latched(view.stage, view.now_s, out)
+        if view.camera_moving_s is not None:
+            # What is known holds no more. The stage's request stays: the gate holds the motion, as long as this lasts.
+            self._search, self._not_before_s = None, max(self._not_before_s, view.now_s)
+            return tuple(out)
+        if view.known.epoch != self._epoch:
+            self._epoch, self._pms, self._done_at, self._deaf = view.known.epoch, 0, None, 0
+            self._told_refused = 0
+            self._search = None
+            out.append(Tell("the camera has moved: the registration begins anew"))
+        self._advance(view, out)
+        if any(isinstance(action, Ask | Halt | Release) for action in out):
+            self._search = None
+            return tuple(out)  # what the stage is asked for next depends on how it takes that
+        if view.stage is not None and not latched and self._may_turn(view, view.stage, out):
+            searches = view.stage.requested is MotionKind.SEARCH
+            if self.stage is Stage.COLLECTING or (self.stage is Stage.FOLLOWING and searches):
+                self._collect(view, view.stage, out)
+            elif self.stage is Stage.FOLLOWING:
+                self._follow(view, view.stage, out)
+        else:
+            self._search = None
+        return tuple(out)
+
+    def _is_latched(self, stage: StageView, now_s: float, out: list[Action]) -> bool:
+        """Whether nothing may move until the operator's reset; asks for it."""
+        if stage.latched != self._latched:
+            self._latched, self._wanted = stage.latched, None  # told at once, and what it needs after it, too
+            if not stage.latched:
+                out.append(Tell("the stage is free again, and moves once it is asked to"))
+        if stage.latched:
+            text = f"the stage is latched ({stage.latched}): look at it and the probe, and when it may move again"
+            self._want(CommandKind.RESET, text, now_s, out)
+        return bool(stage.latched)
+
+    def _may_turn(self, view: Inputs, stage: StageView, out: list[Action]) -> bool:
+        """Whether the stage knows its zero and has the operator's request for what comes next; asks where not."""
+        if not stage.homed:
+            self._want(CommandKind.HOME, "the stage has to find its zero position", view.now_s, out)
+            return False
+        if self.stage is Stage.COLLECTING and stage.requested is not MotionKind.SEARCH:
+            self._want(CommandKind.SEARCH, "the stage has to turn in search of PMs", view.now_s, out)
+            return False
+        if self.stage is Stage.FOLLOWING and self._settings.follow and self._search is None:
+            answered = view.answer is not None and view.answer.stage_rad is not None
+            if answered and stage.requested is not MotionKind.TRACK:
+                self._want(CommandKind.FOLLOW, "the stage is ready to follow the beam", view.now_s, out)
+            elif not answered and view.answer is not None and stage.requested is MotionKind.TRACK:
+                self._want(CommandKind.SEARCH, f"{view.answer.reason}: hold it still and search here", view.now_s, out)
+        return True
+
+    def _want(self, said: CommandKind, text: str, now_s: float, out: list[Action]) -> None:
+        """Ask the operator, and again after a while."""
+        if self._wanted == said and now_s - self._wanted_s < ASK_AGAIN_S:
+            return
+        self._wanted, self._wanted_s = said, now_s
+        out.append(Tell(text, wants=said))
+
+    # --- the session's course ---------------------------------------------------------------------------------------
+
+    def _obey(self, command: OperatorCommand, view: Inputs) -> list[Action]:
+        match command.kind:
+            case CommandKind.HOME:
+                return [Ask(MotionKind.HOME)]
+            case CommandKind.SEARCH:
+                return [Ask(MotionKind.SEARCH)]
+            case CommandKind.FOLLOW:
+                return [Ask(MotionKind.TRACK)]
+            case CommandKind.AIM if command.corner is not None:
+                return [TakeAim(command.corner)]
+            case CommandKind.REGISTER if self.stage is Stage.AIMING:
+                self.stage = Stage.COLLECTING
+            case CommandKind.NEXT:
+                self._search = None
+            case CommandKind.MOVED:
+                self._search = None
+                return [TakeMove()]
+            case CommandKind.STOP:
+                self._search = None
+                return [Halt("the operator has stopped the stage")]
+            case CommandKind.RESET:
+                if view.stage is not None and view.stage.latched:
+                    return [Release()]
+                return [Tell(f"no reset: the stage is not {'there' if view.stage is None else 'latched'}")]
+        return []
+
+    def _advance(self, view: Inputs, out: list[Action]) -> None:
+        known = view.known
+        usable = known.registered and known.verdict is not Verdict.REFUSED
+        if self.stage is Stage.AIMING and view.aims >= self._settings.aims:
+            self.stage = Stage.COLLECTING
+            out.append(Tell("calibrated: hold the fibre at the tissue", done=True))
+        elif self.stage is Stage.COLLECTING and usable:
+            enough = self._settings.pms if known.verdict is Verdict.OK else self._settings.most_pms
+            if self._pms >= enough and self._search is None:
+                self.stage = Stage.FOLLOWING
+                out.append(Tell("registered", done=True))
+        elif self.stage is Stage.COLLECTING and self._pms >= self._told_refused + self._settings.most_pms:
+            self._told_refused = self._pms
+            out.append(Tell(f"{self._pms} PMs, and refused: {_why(known)}; if the camera was moved, say so (moved)"))
+        elif self.stage is Stage.FOLLOWING and not usable:
+            self.stage, self._pms, self._told_refused = Stage.COLLECTING, 0, 0
+            why = _why(known)
+            out += [Halt(f"the registration is refused: {why}"), Tell("hold the fibre at the tissue: registering")]
+
+    # --- searching --------------------------------------------------------------------------------------------------
+
+    def _collect(self, view: Inputs, stage: StageView, out: list[Action]) -> None:
+        held = held_pose(view.poses, view.now_s)
+        if self._search is None:
+            if held is None or not self._is_another(held):
+                self._wait(view, held, out)
+                return
+            self._waits_s = view.now_s
+            self._search = self._begin(view, stage, held, cold=False)
+        elif (slipped := self._slipped(view, self._search)) is not None:
+            self._search = None
+            if slipped:
+                out.append(Tell(f"{slipped}: hold it still"))
+            return
+        step = self._search.step(view.now_s, stage, view.heard)
+        if isinstance(step, Turn):
+            out.append(Sweep(step.scan_rad, step.reason))
+        elif isinstance(step, Found):
+            self._found(view.now_s, self._search, step, out)
+        elif isinstance(step, NotFound):
+            self._not_found(view, stage, self._search, step, out)
+
+    def _wait(self, view: Inputs, held: FloatArray | None, out: list[Action]) -> None:
+        """Say what is waited for, once it lasts."""
+        if view.now_s - self._waits_s < PATIENCE_S:
+            return
+        self._waits_s = view.now_s
+        newest = view.poses.newest()
+        if newest is None or view.now_s - newest.t_s > 1.0:
+            out.append(Tell("the marker is not seen: hold the fibre elsewhere", done=True))
+        elif held is None:
+            out.append(Tell("hold the fibre still", done=False))
+        else:
+            out.append(Tell("this spot is done: hold the fibre elsewhere", done=True))
+
+    def _begin(self, view: Inputs, stage: StageView, held: FloatArray, *, cold: bool) -> PmSearch:
+        low, high = self._field
+        prediction, answer = None, view.answer
+        if not cold and answer is not None and answer.stage_rad is not None and answer.sigma_rad is not None:
+            at, sigma = self._model.stage.scan_from_device(answer.stage_rad), max(answer.sigma_rad, 1e-3)
+            if low <= at <= high and sigma <= WORTH_PREDICTING_RAD and view.known.verdict is not Verdict.REFUSED:
+                prediction = Prediction(at, sigma)
+        stands = min(max(stage.scan_rad, low), high)
+        planner = SearchPlanner(self._hearing, low, high, stands, prediction)
+        return PmSearch(planner, held, prediction is None, self._settings.hearing_threshold, view.now_s, [])
+
+    def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
+        self._search, self._done_at, self._waits_s = None, search.held, now_s
+        looks = tuple(look for look in search.kept(found, self._model) if look.marker is not None)
+        if not looks:
+            why = next((look.unpaired for look in search.looks if look.unpaired), "the looks were off the window")
+            out.append(Tell(f"the PM was heard, but cannot be paired ({why}): go on to the next spot", done=True))
+            return
+        out.append(TakePairs(self._next_pm, looks))
+        self._next_pm += 1
+        self._pms += 1
+        turn, sigma = math.degrees(found.scan_rad), math.degrees(found.sigma_rad)
+        text = f"PM heard at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions: go on to the next spot"
+        out.append(Tell(text, done=True))
+
+    def _not_found(self, view: Inputs, stage: StageView, search: PmSearch, why: NotFound, out: list[Action]) -> None:
+        if not search.cold:
+            self._search = self._begin(view, stage, search.held, cold=True)
+            out.append(Tell(f"{why.reason}: searching the whole field"))
+            return
+        self._search, self._done_at, self._waits_s = None, search.held, view.now_s
+        out.append(Tell(f"{why.reason}: go on to the next spot", done=True))
+
+    def _slipped(self, view: Inputs, search: PmSearch) -> str | None:
+        """Why a search is over; None where it goes on."""
+        newest = view.poses.newest()
+        if newest is None or view.now_s - newest.t_s > 1.0:
+            return "the marker is not seen"
+        pose = newest.parent_T_child
+        if moved_mm(pose, search.held) > SLIP_MM or turned_rad(pose, search.held) > SLIP_RAD:
+            return "the fibre has moved during the search"
+        return None
+
+    def _is_another(self, held: FloatArray) -> bool:
+        """Whether the fibre is held elsewhere than where the last PM was taken."""
+        if self._done_at is None:
+            return True
+        return moved_mm(held, self._done_at) > ANOTHER_MM or turned_rad(held, self._done_at) > ANOTHER_RAD
+
+    # --- following --------------------------------------------------------------------------------------------------
+
+    def _follow(self, view: Inputs, stage: StageView, out: list[Action]) -> None:
+        answer, newest = view.answer, view.poses.newest()
+        if answer is None or answer.stage_rad is None or answer.sigma_rad is None or newest is None:
+            return
+        plane = self._model.stage.scan_from_device(answer.stage_rad)
+        if self._settings.follow and stage.requested is MotionKind.TRACK:
+            reason = f"following the beam, +- {math.degrees(answer.sigma_rad):.1f} deg"
+            out.append(Follow(plane, answer.sigma_rad, newest.t_s, reason))
+        held = held_pose(view.poses, view.now_s)
+        if held is None or abs(stage.scan_rad - plane) > CHECK_RAD:
+            self._deaf = 0
+            return
+        self._checks = view.now_s - self._checked_s > CHECK_S
+        for pulse in view.heard:
+            if pulse.scan_rad is None or abs(pulse.scan_rad - plane) > CHECK_RAD or pulse.pulse_s < self._not_before_s:
+                continue
+            self._checked_s = view.now_s
+            loud = pulse.amplitude is not None and pulse.amplitude >= self._settings.hearing_threshold
+            self._deaf = 0 if loud else self._deaf + 1
+            if loud and pulse.marker is not None and self._is_another(held):
+                self._done_at = held
+                out.append(TakePairs(self._next_pm, (pulse,)))
+                self._next_pm += 1
+                self._pms += 1
+        if self._deaf == DEAF:
+            out.append(Tell("the PM is not heard where the registration expects it: has the camera moved?"))
+
+
+__all__ = ["LocatedPulse", "Stage", "Workflow", "WorkflowSettings"]

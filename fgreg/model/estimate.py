@@ -1,0 +1,215 @@
+"""What comes out: registration, beam, PMs, tracks and a verdict. Millimetres, radians.
+
+The classes are the description of ``result.yaml``, too. Transforms are written to 1e-9 in rotation and 1e-6 mm in
+translation, so that rotations stay rigid to 1e-8; angles and lengths to 1e-6; covariances to ten digits; times whole.
+"""
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Annotated
+
+from fgreg.geometry.transforms import FloatArray
+from fgreg.schema.kinds import ANY_SIZE, SECONDS, Covariance, Figure, Integer, ListOf, Number, Numbers, Text, Transform
+from fgreg.schema.record import Key, NotStored, record
+
+RESULT_FORMAT = "fgreg-result/1"
+
+# A best estimate of a refused session may be anywhere.
+_TRANSFORM = Transform(max_translation_mm=math.inf, decimals=(9, 6))
+_COUNT = Integer(0, 2**31 - 1)
+_SIZE = Number(ANY_SIZE.low, ANY_SIZE.high, decimals=6)
+_ANGLE = Number(ANY_SIZE.low, ANY_SIZE.high, degrees=True, decimals=6)
+_NOT_NEGATIVE = Number(0.0, ANY_SIZE.high, decimals=6)
+_TRE = Figure(0.0, ANY_SIZE.high, decimals=6)
+
+
+def _covariance(size: int) -> Covariance:
+    return Covariance(size, semidefinite=True, digits=10)
+
+
+class Verdict(StrEnum):
+    """``ok``: usable; ``warning``: usable, a condition missed; ``refused``: no transform may be used."""
+
+    OK = "ok"
+    WARNING = "warning"
+    REFUSED = "refused"
+
+    @property
+    def severity(self) -> int:
+        return [Verdict.OK, Verdict.WARNING, Verdict.REFUSED].index(self)
+
+
+VERDICT = Text.of(Verdict, "a verdict")
+
+
+def worst_verdict(*verdicts: Verdict) -> Verdict:
+    """The most severe of the verdicts, ``ok`` of none."""
+    return max(verdicts, key=lambda verdict: verdict.severity, default=Verdict.OK)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserEstimate:
+    """The beam: ``marker_T_laser`` (4, 4), covariance (6, 6), right tangent."""
+
+    marker_T_laser: Annotated[FloatArray, Key("z along the beam", _TRANSFORM)]
+    covariance: Annotated[
+        FloatArray, Key("of the transform; 0 for the roll about the beam and the shift along it", _covariance(6))
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedTre:
+    """Predicted target registration error, mm, from the posterior at each target."""
+
+    mean_mm: Annotated[float, Key("average over targets of sqrt(E|e|^2)", _TRE, name="mean")]
+    p95_mm: Annotated[float, Key("average over targets of the 95 % quantile of |e|", _TRE, name="p95")]
+    worst_mm: Annotated[float, Key("the largest of those quantiles", _TRE, name="worst")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochEstimate:
+    """One camera epoch: registration (None where none can be computed), covariance (6, 6) over the right tangent."""
+
+    index: Annotated[int, Key("its place in the list, from 0", _COUNT)]
+    start_s: Annotated[float, Key("time of its first event", SECONDS)]
+    trus_T_camera: Annotated[
+        FloatArray | None, Key("the registration; null where none can be computed", _TRANSFORM, null=True)
+    ]
+    covariance: Annotated[FloatArray | None, Key("of the registration", _covariance(6), null=True)]
+    pairs: Annotated[int, Key("looks that were recorded in it", _COUNT)]
+    verdict: Annotated[Verdict, Key("on this epoch", VERDICT)]
+    predicted_tre: Annotated[
+        PredictedTre | None, Key("predicted target registration error", name="predicted_tre_mm", null=True)
+    ]
+
+
+_USED = ("used", True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairEstimate:
+    """One look, in event order. Figures are None where they are not known; ``covariance`` (3, 3)."""
+
+    t: Annotated[float, NotStored(math.nan)]
+    pm: Annotated[int, Key("of the look", _COUNT)]
+    epoch: Annotated[int, Key("index of its camera epoch", _COUNT)]
+    used: Annotated[bool, Key("whether the estimate rests on it")]
+    lambda_mm: Annotated[
+        float | None,
+        Key("distance along the beam from the laser frame's origin", _SIZE, null=True, required_if=_USED),
+    ] = None
+    theta_rad: Annotated[
+        float | None, Key("arc angle theta' (TRUS convention)", _ANGLE, null=True, required_if=_USED)
+    ] = None
+    rotation_rad: Annotated[
+        float | None,
+        Key(
+            "turn of the stage (device) from the look's `scan_deg` that brings the PM into the plane",
+            _ANGLE,
+            null=True,
+            required_if=_USED,
+        ),
+    ] = None
+    trus_p_pm_mm: Annotated[FloatArray | None, Key("the PM", Numbers(3, _SIZE), null=True, required_if=_USED)] = None
+    covariance: Annotated[FloatArray | None, Key("of the PM", _covariance(3), null=True, required_if=_USED)] = None
+    residual_mm: Annotated[
+        float | None,
+        Key("root of the squared (x, range) misfit, both in mm", _NOT_NEGATIVE, null=True, required_if=_USED),
+    ] = None
+    nis: Annotated[
+        float | None,
+        Key(
+            "squared misfit over its predicted covariance, both by the estimate without this PM",
+            _NOT_NEGATIVE,
+            null=True,
+            required_if=_USED,
+        ),
+    ] = None
+    reason: Annotated[str, Key("why it was not used", brief=True, required_if=("used", False))] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackEstimate:
+    """Where to turn to: absolute device angle and sigma (rad), or None with a reason."""
+
+    t: Annotated[float, Key("of the query", SECONDS)]
+    stage_rad: Annotated[
+        float | None, Key("where to turn to, absolute device angle; null where there is no answer", _ANGLE, null=True)
+    ]
+    sigma_rad: Annotated[
+        float | None,
+        Key("its standard deviation", Number(0.0, ANY_SIZE.high, degrees=True, decimals=6), null=True),
+    ]
+    lambda_mm: Annotated[float | None, Key("distance along the beam", _SIZE, null=True)]
+    causal: Annotated[bool, Key("true: from what was known at `t` (replay); false: from the whole session")]
+    reason: Annotated[str, Key("why there is no answer", brief=True, required_if=("stage_deg", None))] = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AimEstimate:
+    """One calibration shot: distance of the spot from the beam (mm), and its misfit (``nis`` as of a pair)."""
+
+    t: float
+    used: bool
+    reason: str = ""
+    lambda_mm: float | None = None
+    residual_mm: float | None = None
+    nis: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Of how long something took, ms."""
+
+    p50: Annotated[float, Key("median", _NOT_NEGATIVE)]
+    p99: Annotated[float, Key("99 % quantile", _NOT_NEGATIVE)]
+    max: Annotated[float, Key("longest", _NOT_NEGATIVE)]
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long things took; None where there was none of them."""
+
+    add: Annotated[
+        Quantiles | None, Key("taking in an aim, a pair or a move, and judging all of it where that is due", null=True)
+    ]
+    track: Annotated[Quantiles | None, Key("answering a query", null=True)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionEstimate:
+    """The whole answer for a session; what ``result.yaml`` holds, and the calibration shots besides.
+
+    ``timing``: where events were taken in one by one.
+    """
+
+    version: Annotated[str, Key("version of fgreg that made it", name="fgreg", required=True)] = field(
+        default="", kw_only=True
+    )
+    session: Annotated[str, Key("its name")]
+    verdict: Annotated[Verdict, Key("ok: usable; warning: a condition is missed; refused: use no transform", VERDICT)]
+    reasons: Annotated[
+        tuple[str, ...],
+        Key(
+            "plain sentences with the figure behind each and what to do about it",
+            ListOf(Text(), "a list of texts", empty=True),
+        ),
+    ]
+    laser: Annotated[LaserEstimate | None, Key("the beam", null=True)]
+    epochs: Annotated[
+        tuple[EpochEstimate, ...],
+        Key("all camera epochs, also when refused", ListOf(record(EpochEstimate), empty=True)),
+    ]
+    pairs: Annotated[
+        tuple[PairEstimate, ...], Key("one per look, in the order of events", ListOf(record(PairEstimate), empty=True))
+    ]
+    tracks: Annotated[tuple[TrackEstimate, ...], Key("one per track event", ListOf(record(TrackEstimate), empty=True))]
+    aims: tuple[AimEstimate, ...] = ()
+    timing: Annotated[
+        Timing | None, Key("of `fgreg replay` only; null where there was no such event", name="timing_ms")
+    ] = None
+
+
+RESULT = record(SessionEstimate, ("format", RESULT_FORMAT))
+"""``result.yaml``."""

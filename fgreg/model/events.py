@@ -1,0 +1,292 @@
+"""What happened in a session, as recorded: one dataclass per event type of ``events.jsonl``, which it describes.
+
+``line`` is the 1-based line in the file. Frame names are resolved paths inside the session's folder. Angles here are
+still the *device's*, in degrees, as the file has them: measurements.py holds what the estimator sees.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from fgreg.geometry.transforms import FloatArray
+from fgreg.schema.files import FrameKind, FrameName
+from fgreg.schema.kinds import (
+    NOT_NEGATIVE,
+    POINT_MM,
+    SCAN_DEG,
+    SECONDS,
+    Anything,
+    Covariance,
+    Integer,
+    IntegerPair,
+    Number,
+    OneOf,
+    Transform,
+)
+from fgreg.schema.problems import FieldError, shown
+from fgreg.schema.record import Key, Tagged
+
+RANGE_MM = Number(0.0, 300.0, above=True, unit="mm")
+LATERAL_MM = Number(-200.0, 200.0, unit="mm")
+
+_CAMERA_FRAME = FrameName(FrameKind.CAMERA)
+Seconds = Annotated[float, Key("s, not decreasing", SECONDS)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerRecord:
+    """A marker as recorded: a pose, the frames to get it from, or both (then the pose wins)."""
+
+    JSON_RULES: ClassVar = (
+        {"anyOf": [{"required": ["camera_T_marker"]}, {"required": ["left"]}]},
+        {"dependentRequired": {"right": ["left"]}},
+    )
+
+    camera_T_marker: Annotated[FloatArray | None, Key("the pose", Transform())] = None
+    covariance: Annotated[FloatArray | None, Key("of the pose", Covariance(6), requires="camera_T_marker")] = None
+    left: Annotated[Path | None, Key("frame of the left camera", _CAMERA_FRAME)] = None
+    right: Annotated[Path | None, Key("frame of the right camera", _CAMERA_FRAME)] = None
+
+    def __post_init__(self) -> None:
+        if self.right is not None and self.left is None:
+            raise FieldError.of("nothing", "a frame of the left camera too", "left")
+        if self.camera_T_marker is None and self.left is None:
+            expected = "the marker's pose or the frames to get it from"
+            raise FieldError.of("neither camera_T_marker nor left", expected)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrusRecord:
+    """A look as recorded: x and range, or the frame to get them from."""
+
+    JSON_RULES: ClassVar = (
+        {"anyOf": [{"required": ["x_mm", "range_mm"]}, {"required": ["frame"]}]},
+        *({"not": {"required": ["frame", key]}} for key in ("x_mm", "range_mm", "covariance")),
+    )
+
+    scan_deg: Annotated[float, Key("what the device reads", SCAN_DEG)]
+    x_mm: Annotated[float | None, Key("along the axis of rotation", LATERAL_MM)] = None
+    range_mm: Annotated[
+        float | None, Key("from the element, not from the axis: sound speed times time of flight", RANGE_MM)
+    ] = None
+    frame: Annotated[Path | None, Key("instead of x and range", FrameName(FrameKind.TRUS))] = None
+    covariance: Annotated[FloatArray | None, Key("over (x_mm, range_mm)", Covariance(2))] = None
+    amplitude: Annotated[float | None, Key("comparable only between looks at one `pm`", NOT_NEGATIVE)] = None
+    sweep: Annotated[
+        int,
+        Key(
+            "+1 or -1 where the stage was stepping that way (device angle increasing or decreasing by `step_deg`) and "
+            "stopped at the first angle at which the PM was heard",
+            OneOf((0, 1, -1)),
+            brief=True,
+        ),
+    ] = 0
+
+    def __post_init__(self) -> None:
+        if self.frame is None:
+            for key, value, bounds in (("x_mm", self.x_mm, LATERAL_MM), ("range_mm", self.range_mm, RANGE_MM)):
+                if value is None:
+                    raise FieldError.of("nothing", bounds.expected, key)
+        elif self.x_mm is not None or self.range_mm is not None:
+            raise FieldError.of("it together with x_mm or range_mm", "x_mm and range_mm, or frame", "frame")
+        elif self.covariance is not None:
+            raise FieldError.of("it together with frame", "it with x_mm and range_mm only", "covariance")
+
+    @property
+    def needs_frame(self) -> bool:
+        """Whether x and range are to be found in the frame."""
+        return self.frame is not None and self.x_mm is None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AimEvent:
+    """A calibration shot: the beam was aimed at a known spot."""
+
+    JSON_RULES: ClassVar = ({"oneOf": [{"required": ["camera_p_spot_mm"]}, {"required": ["corner"]}]},)
+
+    t: Seconds
+    line: int
+    marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
+    camera_p_spot_mm: Annotated[FloatArray | None, Key("[x, y, z] of the spot", POINT_MM)] = None
+    covariance: Annotated[FloatArray | None, Key("of the spot", Covariance(3), requires="camera_p_spot_mm")] = None
+    corner: Annotated[
+        tuple[int, int] | None,
+        Key(
+            "[column, row] of the board's corner that was aimed at, to be found in the same frames; instead of a spot",
+            IntegerPair(0, 2**31 - 1, "[column, row], two integers >= 0"),
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.corner is not None and self.marker.left is None:
+            raise FieldError.of("it without frames", "marker.left, the frame in which to find the board", "corner")
+        if (self.corner is None) == (self.camera_p_spot_mm is None):
+            raise FieldError.of("neither" if self.corner is None else "both", "camera_p_spot_mm or corner")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairEvent:
+    """A registration shot: a beam and one look at its photoacoustic marker."""
+
+    t: Seconds
+    line: int
+    pm: Annotated[int, Key("events with the same `pm` are looks at the same spot", Integer(0, 2**31 - 1))]
+    marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
+    trus: Annotated[TrusRecord, Key("the look")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackEvent:
+    """A query: where to turn the stage for this beam."""
+
+    JSON_RULES: ClassVar = (
+        {"anyOf": [{"required": [key]} for key in ("trus", "looks", "scan_deg")]},
+        {"not": {"required": ["trus", "looks"]}},
+    )
+
+    t: Seconds
+    line: int
+    marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
+    trus: Annotated[TrusRecord | None, Key("the look, where the PM is heard now")] = None
+    several: Annotated[tuple[TrusRecord, ...], Key("several such looks, instead", name="looks", brief=True)] = ()
+    scan_deg: Annotated[float | None, Key("where the stage stands, where the PM is not heard", SCAN_DEG)] = None
+
+    def __post_init__(self) -> None:
+        if self.trus is not None and self.several:
+            raise FieldError.of("it together with trus", "one of the two", "looks")
+        if self.trus is None and not self.several and self.scan_deg is None:
+            raise FieldError.of("none of trus, looks, scan_deg", "one of them")
+
+    @property
+    def looks(self) -> tuple[TrusRecord, ...]:
+        """Of the PM, where it is heard now."""
+        return self.several if self.trus is None else (self.trus,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMovedEvent:
+    """The endoscope moved: a new epoch begins."""
+
+    JSON_RULES: ClassVar = (
+        {
+            "dependentSchemas": {
+                "since_t": {"properties": {"detected": {"const": True}}, "required": ["detected"]},
+            }
+        },
+    )
+
+    t: Seconds
+    line: int
+    camera_new_T_camera_old: Annotated[FloatArray | None, Key("the move, where it is known", Transform())] = None
+    covariance: Annotated[FloatArray | None, Key("of the move", Covariance(6), requires="camera_new_T_camera_old")] = (
+        None
+    )
+    detected: Annotated[bool, Key("a program noticed, nobody reported it", brief=True)] = False
+    since_t: Annotated[float | None, Key("with `detected`: from when on the new epoch counts, s", SECONDS)] = None
+
+    def __post_init__(self) -> None:
+        if self.since_t is not None:
+            if not self.detected:
+                raise FieldError.of("it without detected: true", "both or none", "since_t")
+            if self.since_t > self.t:
+                raise FieldError.of(shown(self.since_t), f"at most t, {self.t:.17g}", "since_t")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefusedEvent:
+    """An event that was not taken in: ``event`` as recorded (a mapping as a rule), and why.
+
+    Where the event itself is in the file, on an earlier line, ``event`` names that line: it does not count.
+    """
+
+    t: Seconds
+    line: int
+    event: Annotated[
+        object,
+        Key(
+            "the event as it was told; where it was recorded first, on a line of its own, its `line` (a number)",
+            Anything("the event that was not taken in"),
+        ),
+    ]
+    reason: Annotated[str, Key("why")]
+
+    @property
+    def refused_line(self) -> int | None:
+        """Line of the refused event, where it was recorded before it was refused."""
+        line = self.event.get("line") if isinstance(self.event, Mapping) else None
+        return line if type(line) is int else None
+
+
+@dataclass(frozen=True, slots=True)
+class StageEvent:
+    """What the stage was told: of no effect on an estimate."""
+
+    t: Seconds
+    line: int
+    command: Annotated[str, Key("what it was told")]
+    scan_deg: Annotated[float | None, Key("where to, device angle", SCAN_DEG)] = None
+    reason: Annotated[str, Key("why", brief=True)] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class NoteEvent:
+    """Somebody's words: of no effect on an estimate."""
+
+    t: Seconds
+    line: int
+    text: Annotated[str, Key("for the record")]
+
+
+Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | RefusedEvent | StageEvent | NoteEvent
+
+EVENTS = Tagged(
+    "type",
+    {
+        "aim": AimEvent,
+        "pair": PairEvent,
+        "track": TrackEvent,
+        "camera_moved": CameraMovedEvent,
+        "refused": RefusedEvent,
+        "stage": StageEvent,
+        "note": NoteEvent,
+    },
+)
+"""A line of ``events.jsonl``."""
+
+
+Shot = AimEvent | PairEvent | TrackEvent
+"""Events with a marker."""
+
+
+def looks_of(event: Event) -> tuple[TrusRecord, ...]:
+    """The looks that an event brings."""
+    if isinstance(event, PairEvent):
+        return (event.trus,)
+    return event.looks if isinstance(event, TrackEvent) else ()
+
+
+def needs_marker_frames(record: MarkerRecord, *, redetect: bool) -> bool:
+    """Whether the marker is to be found in the frames rather than taken from the recorded pose."""
+    return record.left is not None and (record.camera_T_marker is None or redetect)
+
+
+def needs_board(event: Shot) -> bool:
+    """Whether the board is to be found in the frames of an aim, rather than the spot taken as recorded."""
+    return isinstance(event, AimEvent) and event.camera_p_spot_mm is None
+
+
+def needs_frames(event: Event, *, redetect: bool) -> bool:
+    """Whether anything of an event is to be found in its frames."""
+    if isinstance(event, Shot) and (needs_board(event) or needs_marker_frames(event.marker, redetect=redetect)):
+        return True
+    return any(look.needs_frame for look in looks_of(event))
+
+
+def refused_lines(events: Iterable[Event]) -> dict[int, str]:
+    """Lines of recorded events that were refused afterwards, each with the reason."""
+    found = {}
+    for event in events:
+        if isinstance(event, RefusedEvent) and (line := event.refused_line) is not None:
+            found[line] = event.reason
+    return found

@@ -1,0 +1,146 @@
+"""What the estimator sees: numbers with covariances. Millimetres, radians, TRUS and camera frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from fgreg.geometry.transforms import FloatArray, right_from_parent_covariance
+from fgreg.model.session_model import NoiseModel
+
+FLOOR_RAD = 1e-5
+FLOOR_MM = 1e-3
+"""What a noise of zero (a session may say so) counts as; a covariance with a direction below these gets them added."""
+POSE_FLOOR = (FLOOR_RAD,) * 3 + (FLOOR_MM,) * 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerObservation:
+    """One detection of the marker.
+
+    Attributes:
+        camera_T_marker: (4, 4).
+        covariance: (6, 6) over the right tangent (rotation rad, translation mm).
+        id: equal for observations that are one and the same (same frames, or same matrix), unique otherwise.
+    """
+
+    camera_T_marker: FloatArray
+    covariance: FloatArray
+    id: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """One hearing of a PM in the TRUS image plane.
+
+    Attributes:
+        scan_rad: stage angle t of the plane (TRUS convention).
+        scan_sigma_rad: of the stage reading.
+        x_mm, range_mm: lateral position, and range from the element.
+        covariance: (2, 2) over (x_mm, range_mm).
+        sweep: +1 or -1 where the plane was stepping towards larger or smaller ``scan_rad`` and stopped at its first
+            hit, else 0.
+        amplitude: comparable within one PM only.
+    """
+
+    scan_rad: float
+    scan_sigma_rad: float
+    x_mm: float
+    range_mm: float
+    covariance: FloatArray
+    sweep: int = 0
+    amplitude: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Aim:
+    """A calibration shot: marker and the spot (3,) in the camera frame with its (3, 3) covariance."""
+
+    t: float
+    marker: MarkerObservation
+    camera_p_spot_mm: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """A registration shot: one look at PM ``pm`` with the beam that made it, in camera epoch ``epoch``."""
+
+    t: float
+    pm: int
+    epoch: int
+    marker: MarkerObservation
+    look: Look
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """A query in camera epoch ``epoch``; ``looks`` where the PM is heard now.
+
+    ``look_markers``: one per look, where the marker was detected anew at each; else ``marker`` serves them all.
+    """
+
+    t: float
+    epoch: int
+    marker: MarkerObservation
+    looks: tuple[Look, ...] = ()
+    scan_rad: float | None = None
+    look_markers: tuple[MarkerObservation, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpochStart:
+    """Start of a camera epoch; the motion (and its 6x6 covariance, right tangent) where kinematics gave it.
+
+    ``after``: the epoch that the motion is counted from, an earlier one than the last where the camera came back to it.
+    """
+
+    t: float
+    camera_new_T_camera_old: FloatArray | None = None
+    covariance: FloatArray | None = None
+    after: int | None = None
+
+    def old(self, index: int) -> int:
+        """The epoch that the motion is counted from, of an epoch with this index."""
+        return index - 1 if self.after is None else self.after
+
+    @property
+    def motion_known(self) -> bool:
+        """Whether the epoch is tied to the one before: a motion without a covariance says nothing to rely on."""
+        return self.camera_new_T_camera_old is not None and self.covariance is not None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
+    """All of a session that enters the estimate. ``epochs[0]`` starts the session."""
+
+    aims: tuple[Aim, ...]
+    pairs: tuple[Pair, ...]
+    epochs: tuple[EpochStart, ...]
+
+
+def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) -> FloatArray:
+    """(6, 6) right-tangent covariance of a marker pose that came without one (session-format, ``noise``)."""
+    sigma = np.array([*noise.marker_rotation_rad, *noise.marker_translation_mm])
+    return right_from_parent_covariance(camera_T_marker[:3, :3], np.diag(sigma**2))
+
+
+def usable_covariance(covariance: FloatArray, floor: Sequence[float]) -> FloatArray:
+    """Covariances (..., n, n), with the floor's squares (n,) added to those with a direction below the floor."""
+    least = _squares(tuple(floor))
+    try:
+        # Less the floor it has a Cholesky factor: a fraction of the time that its eigenvalues take.
+        np.linalg.cholesky(covariance - least)
+    except np.linalg.LinAlgError:
+        below = np.linalg.eigvalsh(covariance - least)[..., :1, None] <= 0.0
+        return np.where(below, covariance + least, covariance)
+    return covariance
+
+
+@lru_cache
+def _squares(sigmas: tuple[float, ...]) -> FloatArray:
+    """Diagonal matrix of squares."""
+    return np.diag(np.square(sigmas))

@@ -1,0 +1,474 @@
+"""What a session is made of: probe, stage, cameras, marker, board, noise. Frozen; lengths mm, angles rad.
+
+The classes are the description of ``session.yaml``, too: keys, bounds and units of the file stand in their types
+(fgreg.schema.record). Each raises ValueError on values that do not fit together; the session reader turns that into a
+line that names the key.
+"""
+
+import math
+import re
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.schema.kinds import (
+    COORDINATE_MM,
+    NOISE_MM,
+    NOT_NEGATIVE,
+    POINT_MM,
+    POSITIVE_MM,
+    SCAN_DEG,
+    Converted,
+    Integer,
+    IntegerPair,
+    Matrix,
+    Number,
+    Numbers,
+    NumberTuple,
+    OneOf,
+    Points,
+    Text,
+    Transform,
+    in_radians,
+)
+from fgreg.schema.problems import FieldError, shown
+from fgreg.schema.record import Key, record
+
+SESSION_FORMAT = "fgreg-session/1"
+
+_MICROSECONDS = Number(-1e6, 1e6, unit="us")
+_PIXELS = 1e5
+
+DICTIONARY_SIZES = {
+    **{f"DICT_{n}X{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "DICT_ARUCO_ORIGINAL": 1024,
+    **dict.fromkeys(("DICT_ARUCO_MIP_36h12", "DICT_ARUCO_MIP_36H12"), 250),
+    **dict.fromkeys(("DICT_APRILTAG_16h5", "DICT_APRILTAG_16H5"), 30),
+    **dict.fromkeys(("DICT_APRILTAG_25h9", "DICT_APRILTAG_25H9"), 35),
+    **dict.fromkeys(("DICT_APRILTAG_36h10", "DICT_APRILTAG_36H10"), 2320),
+    **dict.fromkeys(("DICT_APRILTAG_36h11", "DICT_APRILTAG_36H11"), 587),
+}
+"""OpenCV's predefined dictionaries and how many tags each has."""
+
+DICTIONARY = Text("an OpenCV dictionary such as DICT_4X4_50", tuple(DICTIONARY_SIZES))
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not (math.isfinite(value) and value > 0):
+            raise ValueError(f"{name} is {value}, expected a number > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensitivityModel:
+    """Half width of the window in which the probe hears a source, as *stage rotation*, against depth.
+
+    Attributes:
+        depth_mm, half_width_rad: (n,).
+        curve_rotation_rad, curve_amplitude: (m,), or both None.
+    """
+
+    depth_mm: Annotated[FloatArray, Key("from the element; increasing", Numbers(None, Number(0.0, 300.0, unit="mm")))]
+    half_width_rad: Annotated[
+        FloatArray,
+        Key(
+            "how far the stage may be turned away from a source that is still heard, at each depth; linear between, "
+            "constant beyond",
+            Numbers(None, Number(0.0, 45.0, above=True, unit="deg", degrees=True)),
+        ),
+    ]
+    edge_sigma_rad: Annotated[
+        float,
+        Key(
+            "how well the half width is known: one error for the whole session",
+            Number(0.0, 45.0, unit="deg", degrees=True),
+        ),
+    ]
+    curve_rotation_rad: Annotated[
+        FloatArray | None,
+        Key(
+            "turn of the stage, for looks that give an amplitude; increasing",
+            Numbers(None, Number(-90.0, 90.0, unit="deg", degrees=True)),
+            name="curve.rotation_deg",
+            required=True,
+        ),
+    ] = None
+    curve_amplitude: Annotated[
+        FloatArray | None,
+        Key("amplitude at each of these turns", Numbers(None, NOT_NEGATIVE), name="curve.amplitude", required=True),
+    ] = None
+
+    def __post_init__(self) -> None:
+        _check_table("depth_mm", self.depth_mm, self.half_width_rad, "half_width_deg")
+        if self.curve_rotation_rad is not None and self.curve_amplitude is not None:
+            _check_table("rotation_deg", self.curve_rotation_rad, self.curve_amplitude, "curve", "amplitude")
+            if not self.curve_amplitude.any():
+                raise FieldError.of("only zeros", "at least one number > 0", "curve", "amplitude")
+
+    def half_width_at(self, depth_mm: FloatArray | float) -> FloatArray:
+        """Half width (rad) at depths from the element (mm), linear between and constant beyond the table."""
+        return np.asarray(np.interp(depth_mm, self.depth_mm, self.half_width_rad))
+
+
+def _check_table(over: str, abscissa: FloatArray, ordinate: FloatArray, *path: str) -> None:
+    """Raises FieldError where a table's first column ``over`` does not increase, or its second, at ``path``, has not
+    as many entries."""
+    if (np.diff(abscissa) <= 0).any():
+        raise FieldError.of("numbers that do not increase", "each number larger than the one before", *path[:-1], over)
+    if abscissa.shape != ordinate.shape:
+        raise FieldError.of(f"{ordinate.size} numbers", f"{abscissa.size}, one for each in {over}", *path)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelModel:
+    """Sampling of channel data."""
+
+    sampling_mhz: Annotated[float, Key("rate", Number(0.1, 1e4, unit="MHz"))]
+    t0_us: Annotated[float, Key("time of sample 0 after the laser's trigger", _MICROSECONDS)] = 0.0
+    pulse_delay_us: Annotated[
+        float, Key("by which the envelope of a wave has its maximum later than the true arrival", _MICROSECONDS)
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        _positive(sampling_mhz=self.sampling_mhz)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageModel:
+    """Scan-converted envelope images (depth, lateral)."""
+
+    pixel_mm: Annotated[tuple[float, float], Key("pitch along depth and lateral", NumberTuple(2, POSITIVE_MM))]
+    origin_mm: Annotated[
+        tuple[float, float],
+        Key("centre of pixel [0, 0]: range from the element face, x", NumberTuple(2, COORDINATE_MM)),
+    ]
+
+    def __post_init__(self) -> None:
+        _positive(dz=self.pixel_mm[0], dx=self.pixel_mm[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProbeModel:
+    """The TRUS probe: linear array parallel to the rotation axis at ``radius_mm`` from it."""
+
+    elements: Annotated[int, Key("of the array", Integer(1, 65536))]
+    pitch_mm: Annotated[
+        float, Key("element i is at x = (i - (elements - 1) / 2) * pitch_mm", Number(1e-3, 100.0, unit="mm"))
+    ]
+    flip: Annotated[bool, Key("true: element 0 is at +x")]
+    radius_mm: Annotated[float, Key("from the axis of rotation to the element faces", POSITIVE_MM)]
+    sound_speed_m_s: Annotated[
+        float, Key("that ranges were, or are to be, computed with", Number(0.0, 1e5, above=True, unit="m/s"))
+    ]
+    sensitivity: Annotated[SensitivityModel, Key("the window in which a source is heard")]
+    channels: Annotated[ChannelModel | None, Key("of channel data")] = None
+    image: Annotated[ImageModel | None, Key("of envelope images")] = None
+
+    def __post_init__(self) -> None:
+        _positive(elements=self.elements, pitch_mm=self.pitch_mm, radius_mm=self.radius_mm)
+        _positive(sound_speed_m_s=self.sound_speed_m_s)
+
+    def is_channel_data(self, frame: npt.NDArray[np.generic]) -> bool:
+        """Whether a frame is channel data; of a probe with ``image``, too, all others are images."""
+        return self.holds_channels(frame.shape, frame.dtype)
+
+    def holds_channels(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> bool:
+        """Whether an array of this shape and type is channel data: (elements, samples), float32 or int16."""
+        is_type = (dtype.kind, dtype.itemsize) in (("f", 4), ("i", 2))
+        return self.channels is not None and is_type and len(shape) == 2 and shape[0] == self.elements
+
+    @property
+    def element_x_mm(self) -> FloatArray:
+        """TRUS x of each element, (elements,), in the order of the channel data's rows."""
+        x = (np.arange(self.elements) - (self.elements - 1) / 2.0) * self.pitch_mm
+        return np.asarray(-x if self.flip else x)
+
+
+@dataclass(frozen=True, slots=True)
+class StageModel:
+    """The rotation stage. ``scan`` angles inside are the plane's (TRUS convention); files hold device angles.
+
+    ``scan = direction * (device - zero)``.
+    """
+
+    step_rad: Annotated[float, Key("of a sweep", Number(0.0, 180.0, above=True, unit="deg", degrees=True))]
+    limits_device_rad: Annotated[
+        tuple[float, float], Key("of the device", NumberTuple(2, in_radians(SCAN_DEG)), name="limits_deg")
+    ] = (math.radians(-60.0), math.radians(60.0))
+    direction: Annotated[
+        int,
+        Key("-1: the device's positive turn is the other way; +1 turns the plane from +z towards +y", OneOf((1, -1))),
+    ] = 1
+    zero_device_rad: Annotated[
+        float, Key("device angle at which the plane points along +z", in_radians(SCAN_DEG), name="zero_deg")
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        _positive(step=self.step_rad)
+        if self.direction not in (-1, 1):
+            raise ValueError(f"direction is {self.direction}, expected 1 or -1")
+        if self.limits_device_rad[0] >= self.limits_device_rad[1]:
+            limits_deg = [round(math.degrees(limit), 9) for limit in self.limits_device_rad]
+            raise FieldError.of(shown(limits_deg), "the lower limit, then the upper one", "limits_deg")
+
+    def scan_from_device(self, device_rad: float) -> float:
+        """Plane angle (rad, TRUS convention) of a device angle (rad)."""
+        return self.direction * (device_rad - self.zero_device_rad)
+
+    def device_from_scan(self, scan_rad: float) -> float:
+        """Device angle (rad) of a plane angle (rad, TRUS convention)."""
+        return self.direction * scan_rad + self.zero_device_rad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    """Pinhole camera with OpenCV's five-parameter distortion: matrix (3, 3) px, distortion (5,), size (w, h) px."""
+
+    image_size: tuple[int, int]
+    matrix: FloatArray
+    distortion: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LensSection:
+    """One camera of ``session.yaml``; its image size is that of both."""
+
+    matrix: Annotated[FloatArray, Key("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px", Matrix(3))]
+    distortion: Annotated[FloatArray, Key("[k1, k2, p1, p2, k3], OpenCV's", Numbers(5, Number(-1e4, 1e4)))]
+
+    def __post_init__(self) -> None:
+        matrix = self.matrix
+        zeros = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1.0)
+        positive = matrix[0, 0] > 0 and matrix[1, 1] > 0
+        if not (positive and max(map(abs, zeros)) <= 1e-9 and np.abs(matrix).max() <= _PIXELS):
+            found = "[" + ", ".join("[" + ", ".join(f"{v:g}" for v in row) + "]" for row in matrix) + "]"
+            raise FieldError.of(found, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0", "matrix")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoRig:
+    """The endoscope: left camera (frame ``camera``) and, where there is one, the right with ``right_T_left``."""
+
+    left: CameraModel
+    right: CameraModel | None = None
+    right_T_left: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if (self.right is None) != (self.right_T_left is None):
+            raise ValueError("right and right_T_left go together")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CameraSection:
+    """``camera`` of ``session.yaml``."""
+
+    JSON_RULES: ClassVar = ({"dependentRequired": {"right": ["right_T_left"], "right_T_left": ["right"]}},)
+
+    image_size: Annotated[
+        tuple[int, int],
+        Key(
+            "width and height, px, of both cameras",
+            IntegerPair(1, 32768, "[width, height], two integers from 1 to 32768"),
+        ),
+    ]
+    left: Annotated[_LensSection, Key("the left camera, whose frame is `camera`")]
+    right: Annotated[_LensSection | None, Key("the right camera, where there is one")] = None
+    right_T_left: Annotated[FloatArray | None, Key("together with `right`", Transform())] = None
+
+    def __post_init__(self) -> None:
+        if (self.right is None) != (self.right_T_left is None):
+            absent = "right" if self.right is None else "right_T_left"
+            raise FieldError.of("nothing", "right and right_T_left together", absent)
+
+    def rig(self) -> StereoRig:
+        """The rig that the section describes."""
+
+        def camera(lens: _LensSection) -> CameraModel:
+            return CameraModel(self.image_size, lens.matrix, lens.distortion)
+
+        return StereoRig(camera(self.left), None if self.right is None else camera(self.right), self.right_T_left)
+
+    @classmethod
+    def of(cls, rig: StereoRig) -> Self:
+        """The section that describes a rig."""
+        left, right = rig.left, rig.right
+        lens = None if right is None else _LensSection(right.matrix, right.distortion)
+        return cls(left.image_size, _LensSection(left.matrix, left.distortion), lens, rig.right_T_left)
+
+
+STEREO_RIG = Converted(record(_CameraSection), _CameraSection.rig, _CameraSection.of)
+"""``camera`` of ``session.yaml``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagModel:
+    """One square tag: id, outer edge of its black border (mm), and where it sits on the marker body."""
+
+    id: Annotated[int, Key("in the dictionary", Integer(0, max(DICTIONARY_SIZES.values()) - 1))]
+    size_mm: Annotated[float, Key("outer edge of the black border", POSITIVE_MM)]
+    marker_T_tag: Annotated[
+        FloatArray, Key("where it sits on the marker body", Transform(), default="identity", brief=True)
+    ] = field(default_factory=lambda: as_float_array(np.eye(4)))
+
+    def __post_init__(self) -> None:
+        _positive(size_mm=self.size_mm)
+
+    @property
+    def marker_p_corners_mm(self) -> FloatArray:
+        """(4, 3) corners in the marker frame, in the detector order: top left, top right, bottom right, bottom left."""
+        h = self.size_mm / 2.0
+        tag_p = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+        return np.asarray(tag_p @ self.marker_T_tag[:3, :3].T + self.marker_T_tag[:3, 3])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerModel:
+    """The fibre's fiducial: a rigid body of one or many square tags of one OpenCV dictionary."""
+
+    dictionary: Annotated[str, Key("OpenCV's name of it", DICTIONARY)]
+    tags: Annotated[tuple[TagModel, ...], Key("one or several on a rigid body")]
+
+    def __post_init__(self) -> None:
+        if not self.tags:
+            raise ValueError("a marker needs at least one tag")
+        largest = DICTIONARY_SIZES.get(self.dictionary, 1_000_000) - 1
+        for i, tag in enumerate(self.tags):
+            if tag.id > largest:
+                raise FieldError.of(str(tag.id), f"an integer from 0 to {largest}", "tags", i, "id")
+            if any(other.id == tag.id for other in self.tags[:i]):
+                raise FieldError.of(f"{tag.id} again", "each id once", "tags", i, "id")
+
+
+@dataclass(frozen=True, slots=True)
+class CharucoModel:
+    """The markers of a ChArUco board: OpenCV dictionary and marker edge (mm)."""
+
+    dictionary: Annotated[str, Key("OpenCV's name of it", DICTIONARY)]
+    marker_mm: Annotated[float, Key("outer edge of a marker's black border", POSITIVE_MM)]
+
+
+@dataclass(frozen=True, slots=True)
+class BoardModel:
+    """The calibration board; columns and rows count inner corners."""
+
+    columns: Annotated[int, Key("inner corners along x", Integer(2, 200))]
+    rows: Annotated[int, Key("inner corners along y", Integer(2, 200))]
+    square_mm: Annotated[float, Key("edge of a square", POSITIVE_MM)]
+    charuco: Annotated[CharucoModel | None, Key("absent: a plain chessboard")] = None
+
+    def __post_init__(self) -> None:
+        _positive(square_mm=self.square_mm)
+        if self.charuco is None:
+            # OpenCV finds plain chessboards from 3 x 3 inner corners on.
+            for key, count in (("columns", self.columns), ("rows", self.rows)):
+                if count < 3:
+                    raise FieldError.of(str(count), "an integer from 3 to 200", key)
+            if (self.columns + self.rows) % 2 == 0:
+                # The square at the far end from a black corner square is columns + rows squares away: black, too.
+                found = f"{self.columns} x {self.rows} inner corners, the same when turned by half a turn"
+                raise FieldError.of(found, "columns + rows odd, or a charuco board")
+        else:
+            if self.columns < 2 or self.rows < 2:
+                raise ValueError("a board needs at least 2 x 2 inner corners")
+            if not self.charuco.marker_mm < self.square_mm:
+                expected = f"less than square_mm, {self.square_mm:g} mm"
+                raise FieldError.of(shown(self.charuco.marker_mm), expected, "charuco", "marker_mm")
+            if self.markers > DICTIONARY_SIZES.get(self.charuco.dictionary, 1_000_000):
+                expected = f"one of at least {self.markers} markers, as the board has"
+                raise FieldError.of(self.charuco.dictionary, expected, "charuco", "dictionary")
+
+    @property
+    def markers(self) -> int:
+        """Of a ChArUco board of (columns + 1) x (rows + 1) squares: one on every white square."""
+        return (self.columns + 1) * (self.rows + 1) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """Standard deviations to assume where an observation brings no covariance of its own (session-format)."""
+
+    marker_translation_mm: Annotated[
+        tuple[float, float, float], Key("along the camera's x, y, z", NumberTuple(3, NOISE_MM))
+    ] = (0.1, 0.1, 0.8)
+    marker_rotation_rad: Annotated[
+        tuple[float, float, float],
+        Key(
+            "about axes parallel to the camera's, through the marker's origin",
+            NumberTuple(3, Number(0.0, math.pi, unit="rad")),
+        ),
+    ] = (0.01, 0.01, 0.01)
+    marker_bias_mm: Annotated[
+        float, Key("per camera axis: one unknown offset of all marker poses of the session", NOISE_MM)
+    ] = 0.0
+    aim_mm: Annotated[
+        tuple[float, float, float],
+        Key(
+            "beam against spot: board axes for a `corner`, camera axes for `camera_p_spot_mm`", NumberTuple(3, NOISE_MM)
+        ),
+    ] = (1.0, 1.0, 0.1)
+    lateral_mm: Annotated[float, Key("x of a PM", NOISE_MM)] = 0.3
+    range_mm: Annotated[float, Key("its range", NOISE_MM)] = 0.2
+    scan_rad: Annotated[float, Key("reading of the stage", Number(0.0, 180.0, unit="deg", degrees=True))] = (
+        math.radians(0.1)
+    )
+
+
+def default_targets_mm(radius_mm: float) -> FloatArray:
+    """(27, 3) TRUS points: x -20, 0, 20; stage angle -30, 0, 30 deg; 22, 32, 42 mm beyond the probe's radius."""
+    return as_float_array(
+        [
+            [x, (radius_mm + depth) * math.sin(a), (radius_mm + depth) * math.cos(a)]
+            for x in (-20.0, 0.0, 20.0)
+            for a in (math.radians(-30.0), 0.0, math.radians(30.0))
+            for depth in (22.0, 32.0, 42.0)
+        ]
+    )
+
+
+def _check_name(name: str) -> None:
+    if not re.fullmatch(r"\S(.{0,198}\S)?", name) or not name.isprintable():
+        raise FieldError.of(shown(name), "a name of at most 200 printable characters")
+
+
+NAME = Text(check=_check_name)
+"""A session's name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionModel:
+    """How a session was set up: everything ``session.yaml`` says; ``targets_mm`` (n, 3)."""
+
+    name: Annotated[str, Key("of the session", NAME, default="the folder's")]
+    probe: Annotated[ProbeModel, Key("the TRUS probe")]
+    stage: Annotated[StageModel, Key("the stage that turns it")]
+    camera: Annotated[StereoRig | None, Key("the endoscope", STEREO_RIG)] = None
+    marker: Annotated[MarkerModel | None, Key("the fibre's fiducial")] = None
+    board: Annotated[BoardModel | None, Key("the calibration board")] = None
+    noise: Annotated[
+        NoiseModel, Key("standard deviations where an observation brings no covariance", default="those below")
+    ] = field(default_factory=NoiseModel)
+    initial_trus_T_camera: Annotated[
+        FloatArray | None, Key("a guess of the registration", Transform(), name="initial.trus_T_camera")
+    ] = None
+    initial_marker_T_laser: Annotated[
+        FloatArray | None, Key("a guess of the beam on the marker", Transform(), name="initial.marker_T_laser")
+    ] = None
+    targets_mm: Annotated[
+        FloatArray,
+        Key(
+            "TRUS points at which the error matters",
+            Points(POINT_MM),
+            default="27 points: x -20, 0, 20; stage angle -30, 0, 30 deg; 22, 32, 42 mm beyond the probe's radius",
+        ),
+    ] = field(default_factory=lambda: as_float_array(np.zeros((0, 3))))
+
+    def __post_init__(self) -> None:
+        if not len(self.targets_mm):
+            object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
+
+
+SESSION = record(SessionModel, ("format", SESSION_FORMAT))
+"""``session.yaml``."""

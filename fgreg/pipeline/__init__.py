@@ -1,0 +1,1 @@
+"""Recorded sessions, solved as a whole or replayed event by event."""

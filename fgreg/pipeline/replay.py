@@ -1,0 +1,326 @@
+"""A recorded session through the online engine, event by event, as it would have gone: the steps of ``fgreg replay``.
+
+read the session -> recognise its frames -> each event into the engine in its turn, tracking queries answered from what
+was known then -> judge all of it -> write the result, with how long things took (and the recording).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from fgreg.detection.events_to_measurements import Recognised, recognise
+from fgreg.errors import EventRefused, InputError
+from fgreg.model.estimate import Quantiles, Timing, TrackEstimate, Verdict
+from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent, TrackEvent, refused_lines
+from fgreg.model.measurements import Aim, Pair, Track
+from fgreg.model.solve_config import SolveConfig
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.live_session import Engine, EpochFeed, MakeEngine, online_engine
+from fgreg.online.recorded_moves import EpochsFound
+from fgreg.pipeline.solve import (
+    RESULT_FILE,
+    Progress,
+    SolveReport,
+    detection_conditions,
+    errors_where_known,
+    move_conditions,
+    remove_older_result,
+    session_estimate,
+    show_frames,
+    sound_speed_prior,
+)
+from fgreg.registration.solve import solve
+from fgreg.session.result_file import write_result
+from fgreg.session.session_reader import Session, read_ground_truth, read_session
+from fgreg.version import __version__
+from fgreg.viewer.null_viewer import NullViewer, open_viewer
+from fgreg.viewer.recording import Moment, Viewer
+from fgreg.viewer.spawn import spawn_viewer
+
+Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRequest:
+    """What to do.
+
+    Attributes:
+        folder: the session. out: where the result goes; ``result.yaml`` in the session's folder where None.
+        rrd: the recording to write, if any. live: show it in a viewer of its own while it grows.
+        speed: session seconds per second; None: as fast as it goes.
+        redetect: look at frames even where poses are recorded.
+    """
+
+    folder: Path
+    out: Path | None = None
+    rrd: Path | None = None
+    live: bool = False
+    speed: float | None = None
+    redetect: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayStep:
+    """One event that was replayed.
+
+    Attributes:
+        event: as recorded. done, total: its number among those to replay, from 1, and how many there are.
+        estimate: known after it; None before anything is. answer: to a track.
+        refused: why it was not taken in; empty where it was.
+        elapsed_ms: what the engine took for it; None where it did not get that far.
+        noticed: whether the engine found out here by itself that the camera had moved.
+    """
+
+    event: Shown
+    done: int
+    total: int
+    estimate: OnlineEstimate | None
+    answer: TrackEstimate | None
+    refused: str
+    elapsed_ms: float | None
+    noticed: bool = False
+
+
+OnStep = Callable[[ReplayStep], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayReport:
+    """All that came of a replay: what a solve reports, and what the engine said at its end."""
+
+    solved: SolveReport
+    settled: OnlineEstimate | None
+
+
+def replay_session(
+    request: ReplayRequest,
+    config: SolveConfig | None = None,
+    progress: Progress | None = None,
+    on_step: OnStep | None = None,
+    make_engine: MakeEngine | None = None,
+) -> ReplayReport:
+    """Replay a recorded session.
+
+    Args:
+        request: what to do.
+        config: of the estimate.
+        progress: called as frames are looked at.
+        on_step: called after each event.
+        make_engine: the online engine where not the package's own.
+
+    Raises:
+        InputError: bad input; no result is left behind, not even an older one.
+        ViewerError: there is no viewer to show it in.
+    """
+    start = time.perf_counter()
+    config = config or SolveConfig()
+    result_path = request.folder / RESULT_FILE if request.out is None else request.out
+    if request.rrd is not None and request.rrd.resolve() == result_path.resolve():
+        raise InputError("--rrd", f"{request.rrd}, where the result goes", "a file of its own")
+    if request.speed is not None and not 0 < request.speed < float("inf"):
+        raise InputError("--speed", str(request.speed), "1, 10 or another number > 0, or max")
+    remove_older_result(request.folder, result_path)
+    session = read_session(request.folder)
+    truth = read_ground_truth(request.folder)
+    url = spawn_viewer() if request.live else None
+    with open_viewer(request.rrd, session.model.name, url) as viewer:
+        viewer.session(session.model)
+        recognised = recognise(
+            session.events,
+            session.model,
+            redetect=request.redetect,
+            progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
+        )
+        prior = sound_speed_prior(recognised, config)
+        # Moves that were detected when the session was recorded are events: they are taken as they were found then.
+        recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
+        engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config, prior)
+        player = _Player(session, recognised, engine, viewer, request.speed)
+        player.play(on_step)
+        taken, found = player.taken(), player.found()
+        solution = solve(
+            taken.measurements,
+            (),
+            session.model,
+            config,
+            [*move_conditions(found), *detection_conditions(recognised, config)],
+            prior,
+        )
+        settled = engine.settle() if player.estimate is not None else None
+        estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())
+        estimate = replace(estimate, tracks=player.answers(estimate.tracks))
+        errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
+        viewer.result(session.model, taken.measurements, estimate, truth, recognised.tracks)
+        write_result(estimate, session.model, result_path, __version__)
+    elapsed = time.perf_counter() - start
+    solved = SolveReport(session, taken, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
+    return ReplayReport(solved, settled)
+
+
+class _Player:
+    """Gives a session's events to an engine in their turn."""
+
+    def __init__(
+        self,
+        session: Session,
+        recognised: Recognised,
+        engine: Engine,
+        viewer: Viewer | NullViewer,
+        speed: float | None,
+    ) -> None:
+        self._session, self._recognised, self._engine = session, recognised, engine
+        self._viewer, self._speed, self._feed = viewer, speed, EpochFeed(engine)
+        self._measured: dict[int, Aim | Pair | Track] = {
+            **dict(zip(recognised.aim_events, recognised.measurements.aims, strict=True)),
+            **dict(zip(recognised.pair_events, recognised.measurements.pairs, strict=True)),
+            **dict(zip(recognised.track_events, recognised.tracks, strict=True)),
+        }
+        self._unused = dict(recognised.unused)
+        self._add_ms: list[float] = []
+        self._track_ms: list[float] = []
+        self._answers: dict[int, TrackEstimate] = {}
+        self.estimate: OnlineEstimate | None = None
+
+    def play(self, on_step: OnStep | None) -> None:
+        """All events, each at its time where there is a speed."""
+        refused = refused_lines(self._session.events)
+        shown = [
+            (index, event)
+            for index, event in enumerate(self._session.events)
+            if isinstance(event, Shown) and event.line not in refused
+        ]
+        began, shot = time.monotonic(), 0
+        for done, (index, event) in enumerate(shown, 1):
+            if self._speed is not None:
+                wait = began + (event.t - shown[0][1].t) / self._speed - time.monotonic()
+                time.sleep(max(0.0, wait))
+            step = replace(self._take(index, event), done=done, total=len(shown))
+            if not isinstance(event, CameraMovedEvent):
+                show_frames(self._viewer, self._session, self._recognised, index, event, shot)
+            self._show(index, event, shot, step)
+            shot += not isinstance(event, CameraMovedEvent)
+            if on_step is not None:
+                on_step(step)
+
+    def _take(self, index: int, event: Shown) -> ReplayStep:
+        measured = self._measured.get(index)
+        refused, elapsed_ms, answer, noticed = self._unused.get(index, ""), None, None, False
+        start = time.perf_counter()
+        if isinstance(measured, Track):
+            answer = replace(self._engine.track(replace(measured, epoch=self._feed.epoch)), causal=True)
+            elapsed_ms = 1e3 * (time.perf_counter() - start)
+            self._track_ms.append(elapsed_ms)
+            self._answers[index] = answer
+        elif measured is not None or isinstance(event, CameraMovedEvent):
+            before = self._feed.noticed
+            try:
+                estimate = self._feed.add(event if isinstance(event, CameraMovedEvent) else _shot(measured))
+                elapsed_ms = 1e3 * (time.perf_counter() - start)
+                self._add_ms.append(elapsed_ms)
+                self.estimate = estimate or self.estimate
+                noticed = self._feed.noticed > before
+            except EventRefused as error:
+                refused = self._unused[index] = error.reason
+        return ReplayStep(event, 0, 0, self.estimate, answer, refused, elapsed_ms, noticed)
+
+    def _show(self, index: int, event: Shown, shot: int, step: ReplayStep) -> None:
+        if isinstance(self._viewer, NullViewer):
+            return
+        known = self.estimate
+        self._viewer.moment(
+            Moment(
+                t=event.t,
+                number=shot,
+                shot=self._measured.get(index) if not step.refused else None,
+                note=describe(step),
+                trus_T_camera=None if known is None else known.trus_T_camera,
+                covariance=None if known is None else known.covariance,
+                marker_T_laser=self._engine.marker_T_laser(),
+                tre=None if known is None else known.predicted_tre,
+                verdict=Verdict.REFUSED if known is None else known.verdict,
+                reasons=() if known is None else known.reasons,
+                pairs=0 if known is None else known.pairs,
+                nis=known.nis if known is not None and isinstance(event, PairEvent) else None,
+                used=known is not None and known.used,
+                answer=step.answer,
+            )
+        )
+
+    def taken(self) -> Recognised:
+        """What the engine took in: its measurements, the events behind them, and why others are not among them."""
+        recognised, measurements = self._recognised, self._engine.measurements()
+        epoch_of = recognised.epoch_of
+        if self._engine.moves:
+            began = [start.t for start in measurements.epochs[1:]]
+            epoch_of = tuple(sum(t <= event.t for t in began) for event in self._session.events)
+        return replace(
+            recognised,
+            measurements=measurements,
+            epoch_of=epoch_of,
+            aim_events=tuple(i for i in recognised.aim_events if i not in self._unused),
+            pair_events=tuple(i for i in recognised.pair_events if i not in self._unused),
+            tracks=(),
+            unused=self._unused,
+        )
+
+    def found(self) -> EpochsFound:
+        """What the engine found out and the session does not tell."""
+        told = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
+        moves = tuple(move for move in self._engine.moves if move.since_t not in told)
+        return EpochsFound(moves, self._engine.returns)
+
+    def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
+        """One per track event, in order; ``unanswered`` has the reasons of those that were not put to the engine."""
+        places = [i for i, event in enumerate(self._session.events) if isinstance(event, TrackEvent)]
+        return tuple(
+            self._answers.get(place, replace(none, causal=True)) for place, none in zip(places, unanswered, strict=True)
+        )
+
+    def timing(self) -> Timing:
+        return Timing(quantiles(self._add_ms), quantiles(self._track_ms))
+
+
+def _shot(measured: Aim | Pair | Track | None) -> Aim | Pair:
+    if not isinstance(measured, Aim | Pair):
+        raise AssertionError("neither an aim nor a pair")
+    return measured
+
+
+def quantiles(elapsed_ms: Sequence[float]) -> Quantiles | None:
+    """Median, 99 % quantile and maximum; None of nothing."""
+    if not elapsed_ms:
+        return None
+    p50, p99 = (float(value) for value in np.quantile(elapsed_ms, (0.5, 0.99)))
+    return Quantiles(p50, p99, max(elapsed_ms))
+
+
+def left_out(known: OnlineEstimate | None) -> bool:
+    """Whether the pair just added does not fit; before there is a registration none does or does not."""
+    return known is not None and known.trus_T_camera is not None and not known.used
+
+
+def describe(step: ReplayStep) -> str:
+    """What the event was, in a few words."""
+    event = step.event
+    match event:
+        case AimEvent():
+            what = "aim"
+        case PairEvent():
+            what = f"pair, PM {event.pm}"
+        case TrackEvent():
+            what = "track"
+        case CameraMovedEvent():
+            what = "camera moved" + (" (found out)" if event.detected else "")
+    if step.refused:
+        what += f", not used: {step.refused}"
+    elif isinstance(event, PairEvent) and left_out(step.estimate):
+        what += ", not used"
+    if step.answer is not None and step.answer.stage_rad is None:
+        what += f", no answer: {step.answer.reason}"
+    return what

@@ -1,0 +1,340 @@
+"""A recorded session, from its folder to its result: the steps of ``fgreg solve`` on one page.
+
+read the session -> recognise marker, board and PM in the frames -> calibrate and register in one graph -> judge
+-> answer the tracking queries -> write the result (and the recording).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fgreg.detection.camera import project
+from fgreg.detection.events_to_measurements import Recognised, recognise
+from fgreg.detection.results import MarkerFit, NoSignal, PaFind, pool_sound_speed_ratio
+from fgreg.errors import InputError
+from fgreg.geometry.target_error import beam_error, tre_mm
+from fgreg.geometry.transforms import FloatArray, transform_points
+from fgreg.model.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
+from fgreg.model.events import AimEvent, Event, PairEvent, TrackEvent, looks_of
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.register import SoundSpeedPrior
+from fgreg.registration.solve import Solution, solve
+from fgreg.registration.verdict import Condition
+from fgreg.session.ground_truth import GroundTruth
+from fgreg.session.result_file import remove_result, write_result
+from fgreg.session.session_reader import Session, read_ground_truth, read_session
+from fgreg.version import __version__
+from fgreg.viewer.null_viewer import NullViewer, open_viewer
+
+if TYPE_CHECKING:
+    from fgreg.online.recorded_moves import DetectedMove, EpochsFound
+    from fgreg.viewer.recording import Viewer
+    from fgreg.viewer.scene import ShotKind
+
+RESULT_FILE = "result.yaml"
+SOUND_SPEED_TOLERANCE = 0.005
+"""Deviations of the sound speed ratio below this cost less than the noise does, however well they are known."""
+TOO_FEW_AIMS = 0.5
+"""Share of aims that have to be usable."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with the step's name, items done and items in all."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolveRequest:
+    """What to do.
+
+    Attributes:
+        folder: the session. out: where the result goes; ``result.yaml`` in the session's folder where None.
+        rrd: the recording to write, if any. redetect: look at frames even where poses are recorded.
+        detect_moves: look for camera moves that nobody told, and solve what lies between as epochs.
+    """
+
+    folder: Path
+    out: Path | None = None
+    rrd: Path | None = None
+    redetect: bool = False
+    detect_moves: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthErrors:
+    """Errors against the ground truth.
+
+    Attributes:
+        tre_mm: per epoch, distances (n,) at the targets; None where there is no registration or no truth.
+        beam_angle_rad, beam_offset_mm: angle between the beams; distance of the true beam's origin from the beam.
+        track_rad: per track, estimated less true stage angle, None where unanswered.
+    """
+
+    tre_mm: tuple[FloatArray | None, ...]
+    beam_angle_rad: float | None
+    beam_offset_mm: float | None
+    track_rad: tuple[float | None, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolveReport:
+    """All that came of a solve, for reports and programs."""
+
+    session: Session
+    recognised: Recognised
+    solution: Solution
+    estimate: SessionEstimate
+    truth: GroundTruth | None
+    errors: TruthErrors | None
+    result_path: Path
+    rrd_path: Path | None
+    elapsed_s: float
+
+
+def solve_session(
+    request: SolveRequest, config: SolveConfig | None = None, progress: Progress | None = None
+) -> SolveReport:
+    """Solve a recorded session.
+
+    Raises:
+        InputError: bad input; no result is left behind, not even an older one.
+    """
+    start = time.perf_counter()
+    config = config or SolveConfig()
+    result_path = request.folder / RESULT_FILE if request.out is None else request.out
+    if request.rrd is not None and request.rrd.resolve() == result_path.resolve():
+        raise InputError("--rrd", f"{request.rrd}, where the result goes", "a file of its own")
+    remove_older_result(request.folder, result_path)
+    session = read_session(request.folder)
+    truth = read_ground_truth(request.folder)
+    with open_viewer(request.rrd, session.model.name) as viewer:
+        recognised = recognise(
+            session.events,
+            session.model,
+            redetect=request.redetect,
+            progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
+        )
+        prior = sound_speed_prior(recognised, config)
+        moves: tuple[DetectedMove, ...] = ()
+        conditions = detection_conditions(recognised, config)
+        if request.detect_moves:
+            from fgreg.online.recorded_moves import find_epochs  # loads the online engine
+
+            found = find_epochs(recognised.measurements, session.model, config, prior)
+            recognised, moves = with_moves(recognised, found), found.moves
+            conditions = [*move_conditions(found), *conditions]
+        solution = solve(
+            recognised.measurements,
+            recognised.tracks,
+            session.model,
+            config,
+            conditions,
+            prior,
+        )
+        estimate = session_estimate(session, recognised, solution)
+        errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
+        show(viewer, session, recognised, estimate, truth)
+        write_result(estimate, session.model, result_path, __version__)
+    elapsed = time.perf_counter() - start
+    return SolveReport(session, recognised, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
+
+
+def remove_older_result(folder: Path, result_path: Path) -> None:
+    """Remove an older result before work starts, so that a failure never leaves one that looks current.
+
+    Raises:
+        InputError: the session's folder is not there, or the result's place cannot be written to.
+    """
+    if not folder.is_dir():
+        raise InputError(str(folder), "a file" if folder.exists() else "nothing", "a session's folder")
+    remove_result(result_path)
+
+
+def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
+    """The session's events with camera moves in place that were found out: epochs of pairs and tracks follow."""
+    from fgreg.online.recorded_moves import renumbered, split_epochs
+
+    if not found.texts:
+        return recognised
+    epoch_of = renumbered(recognised.epoch_of, recognised.pair_events, found.moves)
+    tracks = zip(recognised.track_events, recognised.tracks, strict=True)
+    return replace(
+        recognised,
+        measurements=split_epochs(recognised.measurements, found.moves, found.returns),
+        tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
+        epoch_of=epoch_of,
+    )
+
+
+def move_conditions(found: EpochsFound) -> list[Condition]:
+    """What moves that were found out mean for the verdict."""
+    return [Condition(Verdict.WARNING, text) for text in found.texts]
+
+
+def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:
+    """What the wavefronts say of the sound speed, weighed with the configuration's prior; None without wavefronts."""
+    pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
+    if pooled is None:
+        return None
+    ratio, sigma = pooled
+    by_frames, by_prior = sigma**-2, config.sound_speed_sigma**-2
+    mean = (ratio * by_frames + by_prior) / (by_frames + by_prior)
+    return SoundSpeedPrior(mean, (by_frames + by_prior) ** -0.5)
+
+
+def detection_conditions(recognised: Recognised, config: SolveConfig) -> list[Condition]:
+    """What the frames say against the session: wrong sound speed (unless estimated), calibration shots lost."""
+    found = []
+    pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
+    if pooled is not None and not config.estimate_sound_speed:
+        ratio, sigma = pooled
+        if abs(ratio - 1.0) > max(3.0 * sigma, SOUND_SPEED_TOLERANCE):
+            text = (
+                f"the wavefronts say that sound travels at {ratio:.4f} +- {sigma:.4f} of probe.sound_speed_m_s: "
+                "correct it in session.yaml (ranges given as numbers have to be computed anew)"
+            )
+            found.append(Condition(Verdict.WARNING, text))
+    lost_aims, used = recognised.unused_aims, len(recognised.measurements.aims)
+    if lost_aims and len(lost_aims) >= TOO_FEW_AIMS * (used + len(lost_aims)):
+        text = (
+            f"{len(lost_aims)} of {used + len(lost_aims)} aims could not be used ({recognised.unused[lost_aims[0]]}): "
+            "take them again with marker and board in both views"
+        )
+        found.append(Condition(Verdict.WARNING, text))
+    return found
+
+
+def session_estimate(session: Session, recognised: Recognised, solution: Solution) -> SessionEstimate:
+    """The solution with every shot of the session in it, in event order: those left out carry their reason."""
+    pairs = dict(zip(recognised.pair_events, solution.pairs, strict=True))
+    tracks = dict(zip(recognised.track_events, solution.tracks, strict=True))
+    aims = dict(zip(recognised.aim_events, solution.aims, strict=True))
+    for index, event in enumerate(session.events):
+        reason = recognised.unused.get(index, "")
+        if isinstance(event, PairEvent) and index not in pairs:
+            pairs[index] = PairEstimate(event.t, event.pm, recognised.epoch_of[index], used=False, reason=reason)
+        elif isinstance(event, TrackEvent) and index not in tracks:
+            tracks[index] = TrackEstimate(event.t, None, None, None, causal=False, reason=reason)
+        elif isinstance(event, AimEvent) and index not in aims:
+            aims[index] = AimEstimate(event.t, used=False, reason=reason)
+    return replace(
+        solution.as_session(session.model.name),
+        pairs=tuple(pairs[i] for i in sorted(pairs)),
+        tracks=tuple(tracks[i] for i in sorted(tracks)),
+        aims=tuple(aims[i] for i in sorted(aims)),
+    )
+
+
+def errors_where_known(
+    estimate: SessionEstimate, truth: GroundTruth | None, moves: Sequence[DetectedMove], targets_mm: FloatArray
+) -> TruthErrors | None:
+    """:func:`truth_errors`; None without a truth, or where moves that were found make other epochs than it has."""
+    if truth is None or (moves and len(truth.trus_T_camera) != len(estimate.epochs)):
+        return None
+    return truth_errors(estimate, truth, targets_mm)
+
+
+def truth_errors(estimate: SessionEstimate, truth: GroundTruth, targets_mm: FloatArray) -> TruthErrors:
+    """Errors of an estimate against the session's ground truth."""
+    tre: list[FloatArray | None] = []
+    for epoch in estimate.epochs:
+        if epoch.trus_T_camera is None or epoch.index >= len(truth.trus_T_camera):
+            tre.append(None)
+            continue
+        tre.append(tre_mm(epoch.trus_T_camera, truth.trus_T_camera[epoch.index], targets_mm))
+    angle = offset = None
+    if estimate.laser is not None and truth.marker_T_laser is not None:
+        angle, offset = beam_error(estimate.laser.marker_T_laser, truth.marker_T_laser)
+    stage = {round(track.t, 6): track.stage_rad for track in truth.tracks}
+    track_rad = tuple(
+        None
+        if track.stage_rad is None or round(track.t, 6) not in stage
+        else float(np.mod(track.stage_rad - stage[round(track.t, 6)] + np.pi, 2 * np.pi) - np.pi)
+        for track in estimate.tracks
+    )
+    return TruthErrors(tuple(tre), angle, offset, track_rad)
+
+
+def show(
+    viewer: Viewer | NullViewer,
+    session: Session,
+    recognised: Recognised,
+    estimate: SessionEstimate,
+    truth: GroundTruth | None,
+) -> None:
+    """Everything into the recording: frames with what was found in them, then the result."""
+    if isinstance(viewer, NullViewer):
+        return  # spares reading the frames again
+    model = session.model
+    viewer.session(model)
+    shot = 0
+    for index, event in enumerate(session.events):
+        if isinstance(event, AimEvent | PairEvent | TrackEvent):
+            show_frames(viewer, session, recognised, index, event, shot)
+            shot += 1
+    viewer.result(model, recognised.measurements, estimate, truth, recognised.tracks)
+
+
+def show_frames(
+    viewer: Viewer | NullViewer,
+    session: Session,
+    recognised: Recognised,
+    index: int,
+    event: AimEvent | PairEvent | TrackEvent,
+    shot: int,
+) -> None:
+    """The frames of one event with what was found in them; ``shot`` is its number among aims, pairs and tracks."""
+    if isinstance(viewer, NullViewer):
+        return  # spares reading the frames again
+    from fgreg.detection.event_frames import load_trus_frame, marker_pictures
+
+    model = session.model
+    kind: ShotKind = "aim" if isinstance(event, AimEvent) else "pair" if isinstance(event, PairEvent) else "track"
+    if event.marker.left is not None and model.camera is not None:
+        left, right = marker_pictures(event.marker, event.line, model.camera)
+        viewer.shot_images(
+            event.t,
+            kind,
+            shot,
+            left,
+            right,
+            _outlines(recognised, index, model),
+            _corner(recognised, index, event, model),
+        )
+    for number, look in enumerate(looks_of(event)):
+        if look.frame is None:
+            continue
+        frame = load_trus_frame(look.frame, event.line, "trus.frame", model)
+        find = recognised.finds.get((index, number), NoSignal(""))
+        heard = find if isinstance(find, PaFind) else None
+        viewer.pa_frame(
+            event.t,
+            shot,
+            frame,
+            heard.x_mm if heard else look.x_mm,
+            heard.range_mm if heard else look.range_mm,
+            heard.covariance if heard else look.covariance,
+            model.probe,
+        )
+
+
+def _outlines(recognised: Recognised, index: int, model: SessionModel) -> list[FloatArray] | None:
+    """The tags' outlines in the left image as the fitted pose has them."""
+    fit = recognised.markers.get(index)
+    if not isinstance(fit, MarkerFit) or model.marker is None or model.camera is None:
+        return None
+    left = model.camera.left
+    return [project(left, transform_points(fit.camera_T_marker, tag.marker_p_corners_mm)) for tag in model.marker.tags]
+
+
+def _corner(recognised: Recognised, index: int, event: Event, model: SessionModel) -> FloatArray | None:
+    """The aimed-at spot in the left image."""
+    if not isinstance(event, AimEvent) or index not in recognised.aim_events or model.camera is None:
+        return None
+    aim = recognised.measurements.aims[recognised.aim_events.index(index)]
+    return np.asarray(project(model.camera.left, aim.camera_p_spot_mm[None])[0])

@@ -1,0 +1,43 @@
+"""Camera epochs by the measured motions between them: which can be solved, which hang together, some of them alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fgreg.model.measurements import EpochStart, Measurements
+from fgreg.registration.multistart import EpochSearch
+
+
+def solvable_epochs(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
+    """Epochs with minima of their own or tied to such a one by measured camera motions."""
+    known = {k for k, search in enumerate(searches) if search.minima}
+    tied = {k: epoch.old(k) for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
+    for _ in range(len(searches)):
+        known |= {k for k, old in tied.items() if old in known} | {old for k, old in tied.items() if k in known}
+    return sorted(known)
+
+
+def epoch_chains(measurements: Measurements, solvable: list[int]) -> list[list[int]]:
+    """Solvable epochs, grouped by the measured motions between them."""
+    out: list[list[int]] = []
+    for k in solvable:
+        start = measurements.epochs[k]
+        chain = next((chain for chain in out if start.motion_known and start.old(k) in chain), None)
+        if chain is not None:
+            chain.append(k)
+        else:
+            out.append([k])
+    return out
+
+
+def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
+    """The measurements of some epochs only, renumbered in order; a motion is kept where both its sides are."""
+    place = {k: i for i, k in enumerate(epochs)}
+    starts = tuple(
+        replace(start, after=place[start.old(k)] if start.after is not None else None)
+        if start.old(k) in place
+        else EpochStart(start.t)
+        for k, start in ((k, measurements.epochs[k]) for k in epochs)
+    )
+    pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
+    return Measurements(measurements.aims, pairs, starts)

@@ -1,0 +1,447 @@
+"""Where the next shot helps most: candidate beams and spots, ranked by the drop of the predicted target error.
+
+Candidates: spots on the tissue that the PMs so far trace, each hit from directions about the mean beam. What a
+candidate would tell is known before it is taken: a noise-free virtual pair, built at the estimate, adds its Hessian A
+to the information H of the shared variables, and the covariance there would be is (H + A)^-1.
+
+While two registrations cannot be told apart that is not all: a shot also separates them. A virtual pair that the better
+one explains costs the other D chi square (at its own best), and the chance of ending with the wrong one is at most
+sqrt(p q) exp(-D / 8) (Chernoff), p and q their posterior weights. What is ranked is the expected squared error with
+both in it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.errors import EstimationError
+from fgreg.geometry.target_error import expected_tre_mm, target_jacobians
+from fgreg.geometry.transforms import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    as_float_array,
+    inverse,
+    make_transform,
+    right_from_parent_covariance,
+    rotation_to_direction,
+    transform_points,
+)
+from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import evaluate, pm_contributions, refine
+from fgreg.graph.shared_state import SharedState
+from fgreg.model.measurements import EpochStart, Look, MarkerObservation, Measurements, Pair
+from fgreg.model.session_model import CameraModel, SessionModel
+from fgreg.model.tissue_surface import REACH_MM, TissueSurface, fit_surface
+from fgreg.registration.epochs import restrict_epochs
+from fgreg.registration.register import Minimum, Registration
+
+TILT_RAD = math.radians(25.0)
+TILT_STEPS = 5
+"""Directions lean from the mean beam by up to this to either side, about two axes, in so many steps."""
+SPOT_STEP_MM = 4.0
+MOST_SPOTS = 60
+APART_MM = 8.0
+APART_RAD = math.radians(12.0)
+"""Of advised shots less than both of these apart only the better is listed."""
+IMAGE_MARGIN = 0.04
+"""Share of the image's width that spots and markers keep from its edge."""
+RIVAL_CHI2 = 14.0
+"""Other registrations whose cost is within this of the best are worth separating."""
+FEW_PAIRS = 6
+REFINEMENTS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """n shots that could be taken.
+
+    Attributes:
+        camera_p_spot_mm: (n, 3) where to point. camera_d: (n, 3) unit direction of the beam.
+        camera_T_marker: (n, 4, 4) where the marker would be. trus_p_mm: (n, 3) the PM expected.
+        tilt_rad: (n, 2) lean from the mean beam towards the image's right and its lower edge.
+        scan_rad: (n,) plane angle at which the PM would be heard first. sweep: +1 or -1 (plane), 0 where not swept.
+        pairs: the noise-free virtual pairs, each of a PM of its own.
+    """
+
+    camera_p_spot_mm: FloatArray
+    camera_d: FloatArray
+    camera_T_marker: FloatArray
+    trus_p_mm: FloatArray
+    tilt_rad: FloatArray
+    scan_rad: FloatArray
+    sweep: int
+    pairs: tuple[Pair, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdvisedShot:
+    """One shot worth taking.
+
+    Attributes:
+        candidate: its number among the candidates.
+        camera_p_spot_mm: (3,) where to point the beam. camera_d: (3,) its direction.
+        tilt_right_rad, tilt_down_rad: lean from the mean beam so far, towards the image's right and lower edge.
+        trus_p_mm: (3,) where the PM is expected.
+        device_rad: stage angle at which it would be heard. sweep: +1 or -1, the device's turn to find it with; 0: none.
+        expected_mm: predicted TRE after it (mean over targets of the root of the expected square).
+        separation: chi square by which it would tell the rival registration apart; None without a rival.
+    """
+
+    candidate: int
+    camera_p_spot_mm: FloatArray
+    camera_d: FloatArray
+    tilt_right_rad: float
+    tilt_down_rad: float
+    trus_p_mm: FloatArray
+    device_rad: float
+    sweep: int
+    expected_mm: float
+    separation: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Advice:
+    """Shots, best first.
+
+    Attributes:
+        epoch: of the camera. pairs: PMs taken in it.
+        expected_mm: predicted TRE now (mean over targets of the root of the expected square).
+        shots: distinct ones. candidates: all, as ``order`` (n,) ranks them.
+        notes: what to bear in mind.
+    """
+
+    epoch: int
+    pairs: int
+    expected_mm: float
+    shots: tuple[AdvisedShot, ...]
+    candidates: Candidates
+    order: IntArray
+    notes: tuple[str, ...]
+
+
+def advise(registration: Registration, *, epoch: int | None = None, count: int = 5) -> Advice:
+    """Rank what could be shot next.
+
+    Args:
+        registration: of the session so far.
+        epoch: the session's camera epoch to advise on; the last that has a registration where None.
+        count: how many shots to list.
+
+    Raises:
+        EstimationError: the epoch has no registration, or there is nothing that could be shot.
+    """
+    model = registration.model
+    epoch = registration.epochs[-1] if epoch is None else epoch
+    if epoch not in registration.epochs:
+        raise EstimationError(f"camera epoch {epoch} has no registration to advise on")
+    place = registration.epochs.index(epoch)
+    mine = [pair for pair in registration.measurements.pairs if pair.epoch == place]
+    if not mine:
+        raise EstimationError(f"camera epoch {epoch} has no pairs of its own to advise on")
+    found = propose(registration, place)
+    state = registration.optimum.state
+    transform = state.trus_T_camera(place)[0]
+    block = slice(6 * place, 6 * place + 6)
+    problem = pack(Measurements((), found.pairs, registration.measurements.epochs), model)
+    added = _contributions(problem, state, found.trus_p_mm)[2]
+    after = np.linalg.inv(registration.optimum.evaluation.hessian[0] + added)[:, block, block]
+    expected = expected_tre_mm(after, transform, model.targets_mm).mean(axis=-1)
+    jacobian = target_jacobians(transform, model.targets_mm)
+    square = np.einsum("nij,sjk,nik->s", jacobian, after, jacobian) / len(model.targets_mm)
+    separation = _separate(registration, epoch, found)
+    risk = square
+    if separation is not None:
+        wrong = np.sqrt(separation.weight * (1.0 - separation.weight)) * np.exp(-separation.chi2 / 8.0)
+        risk = square + wrong * separation.distance2_mm2
+    order = np.argsort(risk, kind="stable")
+    before = float(expected_tre_mm(registration.covariance[block, block], transform, model.targets_mm).mean())
+    shots = tuple(
+        AdvisedShot(
+            candidate=int(i),
+            camera_p_spot_mm=found.camera_p_spot_mm[i],
+            camera_d=found.camera_d[i],
+            tilt_right_rad=float(found.tilt_rad[i, 0]),
+            tilt_down_rad=float(found.tilt_rad[i, 1]),
+            trus_p_mm=found.trus_p_mm[i],
+            device_rad=model.stage.device_from_scan(float(found.scan_rad[i])),
+            sweep=model.stage.direction * found.sweep,
+            expected_mm=float(expected[i]),
+            separation=None if separation is None else float(separation.chi2[i]),
+        )
+        for i in _distinct(found, order, count)
+    )
+    pms = len({pair.pm for pair in mine})
+    return Advice(epoch, pms, before, shots, found, np.asarray(order), _notes(pms, separation, found))
+
+
+def _notes(pms: int, separation: _Separation | None, found: Candidates) -> tuple[str, ...]:
+    notes = []
+    if separation is not None and separation.weight > 0.01:
+        notes.append(
+            f"another registration explains the {pms} pairs nearly as well ({separation.gap:.1f} chi square apart, "
+            f"{math.sqrt(separation.distance2_mm2):.0f} mm at the targets): shots that tell them apart come first"
+        )
+    elif pms < FEW_PAIRS:
+        notes.append(
+            f"{pms} pairs are few: the registration may be a wrong one, and with it the figures here; take "
+            f"{FEW_PAIRS - pms} more before trusting it"
+        )
+    if found.sweep:
+        notes.append("sweep the stage from the side given: sweeps from both sides make the window's edge known")
+    return tuple(notes)
+
+
+def _distinct(found: Candidates, order: IntArray, count: int) -> list[int]:
+    """The best candidates, none close to a better one in both spot and direction."""
+    chosen: list[int] = []
+    for index in order:
+        i = int(index)
+        near = [
+            np.linalg.norm(found.camera_p_spot_mm[i] - found.camera_p_spot_mm[j]) < APART_MM
+            and float(found.camera_d[i] @ found.camera_d[j]) > math.cos(APART_RAD)
+            for j in chosen
+        ]
+        if not any(near):
+            chosen.append(i)
+        if len(chosen) == count:
+            break
+    return chosen
+
+
+# ---- candidates ----
+
+
+def propose(registration: Registration, place: int) -> Candidates:
+    """All shots worth considering in one of the solved epochs (its place among them).
+
+    Raises:
+        EstimationError: none is within the probe's, the stage's and the camera's reach.
+    """
+    model, problem = registration.model, registration.problem
+    state, at = registration.optimum.state, registration.optimum.evaluation
+    transform = state.trus_T_camera(place)[0]
+    beams = np.flatnonzero(problem.beam_epoch == place)
+    looks = np.flatnonzero(problem.beam_epoch[problem.look_beam] == place)
+    camera_d = problem.beams.rotation[beams] @ state.beam_direction()[0]
+    trus_p = at.private.trus_p_pm[0, np.unique(problem.beam_pm[beams])]
+    spots = _spots(registration, place, trus_p, camera_d @ transform[:3, :3].T)
+    directions, tilts = _directions(camera_d)
+    trus_p_spot = np.repeat(spots, len(directions), axis=0)
+    d = np.tile(directions, (len(spots), 1))
+    camera_p = transform_points(inverse(transform), trus_p_spot)
+    # Each is held as the shot so far whose beam is nearest to it, turned by the least that makes up the difference.
+    nearest = beams[np.argmax(d @ camera_d.T, axis=1)]
+    turned = np.stack(
+        [
+            rotation_to_direction(new) @ rotation_to_direction(old).T @ problem.beams.rotation[beam]
+            for new, old, beam in zip(d, camera_d[np.searchsorted(beams, nearest)], nearest, strict=True)
+        ]
+    )
+    lambda_mm = float(np.median(at.lambda_mm[0, beams]))
+    on_beam = state.beam_origin()[0] + lambda_mm * state.beam_direction()[0]
+    camera_T_marker = make_transform(turned, camera_p - turned @ on_beam + state.bias_mm[0])
+    sweep = _sweep_side(registration, place)
+    scan = np.array([_heard_at(p, sweep, model) for p in trus_p_spot])
+    low, high = sorted(model.stage.scan_from_device(limit) for limit in model.stage.limits_device_rad)
+    aperture = model.probe.element_x_mm
+    keep = (scan >= low) & (scan <= high) & (trus_p_spot[:, 0] > aperture.min()) & (trus_p_spot[:, 0] < aperture.max())
+    if model.camera is not None:
+        keep &= _in_view(model.camera.left, camera_p) & _in_view(model.camera.left, camera_T_marker[:, :3, 3])
+    index = np.flatnonzero(keep)
+    if index.size == 0:
+        raise EstimationError("no spot within the reach of probe, stage and camera is left to advise on")
+    marker_covariance = problem.beams.covariance[beams].mean(axis=0)
+    look_covariance = np.linalg.inv(problem.looks.weight[looks][:, :2, :2]).mean(axis=0)
+    scan_sigma = float(np.mean([p.look.scan_sigma_rad for p in registration.measurements.pairs if p.epoch == place]))
+    pairs = tuple(
+        Pair(
+            t=0.0,
+            pm=number,
+            epoch=place,
+            marker=MarkerObservation(
+                camera_T_marker=as_float_array(camera_T_marker[i], 4, 4),
+                covariance=as_float_array(right_from_parent_covariance(turned[i], marker_covariance), 6, 6),
+                id=number,
+            ),
+            look=_exact_look(trus_p_spot[i], float(scan[i]), sweep, scan_sigma, look_covariance, model),
+        )
+        for number, i in enumerate(index)
+    )
+    return Candidates(
+        camera_p_spot_mm=camera_p[index],
+        camera_d=d[index],
+        camera_T_marker=camera_T_marker[index],
+        trus_p_mm=trus_p_spot[index],
+        tilt_rad=np.tile(tilts, (len(spots), 1))[index],
+        scan_rad=scan[index],
+        sweep=sweep,
+        pairs=pairs,
+    )
+
+
+def _spots(registration: Registration, place: int, trus_p_pm: FloatArray, trus_d: FloatArray) -> FloatArray:
+    """(m, 3) TRUS points of the traced tissue, on a grid out to ``REACH_MM`` from the PMs."""
+    problem, at = registration.problem, registration.optimum.evaluation
+    pms = np.unique(problem.beam_pm[problem.beam_epoch == place])
+    surface = fit_surface(trus_p_pm, at.point_covariance[0, pms], trus_d[: len(pms)])
+    points = _grid_on(surface) if surface is not None else _grid_about(trus_p_pm)
+    if len(points) > MOST_SPOTS:
+        points = points[np.linspace(0, len(points) - 1, MOST_SPOTS).round().astype(int)]
+    return points
+
+
+def _grid(place: FloatArray, step_mm: float = SPOT_STEP_MM) -> FloatArray:
+    """(m, 2) grid points within reach of places (n, 2)."""
+    low, high = place.min(axis=0) - REACH_MM, place.max(axis=0) + REACH_MM
+    axes = [np.arange(a, b + step_mm, step_mm) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    near = np.linalg.norm(grid[:, None] - place, axis=-1).min(axis=1)
+    return np.asarray(grid[near < REACH_MM])
+
+
+def _grid_on(surface: TissueSurface) -> FloatArray:
+    grid = _grid(surface.place)
+    height, _ = surface.height(grid)
+    return np.asarray(surface.centre + np.column_stack([grid, height]) @ surface.axes.T)
+
+
+def _grid_about(trus_p: FloatArray) -> FloatArray:
+    """Where the PMs trace no surface yet: depths weighted by inverse square distance along x and around the axis."""
+    reach = np.hypot(trus_p[:, 1], trus_p[:, 2])
+    angle = np.arctan2(trus_p[:, 1], trus_p[:, 2])
+    middle = float(reach.mean())
+    place = np.column_stack([trus_p[:, 0], middle * angle])
+    grid = _grid(place)
+    weight = 1.0 / (np.sum((grid[:, None] - place) ** 2, axis=-1) + 1.0)
+    rho = (weight @ reach) / weight.sum(axis=1)
+    around = grid[:, 1] / middle
+    return np.column_stack([grid[:, 0], rho * np.sin(around), rho * np.cos(around)])
+
+
+def _directions(camera_d: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions (k, 3) about the mean of (n, 3), and their lean (k, 2) towards the image's right and lower edge."""
+    mean = camera_d.mean(axis=0)
+    mean = mean / np.linalg.norm(mean)
+    turn = rotation_to_direction(mean)
+    steps = np.linspace(-TILT_RAD, TILT_RAD, TILT_STEPS)
+    tilts = np.array([(a, b) for a in steps for b in steps if math.hypot(a, b) < 1.2 * TILT_RAD])
+    local = np.column_stack([np.tan(tilts), np.ones(len(tilts))])
+    return local / np.linalg.norm(local, axis=1, keepdims=True) @ turn.T, tilts
+
+
+def _sweep_side(registration: Registration, place: int) -> int:
+    """The plane's direction of sweep that was used less; 0 where the session does not sweep."""
+    sides = [pair.look.sweep for pair in registration.measurements.pairs if pair.epoch == place and pair.look.sweep]
+    return 0 if not sides else 1 if sides.count(1) <= sides.count(-1) else -1
+
+
+def _heard_at(trus_p: FloatArray, sweep: int, model: SessionModel) -> float:
+    """Plane angle of the look to expect: in the middle of what a first hit, or the window, leaves open."""
+    bearing, radius = math.atan2(float(trus_p[1]), float(trus_p[2])), model.probe.radius_mm
+    scan = bearing
+    for _ in range(4):  # the window depends on the range, the range (a little) on the angle
+        range_mm = math.hypot(trus_p[1] - radius * math.sin(scan), trus_p[2] - radius * math.cos(scan))
+        width = float(model.probe.sensitivity.half_width_at(range_mm))
+        ahead = width - 0.5 * min(model.stage.step_rad, 2.0 * width)
+        scan = bearing - sweep * ahead
+    return scan
+
+
+def _exact_look(
+    trus_p: FloatArray, scan_rad: float, sweep: int, scan_sigma_rad: float, covariance: FloatArray, model: SessionModel
+) -> Look:
+    radius = model.probe.radius_mm
+    dy, dz = trus_p[1] - radius * math.sin(scan_rad), trus_p[2] - radius * math.cos(scan_rad)
+    return Look(
+        scan_rad=scan_rad,
+        scan_sigma_rad=scan_sigma_rad,
+        x_mm=float(trus_p[0]),
+        range_mm=math.hypot(float(dy), float(dz)),
+        covariance=as_float_array(covariance, 2, 2),
+        sweep=sweep,
+    )
+
+
+def _in_view(camera: CameraModel, camera_p: FloatArray) -> BoolArray:
+    """Whether points (n, 3) fall into the image; lens distortion is left out, the margin covers it."""
+    depth = np.maximum(camera_p[:, 2], 1e-6)
+    pixel = camera_p[:, :2] / depth[:, None] * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
+    size = np.array(camera.image_size, dtype=np.float64)
+    margin = IMAGE_MARGIN * size[0]
+    return np.asarray((camera_p[:, 2] > 1.0) & (pixel > margin).all(axis=1) & (pixel < size - margin).all(axis=1))
+
+
+# ---- what they would tell ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Separation:
+    """What tells the best registration from its likeliest rival.
+
+    ``weight`` of the rival now, cost ``gap``, mean square distance of the targets, and each candidate's chi square.
+    """
+
+    weight: float
+    gap: float
+    distance2_mm2: float
+    chi2: FloatArray
+
+
+def _contributions(
+    problem: PackedProblem, state: SharedState, trus_p: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cost (n,), gradient (n, D) and Hessian (n, D, D) of virtual pairs at a state, PMs started at (n, 3)."""
+    private = replace(initial_private(problem, state), trus_p_pm=trus_p[None])
+    for _ in range(REFINEMENTS):
+        _, private = refine(problem, state, private)
+    parts = pm_contributions(problem, state, private)
+    return parts.cost, parts.gradient, parts.hessian
+
+
+def _separate(registration: Registration, epoch: int, found: Candidates) -> _Separation | None:
+    """Compare with the likeliest other minimum of the epoch's own search; None where there is none near."""
+    search, model = registration.searches[epoch], registration.model
+    place = registration.epochs.index(epoch)
+    here = registration.optimum.state.trus_T_camera(place)[0]
+
+    def apart(minimum: Minimum) -> float:
+        camera_p = transform_points(inverse(here), model.targets_mm)
+        there = transform_points(minimum.state.trus_T_camera()[0], camera_p)
+        return float(np.mean(np.sum((there - model.targets_mm) ** 2, axis=1)))
+
+    rivals = [m for m in search.minima if apart(m) > 1.0 and m.cost - search.minima[0].cost < RIVAL_CHI2]
+    if not rivals:
+        return None
+    rival = rivals[0]
+    problem = pack(restrict_epochs(registration.measurements, [place]), model)
+    hessians = []
+    for state in (_alone(registration, place), rival.state):
+        private = initial_private(problem, state)
+        for _ in range(REFINEMENTS):
+            _, private = refine(problem, state, private)
+        at = evaluate(problem, state, private)
+        hessians.append((float(at.cost[0]), at.hessian[0]))
+    (cost, hessian), (rival_cost, rival_hessian) = hessians
+    # Laplace: weight ~ exp(-cost / 2) / sqrt(det H).
+    log_ratio = -0.5 * (rival_cost - cost) - 0.5 * (np.linalg.slogdet(rival_hessian)[1] - np.linalg.slogdet(hessian)[1])
+    weight = float(1.0 / (1.0 + np.exp(-np.clip(log_ratio, -30.0, 30.0))))
+    virtual = pack(Measurements((), tuple(replace(pair, epoch=0) for pair in found.pairs), (EpochStart(0.0),)), model)
+    # The looks are what the best registration expects, so the PMs start there for the rival, too.
+    c, g, a = _contributions(virtual, rival.state, found.trus_p_mm)
+    chi2 = c - np.sum(g * np.linalg.solve(rival_hessian + a, g[..., None])[..., 0], axis=-1)
+    return _Separation(weight, rival_cost - cost, apart(rival), np.maximum(chi2, 0.0))
+
+
+def _alone(registration: Registration, place: int) -> SharedState:
+    """The joint optimum with one of its epochs only."""
+    state = registration.optimum.state
+    return replace(
+        state,
+        rotation=state.rotation[:, place : place + 1],
+        translation_mm=state.translation_mm[:, place : place + 1],
+    )

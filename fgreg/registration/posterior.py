@@ -1,0 +1,436 @@
+"""Samples of the posterior of the shared variables, and what they say: the estimate, its covariance, regions, errors.
+
+The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear, and the windows are
+intervals. So the density of the shared variables (fgreg.graph.reduced_graph.log_posterior) is sampled by adaptive
+multiple importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what the
+samples so far show, all samples weighted by the mixture of all proposals. Deterministic by seed.
+
+Chart: ``trus_T_camera = estimate * Expmap(xi)``, GTSAM's tangent. In it a turn about any point of the scene is a
+straight line, where (rotation, translation) apart bend: the lever from camera to tissue is long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, hat, inverse, log_so3, transform_points
+from fgreg.graph.columns import Columns
+from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
+from fgreg.graph.reduced_blocks import PrivateState
+from fgreg.graph.reduced_graph import evaluate, log_posterior, refine
+from fgreg.graph.reduced_solver import Optimum
+from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.split_points import logsumexp
+from fgreg.model.estimate import PredictedTre
+
+DEGREES_OF_FREEDOM = 6.0
+"""Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
+QUANTILE = 0.95
+MOST_TRANSLATION_MM = 2000.0
+"""No camera is farther from a probe (the session format's bound): far out, rounding alone may look like a fit."""
+CHUNK = 4000
+"""Samples times PMs that are evaluated at once: what stays in the cache."""
+REFINED_PMS = 8
+"""With fewer PMs the samples reach so far that the private variables are refined once more for each."""
+FITTING, TAILS = 0.4, 4.0
+"""Share of effective samples in the first round below which the posterior has tails that take more samples to find."""
+KERNELS = 40
+"""Proposals of a later round that sit on samples of the earlier ones."""
+WIDE, SHARES = 1.8, (0.4, 0.1, 0.5)
+"""Scale of a wide proposal that looks for arms; shares of draws about the mean, as wide as that, and on samples."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Weighted samples of the shared variables.
+
+    Attributes:
+        columns: where each shared variable sits in ``step``.
+        mean: the estimate they are centred on (one hypothesis).
+        step: (S, D) deviations of the samples from it, as :meth:`SharedState.retract` takes them.
+        tangent: (S, D) the same with registrations in GTSAM's tangent.
+        weight: (S,) sums to 1.
+        log_density: (S,) of the samples, up to a constant; see :meth:`contains`.
+        effective: number of independent samples they are worth.
+        covariance: (D, D) second moment of ``tangent`` about the estimate.
+    """
+
+    columns: Columns
+    mean: SharedState
+    step: FloatArray
+    tangent: FloatArray
+    weight: FloatArray
+    log_density: FloatArray
+    effective: float
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubted:
+    """The problem with all PMs, those left out and those kept, each good or junk (``problem.log_junk``).
+
+    ``private`` and ``point_gain`` (1, J, 3, D) are at the optimum of a mode.
+    """
+
+    problem: PackedProblem
+    private: PrivateState
+    point_gain: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mode:
+    """Where to look for probability: an optimum of a problem (one hypothesis) and the covariance (D, D) about it.
+
+    ``doubted``: the density to sample where shots were left out; the problem's own where None.
+    """
+
+    problem: PackedProblem
+    optimum: Optimum
+    covariance: FloatArray
+    doubted: Doubted | None = None
+
+
+def _expmap_gain(omega: FloatArray) -> FloatArray:
+    """V (..., 3, 3) of SE(3): the translation of ``Expmap(omega, rho)`` is ``V rho``."""
+    angle2 = np.sum(omega * omega, axis=-1)[..., None, None]
+    small = angle2 < 1e-8
+    angle = np.sqrt(np.where(small, 1.0, angle2))
+    a = np.where(small, 0.5 - angle2 / 24.0, (1.0 - np.cos(angle)) / angle**2)
+    b = np.where(small, 1.0 / 6.0 - angle2 / 120.0, (angle - np.sin(angle)) / angle**3)
+    k = hat(omega)
+    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+
+
+def step_of_tangent(tangent: FloatArray, columns: Columns) -> FloatArray:
+    """(S, D) steps of :meth:`SharedState.retract` from deviations with registrations in GTSAM's tangent."""
+    step = tangent.copy()
+    for k in range(columns.epochs):
+        omega = tangent[:, 6 * k : 6 * k + 3]
+        step[:, 6 * k + 3 : 6 * k + 6] = (_expmap_gain(omega) @ tangent[:, 6 * k + 3 : 6 * k + 6, None])[..., 0]
+    return step
+
+
+def tangent_of_step(step: FloatArray, columns: Columns) -> FloatArray:
+    """Inverse of :func:`step_of_tangent`."""
+    tangent = step.copy()
+    for k in range(columns.epochs):
+        omega = step[:, 6 * k : 6 * k + 3]
+        shift = step[:, 6 * k + 3 : 6 * k + 6, None]
+        tangent[:, 6 * k + 3 : 6 * k + 6] = np.linalg.solve(_expmap_gain(omega), shift)[..., 0]
+    return tangent
+
+
+def _log_volume(tangent: FloatArray, columns: Columns) -> FloatArray:
+    """(S,) log of the volume (Haar measure times translation) of the tangent's unit cell: 2 log(2 (1 - cos a) / a^2).
+
+    Once for the rotation, once for the translation's gain.
+    """
+    total = np.zeros(len(tangent))
+    for k in range(columns.epochs):
+        angle2 = np.sum(tangent[:, 6 * k : 6 * k + 3] ** 2, axis=1)
+        half2 = np.maximum(0.25 * angle2, 1e-12)
+        total += 4.0 * np.log(np.abs(np.sinc(np.sqrt(half2) / np.pi)) + 1e-30)
+    return total
+
+
+def light(mode: Mode) -> Mode:
+    """The mode with its calibration shots summed up: a Gaussian of the beam (and bias), on which alone they depend.
+
+    In the beam's chart they are next to quadratic, and leaving them out of every sample saves most of its time at few
+    pairs.
+    """
+    problem, at = mode.problem, mode.optimum.evaluation
+    if not len(problem.aims.rotation) or problem.anchor is not None:
+        return mode
+    aims = only_aims(problem)
+    private = replace(at.private, trus_p_pm=at.private.trus_p_pm[:, :0], beam_error=at.private.beam_error[:, :0])
+    there = evaluate(aims, mode.optimum.state, private)
+    centre = -np.linalg.pinv(there.hessian[0], rcond=1e-12, hermitian=True) @ there.gradient[0]
+    anchor = Anchor(mode.optimum.state.retract(centre[None], problem.columns), there.hessian[0])
+    lighter = without_aims(problem, anchor)
+    private = replace(at.private, aim_error=at.private.aim_error[:, :0], aim_shift=at.private.aim_shift[:, :0])
+    evaluation = replace(at, private=private)
+    doubted = mode.doubted
+    if doubted is not None:
+        private = replace(doubted.private, aim_error=private.aim_error, aim_shift=private.aim_shift)
+        doubted = replace(doubted, problem=without_aims(doubted.problem, anchor), private=private)
+    return Mode(lighter, replace(mode.optimum, evaluation=evaluation), mode.covariance, doubted)
+
+
+def _repeat(state: SharedState, count: int) -> SharedState:
+    return state.take(np.zeros(count, dtype=np.int64))
+
+
+def log_density(mode: Mode, step: FloatArray) -> FloatArray:
+    """(S,) log density at steps (S, D) from a mode's optimum, up to a constant common to a session's modes."""
+    problem = mode.problem if mode.doubted is None else mode.doubted.problem
+    state = _repeat(mode.optimum.state, len(step)).retract(step, problem.columns)
+    private = moved_private(mode, step)
+    with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
+        if len(problem.pms) < REFINED_PMS or mode.doubted is not None:
+            _, private = refine(problem, state, private)
+        log = log_posterior(problem, state, private)
+        near = (np.linalg.norm(state.translation_mm, axis=-1) <= MOST_TRANSLATION_MM).all(axis=1)
+    return np.where(np.isfinite(log) & near, log, -np.inf)
+
+
+def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
+    """Private variables of the density's problem at steps (S, D) from the mode's optimum, to first order."""
+    at = mode.optimum.evaluation if mode.doubted is None else mode.doubted
+    private = at.private.take(np.zeros(len(step), dtype=np.int64))
+    return replace(private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Students:
+    """Mixture of multivariate Student densities, grouped by shape: roots (G, D, D), of which each has scales.
+
+    Attributes:
+        centre: (K, D). group: (K,) which root each has. scale: (K,) what multiplies it. share: (K,).
+        root: (G, D, D) lower triangular.
+    """
+
+    centre: FloatArray
+    group: IntArray
+    scale: FloatArray
+    share: FloatArray
+    root: FloatArray
+
+    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
+        which = rng.choice(len(self.share), count, p=self.share)
+        normal = rng.standard_normal((count, self.centre.shape[1]))
+        stretch = self.scale[which] * np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
+        out = self.centre[which]
+        for group, root in enumerate(self.root):
+            mine = self.group[which] == group
+            out[mine] += (normal[mine] * stretch[mine, None]) @ root.T
+        return out
+
+    def log(self, x: FloatArray) -> FloatArray:
+        """(S,) log density up to a constant common to all mixtures."""
+        size = x.shape[1]
+        out = np.empty((len(self.root), len(x)))
+        for group, root in enumerate(self.root):
+            mine = np.flatnonzero(self.group == group)
+            # About the group's first centre: squares of small numbers only.
+            origin = self.centre[mine[0]]
+            at = np.linalg.solve(root, (x - origin).T)
+            centre = np.linalg.solve(root, (self.centre[mine] - origin).T)
+            square = np.sum(centre**2, axis=0)[:, None] - 2.0 * centre.T @ at + np.sum(at**2, axis=0)
+            square = np.maximum(square, 0.0) / (DEGREES_OF_FREEDOM * self.scale[mine, None] ** 2)
+            kernel = np.exp(-0.5 * (DEGREES_OF_FREEDOM + size) * np.log(1.0 + square))
+            out[group] = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
+        return logsumexp(out, axis=0)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+
+
+def _effective(log_weight: FloatArray) -> float:
+    return float(np.exp(2.0 * logsumexp(log_weight) - logsumexp(2.0 * log_weight)))
+
+
+def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
+    """Weights (S,), flattened by a power where they would be worth fewer than ``least`` samples."""
+    power = 1.0
+    while _effective(power * log_weight) < min(least, 0.5 * len(log_weight)) and power > 1e-3:
+        power *= 0.8
+    return np.asarray(np.exp(power * log_weight - logsumexp(power * log_weight)))
+
+
+def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: np.random.Generator) -> _Students:
+    """A proposal for the next round: about the samples' mean, and about some of the samples themselves."""
+    size = x.shape[1]
+    weight = _tempered(log_weight, 3.0 * size)
+    effective = 1.0 / float(np.sum(weight**2))
+    centre = weight @ x
+    spread = x - centre
+    trust = effective / (effective + size)
+    moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * fallback
+    root = _root(moment)
+    # Kernels as wide as a density estimate from so many samples would have them.
+    width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
+    at = x[rng.choice(len(x), KERNELS, p=weight)]
+    return _Students(
+        centre=np.concatenate([centre[None], centre[None], at]),
+        group=np.zeros(2 + KERNELS, dtype=np.int64),
+        scale=np.concatenate([[1.0, WIDE], np.full(KERNELS, width)]),
+        share=np.concatenate([SHARES[:2], np.full(KERNELS, SHARES[2] / KERNELS)]),
+        root=root[None],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Target:
+    """The density to sample, over tangents about the first mode."""
+
+    modes: tuple[Mode, ...]
+
+    @property
+    def columns(self) -> Columns:
+        return self.modes[0].problem.columns
+
+    def state(self, tangent: FloatArray) -> SharedState:
+        base = self.modes[0].optimum.state
+        return _repeat(base, len(tangent)).retract(step_of_tangent(tangent, self.columns), self.columns)
+
+    def log(self, tangent: FloatArray) -> tuple[FloatArray, IntArray]:
+        """(S,) log density of samples, and (S,) the mode nearest to each by its own covariance."""
+        columns, steps = self.columns, [step_of_tangent(tangent, self.columns)]
+        nearest = np.zeros(len(tangent), dtype=np.int64)
+        if len(self.modes) > 1:
+            state = _repeat(self.modes[0].optimum.state, len(tangent)).retract(steps[0], columns)
+            steps += [step_between(mode.optimum.state, state, columns) for mode in self.modes[1:]]
+            far = [
+                np.sum(np.linalg.solve(_root(mode.covariance), step.T) ** 2, axis=0)
+                for mode, step in zip(self.modes, steps, strict=True)
+            ]
+            nearest = np.argmin(far, axis=0)
+        out = np.empty(len(tangent))
+        for index, (mode, step) in enumerate(zip(self.modes, steps, strict=True)):
+            rows = np.flatnonzero(nearest == index)
+            for part in np.array_split(rows, max(1, -(-len(rows) * len(mode.problem.pms) // CHUNK))):
+                if len(part):
+                    out[part] = log_density(mode, step[part])
+        return out + _log_volume(tangent, columns), nearest
+
+
+def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: int) -> Posterior:
+    """Weighted samples of the posterior, about its mean (of the part that is nearest to the weightiest mode).
+
+    Args:
+        modes: minima of one session, the best first.
+        goal: effective samples to go for.
+        most: draws after which to be content with less.
+        seed: of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    modes = tuple(light(mode) for mode in modes)
+    columns, target = modes[0].problem.columns, _Target(modes)
+    fallback = modes[0].covariance
+    starts = [np.zeros((1, columns.size))]
+    starts += [
+        tangent_of_step(step_between(modes[0].optimum.state, mode.optimum.state, columns), columns)
+        for mode in modes[1:]
+    ]
+    proposals = [
+        _Students(
+            centre=np.concatenate(starts),
+            group=np.arange(len(modes)),
+            scale=np.ones(len(modes)),
+            share=np.full(len(modes), 1.0 / len(modes)),
+            root=np.stack([_root(mode.covariance) for mode in modes]),
+        )
+    ]
+    x, log_target, nearest = np.zeros((0, columns.size)), np.zeros(0), np.zeros(0, dtype=np.int64)
+    counts: list[int] = []
+    log_proposal = np.zeros((0, 0))
+    draws = 300
+    while True:
+        fresh = proposals[-1].draw(rng, draws)
+        old_under_new = proposals[-1].log(x) if len(x) else np.zeros(0)
+        new_under_all = np.stack([proposal.log(fresh) for proposal in proposals])
+        if len(x):
+            log_proposal = np.concatenate([np.concatenate([log_proposal, old_under_new[None]]), new_under_all], axis=1)
+        else:
+            log_proposal = new_under_all
+        log_fresh, nearest_fresh = target.log(fresh)
+        x, log_target = np.concatenate([x, fresh]), np.concatenate([log_target, log_fresh])
+        nearest = np.concatenate([nearest, nearest_fresh])
+        counts.append(draws)
+        share = np.log(np.array(counts) / sum(counts))
+        log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
+        if not np.isfinite(log_weight).any():  # the optimum itself is nowhere that a camera may be
+            break
+        if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
+            goal = TAILS * goal  # far from Gaussian: what has not been drawn does not lower the count
+        if _effective(log_weight) >= goal or len(x) >= most:
+            break
+        proposals.append(_refitted(x, log_weight, fallback, rng))
+        draws = min(max(300, len(x) // 2), max(most - len(x), 100))
+    effective = _effective(log_weight) if np.isfinite(log_weight).any() else 0.0
+    if effective < LEAST_SAMPLES:
+        return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=effective)
+    weight = np.exp(log_weight - logsumexp(log_weight))
+    mass = np.bincount(nearest, weight, minlength=len(modes))
+    main = np.where(nearest == int(np.argmax(mass)), weight, 0.0)
+    return _about_mean(target, x, weight, main / main.sum(), log_target, effective)
+
+
+ENOUGH_SAMPLES = 60.0
+"""Independent samples from which moments stand on their own."""
+LEAST_SAMPLES = 5.0
+"""Fewer say nothing, and would seem certain of it: the Gaussian at the optimum stands in for them."""
+
+
+def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
+    """Samples of the Gaussian at a mode: what the posterior is with many pairs."""
+    x = np.random.default_rng(seed).standard_normal((count, len(mode.covariance)))
+    x = np.concatenate([x, -x])  # in pairs about the mode, which so stays the mean
+    weight = np.full(len(x), 1.0 / len(x))
+    # Stretched to have the mode's covariance exactly.
+    x = np.linalg.solve(_root(x.T @ x / len(x)), x.T).T @ _root(mode.covariance).T
+    log = -0.5 * np.sum(np.linalg.solve(_root(mode.covariance), x.T) ** 2, axis=0)
+    return _about_mean(_Target((mode,)), x, weight, weight, log, float(count))
+
+
+def _about_mean(
+    target: _Target, x: FloatArray, weight: FloatArray, main: FloatArray, log: FloatArray, effective: float
+) -> Posterior:
+    columns = target.columns
+    centre = main @ x
+    spread = x - centre
+    moment = (spread * main[:, None]).T @ spread
+    # A few heavy samples span no volume: the optimum's own covariance stands in for what they cannot tell.
+    missing = max(0.0, 1.0 - effective / ENOUGH_SAMPLES) + 1e-9
+    moment = moment + missing * target.modes[0].covariance
+    # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
+    # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
+    square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
+    keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12))
+    shift = step_of_tangent(keep * centre[None], columns)
+    mean = target.modes[0].optimum.state.retract(shift, columns)
+    step = step_between(mean, target.state(x), columns)
+    tangent = tangent_of_step(step, columns)
+    covariance = np.asarray((tangent * weight[:, None]).T @ tangent) + missing * target.modes[0].covariance
+    return Posterior(columns, mean, step, tangent, weight, log, effective, covariance)
+
+
+def pose_tangent(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(6,) ``Logmap(first^-1 second)`` of transforms (4, 4), GTSAM's: rotation rad, then translation mm."""
+    back = first[:3, :3].T
+    omega = log_so3(back @ second[:3, :3])
+    shift = back @ (second[:3, 3] - first[:3, 3])
+    return np.concatenate([omega, np.linalg.solve(_expmap_gain(omega), shift)])
+
+
+def weighted_quantile(values: FloatArray, weight: FloatArray, quantile: float) -> FloatArray:
+    """Quantile along the first axis of (S, n) values with weights (S,): (n,)."""
+    order = np.argsort(values, axis=0)
+    cumulative = np.cumsum(weight[order], axis=0)
+    row = np.minimum((cumulative < quantile).sum(axis=0), len(values) - 1)
+    return np.asarray(np.take_along_axis(np.take_along_axis(values, order, axis=0), row[None], axis=0)[0])
+
+
+def target_errors(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> FloatArray:
+    """(S, n) distances (mm) by which each sample moves the camera points that the estimate puts at the targets."""
+    estimate = posterior.mean.trus_T_camera(epoch)[0]
+    camera_p = transform_points(inverse(estimate), targets_mm)
+    twist = posterior.step[:, 6 * epoch : 6 * epoch + 6]
+    # A sample is estimate * (Exp(omega), v): in camera axes it moves p to Exp(omega) p + v.
+    moved = (exp_so3(twist[:, :3]) - np.eye(3)) @ camera_p.T + twist[:, 3:, None]
+    return np.asarray(np.sqrt(np.einsum("sin,sin->sn", moved, moved)))
+
+
+def predicted_tre(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> PredictedTre:
+    """Predicted target registration error of one epoch (definitions: :class:`fgreg.model.estimate.PredictedTre`)."""
+    error = target_errors(posterior, epoch, targets_mm)
+    quantiles = weighted_quantile(error, posterior.weight, QUANTILE)
+    return PredictedTre(
+        mean_mm=float(np.sqrt(posterior.weight @ error**2).mean()),
+        p95_mm=float(quantiles.mean()),
+        worst_mm=float(quantiles.max()),
+    )

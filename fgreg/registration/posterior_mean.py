@@ -1,0 +1,200 @@
+"""From the optimum to the answer: the posterior around it, and the session's estimate at the posterior's mean.
+
+The optimum of the graph with Gaussian windows (fgreg.registration.register) is where the search ends, what the explicit
+graph is compared with and what residuals are judged at. What is reported is the mean of the posterior, in which windows
+have
+their own shape and the geometry its nonlinearity: a smaller expected error, and the point its moments are about.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.expectation_propagation import inverse_hessian, propagate
+from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.reduced_blocks import PrivateState, initial_private
+from fgreg.graph.reduced_graph import evaluate, refine
+from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.multistart import targets_moved
+from fgreg.registration.outliers import log_junk
+from fgreg.registration.posterior import (
+    MOST_TRANSLATION_MM,
+    Doubted,
+    Mode,
+    Posterior,
+    gaussian_posterior,
+    sample_posterior,
+)
+from fgreg.registration.register import Registration, Shots
+
+RIVALS = 3
+"""At most so many other minima enter the posterior."""
+RIVAL_CHI2 = 14.0
+"""Minima whose chi square is larger by more than this hold too little of the posterior to matter."""
+
+FREE_SOUND_SPEED = 0.1
+"""Prior sigma of a sound speed ratio that only the residuals are to determine."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """The session's estimate: ``registration`` with its optimum moved to the posterior's mean, and the posterior.
+
+    ``registration.problem`` has the windows' Gaussian sites where they settled, ``registration.covariance`` is the
+    posterior's second moment about the estimate. ``modes`` are what the posterior was sampled from.
+    """
+
+    registration: Registration
+    posterior: Posterior
+    modes: tuple[Mode, ...]
+
+
+def answer(registration: Registration, config: SolveConfig) -> Answer:
+    """Sample the posterior of a registration and centre the estimate on it."""
+    modes = _modes(registration)
+    if len(registration.problem.look_pm) > config.posterior_looks:
+        posterior = gaussian_posterior(modes[0], count=round(config.posterior_effective), seed=config.seed)
+    else:
+        posterior = sample_posterior(
+            modes, goal=config.posterior_effective, most=config.posterior_samples, seed=config.seed
+        )
+    problem = modes[0].problem
+    moved = _evaluated(problem, posterior.mean, modes[0].optimum)
+    shots = _moved_shots(registration.shots, problem, moved)
+    return Answer(
+        replace(registration, problem=problem, optimum=moved, covariance=posterior.covariance, shots=shots),
+        posterior,
+        modes,
+    )
+
+
+def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
+    """All shots at the moved estimate, those kept with the stand-ins of ``problem``; innovations stay as judged."""
+    if shots.pm_kept.all() and shots.aim_kept.all():
+        return replace(shots, problem=problem, evaluation=moved.evaluation)
+    whole = _with_all_pms(shots, problem)
+    return replace(shots, problem=whole, evaluation=evaluate(whole, moved.state, _settled(whole, moved.state)))
+
+
+def _with_all_pms(shots: Shots, problem: PackedProblem) -> PackedProblem:
+    """All shots, those kept with the stand-ins of ``problem``."""
+    looks, kept = shots.problem.looks, shots.pm_kept[shots.problem.look_pm]
+    weight, centre = looks.weight.copy(), looks.centre_rad.copy()
+    weight[kept], centre[kept] = problem.looks.weight, problem.looks.centre_rad
+    return replace(shots.problem, looks=replace(looks, weight=weight, centre_rad=centre))
+
+
+def _settled(problem: PackedProblem, state: SharedState) -> PrivateState:
+    private = initial_private(problem, state)
+    for _ in range(4):
+        _, private = refine(problem, state, private)
+    return private
+
+
+def _with_doubts(shots: Shots, mode: Mode) -> Mode:
+    """The mode with all PMs in its density, each good or junk: which they are is not known for certain."""
+    if shots.pm_kept.all():
+        return mode
+    problem, state = mode.problem, mode.optimum.state
+    whole = replace(
+        _with_all_pms(shots, problem),
+        aims=problem.aims,
+        aim_spot_mm=problem.aim_spot_mm,
+        aim_spot_covariance=problem.aim_spot_covariance,
+    )
+    whole = replace(whole, log_junk=log_junk(whole, shots.pm_kept))
+    at = evaluate(whole, state, _settled(whole, state))
+    return replace(mode, doubted=Doubted(whole, at.private, at.point_gain))
+
+
+@dataclass(frozen=True, slots=True)
+class Estimated:
+    """A session-wide variable: value and standard deviation."""
+
+    value: float
+    sigma: float
+
+
+def sound_speed_from_residuals(registration: Registration) -> Estimated:
+    """The ratio of true to assumed sound speed that the pairs ask for, next to no prior on it.
+
+    For a registration in which it is no variable: one Gauss-Newton step from its optimum with the ratio set free.
+    """
+    free = pack(registration.measurements, registration.model, sound_speed_sigma=FREE_SOUND_SPEED)
+    optimum, column = registration.optimum, free.columns.sound_speed
+    at = evaluate(free, optimum.state, optimum.evaluation.private)
+    inverse = inverse_hessian(at.hessian[0])
+    if inverse is None or column is None:
+        return Estimated(1.0, FREE_SOUND_SPEED)
+    return Estimated(1.0 - float(inverse[column] @ at.gradient[0]), float(np.sqrt(inverse[column, column])))
+
+
+def estimated_sound_speed(found: Registration) -> Estimated | None:
+    """The ratio of true to assumed sound speed where it is a variable."""
+    at = found.problem.columns.sound_speed
+    value = float(found.optimum.state.sound_speed_ratio[0])
+    return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
+
+
+def estimated_radius(found: Registration) -> Estimated | None:
+    """The probe's radius (mm) where it is a variable."""
+    at = found.problem.columns.radius
+    value = float(found.optimum.state.radius_mm[0])
+    return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
+
+
+def _with_sites(problem: PackedProblem, optimum: Optimum, covariance: FloatArray) -> Mode:
+    """A mode of the posterior: the windows' sites where they settle, the Gaussian windows where not."""
+    found = propagate(problem, optimum)
+    if found is None:
+        return Mode(problem, optimum, covariance)
+    sites, there = found
+    inverse = inverse_hessian(there.evaluation.hessian[0])
+    away = np.linalg.norm(there.state.translation_mm, axis=-1).max()
+    if inverse is None or not away <= MOST_TRANSLATION_MM:  # at few pairs the sites may let the optimum run away
+        return Mode(problem, optimum, covariance)
+    return Mode(sites, there, inverse)
+
+
+def _modes(registration: Registration) -> tuple[Mode, ...]:
+    """The optimum's mode first, then those of other minima that hold a share of the posterior."""
+    problem, best = registration.problem, registration.optimum
+    modes = [_with_sites(problem, best, registration.covariance)]
+    targets = registration.model.targets_mm
+    for place, epoch in enumerate(registration.epochs):
+        minima = registration.searches[epoch].minima
+        for minimum in minima:
+            if len(modes) > RIVALS or minimum.cost > minima[0].cost + RIVAL_CHI2:
+                break
+            transform = minimum.state.trus_T_camera()[0]
+            if targets_moved(best.state.trus_T_camera(place)[0], transform, targets) < 1.0:
+                continue
+            transforms = np.stack([best.state.trus_T_camera(k) for k in range(problem.columns.epochs)], axis=1)
+            transforms[0, place] = transform
+            start = make_state(transforms, best.state.marker_T_nominal[0], problem.radius_mm, best.state.beam)
+            found = optimize(problem, start)
+            inverse = inverse_hessian(found.evaluation.hessian[0])
+            cost = float(found.evaluation.cost[0])
+            if inverse is None or not cost < float(best.evaluation.cost[0]) + RIVAL_CHI2:
+                continue
+            others = [mode.optimum.state.trus_T_camera(place)[0] for mode in modes]
+            if all(targets_moved(o, found.state.trus_T_camera(place)[0], targets) > 1.0 for o in others):
+                modes.append(_with_sites(problem, found, inverse))
+    return tuple(_with_doubts(registration.shots, mode) for mode in modes)
+
+
+def _evaluated(problem: PackedProblem, state: SharedState, near: Optimum) -> Optimum:
+    """The problem at a state, private variables at their optimum there."""
+    private = near.evaluation.private
+    for start in (private, initial_private(problem, state)):
+        private = start
+        for _ in range(4):
+            cost, private = refine(problem, state, private)
+        if np.isfinite(cost).all():
+            break
+    return Optimum(state, evaluate(problem, state, private), near.converged, near.iterations)

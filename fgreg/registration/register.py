@@ -1,0 +1,472 @@
+"""Calibration and registration in the one graph, from no guess: all minima worth knowing, best first.
+
+1. Beam and minima of each camera epoch (fgreg.registration.multistart).
+2. All epochs together from the best of each: Levenberg-Marquardt on the reduced graph.
+3. Where a shot does not fit (its innovation is beyond what the stated noise explains), who is kept is settled on the
+   joint problem (fgreg.registration.outliers), and the answer is the plain least squares optimum of those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.errors import EstimationError
+from fgreg.geometry.transforms import BoolArray, FloatArray, inverse
+from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.reduced_blocks import initial_private
+from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
+from fgreg.model.measurements import Measurements
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.epochs import epoch_chains, restrict_epochs, solvable_epochs
+from fgreg.registration.multistart import (
+    MIN_KEPT_AIMS,
+    MIN_KEPT_PMS,
+    SAME_MINIMUM_MM,
+    EpochSearch,
+    Minimum,
+    calibrate_beam,
+    choose_minimum,
+    search_epoch,
+    targets_moved,
+)
+from fgreg.registration.outliers import (
+    FEW,
+    Innovations,
+    Sorted,
+    deviant,
+    graduated_or_near,
+    innovations_at,
+    plausible_cost,
+    predicted_pms,
+    sort_shots,
+)
+
+__all__ = [
+    "EpochSearch",
+    "Minimum",
+    "Registration",
+    "Shots",
+    "calibrate_beam",
+    "choose_minimum",
+    "register",
+    "register_near",
+    "search_epoch",
+    "targets_moved",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class SoundSpeedPrior:
+    """What is known beforehand of the ratio of true to assumed sound speed."""
+
+    mean: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shots:
+    """All shots of the epochs solved, at the optimum of those kept.
+
+    Attributes:
+        problem: all of them packed; a registration's own problem where all are kept.
+        evaluation: at the registration's optimum (one hypothesis).
+        pm_kept (J,), aim_kept (A,): over ``problem``'s PMs and aims.
+        innovations: likewise: how far each is from what the others predict.
+        pm_deviant (J,), aim_deviant (A,): those beyond the limit, also where too few shots are there to leave one out.
+    """
+
+    problem: PackedProblem
+    evaluation: Evaluation
+    pm_kept: BoolArray
+    aim_kept: BoolArray
+    innovations: Innovations
+    pm_deviant: BoolArray
+    aim_deviant: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """The joint optimum of a session (one hypothesis) and what led to it.
+
+    Attributes:
+        model: the session's set-up.
+        measurements: what entered: the shots kept of ``epochs``, with their epochs renumbered 0, 1, ...
+        epochs: the session's numbers of the epochs solved.
+        problem, optimum: packed measurements and the optimum of the reduced graph.
+        searches: of every epoch of the session; no minima where it had too few pairs of its own.
+        ambiguous: the session's epochs in which two minima cannot be told apart.
+        covariance: (D, D) inverse Hessian of the shared variables (``problem.columns``).
+        shots: all shots of ``epochs``, also those left out.
+    """
+
+    model: SessionModel
+    measurements: Measurements
+    epochs: tuple[int, ...]
+    problem: PackedProblem
+    optimum: Optimum
+    searches: tuple[EpochSearch, ...]
+    ambiguous: tuple[int, ...]
+    covariance: FloatArray
+    shots: Shots
+
+
+Pack = Callable[[Measurements], PackedProblem]
+
+
+def joint_start(
+    measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
+) -> SharedState:
+    """All solvable epochs in one state: from their own minima, else carried over by the measured motions."""
+    transforms = {k: minimum.state.trus_T_camera()[0] for k, minimum in chosen.items()}
+    while len(transforms) < len(solvable):
+        for k in solvable:
+            epoch = measurements.epochs[k]
+            motion = epoch.camera_new_T_camera_old
+            if not k or motion is None or not epoch.motion_known:
+                continue
+            old = epoch.old(k)
+            if k not in transforms and old in transforms:
+                transforms[k] = transforms[old] @ inverse(motion)
+            elif k in transforms and old in solvable and old not in transforms:
+                transforms[old] = transforms[k] @ motion
+    most = max(chosen, key=lambda k: sum(pair.epoch == k for pair in measurements.pairs))
+    beam = chosen[most].state
+    # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
+    frame = nominal_frame(beam.beam_origin()[0], beam.beam_direction()[0])
+    stacked = np.stack([transforms[k] for k in solvable])[None]
+    start = make_state(stacked, frame, model.probe.radius_mm)
+    return replace(start, edge_rad=beam.edge_rad, bias_mm=beam.bias_mm)
+
+
+def _points_backwards(optimum: Optimum) -> bool:
+    """Whether most spots lie behind the beam's origin."""
+    at = optimum.evaluation
+    return bool(np.median(np.concatenate([at.lambda_mm[0], at.aim_lambda_mm[0]])) < 0)
+
+
+def _turned(state: SharedState, model: SessionModel) -> SharedState:
+    """The same hypothesis with the beam's chart pointing the other way."""
+    frame = nominal_frame(state.beam_origin()[0], -state.beam_direction()[0])
+    count = state.rotation.shape[1]
+    return make_state(np.stack([state.trus_T_camera(k) for k in range(count)], axis=1), frame, model.probe.radius_mm)
+
+
+def _best_start(
+    measurements: Measurements,
+    chosen: dict[int, Minimum],
+    solvable: list[int],
+    model: SessionModel,
+    config: SolveConfig,
+) -> SharedState:
+    """Each epoch from its own minimum, or all that are tied from the one with most pairs: which leads to less cost."""
+    own = joint_start(measurements, chosen, solvable, model)
+    count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
+    leaders: dict[int, Minimum] = {}
+    for chain in epoch_chains(measurements, solvable):
+        among = [k for k in chain if k in chosen]
+        best = max(among, key=lambda k: count[k])
+        leaders[best] = chosen[best]
+    if len(leaders) == len(chosen):
+        return own
+    carried = joint_start(measurements, leaders, solvable, model)
+    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
+    found = [optimize(problem, start, max_iterations=30) for start in (own, carried)]
+    return min(found, key=lambda optimum: float(optimum.evaluation.cost[0])).state
+
+
+def _told_apart(
+    measurements: Measurements,
+    searches: tuple[EpochSearch, ...],
+    is_open: set[int],
+    solvable: list[int],
+    start: SharedState,
+    model: SessionModel,
+    config: SolveConfig,
+) -> tuple[SharedState, set[int]]:
+    """Minima that an epoch's own pairs cannot tell apart, judged with all epochs: the start, and what stays open.
+
+    The other epochs know the beam and the window's edge better than the aims alone, and a measured motion rules out
+    all that is far from where it leads.
+    """
+    if len(solvable) < 2 or not is_open:
+        return start, is_open
+    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
+    left = set(is_open)
+    for epoch in sorted(is_open):
+        search, place = searches[epoch], solvable.index(epoch)
+        if not search.clean:
+            continue
+        rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
+        poses = [start.trus_T_camera(place)[0], *(rival.state.trus_T_camera()[0] for rival in rivals)]
+        many = start.take(np.zeros(len(poses), dtype=np.int64))
+        rotation, translation = many.rotation.copy(), many.translation_mm.copy()
+        rotation[:, place] = [pose[:3, :3] for pose in poses]
+        translation[:, place] = [pose[:3, 3] for pose in poses]
+        found = optimize(problem, replace(many, rotation=rotation, translation_mm=translation), max_iterations=30)
+        cost = np.where(np.isfinite(found.evaluation.cost), found.evaluation.cost, np.inf)
+        best = int(np.argmin(cost))
+        if not np.isfinite(cost[best]):
+            continue
+        start, ends = found.state.take([best]), found.state.trus_T_camera(place)
+        near = np.flatnonzero(cost - cost[best] < config.second_minimum_chi2)
+        if all(targets_moved(ends[best], ends[i], model.targets_mm) <= SAME_MINIMUM_MM for i in near):
+            left.discard(epoch)
+    return start, left
+
+
+def pack_session(
+    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+) -> PackedProblem:
+    """The measurements as arrays, with the variables and shapes that the configuration asks for."""
+    prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+    return pack(
+        measurements,
+        model,
+        sound_speed_sigma=prior.sigma if config.estimate_sound_speed else None,
+        sound_speed_mean=prior.mean if config.estimate_sound_speed else 1.0,
+        radius_sigma_mm=config.radius_sigma_mm if config.estimate_radius else None,
+        shapes=config.window_shape,
+        amplitude_sigma=config.amplitude_sigma,
+    )
+
+
+def _keep(measurements: Measurements, pms: tuple[int, ...], pm_kept: BoolArray, aim_kept: BoolArray) -> Measurements:
+    names = {pm for pm, keep in zip(pms, pm_kept, strict=True) if keep}
+    return replace(
+        measurements,
+        aims=tuple(aim for aim, keep in zip(measurements.aims, aim_kept, strict=True) if keep),
+        pairs=tuple(pair for pair in measurements.pairs if pair.pm in names),
+    )
+
+
+def _enough(problem: PackedProblem, pm_kept: BoolArray, aim_kept: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Who is kept, where an epoch with too few left (or the aims) takes all of its own back."""
+    pm_kept = pm_kept.copy()
+    epoch_of = np.zeros(len(problem.pms), dtype=np.int64)
+    epoch_of[problem.beam_pm] = problem.beam_epoch
+    for epoch in range(problem.columns.epochs):
+        mine = epoch_of == epoch
+        if (pm_kept & mine).sum() < MIN_KEPT_PMS:
+            pm_kept |= mine
+    if aim_kept.sum() < MIN_KEPT_AIMS:
+        aim_kept = np.ones_like(aim_kept)
+    return pm_kept, aim_kept
+
+
+def _split_looks(
+    measurements: Measurements,
+    whole: PackedProblem,
+    kept: tuple[BoolArray, BoolArray],
+    judged: Sorted,
+    packed: Pack,
+) -> tuple[Measurements, BoolArray] | None:
+    """Several looks at a PM of which one is junk: that one becomes a PM of its own, and the others are kept.
+
+    Only where leaving out one look, and no other one, makes the rest fit. None where there is no such PM.
+
+    Returns:
+        the measurements with the junk looks under PM numbers of their own, and which of their PMs are kept.
+    """
+    pm_kept, _ = kept
+    out = {pm for pm, keep in zip(whole.pms, pm_kept, strict=True) if not keep}
+    looks: dict[int, list[int]] = {}
+    for index, pair in enumerate(measurements.pairs):
+        if pair.pm in out:
+            looks.setdefault(pair.pm, []).append(index)
+    trials = [(pm, left) for pm, indices in looks.items() if len(indices) > 1 for left in indices]
+    if not trials:
+        return None
+    # Every trial as a PM of its own.
+    variants = [
+        replace(measurements.pairs[index], pm=number)
+        for number, (pm, left) in enumerate(trials)
+        for index in looks[pm]
+        if index != left
+    ]
+    fits = predicted_pms(packed(replace(measurements, pairs=tuple(variants))), whole, judged)
+    single: dict[int, list[int]] = {}
+    for (pm, left), good in zip(trials, fits, strict=True):
+        if good:
+            single.setdefault(pm, []).append(left)
+    junk = {lefts[0] for lefts in single.values() if len(lefts) == 1}
+    if not junk:
+        return None
+    spare = min(whole.pms) - 1
+    pairs = tuple(
+        replace(pair, pm=spare - index) if index in junk else pair for index, pair in enumerate(measurements.pairs)
+    )
+    rescued = {measurements.pairs[index].pm for index in junk}
+    names = dict.fromkeys(pair.pm for pair in pairs)
+    before = dict(zip(whole.pms, pm_kept, strict=True))
+    return replace(measurements, pairs=pairs), np.array([name in rescued or before.get(name, False) for name in names])
+
+
+def _solve_jointly(
+    measurements: Measurements, packed: Pack, start: SharedState, aim_kept: BoolArray, *, clean: bool
+) -> tuple[Measurements, PackedProblem, Optimum, Shots]:
+    """What is kept, packed, its optimum, and all shots judged by it.
+
+    Args:
+        measurements: of the epochs to be solved.
+        packed: lays measurements out as arrays.
+        start: one hypothesis.
+        aim_kept: (A,) aims that fitted when looked at alone.
+        clean: whether no PM has deviated so far.
+    """
+    whole = packed(measurements)
+    everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
+    if clean and aim_kept.all():
+        optimum = optimize(whole, start, tolerance=1e-8)
+        found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
+        beyond = deviant(whole, found, everyone[0])
+        plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
+        if plausible and not (beyond.pm.any() or beyond.aim.any()):
+            shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
+            return measurements, whole, optimum, shots
+        start = optimum.state
+        clean = bool(plausible and beyond.pm.mean() <= FEW and beyond.aim.sum() <= 1)
+    if clean and aim_kept.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
+        first = _enough(whole, ~beyond.pm, ~beyond.aim)
+    else:
+        robust = graduated_or_near(whole, start, robust_aims=True)
+        start = robust.state
+        first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
+    judged = sort_shots(whole, start, *first)
+    kept = _enough(whole, judged.pm_kept, judged.aim_kept)
+    apart = _split_looks(measurements, whole, kept, judged, packed)
+    if apart is not None:
+        measurements, pm_kept = apart
+        whole = packed(measurements)
+        judged = sort_shots(whole, judged.state, pm_kept, kept[1])
+        kept = _enough(whole, judged.pm_kept, judged.aim_kept)
+    chosen = _keep(measurements, whole.pms, *kept)
+    problem = packed(chosen)
+    optimum = optimize(problem, judged.state, tolerance=1e-8)
+    found = innovations_at(whole, optimum.state, *kept)
+    deviants = deviant(whole, found, kept[0])
+    private = initial_private(whole, optimum.state)
+    for _ in range(4):
+        _, private = refine(whole, optimum.state, private)
+    at = evaluate(whole, optimum.state, private)
+    return chosen, problem, optimum, Shots(whole, at, *kept, found, deviants.pm, deviants.aim)
+
+
+def register(
+    measurements: Measurements,
+    model: SessionModel,
+    config: SolveConfig,
+    sound_speed: SoundSpeedPrior | None = None,
+    searched: Mapping[int, EpochSearch] | None = None,
+) -> Registration:
+    """Calibrate and register: the joint optimum over all epochs that can be solved.
+
+    ``sound_speed`` is what is known of the ratio where it is estimated; the configuration's prior where None.
+    ``searched``: epochs that need no search, with what is known of their minima.
+
+    Raises:
+        EstimationError: no beam to start from, or no epoch with three PMs.
+    """
+    beam = calibrate_beam(measurements, model)
+    trusted = _keep(measurements, (), np.zeros(0, dtype=bool), beam.aim_kept).aims
+    fitting = replace(measurements, aims=trusted)
+    known = searched or {}
+    searches = tuple(
+        known[k] if k in known else search_epoch(fitting, model, beam.frames, k)
+        for k in range(len(measurements.epochs))
+    )
+    solvable = solvable_epochs(measurements, searches)
+    if not solvable:
+        counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
+        raise EstimationError(
+            f"no camera epoch has the 3 photoacoustic markers that a first solution takes (found {counts}); "
+            "take at least 6 pairs without moving the camera"
+        )
+    choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
+    chosen = {k: minimum for k, (minimum, _) in choices.items()}
+    start = _best_start(measurements, chosen, solvable, model, config)
+    is_open = {k for k, (_, undecided) in choices.items() if undecided}
+    start, is_open = _told_apart(fitting, searches, is_open, solvable, start, model, config)
+    clean = all(search.clean for search in searches)
+
+    def packed(of: Measurements) -> PackedProblem:
+        return pack_session(of, model, config, sound_speed)
+
+    epochs = restrict_epochs(measurements, solvable)
+    kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+    if _points_backwards(optimum):
+        # A nominal beam given the wrong way round, and no aim to tell: +z is where the spots are.
+        start = _turned(optimum.state, model)
+        kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+    return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), (kept, problem, optimum, shots))
+
+
+def register_near(
+    measurements: Measurements,
+    model: SessionModel,
+    config: SolveConfig,
+    start: SharedState,
+    epochs: Sequence[int],
+    sound_speed: SoundSpeedPrior | None = None,
+) -> Registration:
+    """:func:`register` where it is known about where the optimum is: who is kept is settled anew, without a search.
+
+    What the wide losses and the narrow one lead to from ``start`` is what they lead :func:`register` to from the best
+    of all minima, where ``start`` is nearest to that one: which shots counted before has no say in it.
+
+    Args:
+        measurements: of the session.
+        model, config, sound_speed: as of :func:`register`.
+        start: one hypothesis, with the registrations of ``epochs``.
+        epochs: those to be solved.
+
+    Raises:
+        EstimationError: the shots leave the registration undetermined.
+    """
+
+    def packed(of: Measurements) -> PackedProblem:
+        return pack_session(of, model, config, sound_speed)
+
+    mine = restrict_epochs(measurements, list(epochs))
+    aims = np.ones(len(mine.aims), dtype=bool)
+    found = _solve_jointly(mine, packed, start, aims, clean=False)
+    searches = tuple(EpochSearch((), None, clean=False) for _ in measurements.epochs)
+    return _registration(model, tuple(epochs), searches, (), found)
+
+
+def _registration(
+    model: SessionModel,
+    epochs: tuple[int, ...],
+    searches: tuple[EpochSearch, ...],
+    ambiguous: tuple[int, ...],
+    found: tuple[Measurements, PackedProblem, Optimum, Shots],
+) -> Registration:
+    """What was found, with its covariance.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    kept, problem, optimum, shots = found
+    hessian = optimum.evaluation.hessian[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    try:
+        covariance = np.linalg.inv(hessian * scale * scale[:, None]) * scale * scale[:, None]
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError("these shots leave the registration undetermined; take more pairs") from error
+    return Registration(
+        model=model,
+        measurements=kept,
+        epochs=epochs,
+        problem=problem,
+        optimum=optimum,
+        searches=searches,
+        ambiguous=ambiguous,
+        covariance=np.asarray(covariance, dtype=np.float64),
+        shots=shots,
+    )

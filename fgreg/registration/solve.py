@@ -1,0 +1,400 @@
+"""Solve a session's measurements as a whole: registration, beam, tracks, verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.errors import EstimationError
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.gtsam_graph import GraphOptions, build_graph
+from fgreg.graph.gtsam_solver import newton_step
+from fgreg.graph.gtsam_values import PrivateValues, SharedValues, values_at
+from fgreg.graph.reduced_blocks import moved_markers
+from fgreg.graph.shared_state import SharedState
+from fgreg.graph.split_points import logsumexp, odds_in_epoch
+from fgreg.model.estimate import (
+    AimEstimate,
+    EpochEstimate,
+    LaserEstimate,
+    PairEstimate,
+    SessionEstimate,
+    TrackEstimate,
+    Verdict,
+)
+from fgreg.model.measurements import Measurements, Track
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.tissue_surface import fit_surface
+from fgreg.registration.posterior import Posterior, predicted_tre
+from fgreg.registration.posterior_mean import (
+    answer,
+    estimated_radius,
+    estimated_sound_speed,
+    sound_speed_from_residuals,
+)
+from fgreg.registration.readout import read_aims, read_laser, read_pairs
+from fgreg.registration.register import EpochSearch, Registration, SoundSpeedPrior, register
+from fgreg.registration.verdict import (
+    SURE_OF_AIMS,
+    SURE_OF_PAIRS,
+    Condition,
+    accuracy,
+    ambiguity,
+    beam_sides,
+    causes_of_error,
+    consistency,
+    estimated,
+    hypotheses,
+    left_out,
+    repeated_markers,
+    sampling,
+    sound_speed_condition,
+    spread,
+    sweeps,
+    too_few_to_tell,
+    understated_noise,
+    unsteady,
+    verdict_of,
+)
+from fgreg.tracking import Snapshot, make_snapshot, track
+
+GRAPH_PAIRS = 200
+"""Up to so many pairs the explicit graph is solved as well, and has to agree."""
+AGREEMENT_SIGMA = 0.05
+"""Largest distance between the two optima, in units of the estimate's own standard deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The answer for a session's measurements: everything but the session's name.
+
+    ``pairs``, ``tracks`` and ``aims`` are in the order of what was given. ``registration``, ``posterior`` and
+    ``snapshot`` (what queries are answered from) are None where nothing could be computed.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    laser: LaserEstimate | None
+    epochs: tuple[EpochEstimate, ...]
+    pairs: tuple[PairEstimate, ...]
+    tracks: tuple[TrackEstimate, ...]
+    aims: tuple[AimEstimate, ...]
+    registration: Registration | None = None
+    posterior: Posterior | None = None
+    snapshot: Snapshot | None = None
+
+    def as_session(self, name: str) -> SessionEstimate:
+        """The estimate as files and reports have it."""
+        return SessionEstimate(
+            name, self.verdict, self.reasons, self.laser, self.epochs, self.pairs, self.tracks, self.aims
+        )
+
+
+def solve(
+    measurements: Measurements,
+    tracks: Sequence[Track],
+    model: SessionModel,
+    config: SolveConfig,
+    conditions: Sequence[Condition] = (),
+    sound_speed_prior: SoundSpeedPrior | None = None,
+    known: Mapping[int, EpochSearch] | None = None,
+) -> Solution:
+    """Calibrate, register, judge, and answer the tracking queries from all of it.
+
+    Args:
+        measurements: aims, pairs, epochs.
+        tracks: queries; they never enter the estimate.
+        model: the session's set-up.
+        config: limits of the verdict.
+        conditions: found before (detection), to be weighed with those found here.
+        sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
+        known: epochs whose minima are known and not searched for again.
+    """
+    try:
+        registration = register(measurements, model, config, sound_speed_prior, known)
+    except EstimationError as error:
+        return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
+    answered = answer(registration, config)
+    posterior, centred = answered.posterior, answered.registration
+    readout = read_laser(centred, model)
+    pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
+    aims = read_aims(measurements, centred, readout.origin_shift_mm)
+    common = [
+        *conditions,
+        *_common_conditions(registration, pairs, aims),
+        *sampling(posterior.effective),
+        *_variable_conditions(centred, sound_speed_prior, config),
+    ]
+    steady = {k: _move_odds(registration, place) for place, k in enumerate(registration.epochs)}
+    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common, steady)
+    refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
+    snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
+    # The last epoch is where the camera stands; an earlier one that failed is told, and no more than a warning.
+    verdict = max(epochs[-1].verdict, verdict_of(common), key=lambda v: v.severity)
+    if verdict is Verdict.OK and any(epoch.verdict is not Verdict.OK for epoch in epochs):
+        verdict = Verdict.WARNING
+    return Solution(
+        verdict=verdict,
+        reasons=tuple(condition.text for condition in [*common, *found]),
+        laser=readout.laser,
+        epochs=epochs,
+        pairs=pairs,
+        tracks=tuple(track(query, snapshot) for query in tracks),
+        aims=aims,
+        registration=registration,
+        posterior=posterior,
+        snapshot=snapshot,
+    )
+
+
+def _nothing(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:
+    """A refusal where nothing could be computed."""
+    reasons = tuple(condition.text for condition in conditions)
+    why = reasons[-1]
+    return Solution(
+        verdict=Verdict.REFUSED,
+        reasons=reasons,
+        laser=None,
+        epochs=tuple(
+            EpochEstimate(k, epoch.t, None, None, sum(p.epoch == k for p in measurements.pairs), Verdict.REFUSED, None)
+            for k, epoch in enumerate(measurements.epochs)
+        ),
+        pairs=tuple(PairEstimate(p.t, p.pm, p.epoch, used=False, reason=why) for p in measurements.pairs),
+        tracks=tuple(TrackEstimate(q.t, None, None, None, False, f"no registration: {why}") for q in tracks),
+        aims=tuple(AimEstimate(a.t, used=False, reason=why) for a in measurements.aims),
+    )
+
+
+def _common_conditions(
+    registration: Registration, pairs: Sequence[PairEstimate], aims: Sequence[AimEstimate]
+) -> list[Condition]:
+    """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
+    problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
+    shots, kept_aims = registration.shots, len(registration.measurements.aims)
+    equations = 2 * kept_aims + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
+    unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
+    lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
+    lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]
+    found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
+    if not registration.optimum.converged.all():
+        text = f"the solve had not settled after {registration.optimum.iterations} steps: take more pairs in each epoch"
+        found.append(Condition(Verdict.REFUSED, text))
+    found.extend(repeated_markers(registration.measurements.pairs))
+    nis = shots.innovations
+    if aims:
+        found.extend(left_out(shots.aim_kept, nis.aim, "aims", SURE_OF_AIMS))
+        found.extend(
+            too_few_to_tell(shots.aim_deviant, shots.aim_kept, nis.aim, [f"the aim at {a.t:.1f} s" for a in aims])
+        )
+    deviant = np.concatenate([shots.pm_deviant, shots.aim_deviant])
+    found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
+    if problem.columns.sound_speed is None:
+        asked = sound_speed_from_residuals(registration)
+        found.extend(sound_speed_condition(asked.value, asked.sigma))
+    if found and verdict_of(found) is Verdict.REFUSED:
+        return found  # what is inconsistent anyway says nothing about the two forms of the graph
+    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph knows its radius
+        found.extend(_agreement(registration))
+    return found
+
+
+def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, config: SolveConfig) -> list[Condition]:
+    """Sound speed and radius: what they came out as."""
+    found = []
+    speed, radius = estimated_sound_speed(centred), estimated_radius(centred)
+    if speed is not None:
+        given = prior or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+        found.append(estimated("sound speed ratio", speed.value, speed.sigma, given.mean, given.sigma, ""))
+    if radius is not None:
+        given_mm = centred.model.probe.radius_mm
+        found.append(estimated("radius", radius.value, radius.sigma, given_mm, config.radius_sigma_mm, " mm"))
+    return found
+
+
+def _agreement(registration: Registration) -> list[Condition]:
+    """The explicit graph has to have its optimum where the reduced one is: two derivations of one answer."""
+    apart = distance_to_explicit(registration)
+    if apart <= AGREEMENT_SIGMA:
+        return []
+    text = f"the two forms of the graph disagree by {apart:.2f} standard deviations: please report this session"
+    return [Condition(Verdict.REFUSED, text)]
+
+
+def distance_to_explicit(registration: Registration) -> float:
+    """Mahalanobis distance between the registrations that the explicit graph and the reduced one lead to.
+
+    By the Gauss-Newton step of each from the reduced optimum, where its own is next to nothing; infinite where the
+    explicit graph, the reference, has none.
+    """
+    state, problem, at = registration.optimum.state, registration.problem, registration.optimum.evaluation
+    epochs = problem.columns.epochs
+    speed = problem.columns.sound_speed
+    options = GraphOptions(
+        marker_T_nominal=state.marker_T_nominal[0],
+        unknown_motion_sigma=None,
+        sound_speed_sigma=None if speed is None else float(problem.prior_information[speed] ** -0.5),
+        sound_speed_mean=problem.sound_speed_mean,
+    )
+    explicit = build_graph(registration.measurements, registration.model, options)
+    shared = SharedValues(
+        trus_T_camera=tuple(state.trus_T_camera(k)[0] for k in range(epochs)),
+        marker_laser=state.beam[0],
+        window_edge_rad=float(state.edge_rad[0]),
+        marker_bias_mm=state.bias_mm[0],
+        sound_speed_ratio=float(state.sound_speed_ratio[0]),
+    )
+    private, bias_mm = at.private, state.bias_mm[0]
+    there = PrivateValues(
+        aim_camera_T_marker=moved_markers(problem.aims, private.aim_error[0], bias_mm),
+        camera_p_spot_mm=problem.aim_spot_mm + private.aim_shift[0],
+        camera_T_marker=moved_markers(problem.beams, private.beam_error[0], bias_mm),
+        trus_p_pm_mm=private.trus_p_pm[0],
+    )
+    step = newton_step(explicit, values_at(explicit, shared, there))
+    if step is None:
+        return math.inf
+    own = -(registration.covariance @ at.gradient[0])[: 6 * epochs]
+    apart = np.concatenate([step.at(key) for key in explicit.keys.trus_T_camera]) - own
+    poses = registration.covariance[: 6 * epochs, : 6 * epochs]
+    return float(np.sqrt(apart @ np.linalg.solve(poses, apart)))
+
+
+def _judge_epochs(
+    measurements: Measurements,
+    registration: Registration,
+    posterior: Posterior,
+    pairs: Sequence[PairEstimate],
+    model: SessionModel,
+    config: SolveConfig,
+    common: Sequence[Condition],
+    steady: Mapping[int, Sequence[Condition]],
+) -> tuple[tuple[EpochEstimate, ...], list[Condition]]:
+    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several).
+
+    ``steady``: conditions of each epoch that were found at the optimum.
+    """
+    several = len(measurements.epochs) > 1
+    out: list[EpochEstimate] = []
+    reasons: list[Condition] = []
+    state = registration.optimum.state
+    for k, start in enumerate(measurements.epochs):
+        count = sum(pair.epoch == k and pair.used for pair in pairs)
+        pms = len({pair.pm for pair in measurements.pairs if pair.epoch == k})
+        if k not in registration.epochs:
+            text = f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
+            found = [Condition(Verdict.REFUSED, text)]
+            out.append(EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None))
+        else:
+            place = registration.epochs.index(k)
+            found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
+            tre = predicted_tre(posterior, place, model.targets_mm)
+            found.extend(accuracy(tre, config, causes_of_error(registration, place, model.targets_mm)))
+            block = slice(6 * place, 6 * place + 6)
+            out.append(
+                EpochEstimate(
+                    index=k,
+                    start_s=start.t,
+                    trus_T_camera=state.trus_T_camera(place)[0],
+                    covariance=posterior.covariance[block, block],
+                    pairs=count,
+                    verdict=verdict_of([*common, *found]),
+                    predicted_tre=tre,
+                )
+            )
+        name = f"epoch {k}: " if several else ""
+        reasons.extend(Condition(condition.verdict, name + condition.text) for condition in found)
+    return tuple(out), reasons
+
+
+def _epoch_conditions(
+    registration: Registration,
+    pairs: Sequence[PairEstimate],
+    epoch: int,
+    model: SessionModel,
+    config: SolveConfig,
+) -> list[Condition]:
+    place, state = registration.epochs.index(epoch), registration.optimum.state
+    mine = [pair for pair in registration.measurements.pairs if pair.epoch == place]
+    search = registration.searches[epoch]
+    linked = any(place in (link.old, link.new) for link in registration.problem.links)
+    found = ambiguity(
+        search,
+        len({pair.pm for pair in mine}),
+        is_open=epoch in registration.ambiguous,
+        has_initial=model.initial_trus_T_camera is not None or linked,
+        config=config,
+    )
+    found.extend(hypotheses(search, config))
+    found.extend(_junk_conditions(registration, place))
+    if mine:
+        directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
+        points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.used and e.trus_p_pm_mm is not None])
+        if not linked or len(mine) >= config.min_pairs:
+            found.extend(spread(directions, points, config))
+        found.extend(sweeps(mine, config))
+    return found
+
+
+def _move_odds(registration: Registration, place: int) -> list[Condition]:
+    """Whether the inliers of one epoch fit one registration, before and after every split point."""
+    pms, log = odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
+    if not len(log):
+        return []
+    best = int(np.argmax(log))
+    return unsteady(float(logsumexp(log)), pms[best], pms[best + 1], len(pms))
+
+
+def _junk_conditions(registration: Registration, place: int) -> list[Condition]:
+    """PMs of one epoch that were left out, or should have been."""
+    shots = registration.shots
+    mine = np.zeros(len(shots.problem.pms), dtype=bool)
+    mine[shots.problem.beam_pm[shots.problem.beam_epoch == place]] = True
+    if not mine.any():
+        return []
+    kept, nis = shots.pm_kept[mine], shots.innovations.pm[mine]
+    names = [f"PM {pm}" for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
+    return [*left_out(kept, nis, "pairs", SURE_OF_PAIRS), *too_few_to_tell(shots.pm_deviant[mine], kept, nis, names)]
+
+
+def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:
+    camera_d = camera_T_marker[:, :3, :3] @ state.beam_direction()[0]
+    return np.asarray(camera_d @ state.rotation[0, epoch].T)
+
+
+def track_snapshot(
+    registration: Registration,
+    model: SessionModel,
+    config: SolveConfig,
+    origin_shift_mm: float,
+    refused: Mapping[int, str] | None = None,
+) -> Snapshot:
+    """What queries about a solved session are answered from.
+
+    Args:
+        registration: at the posterior's mean, its covariance that of the posterior.
+        model, config: of the session.
+        origin_shift_mm: lambda of the laser frame's origin in the beam chart.
+        refused: the epochs refused, with the reason (which may be empty).
+    """
+    problem, at = registration.problem, registration.optimum.evaluation
+    gain = at.point_gain[0]
+    covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
+    state = registration.optimum.state
+    camera_d = problem.beams.rotation @ state.beam_direction()[0]
+    trus_d = np.einsum("bij,bj->bi", state.rotation[0, problem.beam_epoch], camera_d)
+    return make_snapshot(
+        model,
+        config,
+        state,
+        registration.covariance,
+        problem.columns,
+        registration.epochs,
+        origin_shift_mm=origin_shift_mm,
+        surface=fit_surface(at.private.trus_p_pm[0], covariance, trus_d),
+        causal=False,
+        refused=refused,
+    )

@@ -1,0 +1,390 @@
+"""Whether the answer may be used: conditions, each a sentence with its figure and what to do about it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import bdtrc, chdtrc, chdtri
+
+from fgreg.geometry.transforms import BoolArray, FloatArray, hat, inverse, transform_points
+from fgreg.graph.split_points import ALARM
+from fgreg.model.estimate import PredictedTre, Verdict, worst_verdict
+from fgreg.model.measurements import Pair
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.outliers import JUNK_P
+from fgreg.registration.register import EpochSearch, Registration
+
+SUSPICIOUS_P = 1e-3
+IMPOSSIBLE_P = 1e-9
+WARN_LEFT_OUT = 0.25
+REFUSE_LEFT_OUT = 0.5
+"""Shares of the shots that may be junk."""
+SURE_OF_PAIRS = 9
+SURE_OF_AIMS = 6
+"""Shots that have to agree before those that do not are safely junk: half as many again as a solution takes."""
+JUNK_CAUTION = 2
+"""Where shots were left out other hypotheses have more freedom to fit by chance: so many times the gap is needed."""
+CERTAIN_NIS = 30.0
+"""Innovation of one shot that noise does not explain, nor a bad estimate from few others."""
+MIRROR_CHANCE = 2.0
+"""By no more than this a mirrored session fits better by chance: what is told wrongly here costs centimetres."""
+MILD_NIS = 60.0
+MILD_JUNK = 0.1
+"""Junk is mostly farther off than this; so large a share is not."""
+MOST_SOUND_SPEED = 0.1
+"""No medium is farther off than this: the cause is another."""
+TELLING_PMS = 6
+"""Fewer PMs know no registration, and say nothing of a second one."""
+FEW_PMS = 21
+"""PMs up to which those before a camera move are enough to spoil a registration, and have to be looked for there."""
+ABOUT_EVEN = 0.6
+"""Bayes factor of a move before any of few PMs, each as likely, against none, from which it is to be reckoned with: one
+in twelve steady sessions of 10 to 20 PMs reaches it, and so does a move of 2 deg between 5 PMs and 6."""
+SUSPICIOUS_Z = 4.0
+SOUND_SPEED_TOLERANCE = 0.005
+DOMINANT = 0.5
+"""Share of the error's variance from which a cause is named."""
+LEAST_EFFECTIVE = 60.0
+"""Independent samples of the posterior below which its 95 % quantiles are not worth much."""
+SUSPICIOUS_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One condition missed: how bad that is, and the sentence for ``reasons``."""
+
+    verdict: Verdict
+    text: str
+
+
+def verdict_of(conditions: Iterable[Condition]) -> Verdict:
+    """The most severe verdict of the conditions missed."""
+    return worst_verdict(*(condition.verdict for condition in conditions))
+
+
+def ambiguity(
+    search: EpochSearch, pairs: int, *, is_open: bool, has_initial: bool, config: SolveConfig
+) -> list[Condition]:
+    """Second minima, too few pairs, and the mirrored hypothesis, of one epoch."""
+    found = []
+    if is_open and len(search.minima) > 1:
+        gap = search.minima[1].cost - search.minima[0].cost
+        found.append(
+            Condition(
+                Verdict.REFUSED,
+                f"two registrations explain the {pairs} pairs (chi square {search.minima[0].cost:.1f} and "
+                f"{search.minima[1].cost:.1f}, {gap:.1f} apart, {config.second_minimum_chi2:.1f} needed): take more "
+                "pairs at other spots and beam directions, or give initial.trus_T_camera",
+            )
+        )
+    if pairs < config.min_pairs and not has_initial:
+        found.append(
+            Condition(
+                Verdict.REFUSED,
+                f"{pairs} pairs leave the registration open ({config.min_pairs} needed without an initial one): "
+                f"take {config.min_pairs - pairs} more",
+            )
+        )
+    return [*found, *mirrored(search, config)]
+
+
+def mirrored(search: EpochSearch, config: SolveConfig) -> list[Condition]:
+    """The mirrored hypothesis: a stage or probe wired the other way round.
+
+    A mirror image whose beams come from the probe's side is no rival unless it fits far better; where the session as it
+    stands has them come from there, the mirror image is the likelier one already where it fits as well.
+    """
+    if search.mirrored_cost is None or not search.minima:
+        return []
+    cost, rival = search.minima[0].cost, search.mirrored_cost
+    caution = 1 if search.clean else JUNK_CAUTION
+    needed = MIRROR_CHANCE * caution if search.outside else -config.second_minimum_chi2
+    if search.mirrored_outside_cost is not None and search.mirrored_outside_cost < cost - needed:
+        rival = search.mirrored_outside_cost
+    elif rival >= cost - config.second_minimum_chi2 * caution:
+        if search.outside:
+            return []
+        text = (
+            "the beams run away from the probe, as if the fibre were on its side of the tissue: check stage.direction, "
+            "probe.flip and the marker's tags"
+        )
+        return [Condition(Verdict.WARNING, text)]
+    text = (
+        f"the mirrored hypothesis fits {'better' if rival < cost else 'as well'} (chi square {rival:.1f} against "
+        f"{cost:.1f}): the stage turns the other way (stage.direction) or the elements are counted from the other end "
+        "(probe.flip); check the wiring and correct session.yaml"
+    )
+    return [Condition(Verdict.REFUSED, text)]
+
+
+def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
+    """Sweep signs turned round, and another beam in the pairs than in the aims; tried where something does not fit."""
+    found = []
+    if not search.minima:
+        return []
+    cost = search.minima[0].cost
+    # With all sweeps one way the sign does not show, and a small gap is chance.
+    if search.other_way_cost is not None and search.other_way_cost < cost - JUNK_CAUTION * config.second_minimum_chi2:
+        text = (
+            f"the sweeps fit better with their signs turned round (chi square {search.other_way_cost:.1f} against "
+            f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it"
+        )
+        found.append(Condition(Verdict.REFUSED, text))
+    if search.own_beam_cost is not None and search.own_beam_cost < cost - chdtri(4, IMPOSSIBLE_P):
+        found.append(
+            Condition(
+                Verdict.REFUSED,
+                f"the pairs have another beam than the aims (chi square {search.own_beam_cost:.1f} with a beam of "
+                f"their own, {cost:.1f} with that of the aims): the marker was swapped, or moved on the fibre, after "
+                "calibration; take the aims again",
+            )
+        )
+    return found
+
+
+def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Condition]:
+    """Too large a share of the shots left out as junk, or fewer kept than it takes to be ``sure``."""
+    out = int(np.sum(~kept))
+    if out and out <= WARN_LEFT_OUT * len(kept) and kept.sum() < sure:
+        text = (
+            f"{out} of {len(kept)} {what} do not fit the others and are left out; the {kept.sum()} kept are few to be "
+            f"sure which are wrong ({sure} needed): take more {what}"
+        )
+        return [Condition(Verdict.WARNING, text)]
+    if out <= WARN_LEFT_OUT * len(kept):
+        return []
+    refuse = out > REFUSE_LEFT_OUT * len(kept)
+    return [
+        Condition(
+            Verdict.REFUSED if refuse else Verdict.WARNING,
+            f"{out} of {len(kept)} {what} do not fit the others and are left out (nis {nis[~kept].min():.0f} to "
+            f"{nis[~kept].max():.0f}, at most {WARN_LEFT_OUT:.0%} accepted): look at what was detected there, check "
+            f"noise, probe and marker in session.yaml, and take {out} {what} anew",
+        )
+    ]
+
+
+def understated_noise(deviant: BoolArray, nis: FloatArray) -> list[Condition]:
+    """Several shots beyond their limit, but not by far: that is noise larger than stated rather than junk."""
+    mild = deviant & (nis < MILD_NIS)
+    share_of_junk = float(np.mean(deviant & ~mild))
+    expected = min(JUNK_P + MILD_JUNK * share_of_junk, 1.0)
+    if float(bdtrc(int(mild.sum()) - 1, len(nis), expected)) >= SUSPICIOUS_P:
+        return []
+    return [
+        Condition(
+            Verdict.WARNING,
+            f"the residuals of {int(mild.sum())} of {len(nis)} shots are larger than the stated noise explains, though "
+            f"not by far (nis {nis[mild].min():.0f} to {nis[mild].max():.0f}): rather than junk that is noise; correct "
+            "noise in session.yaml, or the covariances of the detections",
+        )
+    ]
+
+
+def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names: Sequence[str]) -> list[Condition]:
+    """Shots that do not fit where there are too few to leave one out."""
+    suspects = np.flatnonzero(deviant & kept)
+    if not len(suspects):
+        return []
+    worst = int(suspects[np.argmax(nis[suspects])])
+    return [
+        Condition(
+            Verdict.REFUSED if nis[worst] > CERTAIN_NIS else Verdict.WARNING,
+            f"{names[worst]} does not fit the others (nis {nis[worst]:.1f}), and {int(kept.sum())} are too few to tell "
+            "which is wrong: take more, and look at what was detected there",
+        )
+    ]
+
+
+def unsteady(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
+    """Odds of a camera move among ``pms`` PMs (fgreg.graph.split_points), likeliest between two.
+
+    No registration is of both sides: what they are registered to lies anywhere between, and the predicted error does
+    not know. Among few PMs neither side of a move tells it well, so it counts where a move somewhere among them is
+    about as likely as none; among many the wrong ones are left out, or found by --detect-moves.
+    """
+    few, alarm = pms <= FEW_PMS, log_odds > ALARM
+    somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1)
+    if not (alarm or (few and pms >= TELLING_PMS and somewhere > ABOUT_EVEN)):
+        return []
+    return [
+        Condition(
+            Verdict.REFUSED if few and alarm else Verdict.WARNING,
+            f"the pairs up to PM {before} and those from PM {after} {'do' if alarm else 'may'} not fit one "
+            f"registration (odds {math.exp(min(log_odds, 20.0)):.0f} to 1): if the camera was moved between them, "
+            "tell it (camera_moved) or solve with --detect-moves; where it was not, take more pairs",
+        )
+    ]
+
+
+def spread(directions: FloatArray, points: FloatArray, config: SolveConfig) -> list[Condition]:
+    """Parallel beams and collinear spots, from beam directions (n, 3) and PMs (n, 3) of one epoch."""
+    found = []
+    mean = directions.mean(axis=0)
+    cosine = np.clip(directions @ mean / max(float(np.linalg.norm(mean)), 1e-9), -1.0, 1.0)
+    angle = float(np.sqrt(np.mean(np.arccos(cosine) ** 2)))
+    if angle < config.warn_beam_spread_rad:
+        refuse = angle < config.refuse_beam_spread_rad
+        least = config.refuse_beam_spread_rad if refuse else config.warn_beam_spread_rad
+        found.append(
+            Condition(
+                Verdict.REFUSED if refuse else Verdict.WARNING,
+                f"the beams are {'' if refuse else 'nearly '}parallel ({math.degrees(angle):.1f} deg about their mean, "
+                f"{math.degrees(least):.0f} needed): add pairs with the fibre tilted left, right, up and down",
+            )
+        )
+    away = float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] / math.sqrt(len(points)))
+    if away < config.warn_spot_spread_mm:
+        refuse = away < config.refuse_spot_spread_mm
+        least = config.refuse_spot_spread_mm if refuse else config.warn_spot_spread_mm
+        found.append(
+            Condition(
+                Verdict.REFUSED if refuse else Verdict.WARNING,
+                f"the spots lie {'' if refuse else 'nearly '}on one line ({away:.1f} mm about it, {least:.0f} needed): "
+                "add pairs at spots to either side of it",
+            )
+        )
+    return found
+
+
+def sweeps(pairs: Iterable[Pair], config: SolveConfig) -> list[Condition]:
+    """Sweeps from one side only: a wrong window edge or sweep sign would not show."""
+    sides = [pair.look.sweep for pair in pairs if pair.look.sweep]
+    up, down = sides.count(1), sides.count(-1)
+    if not sides or min(up, down) >= config.min_sweeps_per_side:
+        return []
+    missing = config.min_sweeps_per_side - min(up, down)
+    return [
+        Condition(
+            Verdict.WARNING,
+            f"{max(up, down)} of {up + down} sweeps went one way, where a wrong window edge or sweep sign does not "
+            f"show: take {missing} pairs sweeping the other way",
+        )
+    ]
+
+
+def repeated_markers(pairs: Iterable[Pair]) -> list[Condition]:
+    """One marker observation under several PM numbers: looks that count as independent and are not."""
+    pms: dict[int, set[int]] = {}
+    for pair in pairs:
+        pms.setdefault(pair.marker.id, set()).add(pair.pm)
+    shared = [sorted(names) for names in pms.values() if len(names) > 1]
+    if not shared:
+        return []
+    text = (
+        f"{len(shared)} marker observations serve several PMs (PM {', '.join(str(pm) for pm in shared[0])}): looks at "
+        "one spot have one pm; where the spots differ, the fibre moved and each needs a marker of its own"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
+def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
+    """Residuals against the noise that was stated."""
+    if degrees_of_freedom <= 0:
+        return []
+    p = float(chdtrc(degrees_of_freedom, cost))
+    if p >= SUSPICIOUS_P:
+        return []
+    return [
+        Condition(
+            Verdict.REFUSED if p < IMPOSSIBLE_P else Verdict.WARNING,
+            f"the residuals are larger than the stated noise explains (chi square {cost:.0f} for "
+            f"{degrees_of_freedom} degrees of freedom): look at the pairs with the largest nis, and check noise, "
+            "probe and marker in session.yaml",
+        )
+    ]
+
+
+def estimated(name: str, value: float, sigma: float, prior: float, prior_sigma: float, unit: str) -> Condition:
+    """What a session-wide variable came out as; a warning where it left its prior."""
+    far = abs(value - prior) > SUSPICIOUS_SIGMAS * prior_sigma
+    text = f"estimated {name} {value:.4g} +- {sigma:.2g}{unit} (given {prior:.4g} +- {prior_sigma:.2g}{unit})"
+    if far:
+        return Condition(Verdict.WARNING, f"{text}: farther than its prior allows; correct it in session.yaml")
+    return Condition(Verdict.OK, text)
+
+
+def sampling(effective: float) -> list[Condition]:
+    """Too few independent samples of the posterior for the figures that rest on them."""
+    if effective >= LEAST_EFFECTIVE:
+        return []
+    text = (
+        f"the posterior is hard to sample (worth {effective:.0f} independent samples, {LEAST_EFFECTIVE:.0f} needed), "
+        "so predicted errors are rough: take more pairs"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
+@dataclass(frozen=True, slots=True)
+class Causes:
+    """Share of the variance at the worst target that would go if the beam, or the window edge, were known."""
+
+    beam: float
+    edge: float
+
+
+def accuracy(tre: PredictedTre, config: SolveConfig, causes: Causes | None = None) -> list[Condition]:
+    """Predicted error at the worst target against the limit, with what would lower it most."""
+    if tre.worst_mm <= config.limit_mm:
+        return []
+    far = tre.worst_mm > 2.0 * config.limit_mm
+    advice = "take more pairs, spread over the field and with sweeps from both sides"
+    if causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
+        advice = (
+            f"{causes.beam:.0%} of its variance is the beam's: take more aims, at short and long distances, and roll "
+            "the fibre about its beam during calibration"
+        )
+    elif causes is not None and causes.edge > DOMINANT:
+        advice = f"{causes.edge:.0%} of its variance is the window edge's: take as many pairs sweeping the other way"
+    return [
+        Condition(
+            Verdict.REFUSED if far else Verdict.WARNING,
+            f"the predicted error at the worst target is {tre.worst_mm:.1f} mm (95 %), the limit {config.limit_mm:.1f} "
+            f"mm: {advice}",
+        )
+    ]
+
+
+def causes_of_error(registration: Registration, place: int, targets_mm: FloatArray) -> Causes:
+    """What the error of an epoch (``place`` in ``registration.epochs``) comes from, by the Gaussian at the optimum."""
+    columns, covariance = registration.problem.columns, registration.covariance
+    camera_p = transform_points(inverse(registration.optimum.state.trus_T_camera(place)[0]), targets_mm)
+    # A right perturbation (omega, v) moves the camera point p by omega x p + v.
+    move = np.concatenate([-hat(camera_p), np.broadcast_to(np.eye(3), (len(camera_p), 3, 3))], axis=-1)
+    pose = slice(6 * place, 6 * place + 6)
+    total = np.einsum("nij,jk,nik->n", move, covariance[pose, pose], move)
+    worst = int(np.argmax(total))
+    shares = []
+    for known in (slice(columns.beam, columns.beam + 4), slice(columns.edge, columns.edge + 1)):
+        cross, own = covariance[pose, known], covariance[known, known]
+        explained = cross @ np.linalg.solve(own, cross.T)
+        shares.append(float(np.trace(move[worst] @ explained @ move[worst].T) / total[worst]))
+    return Causes(beam=shares[0], edge=shares[1])
+
+
+def sound_speed_condition(ratio: float, sigma: float) -> list[Condition]:
+    """Whether the pairs ask for another sound speed than they were given, from the ratio that they ask for."""
+    if not max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE) < abs(ratio - 1.0) < MOST_SOUND_SPEED:
+        return []
+    text = (
+        f"the pairs fit better with sound at {ratio:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: measure the medium's "
+        "temperature or sound speed and correct it in session.yaml (with ranges computed anew), or solve with "
+        "--estimate sound_speed"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
+def beam_sides(lambda_mm: FloatArray) -> list[Condition]:
+    """Spots before and behind the laser's origin: the beam cannot point both ways."""
+    behind = int(np.sum(lambda_mm < 0))
+    if behind == 0:
+        return []
+    return [
+        Condition(
+            Verdict.WARNING,
+            f"{behind} of {len(lambda_mm)} spots lie behind the beam's origin: check marker and initial.marker_T_laser",
+        )
+    ]

@@ -1,0 +1,247 @@
+"""``events.jsonl``: what happened, one JSON object per line, described by fgreg.model.events."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from fgreg.errors import InputError, one_line
+from fgreg.model.events import EVENTS, AimEvent, Event, MarkerRecord, PairEvent, RefusedEvent, TrackEvent, TrusRecord
+from fgreg.schema.files import FrameKind
+from fgreg.schema.kinds import SECONDS
+from fgreg.schema.problems import FieldError, Problem, input_error, path_text, shown
+from fgreg.session.frame_files import FrameUse
+from fgreg.session.setup_reader import Setup
+from fgreg.session.yaml_loader import open_file
+
+MAX_LINE_BYTES = 1_000_000
+_MAX_INTEGER_DIGITS = 30
+
+
+@dataclass(slots=True)
+class EventLog:
+    """What an ``events.jsonl`` holds: the events that are right, and warnings."""
+
+    events: list[Event] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+class _RefusedJsonError(ValueError):
+    """Well-formed, but not allowed here: a key twice, a number that is none."""
+
+
+class _CutShortError(ValueError):
+    """A last line without its line break that is no JSON."""
+
+
+def read_events(path: Path, file: str, folder: Path, setup: Setup | None, problems: list[InputError]) -> EventLog:
+    """Reads the events; appends to ``problems`` all that is wrong with them.
+
+    Args:
+        path: the file.
+        file: how messages name it.
+        folder: the session's folder, resolved.
+        setup: what the session has; None where that could not be read, and is not checked against.
+    """
+    log = EventLog()
+    try:
+        stream = open_file(path, file)
+    except InputError as error:
+        problems.append(error)
+        return log
+    last: tuple[float, int] | None = None
+    with stream:
+        for number, line in _lines(stream, file, problems):
+            try:
+                read = read_line(line, number, file, folder, setup, last)
+            except _CutShortError:
+                log.warnings.append(f"{file}: line {number}: cut short, dropped")
+                continue
+            problems += read.problems
+            if read.t is not None:
+                last = (read.t, number)
+            if read.event is not None:
+                log.events.append(read.event)
+    return log
+
+
+@dataclass(frozen=True, slots=True)
+class LineRead:
+    """One line by itself: its event, its time where it has one, and what is wrong with it (then there is no event)."""
+
+    event: Event | None
+    t: float | None
+    problems: tuple[InputError, ...]
+
+
+def read_line(
+    line: bytes, number: int, file: str, folder: Path, setup: Setup | None, last: tuple[float, int] | None
+) -> LineRead:
+    """Reads one line.
+
+    Args:
+        line: with its line break.
+        number: of the line, from 1.
+        file, folder, setup: as of :func:`read_events`.
+        last: time and line of the event before, None for the first.
+    """
+    event: Event | None = None
+    t: float | None = None
+    problems: list[Problem] = []
+    try:
+        document = _parse(line)
+        t, problems = _time(document, last)
+        event = EVENTS.read(document, folder, line=number)
+        problems += _misfits(event, setup)
+    except FieldError as error:
+        problems += error.problems
+    errors = tuple(input_error(problem, file, line=number) for problem in dict.fromkeys(problems))
+    return LineRead(None if errors else event, t, errors)
+
+
+def _time(document: Mapping[str, object], last: tuple[float, int] | None) -> tuple[float | None, list[Problem]]:
+    """The time of an event, None where it has none, and what is wrong with it."""
+    if "t" not in document:
+        return None, []  # missed with the other keys
+    try:
+        t = SECONDS.read(document["t"])
+    except FieldError as error:
+        return None, error.below("t")
+    if last is not None and t < last[0]:
+        return t, [Problem(("t",), f"{t:.17g}", f"at least {last[0]:.17g}, the time on line {last[1]}")]
+    return t, []
+
+
+def frames_of(event: Event, file: str, folder: Path) -> Iterator[FrameUse]:
+    """The frames that an event names."""
+    for path, record in _records(event):
+        uses = (
+            (("left", record.left, FrameKind.CAMERA), ("right", record.right, FrameKind.CAMERA))
+            if isinstance(record, MarkerRecord)
+            else (("frame", record.frame, FrameKind.TRUS),)
+        )
+        for key, frame, kind in uses:
+            if frame is not None:
+                where = f"{file}: line {event.line}: {path_text((*path, key))}"
+                yield FrameUse(frame, frame.relative_to(folder).as_posix(), kind, where)
+
+
+def _records(event: Event) -> Iterator[tuple[tuple[str | int, ...], MarkerRecord | TrusRecord]]:
+    """The marker and the looks of an event, with their places."""
+    if isinstance(event, AimEvent | PairEvent | TrackEvent):
+        yield ("marker",), event.marker
+    if isinstance(event, PairEvent | TrackEvent) and event.trus is not None:
+        yield ("trus",), event.trus
+    if isinstance(event, TrackEvent):
+        for i, look in enumerate(event.several):
+            yield ("looks", i), look
+
+
+def _misfits(event: Event, setup: Setup | None) -> Iterator[Problem]:
+    """What an event says that its session, or its place in the file, does not allow."""
+    if isinstance(event, RefusedEvent):
+        line = event.refused_line
+        if line is not None and not 0 < line < event.line:
+            yield Problem(("event",), f"line {line}", "an earlier line of this file")
+    if setup is None:
+        return
+    corner = event.corner if isinstance(event, AimEvent) else None
+    for path, record in _records(event):
+        if isinstance(record, MarkerRecord):
+            if record.left is not None and (corner is not None or record.camera_T_marker is None):
+                yield from _lacks_camera(record, path, setup)
+        elif record.frame is not None and not setup.present & {"probe.channels", "probe.image"}:
+            found = "a frame, but neither probe.channels nor probe.image in session.yaml"
+            yield Problem((*path, "frame"), found, "one of them there, to read the frame by")
+    if corner is not None:
+        board = setup.board
+        if "board" not in setup.present:
+            yield Problem(("corner",), "it without a board in session.yaml", "board: {columns, rows, square_mm}")
+        elif board is not None and not (corner[0] < board.columns and corner[1] < board.rows):
+            expected = f"[column, row] of a board with {board.columns} columns and {board.rows} rows, counted from 0"
+            yield Problem(("corner",), shown(list(corner)), expected)
+
+
+def _lacks_camera(marker: MarkerRecord, path: tuple[str | int, ...], setup: Setup) -> Iterator[Problem]:
+    if "camera" not in setup.present:
+        found = "a frame, but no camera in session.yaml"
+        yield Problem((*path, "left"), found, "camera there, or camera_T_marker here")
+    elif marker.right is not None and "camera.right" not in setup.present:
+        yield Problem((*path, "right"), "a frame, but no camera.right in session.yaml", "camera.right there")
+    if marker.camera_T_marker is None and "marker" not in setup.present:
+        found = "a frame, but no marker in session.yaml"
+        yield Problem((*path, "left"), found, "marker there, or camera_T_marker here")
+
+
+def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator[tuple[int, bytes]]:
+    number = 0
+    while True:
+        try:
+            line = stream.readline(MAX_LINE_BYTES + 1)
+        except OSError as error:
+            problems.append(InputError(file, f"no access ({error.strerror})", "a file that can be read"))
+            return
+        if not line:
+            return
+        number += 1
+        if number == 1:
+            line = line.removeprefix(b"\xef\xbb\xbf")
+        if len(line) > MAX_LINE_BYTES:
+            # What follows cannot be told apart into lines any more.
+            where = f"{file}: line {number}"
+            problems.append(InputError(where, "a longer line", f"at most {MAX_LINE_BYTES} bytes"))
+            return
+        yield number, line
+
+
+def _parse(line: bytes) -> Mapping[str, object]:
+    """The object on a line. Raises FieldError where it is bad, _CutShortError where a last line was cut short."""
+    if len(line) > MAX_LINE_BYTES:
+        raise FieldError.of(f"{len(line)} bytes", f"at most {MAX_LINE_BYTES}")
+    expected = "one JSON object"
+    try:
+        value = json.loads(
+            line.rstrip(b"\r\n").decode("utf-8"),
+            object_pairs_hook=_object,
+            parse_constant=_refuse_constant,
+            parse_int=_integer,
+        )
+    except _RefusedJsonError as error:
+        found, expected = str(error), "finite numbers, and each key once"
+    except RecursionError:
+        found = "nesting too deep"
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        if not line.endswith(b"\n"):
+            raise _CutShortError from None
+        if isinstance(error, UnicodeDecodeError):
+            found, expected = "bytes that are not UTF-8", "UTF-8 text"
+        elif not line.strip():
+            found = "an empty line"
+        else:
+            found = f"bad JSON ({error.msg}, column {error.colno})"
+    else:
+        if isinstance(value, dict):
+            return value
+        found = shown(value)
+    raise FieldError.of(found, expected)
+
+
+def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    out: dict[str, object] = {}
+    for key, value in pairs:
+        if key in out:
+            raise _RefusedJsonError(f"the key {one_line(key, 40)} twice in one object")
+        out[key] = value
+    return out
+
+
+def _refuse_constant(name: str) -> float:
+    raise _RefusedJsonError(name)
+
+
+def _integer(digits: str) -> int | float:
+    # Python refuses to convert thousands of digits; no field here needs more than a double holds.
+    return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)

@@ -1,0 +1,174 @@
+"""Raw frames that events name: whether they are what they should be, from headers alone."""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import warnings
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.lib import format as npy_format
+
+from fgreg.errors import InputError
+from fgreg.model.session_model import ProbeModel
+from fgreg.schema.files import FrameKind
+from fgreg.schema.problems import shown
+from fgreg.session.yaml_loader import open_file
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_MAX_BYTES = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class FrameUse:
+    """A frame that an event names: resolved path, name in the folder, use, and the place of the name."""
+
+    path: Path
+    name: str
+    kind: FrameKind
+    where: str
+
+
+def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int, int] | None) -> None:
+    """Checks that a file is a whole PNG image of the camera's size, by its chunk headers.
+
+    Args:
+        path: the file.
+        name: as the event has it.
+        where: the place of the name, for messages.
+        image_size: (width, height), or None where there is no camera to compare with.
+
+    Raises:
+        InputError: it is not.
+    """
+    with _open_frame(path, name, where) as file:
+        size = _png_size(file)
+        if size is None:
+            raise InputError(where, f"{shown(name)}, which is no whole PNG image", "a PNG image")
+        if image_size is not None and size != image_size:
+            expected = f"camera.image_size, {image_size[0]} x {image_size[1]}"
+            raise InputError(where, f"{shown(name)} with {size[0]} x {size[1]} px", expected)
+
+
+def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
+    """(width, height) of a PNG file whose chunks are all there, else None. Pixel data are not decoded."""
+    header = file.read(33)
+    if len(header) < 33 or header[:8] != _PNG_SIGNATURE or header[8:16] != b"\x00\x00\x00\x0dIHDR":
+        return None
+    width, height, checksum = struct.unpack(">II5xI", header[16:33])
+    if checksum != zlib.crc32(header[12:29]) or not width or not height:
+        return None
+    end = os.fstat(file.fileno()).st_size
+    at, data = 33, False
+    while True:
+        file.seek(at)
+        chunk = file.read(8)
+        if len(chunk) < 8:
+            return None
+        length, kind = struct.unpack(">I4s", chunk)
+        at += 12 + length
+        if at > end:
+            return None
+        # Checksums here, or a damaged file would be a complaint of the image library's own.
+        body = file.read(length + 4)
+        if zlib.crc32(body[:-4], zlib.crc32(kind)) != int.from_bytes(body[-4:], "big"):
+            return None
+        if kind == b"IEND":
+            return (width, height) if data else None
+        data = data or kind == b"IDAT"
+
+
+def trus_frame_problem(
+    shape: tuple[int, ...], dtype: np.dtype[np.generic], probe: ProbeModel
+) -> tuple[str, str] | None:
+    """What keeps an array from being a TRUS frame of this probe, and what was expected, or None."""
+    if len(shape) != 2 or min(shape) < 2 or dtype.kind not in "iuf":
+        found = f"an array of {dtype} with shape {list(shape)}"
+    elif probe.image is not None or probe.holds_channels(shape, dtype):
+        return None
+    else:
+        found = f"an array of {dtype} with shape {list(shape)}"
+    ways = []
+    if probe.channels is not None:
+        ways.append(f"channel data (float32 or int16) of shape [{probe.elements}, samples]")
+    if probe.image is not None:
+        ways.append("an image of numbers, [depth, lateral]")
+    return found, " or ".join(ways)
+
+
+def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None) -> None:
+    """Checks that a file is an NPY array that this probe can have recorded, by its header and the file's length.
+
+    Args:
+        path: the file.
+        name: as the event has it.
+        where: the place of the name, for messages.
+        probe: to compare with, or None where it could not be read.
+
+    Raises:
+        InputError: it is not. Arrays of Python objects (pickles) are refused unread.
+    """
+    with _open_frame(path, name, where) as file:
+        header = _npy_header(file)
+        if header is None:
+            raise InputError(where, f"{shown(name)}, which is no NPY array", "an NPY array")
+        shape, dtype = header
+        if dtype.hasobject:
+            raise InputError(where, f"{shown(name)} with Python objects", "an NPY array of numbers")
+        needed = file.tell() + dtype.itemsize * math.prod(shape)
+        size = os.fstat(file.fileno()).st_size
+        if not needed <= size <= _MAX_BYTES:
+            raise InputError(where, f"{shown(name)} with {size} bytes", f"{needed} bytes, as its header says")
+        problem = None if probe is None else trus_frame_problem(shape, dtype, probe)
+        if problem is not None:
+            raise InputError(where, f"{shown(name)} with {problem[0]}", problem[1])
+        if dtype.kind == "f" and not np.isfinite(np.frombuffer(file.read(needed - file.tell()), dtype)).all():
+            raise InputError(where, f"{shown(name)} with entries that are not finite", "finite numbers")
+
+
+def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[np.generic]] | None:
+    """Shape and type of an NPY file, read up to its data; None where it is none."""
+    try:
+        version = npy_format.read_magic(file)
+        if version not in ((1, 0), (2, 0), (3, 0)):
+            return None
+        read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            shape, _, dtype = read(file)
+    except Exception:  # numpy parses the header as Python source, and bad bytes raise whatever that parser raises
+        return None
+    return (shape, dtype) if all(n >= 0 for n in shape) else None
+
+
+def _open_frame(path: Path, name: str, where: str) -> IO[bytes]:
+    try:
+        return open_file(path, where)
+    except InputError as error:
+        found = "no such file" if error.found == "nothing" else error.found
+        raise InputError(where, f"{shown(name)}: {found}", error.expected) from None
+
+
+def check_frames(
+    uses: list[FrameUse], probe: ProbeModel | None, image_size: tuple[int, int] | None
+) -> list[InputError]:
+    """Checks each named frame once for each use; returns all that is wrong, in the order of the uses."""
+    problems: list[InputError] = []
+    seen: set[tuple[Path, FrameKind]] = set()
+    for use in uses:
+        if (use.path, use.kind) in seen:
+            continue
+        seen.add((use.path, use.kind))
+        try:
+            if use.kind is FrameKind.CAMERA:
+                check_camera_frame(use.path, use.name, use.where, image_size)
+            else:
+                check_trus_frame(use.path, use.name, use.where, probe)
+        except InputError as error:
+            problems.append(error)
+    return problems

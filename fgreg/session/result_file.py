@@ -1,0 +1,133 @@
+"""``result.yaml``: written whole or not at all, and every field is checked on reading (see fgreg.model.estimate)."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from dataclasses import replace
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.model.estimate import RESULT, SessionEstimate
+from fgreg.model.session_model import SessionModel
+from fgreg.schema.problems import FieldError, input_error
+from fgreg.schema.yaml_writer import yaml_text
+from fgreg.session.yaml_loader import load_yaml
+
+RESULT_FILE = "result.yaml"
+
+_SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml"})
+_MAX_BYTES = 256_000_000
+_MAX_NODES = 20_000_000
+_ONE_LINE = frozenset({"predicted_tre_mm", "pairs", "tracks", "add", "track"})
+
+_FORMAT_LINE = b"format: fgreg-result/"
+
+
+def remove_result(path: Path) -> None:
+    """Removes an older result before work starts, so that no failure leaves one behind.
+
+    Raises:
+        InputError: the folder is absent or cannot be written to, or the path is anything but an older result.
+    """
+    if path.name in _SESSION_FILES:
+        raise InputError(str(path), "the name of a session's own file", "another name for the result")
+    if not path.parent.is_dir():
+        raise InputError(str(path.parent), "no such folder", f"a folder to write {path.name} to")
+    if path.is_dir() and not path.is_symlink():
+        raise InputError(str(path), "a folder", "a file name for the result")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError(str(path.parent), "a folder that cannot be written to", f"one to write {path.name} to")
+    try:
+        if os.path.lexists(path) and not _is_result(path):
+            raise InputError(str(path), "a file that is no result", "a new name, or that of an older result")
+        path.unlink(missing_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), f"a file that cannot be removed ({_reason(error)})", "an older result") from None
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a file is a result, by its name in a session's folder or by its first line: nothing else is removed."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    if path.name == RESULT_FILE:
+        return True
+    with path.open("rb") as file:
+        return file.read(len(_FORMAT_LINE)) == _FORMAT_LINE
+
+
+def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, version: str) -> None:
+    """Writes a result: to a temporary file beside it first, which then takes its name.
+
+    Args:
+        estimate: the answer.
+        model: of the session; gives it its name.
+        path: the file, replaced where it exists.
+        version: of this package.
+
+    Raises:
+        InputError: the file cannot be written.
+        ValueError: a transform of the estimate is not rigid, or an array not finite (a defect of the estimate).
+    """
+    document = RESULT.write(replace(estimate, session=model.name, version=version))
+    # The format's line comes first, and as it is: an older result is known by it.
+    text = f"format: {document.pop('format')}\n" + yaml_text(document, _ONE_LINE)
+    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
+    try:
+        try:
+            with temporary.open("x", encoding="utf-8", newline="\n") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            temporary.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        _sync_folder(path.parent)
+    except OSError as error:
+        raise InputError(str(path), f"a file that cannot be written ({_reason(error)})", "a writable place") from None
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes a rename last through a loss of power; some file systems cannot, and that is no failure."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _reason(error: OSError | ValueError) -> str:
+    return getattr(error, "strerror", None) or str(error)
+
+
+def read_result(path: Path) -> SessionEstimate:
+    """Reads a result and checks every field.
+
+    Times of the looks are not in the file: ``t`` of each pair is NaN; nor are the calibration shots. A predicted error
+    that is ``null`` reads as infinite.
+
+    Raises:
+        InputError: the first problem of the file.
+    """
+    data = load_yaml(path, path.name, max_bytes=_MAX_BYTES, max_nodes=_MAX_NODES)
+    try:
+        estimate: SessionEstimate = RESULT.read(data)
+        _check_indices(estimate)
+    except FieldError as error:
+        raise input_error(error.problems[0], path.name, data) from None
+    return estimate
+
+
+def _check_indices(estimate: SessionEstimate) -> None:
+    """Raises FieldError where an epoch is not at its place in the list, or a look's is not in it."""
+    for i, epoch in enumerate(estimate.epochs):
+        if epoch.index != i:
+            raise FieldError.of(str(epoch.index), f"{i}, the epoch's place in the list", "epochs", i, "index")
+    last = max(0, len(estimate.epochs) - 1)
+    for i, pair in enumerate(estimate.pairs):
+        if pair.epoch > last:
+            raise FieldError.of(str(pair.epoch), f"an integer from 0 to {last}", "pairs", i, "epoch")

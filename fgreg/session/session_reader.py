@@ -1,0 +1,147 @@
+"""A session's folder, read and checked: ``session.yaml``, ``events.jsonl``, ``ground_truth.yaml``, frames.
+
+Every problem becomes an :class:`InputError` that names the file, the key or line, what was found and what was
+expected. :func:`read_session` raises the first, :func:`check_session` returns all of them.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.model.events import Event, PairEvent, TrackEvent
+from fgreg.model.session_model import SessionModel
+from fgreg.schema.problems import FieldError, input_error
+from fgreg.session.event_reader import EventLog, frames_of, read_events
+from fgreg.session.frame_files import check_frames
+from fgreg.session.ground_truth import GROUND_TRUTH, GroundTruth
+from fgreg.session.setup_reader import Setup, read_setup
+from fgreg.session.yaml_loader import load_yaml
+
+SETUP_FILE = "session.yaml"
+EVENTS_FILE = "events.jsonl"
+TRUTH_FILE = "ground_truth.yaml"
+
+_TRUTH_BYTES = 64_000_000
+_TRUTH_NODES = 2_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A session as recorded.
+
+    Attributes:
+        folder: as given.
+        model: how things were set up.
+        events: what happened, in order.
+        warnings: plain sentences on what is allowed but hardly meant, and on a last line that was cut short.
+    """
+
+    folder: Path
+    model: SessionModel
+    events: tuple[Event, ...]
+    warnings: tuple[str, ...]
+
+
+def read_session(folder: Path) -> Session:
+    """Reads a session. Frames that events name lie inside the folder, but whether they exist shows when they are used.
+
+    Raises:
+        InputError: the first problem of the folder, of ``session.yaml`` or of ``events.jsonl``.
+    """
+    problems: list[InputError] = []
+    setup, log = _read(folder, problems)
+    if problems:
+        raise problems[0]
+    if setup is None or setup.model is None:
+        raise AssertionError("no model and no problem")
+    return Session(folder, setup.model, tuple(log.events), tuple(_warnings(setup, log)))
+
+
+def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
+    """Checks a session, its ground truth where there is one, and the headers of all frames that events name.
+
+    Returns:
+        All problems and all warnings; both empty where all is well.
+    """
+    problems: list[InputError] = []
+    setup, log = _read(folder, problems)
+    try:
+        _read_truth(folder, problems)
+    except InputError as error:
+        problems.append(error)
+    camera = None if setup is None else setup.camera
+    probe = None if setup is None else setup.probe
+    frames = [use for event in log.events for use in frames_of(event, EVENTS_FILE, folder.resolve())]
+    problems.extend(check_frames(frames, probe, None if camera is None else camera.left.image_size))
+    return problems, _warnings(setup, log)
+
+
+def read_ground_truth(folder: Path) -> GroundTruth | None:
+    """The truth about a session, or None where there is no ``ground_truth.yaml``.
+
+    Raises:
+        InputError: the first problem of the file.
+    """
+    problems: list[InputError] = []
+    truth = _read_truth(folder, problems)
+    if problems:
+        raise problems[0]
+    return truth
+
+
+def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, EventLog]:
+    """Both files of a session; what is wrong is appended to ``problems``, and the rest still read."""
+    try:
+        resolved = folder.resolve(strict=True)
+        if not resolved.is_dir():
+            problems.append(InputError(str(folder), "a file", "a session's folder"))
+            return None, EventLog()
+    except (OSError, RuntimeError, ValueError) as error:
+        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
+        found = "nothing" if absent else f"no access ({getattr(error, 'strerror', None) or error})"
+        problems.append(InputError(str(folder), found, "a session's folder"))
+        return None, EventLog()
+    setup: Setup | None = None
+    try:
+        data = load_yaml(folder / SETUP_FILE, SETUP_FILE)
+        setup = read_setup(data, SETUP_FILE, resolved.name or "session", problems)
+    except InputError as error:
+        problems.append(error)
+    return setup, read_events(folder / EVENTS_FILE, EVENTS_FILE, resolved, setup, problems)
+
+
+def _warnings(setup: Setup | None, log: EventLog) -> list[str]:
+    """What is allowed but hardly meant, of both files together."""
+    if setup is None:
+        return log.warnings
+    beyond = []
+    if setup.model is not None:
+        lower, upper = (math.degrees(limit) for limit in setup.model.stage.limits_device_rad)
+        for event in log.events:
+            looks = (
+                (event.trus,) if isinstance(event, PairEvent) else event.looks if isinstance(event, TrackEvent) else ()
+            )
+            if any(not lower - 1e-6 <= look.scan_deg <= upper + 1e-6 for look in looks):
+                beyond.append(event.line)
+    out = [*setup.warnings, *log.warnings]
+    if beyond:
+        where = f"{EVENTS_FILE}: line {beyond[0]}" + (f" and {len(beyond) - 1} more" if beyond[1:] else "")
+        out.append(f"{where}: scan_deg is outside stage.limits_deg, [{lower:g}, {upper:g}]")
+    return out
+
+
+def _read_truth(folder: Path, problems: list[InputError]) -> GroundTruth | None:
+    path = folder / TRUTH_FILE
+    if not os.path.lexists(path):
+        return None
+    data = load_yaml(path, TRUTH_FILE, max_bytes=_TRUTH_BYTES, max_nodes=_TRUTH_NODES)
+    try:
+        truth: GroundTruth = GROUND_TRUTH.read(data)
+    except FieldError as error:
+        problems += [input_error(problem, TRUTH_FILE, data) for problem in error.problems]
+        return None
+    return truth

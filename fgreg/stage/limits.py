@@ -1,0 +1,176 @@
+"""What motion is allowed: three kinds, each with its conditions. The figures are the session's and the operator's."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Annotated, Any, Self
+
+from fgreg.model.session_model import StageModel
+from fgreg.schema.kinds import SCAN_DEG, Number, NumberTuple, in_radians
+from fgreg.schema.problems import FieldError, shown
+from fgreg.schema.record import Key, Section, record
+from fgreg.stage.interface import MAX_CALL_S
+
+_SPEED = Number(0.0, 30.0, above=True, unit="deg/s", degrees=True)
+
+
+class MotionKind(StrEnum):
+    """Why the stage turns. Each kind needs a request of its own by the operator; none ever becomes another.
+
+    ``home``: to the zero position. Limits, speed, heartbeat, request.
+    ``search``: a step of a sweep or its refinement. Besides: homed, inside the sweep range.
+    ``track``: after the beam. Besides (homed): marker not too old, a current registration that is not refused, sigma
+    below its limit; for as long as the stage turns.
+    """
+
+    HOME = "home"
+    SEARCH = "search"
+    TRACK = "track"
+
+
+@dataclass(frozen=True, slots=True)
+class MotionLimits:
+    """Limits of motion. Angles rad, speeds rad/s, times s; ``sweep_rad`` is in plane angles.
+
+    Attributes:
+        stage: direction, zero, and the limits that no motion may leave (device angles).
+        home_travel_rad: homing is stopped after this much travel. Until the zero position is found nobody knows where
+            the stage stands; where it stood inside its limits, homing takes no more than their span.
+        heartbeat_s: the main program has to be heard from at least this often, or the stage stops.
+        command_age_s: a command that was on its way for longer is refused: it comes from before a stall.
+        status_age_s: the stage has to be heard from at least this often while it moves.
+        clock_gap_s: the watchdog looks at its clock far more often than this; a longer gap means it did not run.
+        tolerance_rad: of positions: reading, settling, overshoot.
+        deceleration: least of a stage that is told to stop or to turn about, rad/s^2.
+        overspeed: factor above the commanded speed that is taken for a fault.
+        stop_s: time in which a stopped stage has to stand, where its deceleration does not ask for more.
+        slack_s: time that a motion may take beyond its distance at its speed.
+    """
+
+    stage: StageModel
+    sweep_rad: Annotated[
+        tuple[float, float],
+        Key(
+            "plane angles that a search may use",
+            NumberTuple(2, in_radians(SCAN_DEG)),
+            default="all that session.yaml allows",
+            example="[-60, 60]",
+        ),
+    ]
+    home_speed: Annotated[float, Key("highest speed to the zero position", _SPEED, name="home_speed_deg_s")] = (
+        math.radians(10.0)
+    )
+    search_speed: Annotated[float, Key("highest speed of a search", _SPEED, name="search_speed_deg_s")] = math.radians(
+        10.0
+    )
+    track_speed: Annotated[float, Key("highest speed after the beam", _SPEED, name="track_speed_deg_s")] = math.radians(
+        10.0
+    )
+    home_travel_rad: float | None = None
+    track_sigma_rad: Annotated[
+        float,
+        Key(
+            "largest standard deviation of an answer that is followed",
+            Number(0.0, 10.0, above=True, unit="deg", degrees=True),
+        ),
+    ] = math.radians(2.0)
+    marker_age_s: Annotated[
+        float, Key("oldest marker that is followed, from its exposure", Number(0.0, 0.2, above=True, unit="s"))
+    ] = 0.2
+    heartbeat_s: float = 0.25
+    command_age_s: float = 0.2
+    status_age_s: float = 0.3
+    clock_gap_s: float = 0.5
+    request_s: Annotated[float, Key("an operator's request ends by itself after", Number(1.0, 3600.0, unit="s"))] = (
+        600.0
+    )
+    tolerance_rad: float = math.radians(0.5)
+    deceleration: float = math.radians(20.0)
+    overspeed: float = 1.25
+    stop_s: float = 1.5
+    slack_s: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in (
+            *("home_speed", "search_speed", "track_speed", "track_sigma_rad", "marker_age_s", "heartbeat_s"),
+            *("command_age_s", "status_age_s", "clock_gap_s", "request_s", "tolerance_rad", "stop_s", "slack_s"),
+            "deceleration",
+        ):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}, expected a number > 0")
+        if not 1.0 < self.overspeed <= 2.0:
+            raise ValueError(f"overspeed is {self.overspeed}, expected a factor in (1, 2]")
+        low, high = self.sweep_rad
+        if not low < high:
+            found = shown([round(math.degrees(angle), 9) for angle in (low, high)])
+            raise FieldError.of(found, "the lower end, then the upper one", "sweep_deg")
+        if not (self.inside(low) and self.inside(high)):
+            raise ValueError(
+                f"the sweep range {math.degrees(low):.1f} to {math.degrees(high):.1f} deg leaves the stage's limits"
+            )
+        if not self.inside(self.stage.scan_from_device(0.0)):
+            raise ValueError("the stage's zero position, where homing ends, lies outside its limits")
+        if self.home_travel_rad is not None and not self.home_travel_rad > 0:
+            raise ValueError(f"home_travel_rad is {self.home_travel_rad}, expected a number > 0")
+
+    @classmethod
+    def of_session(cls, stage: StageModel, **changes: Any) -> Self:
+        """Defaults for a session's stage: searches may use all of its limits."""
+        low, high = sorted(stage.scan_from_device(limit) for limit in stage.limits_device_rad)
+        return cls(stage, **{"sweep_rad": (low, high), **changes})
+
+    def inside(self, scan_rad: float, tolerance_rad: float = 0.0) -> bool:
+        """Whether a plane angle is inside the stage's limits; no number is not."""
+        device = self.stage.device_from_scan(scan_rad)
+        low, high = self.stage.limits_device_rad
+        return low - tolerance_rad - 1e-12 <= device <= high + tolerance_rad + 1e-12
+
+    def in_sweep(self, scan_rad: float, tolerance_rad: float = 0.0) -> bool:
+        """Whether a plane angle is inside the sweep range."""
+        return self.sweep_rad[0] - tolerance_rad <= scan_rad <= self.sweep_rad[1] + tolerance_rad
+
+    def speed(self, kind: MotionKind) -> float:
+        """Highest speed of a kind."""
+        speeds = {
+            MotionKind.HOME: self.home_speed,
+            MotionKind.SEARCH: self.search_speed,
+            MotionKind.TRACK: self.track_speed,
+        }
+        return speeds[kind]
+
+    def reach_rad(self, speed: float, age_s: float) -> float:
+        """How far from where it was told ``age_s`` ago a stage can get before an order of now has turned it about.
+
+        It goes on at its speed until the order reaches it, at most a driver's call from now, and then brakes:
+        ``speed (age + call) + speed^2 / (2 deceleration)``.
+        """
+        return speed * (age_s + MAX_CALL_S) + speed * speed / (2.0 * self.deceleration)
+
+    def standing_s(self) -> float:
+        """Time after a stop from which on the stage has to be heard standing."""
+        fastest = max(self.speed(kind) for kind in MotionKind)
+        return max(self.stop_s, MAX_CALL_S + fastest / self.deceleration + self.status_age_s)
+
+    def homing_travel(self) -> float:
+        """Most travel of homing: the limits' span unless said otherwise."""
+        low, high = self.stage.limits_device_rad
+        return high - low if self.home_travel_rad is None else self.home_travel_rad
+
+    def document(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return asdict(self)
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Self:
+        """Back from :meth:`document`. Raises ValueError, TypeError, KeyError where it is not one."""
+        fields = dict(document)
+        stage = dict(fields.pop("stage"))
+        low, high = stage.pop("limits_device_rad")
+        sweep_low, sweep_high = fields.pop("sweep_rad")
+        return cls(StageModel(limits_device_rad=(low, high), **stage), (sweep_low, sweep_high), **fields)
+
+
+LIMITS = Section("MotionLimits", record(MotionLimits).fields)
+"""``limits`` of a stage in a configuration: reads to what :meth:`MotionLimits.of_session` takes."""

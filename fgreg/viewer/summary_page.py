@@ -1,0 +1,72 @@
+"""The recording's summary page, as Markdown."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fgreg.model.estimate import EpochEstimate, SessionEstimate, Verdict
+from fgreg.model.session_model import SessionModel
+
+HEADINGS = {
+    Verdict.OK: "# OK: the registration may be used",
+    Verdict.WARNING: "# WARNING: usable, but a condition was missed",
+    Verdict.REFUSED: "# REFUSED: do not use this registration",
+}
+LEGEND = """
+**What is drawn.** Grey: the TRUS probe. Cyan: its image plane, and the arc on which the probe heard each source
+(the plane is thick, so the source may be off it). Green: the laser beam from the fibre's marker (white squares).
+Orange: photoacoustic markers with their 95 % ellipsoids. Blue (red where refused): the endoscope camera. Small
+wire balls: targets with the 95 % ellipsoid of their predicted error. Magenta: the truth, where it is known.
+Bold is the shot at the time cursor, thin are those before it.
+"""
+
+
+def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_errors: list[tuple[float, float]]) -> str:
+    """The page: verdict first, then reasons, registration, pairs and what the colours mean.
+
+    Args:
+        model: the session's set-up.
+        estimate: its answer.
+        camera_errors: per epoch, translation error (mm) and rotation error (rad), where the truth is known.
+    """
+    lines = [HEADINGS[estimate.verdict], ""]
+    lines += [f"- {reason}" for reason in estimate.reasons]
+    used = sum(pair.used for pair in estimate.pairs)
+    lines += [
+        "",
+        f"Session **{estimate.session}**: {used} of {len(estimate.pairs)} looks used, "
+        f"{sum(aim.used for aim in estimate.aims)} of {len(estimate.aims)} calibration shots used, "
+        f"{len(estimate.tracks)} track queries.",
+        "",
+        f"Predicted error at {len(model.targets_mm)} targets, mm:",
+        "",
+        "| camera epoch | verdict | pairs | mean | 95 % | worst |",
+        "|---|---|---|---|---|---|",
+    ]
+    lines += [_epoch_row(epoch) for epoch in estimate.epochs]
+    for epoch in estimate.epochs:
+        lines += _transform(epoch, refused=estimate.verdict is Verdict.REFUSED)
+    for index, (translation_mm, rotation_rad) in enumerate(camera_errors):
+        lines += [
+            "",
+            f"Against the truth, epoch {index}: camera off by {translation_mm:.2f} mm and "
+            f"{math.degrees(rotation_rad):.2f} deg.",
+        ]
+    lines += [LEGEND]
+    return "\n".join(lines)
+
+
+def _epoch_row(epoch: EpochEstimate) -> str:
+    tre = epoch.predicted_tre
+    figures = "| | |" if tre is None else f"{tre.mean_mm:.2f} | {tre.p95_mm:.2f} | {tre.worst_mm:.2f} |"
+    return f"| {epoch.index} (from {epoch.start_s:.1f} s) | {epoch.verdict.value} | {epoch.pairs} | {figures}"
+
+
+def _transform(epoch: EpochEstimate, *, refused: bool) -> list[str]:
+    if epoch.trus_T_camera is None:
+        return ["", f"Epoch {epoch.index}: no registration could be computed."]
+    note = " (refused: for inspection only)" if refused else ""
+    rows = ["  ".join(f"{value:10.5f}" for value in row) for row in np.asarray(epoch.trus_T_camera)]
+    return ["", f"`trus_T_camera`, epoch {epoch.index}{note}:", "", "```", *rows, "```"]

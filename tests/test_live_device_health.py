@@ -1,0 +1,117 @@
+"""Devices that come and go are told once when they go and once when they come; a bad picture is as good as none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from fgreg.drivers.base import DeviceLost, StereoFrame
+from fgreg.live.device_health import FLAT, NOTHING_NEW_S, SILENT_S, START_S, Health, Pictures, Source
+from fgreg.model.time_sync import Stamp
+
+FRAME_S = 1.0 / 30.0
+
+
+@dataclass
+class Device:
+    """A device that does as the test says."""
+
+    connected: bool = True
+    name: str = "the device"
+    loses: list[str] = field(default_factory=list)
+
+    def poll(self) -> list[int]:
+        if self.loses:
+            raise DeviceLost(self.loses.pop())
+        return [1]
+
+
+def frame(rng: np.random.Generator, level: float = 90.0, contrast: float = 30.0, noise: float = 2.0) -> StereoFrame:
+    """One exposure of a scene with a sensor's noise."""
+    scene = level + contrast * np.sin(np.linspace(0.0, 20.0, 320))[None, :] * np.ones((180, 1))
+    sides = [np.clip(scene + noise * rng.standard_normal(scene.shape), 0, 255).astype(np.uint8) for _ in range(2)]
+    return StereoFrame(Stamp(0.0, 0.0), sides[0], sides[1], 0)
+
+
+def test_what_is_lost_and_back_is_told_once_each() -> None:
+    health = Health()
+    health.found("probe", "")
+    assert health.news() == []
+    for reason in ("gone", "gone", "still gone"):
+        health.found("probe", reason)
+    assert health.news() == ["probe lost: gone"]
+    assert health.lost == {"probe": "still gone"}
+    health.found("probe", "")
+    health.found("probe", "")
+    assert health.news() == ["probe is back"]
+    assert health.lost == {}
+
+
+def test_a_loss_is_told_even_if_the_device_is_back_at_once() -> None:
+    device = Device(loses=["cable out"])
+    source = Source(device, 0.0, sends=True)
+    assert source.poll() == ()
+    assert source.trouble(0.1) == "cable out"
+    assert source.trouble(0.2) == ""
+    assert source.poll() == [1]
+
+
+def test_a_device_that_sends_has_some_time_to_begin_and_none_later() -> None:
+    device = Device(connected=False)
+    camera, operator = Source(device, 10.0, sends=True), Source(device, 10.0, sends=False)
+    assert camera.trouble(10.0 + 0.9 * START_S) == ""
+    assert camera.trouble(10.0 + 1.1 * START_S) == "the device does not answer"
+    assert operator.trouble(100.0) == ""
+    device.connected = True
+    assert camera.trouble(20.0) == ""
+    device.connected = False
+    assert camera.trouble(20.1) == "the device does not answer"
+
+
+def test_pictures_that_change_are_new_and_nothing_is_wrong_with_them() -> None:
+    rng, pictures = np.random.default_rng(1), Pictures()
+    for i in range(60):
+        assert pictures.is_new(frame(rng), i * FRAME_S)
+        assert pictures.trouble(i * FRAME_S) == ""
+
+
+@pytest.mark.parametrize("frozen", ["left", "right"])
+def test_a_picture_that_repeats_is_no_new_look_and_soon_told(frozen: str) -> None:
+    rng, pictures = np.random.default_rng(2), Pictures()
+    first = frame(rng)
+    assert pictures.is_new(first, 0.0)
+    told_s = None
+    for i in range(1, 40):
+        other = frame(rng)
+        left, right = (first.left, other.right) if frozen == "left" else (other.left, first.right)
+        assert not pictures.is_new(StereoFrame(Stamp(i * FRAME_S, i * FRAME_S), left, right, i), i * FRAME_S)
+        if told_s is None and pictures.trouble(i * FRAME_S):
+            told_s = i * FRAME_S
+    assert told_s is not None
+    assert NOTHING_NEW_S < told_s < NOTHING_NEW_S + 2 * FRAME_S
+    assert f"{frozen} picture is frozen" in pictures.trouble(40 * FRAME_S)
+    assert pictures.is_new(frame(rng), 40 * FRAME_S)
+    assert pictures.trouble(40 * FRAME_S) == ""
+
+
+@pytest.mark.parametrize(("level", "told"), [(2.0, "shows nothing"), (90.0, "shows nothing"), (255.0, "frozen")])
+def test_black_plain_and_white_pictures_are_told(level: float, told: str) -> None:
+    rng, pictures = np.random.default_rng(3), Pictures()
+    for i in range(30):
+        pictures.is_new(frame(rng, level, 0.0, 0.4 * FLAT if level < 255.0 else 0.0), i * FRAME_S)
+    assert told in pictures.trouble(29 * FRAME_S)
+    assert pictures.is_new(frame(rng), 30 * FRAME_S)
+    assert pictures.trouble(30 * FRAME_S) == ""
+
+
+def test_a_video_that_stops_is_told_and_single_pictures_are_no_video() -> None:
+    rng, video, stills = np.random.default_rng(4), Pictures(), Pictures()
+    for i in range(10):
+        video.is_new(frame(rng), i * FRAME_S)
+        stills.is_new(frame(rng), float(i))
+    last = 9 * FRAME_S
+    assert video.trouble(last + 0.9 * SILENT_S) == ""
+    assert video.trouble(last + 1.1 * SILENT_S) == "it sends no pictures"
+    assert stills.trouble(9.0 + 5.0) == ""

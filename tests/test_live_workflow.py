@@ -1,0 +1,178 @@
+"""The course of a session: calibrating, searching PMs, following, beginning anew; in a simulated room, made-up time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from fgreg.drivers.base import CommandKind
+from fgreg.live.actions import Ask, Follow, Halt, Sweep, TakePairs
+from fgreg.live.workflow import Stage, Workflow, WorkflowSettings
+from fgreg.model.estimate import Verdict
+from fgreg.simulation.room import Room, room_config
+from fgreg.stage.limits import MotionKind
+from tests.rehearsal import Rehearsal
+
+
+def rehearsal(seed: int = 3, *, aims: int = 8, **options: object) -> Rehearsal:
+    return Rehearsal(Room(room_config(seed, aims=aims, bump_every_s=math.inf)), **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def whole() -> Rehearsal:
+    """A session up to following, and a minute of it."""
+    session = rehearsal()
+    while session.workflow.stage is not Stage.FOLLOWING and session.now_s < 240.0:
+        session.run(1.0)
+    predicted = session.engine.estimate.predicted_tre
+    assert predicted is not None
+    session.begun_mm = session.error_mm(), predicted.worst_mm
+    session.run(60.0)
+    return session
+
+
+def test_a_session_comes_to_a_registration_that_is_right(whole: Rehearsal) -> None:
+    assert whole.workflow.stage is Stage.FOLLOWING
+    estimate = whole.engine.estimate
+    assert estimate.verdict is Verdict.OK
+    error_mm, predicted_mm = whole.begun_mm
+    assert error_mm < predicted_mm
+    assert max(error_mm, whole.error_mm()) < 2.0
+
+
+def test_the_stage_follows_the_beam(whole: Rehearsal) -> None:
+    assert len(whole.errors_deg) >= 4
+    assert sorted(whole.errors_deg)[len(whole.errors_deg) // 2] < 1.0
+    assert max(whole.errors_deg) < 3.0
+
+
+def test_every_motion_comes_after_a_request_for_its_kind(whole: Rehearsal) -> None:
+    requested: MotionKind | None = None
+    for _, action in whole.asked:
+        if isinstance(action, Ask):
+            requested = action.kind
+        elif isinstance(action, Sweep):
+            assert requested is MotionKind.SEARCH
+        elif isinstance(action, Follow):
+            assert requested is MotionKind.TRACK
+    kinds = [a.kind for _, a in whole.asked if isinstance(a, Ask)]
+    assert kinds[:3] == [MotionKind.HOME, MotionKind.SEARCH, MotionKind.TRACK]
+    assert kinds.count(MotionKind.HOME) == 1
+
+
+def test_beams_that_miss_the_known_tissue_are_searched_and_then_followed(whole: Rehearsal) -> None:
+    wants = [tell for _, tell in whole.told if tell.wants is CommandKind.SEARCH]
+    assert any("hold it still and search here" in tell.text for tell in wants)
+    kinds = [a.kind for _, a in whole.asked if isinstance(a, Ask)]
+    assert kinds.count(MotionKind.TRACK) >= 2
+
+
+def test_looks_at_a_pm_are_within_its_window_and_paired_at_their_pulse(whole: Rehearsal) -> None:
+    taken = [(t, a) for t, a in whole.asked if isinstance(a, TakePairs)]
+    assert len({a.pm for _, a in taken}) == len(taken)
+    for t, pairs in taken:
+        for look in pairs.looks:
+            assert look.marker is not None
+            assert look.marker.t_s == pytest.approx(look.pulse_s)
+            assert look.pulse_s < t
+            plane = whole.room.plane_rad(look.pulse_s)
+            assert look.scan_rad is not None
+            assert abs(plane - look.scan_rad) < math.radians(7.0)
+
+
+def test_a_stage_that_was_not_asked_to_turn_does_not() -> None:
+    session = rehearsal(aims=0, obliging=False)
+    session.run(25.0)
+    assert session.asked == []
+    wants = [tell.wants for _, tell in session.told if tell.wants is not None]
+    assert 2 <= len(wants) <= 4  # asked again from time to time, not at every frame
+
+
+def test_a_fibre_that_moves_during_a_search_gives_no_pair() -> None:
+    session = rehearsal(aims=0)
+    while not any(isinstance(a, Sweep) for _, a in session.asked):
+        session.run(0.1)
+    session.run(0.3)
+    session.room.proceed(session.now_s)
+    session.run(0.6)
+    assert not any(isinstance(a, TakePairs) for _, a in session.asked)
+    assert any("the fibre has moved during the search" in tell.text for _, tell in session.told)
+
+
+def test_a_pm_that_is_not_heard_is_given_up_and_said_so() -> None:
+    session = rehearsal(aims=0, deaf_from_s=0.0)
+    session.run(45.0)
+    assert not any(isinstance(a, TakePairs) for _, a in session.asked)
+    assert any("nothing heard between" in tell.text and tell.done for _, tell in session.told)
+
+
+def test_without_the_marker_nothing_is_searched() -> None:
+    session = rehearsal(aims=0, blind_from_s=0.0)
+    session.run(15.0)
+    assert not any(isinstance(a, Sweep) for _, a in session.asked)
+
+
+def test_a_marker_lost_during_a_search_ends_it() -> None:
+    session = rehearsal(aims=0)
+    while not any(isinstance(a, Sweep) for _, a in session.asked):
+        session.run(0.1)
+    session.blind_from_s = session.now_s
+    session.run(3.0)
+    assert any("the marker is not seen" in tell.text for _, tell in session.told)
+    assert not any(isinstance(a, TakePairs) for _, a in session.asked)
+
+
+def test_after_a_told_move_it_searches_again_and_halts_first(whole: Rehearsal) -> None:
+    # last of the tests that use the session: it changes it
+    from fgreg.online import CameraMoved
+
+    whole.room.bump(whole.now_s)
+    whole.run(1.0)
+    whole.engine.add(CameraMoved(whole.now_s))
+    before = len(whole.asked)
+    whole.run(30.0)
+    after = [a for _, a in whole.asked[before:]]
+    assert isinstance(after[0], Halt)
+    assert not any(isinstance(a, Follow) for a in after)
+    assert any(isinstance(a, Ask) and a.kind is MotionKind.SEARCH for a in after)
+    assert any(isinstance(a, TakePairs) for a in after)
+    assert whole.workflow.stage is Stage.COLLECTING
+
+
+def test_an_epoch_that_stays_refused_is_told_with_what_helps() -> None:
+    session = rehearsal(aims=0)  # without a beam nothing can be registered
+    session.workflow = Workflow(
+        session.model, WorkflowSettings(aims=0, pms=2, most_pms=2, hearing_threshold=session.threshold)
+    )
+    while session.now_s < 200.0 and sum(isinstance(a, TakePairs) for _, a in session.asked) < 5:
+        session.run(1.0)
+    told = [tell.text for _, tell in session.told if "say so (moved)" in tell.text]
+    assert [text.split()[0] for text in told] == ["2", "4"]
+    assert all("the beam has nowhere to start" in text for text in told)
+
+
+def test_a_bump_after_few_pms_ends_in_following_all_the_same() -> None:
+    session = rehearsal(4)
+    settings = WorkflowSettings(aims=8, pms=8, most_pms=9, hearing_threshold=session.threshold)
+    session.workflow = Workflow(session.model, settings)
+    while sum(isinstance(a, TakePairs) for _, a in session.asked) < 2:
+        session.run(0.5)
+    bumped_s = session.now_s
+    session.room.bump(bumped_s)
+    while session.workflow.stage is not Stage.FOLLOWING and session.now_s < bumped_s + 400.0:
+        session.run(1.0)
+    assert session.workflow.stage is Stage.FOLLOWING
+    assert session.engine.moves
+    estimate = session.engine.estimate
+    assert estimate.epoch == len(session.engine.moves)
+    assert estimate.predicted_tre is not None
+    assert session.error_mm() < max(2.0, 1.5 * estimate.predicted_tre.worst_mm)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"aims": -1}, {"pms": 0}, {"pms": 20}, {"hearing_threshold": 0.0}, {"hearing_threshold": math.nan}]
+)
+def test_settings_that_cannot_be_are_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(changes)).split("_")[0]):
+        WorkflowSettings(**{"hearing_threshold": 1.0, **changes})  # type: ignore[arg-type]

@@ -1,0 +1,112 @@
+"""The scope put back: an epoch whose registration is tied to an earlier one than the last, in batch and online."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fgreg.camera_moves.detector import LoopClosure
+from fgreg.camera_moves.loop_closure import back_to
+from fgreg.geometry.target_error import tre_mm
+from fgreg.geometry.transforms import FloatArray, inverse, make_transform
+from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.online import OnlineRegistration
+from fgreg.online.recorded_moves import events_in_order, find_epochs, split_epochs
+from fgreg.registration.register import register
+from fgreg.registration.solve import distance_to_explicit
+from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
+from tests.online_streams import batch, first, restored, sigmas_apart
+
+AWAY = make_transform(np.eye(3), np.array([12.0, -9.0, 5.0]))
+CONFIG = SolveConfig()
+
+
+def there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, Measurements, list[FloatArray]]:
+    """Epochs in turn at home and away, reported without motions; the true registration of each."""
+    rng = np.random.default_rng(seed)
+    home, beam = random_trus_T_camera(rng), random_marker_T_laser(rng)
+    pairs: list[Pair] = []
+    starts: list[EpochStart] = []
+    truths: list[FloatArray] = []
+    model: SessionModel | None = None
+    aims: tuple[Aim, ...] = ()
+    t = 0.0
+    for epoch, count in enumerate(counts):
+        truths.append(home if epoch % 2 == 0 else home @ inverse(AWAY))
+        # One seed, so that all have the same window edge; without aims all that follows is drawn anew.
+        model, part, _ = make_measurements(
+            np.random.default_rng([seed, 1]), aims=12 + epoch if epoch else 11, pairs=count, marker_T_laser=beam,
+            trus_T_camera=truths[-1],
+        )  # fmt: skip
+        aims = aims or part.aims
+        starts.append(EpochStart(t))
+        for p in part.pairs:
+            marker = replace(p.marker, id=p.marker.id + 1000 * epoch)
+            pairs.append(replace(p, t=t + p.t, pm=p.pm + 1000 * epoch, epoch=epoch, marker=marker))
+        t = pairs[-1].t + 1.0
+    assert model is not None
+    return model, Measurements(aims, tuple(pairs), tuple(starts)), truths
+
+
+def test_the_tied_epoch_has_the_earlier_ones_registration_within_the_tolerance() -> None:
+    model, measurements, truths = there_and_back(3, (14, 8, 4))
+    tied = replace(measurements, epochs=(*measurements.epochs[:2], back_to(measurements.epochs[2], 0)))
+    free, found = register(measurements, model, CONFIG), register(tied, model, CONFIG)
+    assert found.epochs == (0, 1, 2)
+    first, third = (found.optimum.state.trus_T_camera(k)[0] for k in (0, 2))
+    assert tre_mm(third, first, model.targets_mm).max() < 1.0
+    ours, without = (tre_mm(r.optimum.state.trus_T_camera(2)[0], truths[2], model.targets_mm) for r in (found, free))
+    assert ours.mean() < without.mean()
+    assert distance_to_explicit(found) < 0.01
+
+
+def test_an_epoch_tied_to_one_that_is_left_out_stands_alone() -> None:
+    model, measurements, _ = there_and_back(3, (14, 8, 8))
+    only = tuple(pair for pair in measurements.pairs if pair.epoch)
+    tied = Measurements(measurements.aims, only, (*measurements.epochs[:2], back_to(measurements.epochs[2], 0)))
+    found = register(tied, model, CONFIG)
+    assert 2 in found.epochs
+    assert 1 in found.epochs
+
+
+@pytest.mark.parametrize("counts", [(12, 3, 5), (9, 7, 4, 5)])
+def test_the_engine_with_a_closed_loop_is_at_the_batch_optimum(counts: tuple[int, ...]) -> None:
+    model, measurements, _ = there_and_back(5, counts)
+    engine = OnlineRegistration(model, verdicts=False, find_moves=False)
+    restored(engine, first(measurements, sum(counts[:2])))
+    later = [event for _, event in events_in_order(measurements) if event.t > engine.estimate.t]
+    compared = 0
+    for event in later:
+        estimate = engine.add(event)
+        if engine.state.epoch == 2 and engine.state.epoch_pairs == 2:
+            engine._close_loop(LoopClosure(2, 0, 9.0), estimate.t)
+            continue
+        if engine.state.epoch >= 2 and engine.state.epoch_pairs > 2 and estimate.optimum_trus_T_camera is not None:
+            assert sigmas_apart(batch(engine.measurements(), model), estimate) < 0.05
+            compared += 1
+    assert compared >= 2
+    assert engine.measurements().epochs[2].after == 0
+
+
+def test_the_engine_closes_the_loop_and_the_batch_does_too() -> None:
+    model, measurements, truths = there_and_back(7, (25, 4, 12))
+    engine = restored(OnlineRegistration(model, verdicts=False), first(measurements, 29))
+    for _, event in events_in_order(measurements):
+        if event.t > engine.estimate.t:
+            engine.add(event)
+    assert engine.moves == ()
+    (back,) = engine.returns
+    assert (back.epoch, back.to) == (2, 0)
+    assert back.t > measurements.pairs[25 + 4 + 6].t  # not before the eighth pair
+    assert engine.measurements().epochs[2].after == 0
+    estimate = engine.estimate
+    assert estimate.epoch == 2
+    assert estimate.trus_T_camera is not None
+    assert tre_mm(estimate.trus_T_camera, truths[2], model.targets_mm).mean() < 2.5
+    found = find_epochs(measurements, model, CONFIG)
+    assert [(b.epoch, b.to, b.t) for b in found.returns] == [(back.epoch, back.to, back.t)]
+    assert split_epochs(measurements, found.moves, found.returns).epochs[2].after == 0
