@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import time
@@ -15,7 +16,7 @@ from fgreg.errors import EventRefused
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online import OnlineRegistration, engine_process
 from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.events import OnlineEvent
 from fgreg.tracking import track
@@ -91,10 +92,8 @@ def test_a_refused_event_is_refused_here_and_later_ones_work(case: Case, started
 def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:
     engine = EngineProcess(case[0], SolveConfig(), None)
     engine.add(case[1].aims[0])
-    pid = engine._process.pid
-    assert pid is not None
-    os.kill(pid, signal.SIGKILL)
-    engine._process.join()
+    assert engine.pid is not None
+    os.kill(engine.pid, signal.SIGKILL)
     with pytest.raises(EngineGone, match="open the session again"):
         engine.add(case[1].aims[1])
     began = time.monotonic()
@@ -103,8 +102,29 @@ def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:
     assert time.monotonic() - began < 3.0
 
 
-def test_it_ends_with_its_owner(case: Case) -> None:
+def test_it_ends_when_it_is_closed_and_its_memory_with_it(case: Case) -> None:
     engine = EngineProcess(case[0], SolveConfig(), None)
-    engine._connection.close()
-    engine._process.join(10.0)
-    assert engine._process.exitcode == 0
+    reader = engine.reader()
+    (process,) = [child for child in multiprocessing.active_children() if child.pid == engine.pid]
+    engine.close()
+    assert process.exitcode == 0
+    assert not engine.alive
+    assert reader.read().closed
+    reader.close()
+    with pytest.raises(FileNotFoundError):
+        engine.reader()
+
+
+def test_one_that_hangs_is_killed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_process, "ANSWER_S", 1.0)
+    with EngineProcess(case[0], SolveConfig(), None) as engine:
+        assert engine.pid is not None
+        os.kill(engine.pid, signal.SIGSTOP)
+        with pytest.raises(EngineGone):
+            engine.refresh()
+        assert not engine.alive
+
+
+def test_a_model_that_no_engine_takes_is_said() -> None:
+    with pytest.raises(EngineGone, match="AttributeError"):
+        EngineProcess(None, SolveConfig(), None)  # type: ignore[arg-type]

@@ -58,7 +58,7 @@ class Processes:
 
     def kill(self) -> None:
         """End the last one at once, from outside."""
-        pid = self.made[-1]._process.pid
+        pid = self.made[-1].pid
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
 
@@ -194,7 +194,7 @@ class Deadly(EngineProcess):
 
     def add(self, event: OnlineEvent) -> OnlineEstimate:
         if getattr(event, "pm", None) == 4:
-            pid = self._process.pid
+            pid = self.pid
             assert pid is not None
             os.kill(pid, signal.SIGKILL)
         return super().add(event)
@@ -246,7 +246,7 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
         recorder = Recorder(live)
         longest = 0.0
 
-        def until(done: int) -> None:
+        def until(done: int, made: int) -> None:
             """Queries go on while the recorder works; the longest of them is kept."""
             nonlocal longest
             end = time.monotonic() + PATIENCE_S
@@ -258,7 +258,8 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
                 longest = max(longest, time.perf_counter() - start)
                 if UNWATCHED in state.known.reasons:
                     told.append(state.known.verdict)
-                if not state.waiting and state.aims + state.pairs >= done and not state.trouble:
+                taken_in = not state.waiting and state.aims + state.pairs >= done
+                if taken_in and not state.trouble and len(engines.made) >= made:
                     return
                 time.sleep(0.005)
             raise AssertionError(recorder.state)
@@ -267,14 +268,14 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
         try:
             for event in shots[:14]:
                 recorder.hand_over(event)
-            until(14)
-            for start in (14, 22):
+            until(14, 1)
+            for made, start in enumerate((14, 22), 2):
                 killer = threading.Timer(0.05, engines.kill)
                 killer.start()
                 for event in shots[start : start + 8]:
                     recorder.hand_over(event)
                 killer.join()
-                until(start + 8)
+                until(start + 8, made)
                 recorder.hand_over(NoteEvent(shots[start + 7].t, 0, "after"))
         finally:
             recorder.close()

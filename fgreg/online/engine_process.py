@@ -7,13 +7,10 @@ over the events and waits for what comes of them.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
+import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
 
@@ -30,14 +27,18 @@ from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, Snapsh
 from fgreg.online.snapshot_record import Layout
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.tracking import track
-from fgreg.workers.worker_process import NICENESS
+from fgreg.workers.worker_process import Work, WorkerProcess
 
-START_S = 60.0
-IDLE_S = 0.1
-"""Between looks at what the full solve has found, while no event comes."""
+ANSWER_S, END_S = 60.0, 5.0
+"""A process that takes longer for a call, or to end, is killed; the longest call restores a session in some seconds."""
 
+Call = tuple[str, tuple[Any, ...]]
+"""What the engine is to do, and the arguments."""
+After = tuple[str | None, Any, OnlineEstimate | None, tuple[DetectedMove, ...], tuple[DetectedReturn, ...]]
+"""Why an event was refused, what the call returned, and the engine's estimate, moves and returns."""
 
-GONE = "the registration's process has ended: open the session again"
+REMEDY = "open the session again"
+GONE = f"the registration's process has ended: {REMEDY}"
 
 
 class EngineGone(FgregError):  # noqa: N818
@@ -54,30 +55,27 @@ class EngineProcess:
     """
 
     def __init__(self, model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        # Not a daemon: it has children of its own. It ends when this end of the pipe is closed, by whatever.
-        self._process = context.Process(
-            target=_serve,
-            args=(theirs, model, config, sound_speed_prior),
-            name="fgreg-engine",
-            daemon=False,
-        )
         self._turn = threading.Lock()
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
         self._returns: tuple[DetectedReturn, ...] = ()
-        self._process.start()
-        theirs.close()
+        self._worker: WorkerProcess[Call, After] = WorkerProcess(
+            _registering,
+            model,
+            config,
+            sound_speed_prior,
+            name="fgreg-engine",
+            what="the registration's process",
+            answer_s=ANSWER_S,
+            end_s=END_S,
+            restart=False,  # the new one knows no event: who has them makes another engine
+            daemon=False,
+        )
         try:
-            if not self._connection.poll(START_S):
-                raise EngineGone(f"the registration's process did not start within {START_S:.0f} s")
-            self._name = str(self._connection.recv())
-        except (EOFError, OSError):
-            raise EngineGone("the registration's process did not start") from None
-        finally:
-            if not hasattr(self, "_name"):
-                self.close()
+            self._name = str(self._call("name"))
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> EngineProcess:
         return self
@@ -92,19 +90,24 @@ class EngineProcess:
     @property
     def alive(self) -> bool:
         """Whether the process runs."""
-        return self._process.is_alive()
+        return self._worker.alive
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process; None where it has ended."""
+        return self._worker.pid
 
     def _call(self, name: str, *arguments: Any) -> Any:
         with self._turn:
-            try:
-                self._connection.send((name, arguments))
-                how, value, self._estimate, self._moves, self._returns = self._connection.recv()
-            except (EOFError, OSError):
-                raise EngineGone(GONE) from None
-        if how == "refused":
-            raise EventRefused(value)
-        if how == "failed":
-            raise FgregError(value)
+            self._worker.fetch(math.inf)  # the answer to a call that was interrupted
+            self._worker.send((name, arguments))
+            (after,) = self._worker.fetch(math.inf) or (None,)
+            if after is None:
+                failure = self._worker.failure
+                raise EngineGone(f"{failure}: {REMEDY}") if self._worker.lost else FgregError(failure)
+            refused, value, self._estimate, self._moves, self._returns = after
+        if refused is not None:
+            raise EventRefused(refused)
         return value
 
     def add(self, event: OnlineEvent) -> OnlineEstimate:
@@ -172,80 +175,55 @@ class EngineProcess:
 
     def close(self) -> None:
         """End the process."""
-        with suppress(OSError):
-            self._connection.close()
-        self._process.join(5.0)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        self._worker.close()
 
 
-def _serve(
-    connection: Connection[Any, Any],
-    model: SessionModel,
-    config: SolveConfig,
-    prior: SoundSpeedPrior | None,
-) -> None:
-    """The process."""
-    os.nice(NICENESS)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main program ends it, in its own time
+@contextmanager
+def _registering(
+    model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None
+) -> Iterator[Work[Call, After]]:
+    """In the process."""
     with (
         OnlineRegistration(model, config, full_solve="worker", sound_speed_prior=prior) as engine,
         SharedSnapshot(Layout.of(model)) as shared,
-        suppress(EOFError, OSError),
     ):
-        connection.send(shared.name)
-        _Server(connection, engine, shared).run()
-    os._exit(0)  # there is nothing to save, and nobody to wait for
+        yield _Registering(engine, shared)
 
 
-class _Server:
-    def __init__(self, connection: Connection[Any, Any], engine: OnlineRegistration, shared: SharedSnapshot) -> None:
-        self._connection, self._engine, self._shared = connection, engine, shared
+class _Registering:
+    def __init__(self, engine: OnlineRegistration, shared: SharedSnapshot) -> None:
+        self._engine, self._shared = engine, shared
         self._published: OnlineEstimate | None = None
         self._restoring: Any = None
-
-    def run(self) -> None:
-        """Until the other end closes."""
         self._publish()
-        while True:
-            if not self._connection.poll(IDLE_S):
-                if self._restoring is None:
-                    self._engine.refresh()
-                self._publish()
-                continue
-            name, arguments = self._connection.recv()
-            try:
-                answer = ("done", self._do(name, arguments))
-            except EventRefused as error:
-                answer = ("refused", error.reason)
-            except Exception as error:  # a defect: the estimate stands, and the caller is told
-                answer = ("failed", f"{type(error).__name__}: {error}")
+
+    def __call__(self, call: Call) -> After:
+        refused, value = None, None
+        try:
+            value = self._do(*call)
+        except EventRefused as error:
+            refused = error.reason
+        finally:
             self._publish()
-            self._connection.send((*answer, self._engine.estimate, self._engine.moves, self._engine.returns))
+        return refused, value, self._engine.estimate, self._engine.moves, self._engine.returns
+
+    def idle(self) -> None:
+        """What the full solve has found, while no event comes."""
+        if self._restoring is None:
+            self._engine.refresh()
+        self._publish()
 
     def _do(self, name: str, arguments: tuple[Any, ...]) -> Any:
-        engine = self._engine
         match name:
-            case "add":
-                return engine.add(*arguments)
-            case "settle":
-                return engine.settle()
-            case "refresh":
-                return engine.refresh()
-            case "measurements":
-                return engine.measurements()
-            case "marker_T_laser":
-                return engine.marker_T_laser()
+            case "name":
+                return self._shared.name
             case "restore":
-                self._restoring = engine.restoring()
-                self._restoring.__enter__()
-                return None
+                self._restoring = self._engine.restoring()
+                return self._restoring.__enter__()
             case "restored":
                 ending, self._restoring = self._restoring, None
-                ending.__exit__(None, None, None)
-                return None
-        raise ValueError(f"{name} is nothing that the engine does")
+                return ending.__exit__(None, None, None)
+        return getattr(self._engine, name)(*arguments)
 
     def _publish(self) -> None:
         estimate = self._engine.estimate
