@@ -1,13 +1,13 @@
-"""How well the online registration agrees with the batch solver after every event, with and without junk.
+"""How well the online registration agrees with the batch solver after every event, with and without outliers.
 
-    python tools/study_online.py                          # 10 sessions of 50 pairs, clean and with 20 % junk
-    python tools/study_online.py --sessions 2 --pairs 30 --junk 0.2 --shapes "first hit" "three looks"
+    python tools/study_online.py                          # 10 sessions of 50 pairs, clean and with 20 % outliers
+    python tools/study_online.py --sessions 2 --pairs 30 --outliers 0.2 --shapes "first hit" "three looks"
 
 After each pair from the 8th of its camera epoch on, the online optimum's Mahalanobis distance from ``register`` on the
 same events, by the batch covariance. Prints, each figure beside its target: the largest distance of clean sessions
-(0.05), the shares of events within 0.05 (90 %) and 0.5 (99 %) with junk, and in how many sessions the same pairs are
+(0.05), the shares of events within 0.05 (90 %) and 0.5 (99 %) with outliers, in how many sessions the same pairs are
 rejected at the end (all); for first hits, window only, three looks at each PM, and two camera epochs. Also processor
-time of ``add`` from the 41st pair of an epoch on, where junk has events judged anew.
+time of ``add`` from the 41st pair of an epoch on, where outliers ask for full solves.
 """
 
 from __future__ import annotations
@@ -98,15 +98,15 @@ def agreement(measurements: Measurements, model: SessionModel, every: int) -> Ag
 
 def study(sessions: int, pairs: int, share: float, shape: str, seed: int, every: int) -> None:
     """One row."""
-    found, junk = [], 0
+    found, bad = [], 0
     for k in range(sessions):
         rng = np.random.default_rng([seed, k])
         arguments = dict(SHAPES[shape])
         looks = arguments.get("looks_per_pm", 1)
         model, measurements, _ = make_measurements(rng, pairs=-(-pairs // looks), **arguments)
-        measurements, bad = spoiled(measurements, share, rng)
+        measurements, spoilt = spoiled(measurements, share, rng)
         found.append(agreement(measurements, model, every))
-        junk += bad
+        bad += spoilt
     each = np.concatenate([one.distance for one in found])
     late = np.concatenate([one.late_ms for one in found])
     within = f"within 0.05: {np.mean(each <= 0.05):6.1%}  within 0.5: {np.mean(each <= 0.5):6.1%}"
@@ -115,8 +115,8 @@ def study(sessions: int, pairs: int, share: float, shape: str, seed: int, every:
     same = sum(one.same for one in found)
     cost = f"; add from pair {LATE + 1}: median {np.median(late):.1f} ms, largest {late.max():.0f}" if len(late) else ""
     print(
-        f"{f'{shape}, {share:.0%} junk':<36} {len(each):5d} events  {spread}  {within}  {target};"
-        f"  same pairs rejected in {same} of {sessions} (target: all; {junk} spoiled){cost}",
+        f"{f'{shape}, {share:.0%} outliers':<36} {len(each):5d} events  {spread}  {within}  {target};"
+        f"  same pairs rejected in {same} of {sessions} (target: all; {bad} spoiled){cost}",
         flush=True,
     )
 
@@ -126,12 +126,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=10)
     parser.add_argument("--pairs", type=int, default=50)
-    parser.add_argument("--junk", type=float, nargs="+", default=[0.0, 0.2], help="shares of junk")
+    parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.2], help="shares of outliers")
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=list(SHAPES), help="kinds of session")
     parser.add_argument("--every", type=int, default=1, help="compare after every so many pairs")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    for share in arguments.junk:
+    for share in arguments.outliers:
         for shape in arguments.shapes:
             study(arguments.sessions, arguments.pairs, share, shape, arguments.seed, arguments.every)
 
