@@ -57,7 +57,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.
 def live_program(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """``fgreg live`` in the simulated room, which homes the stage and searches; its session is in ``folder``."""
     code = "import sys; from fgreg.cli.main import main; sys.exit(main())"
-    words = ["live", "--no-viewer", "--aims", "0", "--bump-every", "inf", "--out", os.fspath(folder)]
+    words = ["live", "--no-viewer", "--width", "320", "--aims", "0", "--bump-every", "inf", "--out", os.fspath(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         [sys.executable, "-c", code, *words],
