@@ -142,7 +142,7 @@ class LiveSession:
     @classmethod
     def open(
         cls,
-        folder: Path,
+        folder: str | Path,
         config: SolveConfig | None = None,
         make_engine: MakeEngine | None = None,
         *,
@@ -154,7 +154,7 @@ class LiveSession:
             InputError: the session's files, or frames that they name, are not as they should be.
             JournalError: another program records to it, or the disk refuses.
         """
-        journal = Journal.open(folder)
+        journal = Journal.open(Path(folder))
         try:
             found = cls(journal, make_engine or online_engine, config or SolveConfig())
             found.late = late

@@ -83,7 +83,17 @@ class TruthErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolveReport:
-    """All that came of a solve, for reports and programs."""
+    """All that came of a solve.
+
+    Attributes:
+        session: as it was read.
+        recognised: what was found in its frames; ``recognised.measurements`` is what was solved.
+        solution: the estimate with the registration, posterior and snapshot behind it.
+        estimate: what ``result.yaml`` holds: verdict, reasons, beam, epochs, pairs, tracks, aims.
+        truth: of ``ground_truth.yaml``. errors: against it; None where there is none.
+        result_path, rrd_path: what was written; the latter None where no recording was asked for.
+        elapsed_s: from the files to the result.
+    """
 
     session: Session
     recognised: Recognised

@@ -46,12 +46,13 @@ class Session:
     warnings: tuple[str, ...]
 
 
-def read_session(folder: Path) -> Session:
-    """Reads a session. Frames that events name lie inside the folder, but whether they exist shows when they are used.
+def read_session(folder: str | Path) -> Session:
+    """Read a session's folder. Frames that events name lie inside it, but whether they exist shows when they are used.
 
     Raises:
         InputError: the first problem of the folder, of ``session.yaml`` or of ``events.jsonl``.
     """
+    folder = Path(folder)
     problems: list[InputError] = []
     setup, log = _read(folder, problems)
     if problems:
