@@ -12,7 +12,7 @@ from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
 from fgreg.registration.register import SoundSpeedPrior, register
 from fgreg.registration.solve import Solution, solve
 
@@ -35,7 +35,7 @@ class BatchEngine:
         return ()  # what it notices it tells by epochs only
 
     @property
-    def returns(self) -> tuple[DetectedReturn, ...]:
+    def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:
         return ()
 
     def add(self, event: OnlineEvent) -> OnlineEstimate:

@@ -46,9 +46,9 @@ def move_case(measurements: Measurements, model: SessionModel) -> MoveCase:
     for place, pair in enumerate(measurements.pairs):
         pms.setdefault(pair.pm, []).append(place)
     found = register(measurements, model, CONFIG)
-    inlier = dict(zip(found.shots.problem.pms, found.shots.pm_kept, strict=True))
+    inlier = dict(zip(found.shots.problem.pms, found.shots.pm_inlier, strict=True))
     state = None if found.ambiguous else found.optimum.state
-    aims = [aim for aim, fits in zip(measurements.aims, found.shots.aim_kept, strict=True) if fits]
+    aims = [aim for aim, fits in zip(measurements.aims, found.shots.aim_inlier, strict=True) if fits]
     return MoveCase(
         epoch=0,
         pms=tuple(tuple(measurements.pairs[place] for place in places) for places in pms.values()),

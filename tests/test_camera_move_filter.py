@@ -12,7 +12,7 @@ from fgreg.camera_moves.bayes_filter import MoveSettings, move_evidence
 from fgreg.camera_moves.whitened import Gaussian, WhitenedPms
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.split_points import MoveScales, default_scales
-from fgreg.registration.outliers import JUNK_DENSITY
+from fgreg.registration.outliers import OUTLIER_DENSITY
 
 SETTINGS = MoveSettings(default_scales())
 ONE_SCALE = MoveScales(np.array([0.02]), np.array([2.0]), np.array([1.0]))
@@ -36,7 +36,7 @@ def _evidence(before: Gaussian, terms: WhitenedPms, moved: FloatArray, since: in
     rows, values, log = [], [], 0.0
     for j, is_good in enumerate(good):
         if not is_good:
-            log += math.log(JUNK_DENSITY)  # two equations: half the power of two
+            log += math.log(OUTLIER_DENSITY)  # two equations: half the power of two
             continue
         jacobian = terms.jacobian[0, j]
         by_move = jacobian[:, :6] if j >= since else np.zeros((2, 6))

@@ -13,7 +13,7 @@ from fgreg.graph.shared_state import make_state
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.posterior import Mode, light, log_density, pose_tangent, sample_posterior
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import register
 from tests.forward import make_measurements, make_session
 
@@ -23,7 +23,7 @@ def test_the_truth_is_where_the_posterior_says(first_hit: bool) -> None:
     nees, in_region, in_ellipsoid = [], 0, 0
     for seed in range(12):
         model, measurements, truth = make_measurements(np.random.default_rng(300 + seed), pairs=10, first_hit=first_hit)
-        found = answer(register(measurements, model, SolveConfig()), SolveConfig())
+        found = posterior_mean(register(measurements, model, SolveConfig()), SolveConfig())
         posterior = found.posterior
         error = pose_tangent(posterior.mean.trus_T_camera()[0], truth.trus_T_camera[0])
         nees.append(error @ np.linalg.solve(posterior.covariance[:6, :6], error))
@@ -37,7 +37,7 @@ def test_the_truth_is_where_the_posterior_says(first_hit: bool) -> None:
 
 def test_the_region_holds_its_share_of_fresh_samples_and_nothing_far() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(5), pairs=7, first_hit=False)
-    found = answer(register(measurements, model, SolveConfig()), SolveConfig())
+    found = posterior_mean(register(measurements, model, SolveConfig()), SolveConfig())
     region = credible_region(found.modes, found.posterior)
     estimate = found.posterior.mean.trus_T_camera()
     assert region.contains(estimate)
@@ -55,7 +55,7 @@ def test_the_region_holds_its_share_of_fresh_samples_and_nothing_far() -> None:
 
 def test_two_epochs_are_judged_together() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(2), pairs=20, epochs=2)
-    found = answer(register(measurements, model, SolveConfig()), SolveConfig())
+    found = posterior_mean(register(measurements, model, SolveConfig()), SolveConfig())
     region = credible_region(found.modes, found.posterior)
     real = np.stack(truth.trus_T_camera)
     assert region.contains(real)

@@ -15,7 +15,7 @@ import pytest
 from fgreg.camera_moves.detector import CameraMove, find_camera_move
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import exp_so3, make_transform
-from fgreg.graph.split_points import ALARM, GATE, logsumexp, odds_in_epoch
+from fgreg.graph.split_points import ALARM, GATE, logsumexp, move_odds_in_epoch
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
@@ -24,7 +24,7 @@ from fgreg.online import OnlineRegistration
 from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
-from fgreg.registration.verdict import ABOUT_EVEN, FEW_PMS, unsteady
+from fgreg.registration.verdict import ABOUT_EVEN, FEW_PMS, possible_camera_move
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
 from tests.online_streams import unreported_move
@@ -83,7 +83,7 @@ def test_steady_sessions_raise_no_alarm_and_hardly_a_doubt() -> None:
             np.random.default_rng([seed, 40]), pairs=12, first_hit=bool(seed % 2)
         )
         found = register(measurements, model, FAST)
-        pms, log = odds_in_epoch(found.problem, found.optimum, found.covariance, 0)
+        pms, log = move_odds_in_epoch(found.problem, found.optimum, found.covariance, 0)
         assert len(log) == len(pms) - 1
         scores.append(float(logsumexp(log)))
     assert max(scores) < ALARM
@@ -141,6 +141,6 @@ def test_a_steady_epoch_is_left_alone_by_screening() -> None:
     ],
 )
 def test_odds_of_a_move_become_a_verdict(log_odds: float, pms: int, verdicts: list[Verdict]) -> None:
-    found = unsteady(log_odds, 3, 4, pms)
+    found = possible_camera_move(log_odds, 3, 4, pms)
     assert [condition.verdict for condition in found] == verdicts
     assert all("up to PM 3 and those from PM 4" in condition.text for condition in found)

@@ -15,9 +15,9 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel, SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.posterior_mean import (
-    answer,
     estimated_radius,
     estimated_sound_speed,
+    posterior_mean,
     sound_speed_from_residuals,
 )
 from fgreg.registration.register import SoundSpeedPrior, register
@@ -65,13 +65,13 @@ def test_estimating_the_sound_speed_takes_its_error_out() -> None:
             np.random.default_rng(seed), pairs=20, session=session, sound_speed_ratio=1.02
         )
         for config_of, out in ((SolveConfig(), plain), (config, estimated)):
-            found = answer(register(measurements, model, config_of), config_of)
+            found = posterior_mean(register(measurements, model, config_of), config_of)
             out.append(_tre(found.posterior.mean.trus_T_camera()[0], truth, model))
         speed = estimated_sound_speed(found.registration)
         assert speed is not None
         assert abs(speed.value - 1.02) < 4.0 * speed.sigma
         model, measurements, truth = make_measurements(np.random.default_rng(seed), pairs=20, session=session)
-        found = answer(register(measurements, model, SolveConfig()), SolveConfig())
+        found = posterior_mean(register(measurements, model, SolveConfig()), SolveConfig())
         right.append(_tre(found.posterior.mean.trus_T_camera()[0], truth, model))
     assert np.mean(estimated) < 0.6 * np.mean(plain)
     assert np.mean(estimated) < 2.0 * np.mean(right)
@@ -83,7 +83,7 @@ def test_the_radius_is_estimated_with_its_prior() -> None:
     )
     wrong = replace(model, probe=replace(model.probe, radius_mm=10.5))
     config = SolveConfig(estimate_radius=True)
-    found = answer(register(measurements, wrong, config), config)
+    found = posterior_mean(register(measurements, wrong, config), config)
     radius = estimated_radius(found.registration)
     assert radius is not None
     assert estimated_sound_speed(found.registration) is None

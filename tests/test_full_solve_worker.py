@@ -69,7 +69,7 @@ def test_a_worker_reports_what_the_same_process_does(
     assert found.used is waited.used
     np.testing.assert_allclose(np.asarray(found.trus_T_camera), np.asarray(expected.trus_T_camera), rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.asarray(found.covariance), np.asarray(expected.covariance), rtol=1e-5, atol=1e-9)
-    assert working.kept == here.kept
+    assert working.inliers == here.inliers
 
 
 def test_a_worker_killed_at_its_case_is_replaced_and_the_case_is_solved(

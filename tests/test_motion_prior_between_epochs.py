@@ -99,7 +99,7 @@ def test_the_engine_closes_the_loop_and_the_batch_does_too() -> None:
         if event.t > engine.estimate.t:
             engine.add(event)
     assert engine.moves == ()
-    (back,) = engine.returns
+    (back,) = engine.loop_closures
     assert (back.epoch, back.to) == (2, 0)
     assert back.t > measurements.pairs[25 + 4 + 6].t  # not before the eighth pair
     assert engine.measurements().epochs[2].after == 0
@@ -108,5 +108,5 @@ def test_the_engine_closes_the_loop_and_the_batch_does_too() -> None:
     assert estimate.trus_T_camera is not None
     assert tre_mm(estimate.trus_T_camera, truths[2], model.targets_mm).mean() < 2.5
     found = find_epochs(measurements, model, CONFIG)
-    assert [(b.epoch, b.to, b.t) for b in found.returns] == [(back.epoch, back.to, back.t)]
-    assert split_epochs(measurements, found.moves, found.returns).epochs[2].after == 0
+    assert [(b.epoch, b.to, b.t) for b in found.loop_closures] == [(back.epoch, back.to, back.t)]
+    assert split_epochs(measurements, found.moves, found.loop_closures).epochs[2].after == 0

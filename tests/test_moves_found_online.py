@@ -113,7 +113,7 @@ def test_pairs_that_were_outliers_before_the_alarm_are_inliers_after_it() -> Non
         if not engine.moves:
             odd.append((index, estimate.used))
     assert (BEFORE, False) in odd
-    assert all(engine.kept[BEFORE:])
+    assert all(engine.inliers[BEFORE:])
 
 
 def test_one_gross_outlier_is_no_move() -> None:
@@ -125,7 +125,7 @@ def test_one_gross_outlier_is_no_move() -> None:
     for pair in pairs[BEFORE:]:
         engine.add(pair)
     assert engine.moves == ()
-    assert not engine.kept[15]
+    assert not engine.inliers[15]
 
 
 def test_until_the_new_epoch_is_good_enough_the_verdict_says_so_and_queries_are_not_answered() -> None:
@@ -310,6 +310,6 @@ def test_moves_that_were_detected_are_taken_from_the_record_when_restoring() -> 
     assert again.estimate.epoch == first.estimate.epoch == 1
     assert again.estimate.reasons == first.estimate.reasons
     assert again.estimate.verdict is first.estimate.verdict
-    assert again.kept == first.kept
+    assert again.inliers == first.inliers
     assert sigmas_between(again.estimate, first.estimate) < 0.05
     assert [e.t for e in again.measurements().epochs] == [e.t for e in first.measurements().epochs]

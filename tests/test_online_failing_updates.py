@@ -201,7 +201,7 @@ def test_the_linearisation_point_is_handed_to_python_factors_uncopied() -> None:
     # GTSAM's wrapper copies all values at each callback unless their C++ object has a live Python wrapper: the window
     # holds it, and a copy of ISAM2 has one of its own.
     engine, _, _ = _engine(16)
-    window = engine.state.window
+    window = engine.state.active_window
     assert window is not None
     seen: list[gtsam.Values] = []
 

@@ -79,8 +79,8 @@ def test_sound_speed_as_a_variable_is_followed() -> None:
     estimate = run(engine, measurements)[-1]
     found = register(measurements, model, config)
     assert sigmas_apart(found, estimate) < 0.05
-    assert engine.state.window is not None
-    ratio = float(engine.state.window.state.sound_speed_ratio[0])
+    assert engine.state.active_window is not None
+    ratio = float(engine.state.active_window.state.sound_speed_ratio[0])
     assert ratio == pytest.approx(float(found.optimum.state.sound_speed_ratio[0]), abs=1e-4)
     assert ratio != 1.0
 
@@ -128,7 +128,7 @@ def test_between_full_solves_the_report_keeps_the_posteriors_shift_and_width() -
     model, measurements, _ = make_measurements(np.random.default_rng(4), pairs=11, first_hit=False)
     engine = OnlineRegistration(model, find_moves=False)
     solved, last = restored(engine, first(measurements, 10)).estimate, engine.add(measurements.pairs[10])
-    window = engine.state.window
+    window = engine.state.active_window
     assert solved.settled
     assert not last.settled
     assert window is not None
@@ -214,7 +214,7 @@ def test_numbers_of_private_variables_are_used_again_and_never_twice_at_once() -
     restored(engine, first(measurements, 2 * MOST - 4))
     for pair in measurements.pairs[2 * MOST - 4 :]:
         engine.add(pair)
-        window = engine.state.window
+        window = engine.state.active_window
         assert window is not None
         taken = [group.prepared.first + i for group in window.groups for i in range(len(group.pairs))]
         assert len(set(taken)) == len(taken)

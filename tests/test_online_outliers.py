@@ -33,8 +33,8 @@ def test_inliers_near_an_optimum_are_those_after_a_search() -> None:
     # From the optimum of before the last pairs, with the outliers among them.
     before = register(replace(spoiled, pairs=spoiled.pairs[:18]), model, SolveConfig())
     near = register_near(spoiled, model, SolveConfig(), before.optimum.state, [0])
-    np.testing.assert_array_equal(near.shots.pm_kept, found.shots.pm_kept)
-    assert not near.shots.pm_kept[[3, 9, 14, 20]].any()
+    np.testing.assert_array_equal(near.shots.pm_inlier, found.shots.pm_inlier)
+    assert not near.shots.pm_inlier[[3, 9, 14, 20]].any()
     there = found.optimum.state.trus_T_camera()[0]
     np.testing.assert_allclose(near.optimum.state.trus_T_camera()[0], there, rtol=0, atol=1e-4)
 
@@ -59,8 +59,8 @@ def test_online_and_batch_reject_the_same_pairs_while_few_are_there() -> None:
     for pair in spoiled.pairs[7:]:
         estimate = engine.add(pair)
     found = batch(spoiled, model)
-    np.testing.assert_array_equal(engine.kept, found.shots.pm_kept[found.shots.problem.look_pm])
-    assert not np.array(engine.kept)[[9, 12, 16]].any()
+    np.testing.assert_array_equal(engine.inliers, found.shots.pm_inlier[found.shots.problem.look_pm])
+    assert not np.array(engine.inliers)[[9, 12, 16]].any()
     assert sigmas_apart(found, estimate) < 0.05
 
 
@@ -72,8 +72,8 @@ def test_a_look_that_is_an_outlier_is_split_off_and_later_looks_join_the_good_on
     for pair in spoiled.pairs[39:]:
         estimate = engine.add(pair)
     found = batch(spoiled, model)
-    assert engine.kept[42:] == (True, False, True)
-    np.testing.assert_array_equal(engine.kept, found.shots.pm_kept[found.shots.problem.look_pm])
+    assert engine.inliers[42:] == (True, False, True)
+    np.testing.assert_array_equal(engine.inliers, found.shots.pm_inlier[found.shots.problem.look_pm])
     assert sigmas_apart(found, estimate) < 0.05
 
 
@@ -91,8 +91,8 @@ def test_another_look_at_the_oldest_pm_does_not_count_it_twice(pms: int) -> None
     estimate = engine.add(again)
     assert estimate.used
     assert estimate.pairs == pms + 1
-    assert engine.state.window is not None
-    assert oldest in {group.label for group in engine.state.window.groups}
+    assert engine.state.active_window is not None
+    assert oldest in {group.label for group in engine.state.active_window.groups}
     assert oldest not in engine.state.marginalised
     assert engine.state.epoch_pms == pms
     assert sigmas_apart(batch(replace(once, pairs=(*once.pairs, again)), model), estimate) < 0.05

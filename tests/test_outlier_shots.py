@@ -17,7 +17,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.minimal_set_consensus import consensus_starts
 from fgreg.registration.outliers import innovations_at, plausible_cost, pm_degrees_of_freedom
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register, targets_moved
 from fgreg.registration.solve import distance_to_explicit, solve
 from tests.forward import Truth, make_measurements
@@ -61,7 +61,7 @@ def _moved(first: Registration, second: Registration, model: SessionModel) -> fl
 def test_junk_is_named_and_the_answer_is_that_without_it(seed: int) -> None:
     model, spoiled, rest, _ = _spoiled(seed, junk=(2, 9, 16), flips=(5, 20), pairs=25)
     found, reference = register(spoiled, model, SolveConfig()), register(rest, model, SolveConfig())
-    assert list(np.flatnonzero(~found.shots.pm_kept)) == [2, 5, 9, 16, 20]
+    assert list(np.flatnonzero(~found.shots.pm_inlier)) == [2, 5, 9, 16, 20]
     assert _moved(found, reference, model) < 1e-3
     np.testing.assert_allclose(found.covariance, reference.covariance, rtol=1e-4, atol=1e-12)
 
@@ -70,7 +70,7 @@ def test_junk_of_two_fifths_is_left_out() -> None:
     junk, flips = (0, 3, 7, 11, 14, 19), (1, 8, 17, 22)
     model, spoiled, rest, _ = _spoiled(4, junk=junk, flips=flips, pairs=25)
     found, reference = register(spoiled, model, SolveConfig()), register(rest, model, SolveConfig())
-    assert set(np.flatnonzero(~found.shots.pm_kept)) == {*junk, *flips}
+    assert set(np.flatnonzero(~found.shots.pm_inlier)) == {*junk, *flips}
     assert _moved(found, reference, model) < 1e-3
 
 
@@ -93,8 +93,8 @@ def test_left_out_pairs_say_why_and_keep_their_figures() -> None:
 def test_a_session_without_junk_is_plain_least_squares() -> None:
     model, clean, _ = make_measurements(np.random.default_rng(6), pairs=20)
     found = register(clean, model, SolveConfig())
-    assert found.shots.pm_kept.all()
-    assert found.shots.aim_kept.all()
+    assert found.shots.pm_inlier.all()
+    assert found.shots.aim_inlier.all()
     assert len(found.measurements.pairs) == 20
     assert len(found.measurements.aims) == 12
     again = optimize(pack(clean, model), found.optimum.state)
@@ -216,20 +216,20 @@ def test_a_pair_whose_beam_has_no_place_on_its_arc_is_left_out() -> None:
     # Seed 39 has a beam that grazes its arc: its private optimum wanders, and may seem to fit on its way.
     model, spoiled, _, bad = _mixed_junk(39, 0.4)
     found = register(spoiled, model, SolveConfig())
-    assert set(np.flatnonzero(~found.shots.pm_kept)) == bad
+    assert set(np.flatnonzero(~found.shots.pm_inlier)) == bad
     assert float(found.optimum.evaluation.cost[0]) < plausible_cost(found.problem)
 
 
 def test_the_density_of_a_doubted_pm_is_that_of_good_or_junk() -> None:
     model, spoiled, _, _ = _spoiled(0, junk=(2,), pairs=12)
-    found = answer(register(spoiled, model, SolveConfig()), SolveConfig())
-    doubted = found.modes[0].doubted
+    found = posterior_mean(register(spoiled, model, SolveConfig()), SolveConfig())
+    doubted = found.modes[0].mixture
     assert doubted is not None
     state, private = found.modes[0].optimum.state, doubted.private
-    log_k = doubted.problem.log_junk
+    log_k = doubted.problem.log_outlier
     assert log_k is not None
-    without = replace(doubted.problem, log_junk=None)
-    one_pm = replace(found.modes[0].problem, log_junk=None)
+    without = replace(doubted.problem, log_outlier=None)
+    one_pm = replace(found.modes[0].problem, log_outlier=None)
     kept_private = found.modes[0].optimum.evaluation.private
     both = log_posterior(doubted.problem, state, private)[0]
     kept = log_posterior(one_pm, state, kept_private)[0]
@@ -244,7 +244,7 @@ def test_junk_that_bends_the_estimate_until_it_fits_widens_the_posterior() -> No
     for seed in (12, 28, 56):
         model, spoiled, truth, _ = _mixed_junk(seed, 0.4)
         registration = register(spoiled, model, SolveConfig())
-        for found in (registration, answer(registration, SolveConfig()).registration):
+        for found in (registration, posterior_mean(registration, SolveConfig()).registration):
             there = found.optimum.state.trus_T_camera()[0]
             squares.append(targets_moved(truth.trus_T_camera[0], there, model.targets_mm) ** 2)
     optimum, mean = np.mean(squares[::2]), np.mean(squares[1::2])

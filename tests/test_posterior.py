@@ -27,7 +27,7 @@ from fgreg.registration.posterior import (
     target_errors,
     weighted_quantile,
 )
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import register
 from tests.forward import make_measurements
 
@@ -156,14 +156,16 @@ def test_the_answer_keeps_the_optimum_apart_from_the_mean() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(6), pairs=8, first_hit=False)
     config = SolveConfig()
     registration = register(measurements, model, config)
-    found = answer(registration, config)
+    found = posterior_mean(registration, config)
     centred = found.registration
     np.testing.assert_array_equal(centred.optimum.state.trus_T_camera(), found.posterior.mean.trus_T_camera())
     np.testing.assert_array_equal(centred.covariance, found.posterior.covariance)
     assert registration.problem is not centred.problem  # the windows' sites
     # The PMs are those that go with the registration reported: on their beams as it has them.
     assert np.abs(centred.optimum.evaluation.look_residual[0, :, :2]).max() < 2.0
-    gaussian = answer(register(measurements, model, SolveConfig(window_shape=False)), SolveConfig(window_shape=False))
+    gaussian = posterior_mean(
+        register(measurements, model, SolveConfig(window_shape=False)), SolveConfig(window_shape=False)
+    )
     assert gaussian.registration.problem.shapes is None
     assert ellipsoid_contains(found.posterior, truth.trus_T_camera[0])
 

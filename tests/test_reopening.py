@@ -110,13 +110,15 @@ def test_events_taken_in_at_once_give_what_they_give_one_by_one(name: str) -> No
             again.add(event)
     found, expected = again.estimate, lived.estimate
     assert (found.epoch, found.pairs, found.verdict) == (expected.epoch, expected.pairs, expected.verdict)
-    assert again.kept == lived.kept
+    assert again.inliers == lived.inliers
     assert [start.after for start in again.measurements().epochs] == [s.after for s in lived.measurements().epochs]
-    assert [(back.epoch, back.to) for back in again.returns] == [(back.epoch, back.to) for back in lived.returns]
+    assert [(back.epoch, back.to) for back in again.loop_closures] == [
+        (back.epoch, back.to) for back in lived.loop_closures
+    ]
     assert sigmas_between(found, expected) < SIGMAS
     if expected.covariance is not None and found.covariance is not None:
         np.testing.assert_allclose(np.diag(found.covariance), np.diag(expected.covariance), rtol=0.05)
-    assert bool(lived.returns) == (name == "a loop closed")
+    assert bool(lived.loop_closures) == (name == "a loop closed")
     assert bool(lived.moves) == (name == "a move detected")
     assert [pair.epoch for pair in again.measurements().pairs] == [pair.epoch for pair in lived.measurements().pairs]
 
@@ -126,9 +128,9 @@ def test_a_thousand_pairs_in_seven_epochs_are_opened_again() -> None:
     spoiled = _spoiled(first(measurements, 100), 10).pairs
     whole = replace(measurements, pairs=spoiled + measurements.pairs[100:])
     engine = restored(OnlineRegistration(model, verdicts=False), whole)
-    assert (engine.estimate.epoch, len(engine.kept)) == (6, 1000)
-    assert not any(engine.kept[5:100:10])
-    assert sum(engine.kept) > 980
+    assert (engine.estimate.epoch, len(engine.inliers)) == (6, 1000)
+    assert not any(engine.inliers[5:100:10])
+    assert sum(engine.inliers) > 980
     assert engine.add(replace(measurements.pairs[-1], t=engine.estimate.t + 1.0, pm=2000)).used
 
 
@@ -158,7 +160,7 @@ def _recorded(folder: Path, events: Shots) -> tuple[OnlineEstimate, tuple[bool, 
 
 def _kept(live: LiveSession) -> tuple[bool, ...]:
     assert isinstance(live.engine, OnlineRegistration)
-    return live.engine.kept
+    return live.engine.inliers
 
 
 def _is(live: LiveSession, expected: tuple[OnlineEstimate, tuple[bool, ...]]) -> None:

@@ -8,13 +8,13 @@ import numpy as np
 
 from fgreg.camera_moves.static_tags import (
     TagFrame,
+    TagMoveDetector,
     TagPose,
     TagSettings,
-    TagWatch,
     average_tags,
-    restart_watch,
+    detect_tag_move,
+    restart_detector,
     tag_motion,
-    watch_tags,
 )
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform
 
@@ -115,29 +115,29 @@ def test_one_misread_frame_does_not_spoil_the_average() -> None:
 
 def test_a_shift_is_found_within_ten_frames_and_its_frames_start_the_new_reference() -> None:
     rng = np.random.default_rng(7)
-    tags, watch = _tags(rng), TagWatch()
+    tags, detector = _tags(rng), TagMoveDetector()
     for _ in range(60):
-        watch, check = watch_tags(watch, _frame(rng, tags), SETTINGS)
+        detector, check = detect_tag_move(detector, _frame(rng, tags), SETTINGS)
         assert not check.alarm
     moved = _moved(tags, make_transform(np.eye(3), np.array([2.0, 0.0, 0.0])))
     count = 0
     while not check.alarm and count < 10:
-        watch, check = watch_tags(watch, _frame(rng, moved), SETTINGS)
+        detector, check = detect_tag_move(detector, _frame(rng, moved), SETTINGS)
         count += 1
     assert check.alarm
     assert check.motion is not None
-    watch = restart_watch(watch, min(count, check.frames), SETTINGS)
+    detector = restart_detector(detector, min(count, check.frames), SETTINGS)
     for _ in range(40):
-        watch, check = watch_tags(watch, _frame(rng, moved), SETTINGS)
+        detector, check = detect_tag_move(detector, _frame(rng, moved), SETTINGS)
         assert not check.alarm
 
 
 def test_a_slow_creep_is_found_against_the_epochs_start() -> None:
     rng = np.random.default_rng(8)
-    tags, watch, alarm = _tags(rng), TagWatch(), False
+    tags, detector, alarm = _tags(rng), TagMoveDetector(), False
     for count in range(300):
         creep = make_transform(np.eye(3), np.array([0.02 * max(count - 60, 0), 0.0, 0.0]))
-        watch, check = watch_tags(watch, _frame(rng, _moved(tags, creep)), SETTINGS)
+        detector, check = detect_tag_move(detector, _frame(rng, _moved(tags, creep)), SETTINGS)
         alarm = alarm or check.alarm
     assert alarm
 

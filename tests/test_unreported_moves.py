@@ -58,7 +58,7 @@ def test_solved_as_epochs_both_registrations_are_good() -> None:
         estimate = found.optimum.state.trus_T_camera(epoch)[0]
         assert tre_mm(estimate, truth[epoch].trus_T_camera[0], model.targets_mm).mean() < 3.0
     together = register(measurements, model, CONFIG)
-    assert len(together.shots.pm_kept) - together.shots.pm_kept.sum() > 5  # unsplit, one side of it is outliers
+    assert len(together.shots.pm_inlier) - together.shots.pm_inlier.sum() > 5  # unsplit, one side of it is outliers
 
 
 def _pairs(epochs: tuple[int, ...], pms: tuple[int, ...]) -> tuple[Pair, ...]:

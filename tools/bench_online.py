@@ -103,7 +103,7 @@ def bench(model: SessionModel, measurements: Measurements) -> bool:
         engine.track(Track(event.t, estimate.epoch, event.marker, (event.look,)))
         tracks.append(since(start))
     found = f"{len(measurements.pairs)} pairs, {len(measurements.epochs)} epochs"
-    print(f"{found}; {sum(engine.kept)} inliers, {len(engine.moves)} camera moves detected")
+    print(f"{found}; {sum(engine.inliers)} inliers, {len(engine.moves)} camera moves detected")
     met = row("add without the full solve", alone, ADD_MS)
     met &= row(f"add with it, first {FIRST_PAIRS} pairs of an epoch", whole, FIRST_MS)
     met &= row("track", tracks, TRACK_MS)

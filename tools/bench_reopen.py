@@ -79,14 +79,14 @@ def bench(folder: Path, pairs: int, outliers: float, seed: int, make_engine: One
             start = time.perf_counter()
             live.add(event)
             add_ms.append(1e3 * (time.perf_counter() - start))
-        before, kept = live.settle(), live.engine.kept if isinstance(live.engine, OnlineRegistration) else ()
+        before, kept = live.settle(), live.engine.inliers if isinstance(live.engine, OnlineRegistration) else ()
     start = time.perf_counter()
     Journal.open(folder).close()
     read_s = time.perf_counter() - start
     start, cpu = time.perf_counter(), time.process_time()
     with LiveSession.open(folder, make_engine=make_engine) as live:
         open_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu
-        after, again = live.estimate, live.engine.kept if isinstance(live.engine, OnlineRegistration) else ()
+        after, again = live.estimate, live.engine.inliers if isinstance(live.engine, OnlineRegistration) else ()
     sigmas = float("inf") if after is None else sigmas_between(after, before)
     limit = f" (limit {OPEN_S:g})" if pairs == OPEN_PAIRS else ""
     print(f"{pairs} pairs, {before.epoch + 1} epochs")

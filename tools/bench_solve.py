@@ -21,7 +21,7 @@ from fgreg.detection.events_to_measurements import recognise
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import register
 from fgreg.registration.solve import distance_to_explicit, solve
 from fgreg.session.session_reader import read_session
@@ -66,7 +66,7 @@ def main() -> None:
         out["register 15 pairs, ms"] = median_ms(lambda: register(measurements, model, config), args.repeats)
         out["explicit graph from there, ms"] = median_ms(lambda: distance_to_explicit(found), args.repeats)
         out["posterior samples, ms"] = median_ms(
-            lambda: answer(found, config),
+            lambda: posterior_mean(found, config),
             args.repeats,
         )
         out["solve 15 pairs, all of it, ms"] = median_ms(lambda: solve(measurements, [], model, config), args.repeats)

@@ -98,9 +98,9 @@ def _from_mode(mode: Mode, state: SharedState) -> FloatArray:
             hessian = np.nan_to_num(there.hessian[:, poses:, poses:]) + hold
             change[:, poses:] = -np.linalg.solve(hessian, np.nan_to_num(there.gradient[:, poses:, None]))[..., 0]
             moved, private = moved.retract(change, columns), there.private
-        if mode.doubted is not None:
+        if mode.mixture is not None:
             problem, private = (
-                mode.doubted.problem,
+                mode.mixture.problem,
                 moved_private(mode, step_between(mode.optimum.state, moved, columns)),
             )
             _, private = refine(problem, moved, private)

@@ -29,7 +29,7 @@ from fgreg.model.sensitivity import rotation_of_arc
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.initialization import beam_starts
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.readout import read_laser
 from fgreg.registration.register import calibrate_beam, register
 from fgreg.registration.solve import track_snapshot
@@ -212,8 +212,8 @@ def registration(job: Job) -> dict[Any, Row]:
         row: Row = {"bound2": float(np.mean(bound**2))}
         try:
             found = register(some.measurements, some.model, SETTINGS)
-            answered = answer(found, SETTINGS)
-            row["tre"] = sim.tre(answered.posterior.mean.trus_T_camera()[0])
+            centred = posterior_mean(found, SETTINGS)
+            row["tre"] = sim.tre(centred.posterior.mean.trus_T_camera()[0])
             states = [found.optimum.state, *(minimum.state for minimum in found.searches[0].minima)]
             best = min(states, key=lambda state: float(np.mean(sim.tre(state.trus_T_camera()[0]) ** 2)))
             row["best"] = sim.tre(best.trus_T_camera()[0])
@@ -221,9 +221,9 @@ def registration(job: Job) -> dict[Any, Row]:
             row["ambiguous"] = bool(found.ambiguous)
             if job.gaussian:
                 row["optimum_tre"] = sim.tre(found.optimum.state.trus_T_camera()[0])
-                like = answer(register(some.measurements, some.model, GAUSSIAN), GAUSSIAN)
+                like = posterior_mean(register(some.measurements, some.model, GAUSSIAN), GAUSSIAN)
                 row["gaussian_tre"] = sim.tre(like.posterior.mean.trus_T_camera()[0])
-            held_out = predict(answered.registration, held.measurements.pairs)
+            held_out = predict(centred.registration, held.measurements.pairs)
             row["residual"] = np.array([pm.pair_residual_mm for pm in held_out])
         except EstimationError:
             row["failed"] = True
@@ -250,8 +250,8 @@ def one_out(job: Job) -> dict[Any, Row]:
     for left in range(15):
         pairs = sim.measurements.pairs
         kept = replace(sim.measurements, pairs=pairs[:left] + pairs[left + 1 :])
-        answered = answer(register(kept, sim.model, SETTINGS), SETTINGS).registration
-        residuals += [pm.pair_residual_mm for pm in predict(answered, pairs[left : left + 1])]
+        centred = posterior_mean(register(kept, sim.model, SETTINGS), SETTINGS).registration
+        residuals += [pm.pair_residual_mm for pm in predict(centred, pairs[left : left + 1])]
         rest = np.arange(15) != left
         points.append(
             float(
@@ -260,7 +260,7 @@ def one_out(job: Job) -> dict[Any, Row]:
                 )
             )
         )
-    whole = answer(register(sim.measurements, sim.model, SETTINGS), SETTINGS)
+    whole = posterior_mean(register(sim.measurements, sim.model, SETTINGS), SETTINGS)
     tre = sim.tre(whole.posterior.mean.trus_T_camera()[0])
     return {15: {"residual": np.array(residuals), "b_point": np.array(points), "tre": tre}}
 
@@ -269,14 +269,14 @@ def tracking(job: Job) -> dict[Any, Row]:
     """Answers to queries whose PM is heard, with 10 pairs."""
     sim = simulated(replace(job.config, pairs=10, tracks_heard=6, tracks_silent=0), job.seed)
     found = register(sim.measurements, sim.model, SETTINGS)
-    answered = answer(found, SETTINGS)
-    shift = read_laser(answered.registration, sim.model).origin_shift_mm
-    snapshot = track_snapshot(answered.registration, sim.model, SETTINGS, shift)
+    centred = posterior_mean(found, SETTINGS)
+    shift = read_laser(centred.registration, sim.model).origin_shift_mm
+    snapshot = track_snapshot(centred.registration, sim.model, SETTINGS, shift)
     answers = [track(query, snapshot) for query in sim.tracks]
     errors = [
-        abs(math.degrees(answer.stage_rad - right))
-        for answer, right in zip(answers, sim.track_rad, strict=True)
-        if answer.stage_rad is not None
+        abs(math.degrees(found_track.stage_rad - right))
+        for found_track, right in zip(answers, sim.track_rad, strict=True)
+        if found_track.stage_rad is not None
     ]
     return {job.key: {"track": np.array(errors)}}
 

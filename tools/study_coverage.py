@@ -42,7 +42,7 @@ from fgreg.graph.reduced_blocks import look_block
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.posterior import pose_tangent, target_errors, weighted_quantile
-from fgreg.registration.posterior_mean import Answer, answer
+from fgreg.registration.posterior_mean import PosteriorMean, posterior_mean
 from fgreg.registration.register import register
 
 sys.path.insert(0, os.fspath(__import__("pathlib").Path(__file__).resolve().parent.parent))
@@ -51,7 +51,7 @@ from tests.forward import make_measurements, make_session
 LIMIT = float(chi2.ppf(0.95, 6))
 
 
-def rotation_noise(found: Answer) -> FloatArray:
+def rotation_noise(found: PosteriorMean) -> FloatArray:
     """(L,) rad: how well each look's rotation is known from its beam and its hearing alone, the window aside."""
     problem, optimum = found.modes[0].problem, found.modes[0].optimum
     at = optimum.evaluation
@@ -124,7 +124,7 @@ def run(cell: Cell, seed: int) -> Outcome | None:
     config = SolveConfig(window_shape=cell.shape)
     begin = time.perf_counter()
     try:
-        found = answer(register(measurements, model, config), config)
+        found = posterior_mean(register(measurements, model, config), config)
     except EstimationError:
         return None
     seconds = time.perf_counter() - begin

@@ -35,7 +35,7 @@ from fgreg.graph.shared_state import make_state
 from fgreg.model.measurements import Aim, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
@@ -91,7 +91,7 @@ def truth_state_cost(measurements: Measurements, model: SessionModel, truth: Tru
 def solved(measurements: Measurements, model: SessionModel) -> Registration:
     """The registration as it is reported: at the mean of the posterior."""
     config = SolveConfig()
-    return answer(register(measurements, model, config), config).registration
+    return posterior_mean(register(measurements, model, config), config).registration
 
 
 def tre_mm(found: Registration, truth: Truth, model: SessionModel) -> FloatArray:
@@ -150,7 +150,7 @@ def one(seed: int, share: float, args: argparse.Namespace) -> Figures:
     figures.with_mm.append(float(np.mean(tre_mm(found, truth, model))))
     figures.without_mm.append(float(np.mean(tre_mm(reference, truth, model))))
     misfit = truth_state_cost(spoiled, model, truth)
-    named = ~found.shots.pm_kept
+    named = ~found.shots.pm_inlier
     for i in range(args.pairs):
         if i not in kind_of:
             figures.good += 1

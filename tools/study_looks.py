@@ -33,7 +33,7 @@ from fgreg.model.measurements import Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.posterior import target_errors
-from fgreg.registration.posterior_mean import Answer, answer, sound_speed_from_residuals
+from fgreg.registration.posterior_mean import PosteriorMean, posterior_mean, sound_speed_from_residuals
 from fgreg.registration.register import SoundSpeedPrior, register
 from fgreg.registration.verdict import sound_speed_condition
 from fgreg.tracking import make_snapshot, track
@@ -45,12 +45,12 @@ LADDER = {"looks_per_pm": 3, "look_spacing_deg": 2.0, "amplitude_noise": 0.05}
 Row = dict[str, list[float]]
 
 
-def solved(measurements: Measurements, model: SessionModel, config: SolveConfig | None = None) -> Answer:
+def solved(measurements: Measurements, model: SessionModel, config: SolveConfig | None = None) -> PosteriorMean:
     config = config or SolveConfig()
-    return answer(register(measurements, model, config), config)
+    return posterior_mean(register(measurements, model, config), config)
 
 
-def errors(found: Answer, truth: Truth, model: SessionModel) -> tuple[float, float]:
+def errors(found: PosteriorMean, truth: Truth, model: SessionModel) -> tuple[float, float]:
     """Mean squared target error, and the posterior's idea of it, mm^2."""
     camera_p = transform_points(inverse(truth.trus_T_camera[0]), model.targets_mm)
     moved = transform_points(found.posterior.mean.trus_T_camera()[0], camera_p) - model.targets_mm
@@ -157,11 +157,11 @@ def speed(pairs: int, seed: int) -> Row:
         registration = register(measurements, model, SolveConfig())
         asked = sound_speed_from_residuals(registration)
         out[f"{ratio} noticed by residuals"] = [float(bool(sound_speed_condition(asked.value, asked.sigma)))]
-        out[f"{ratio} taken as given"] = [errors(answer(registration, SolveConfig()), truth, model)[0]]
+        out[f"{ratio} taken as given"] = [errors(posterior_mean(registration, SolveConfig()), truth, model)[0]]
         out[f"{ratio} estimated"] = [errors(solved(measurements, model, estimate), truth, model)[0]]
         heard = ratio + 0.003 * float(np.random.default_rng([5, seed]).standard_normal())
         by_frames = register(measurements, model, estimate, SoundSpeedPrior(heard, 0.003))
-        out[f"{ratio} estimated, wavefronts"] = [errors(answer(by_frames, estimate), truth, model)[0]]
+        out[f"{ratio} estimated, wavefronts"] = [errors(posterior_mean(by_frames, estimate), truth, model)[0]]
     return out
 
 

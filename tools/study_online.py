@@ -92,7 +92,7 @@ def agreement(measurements: Measurements, model: SessionModel, every: int) -> Ag
         out.append(sigmas_apart(found, estimate))
         if last:
             solved = np.isin([pair.epoch for pair in measurements.pairs], found.epochs)
-            same = bool((found.shots.pm_kept[found.shots.problem.look_pm] == np.array(engine.kept)[solved]).all())
+            same = bool((found.shots.pm_inlier[found.shots.problem.look_pm] == np.array(engine.inliers)[solved]).all())
     return Agreement(np.array(out), same, np.array(late))
 
 

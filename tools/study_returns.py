@@ -25,7 +25,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.camera_moves.static_tags import TagFrame, TagSettings, TagWatch, watch_tags
+from fgreg.camera_moves.static_tags import TagFrame, TagMoveDetector, TagSettings, detect_tag_move
 from fgreg.errors import EstimationError
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
@@ -89,12 +89,12 @@ def _right_covariance(pose: FloatArray) -> FloatArray:
 
 def tags_clean(count: int, seed: int) -> None:
     settings = TagSettings()
-    scene, watch = TagScene(np.random.default_rng([seed, 0])), TagWatch()
+    scene, watch = TagScene(np.random.default_rng([seed, 0])), TagMoveDetector()
     alarms, before, highest = 0, False, []
     for n in range(1, count + 1):
         if n % 1000 == 0:  # another scene: an epoch does not last for ever, and its start is what is compared with
-            scene, watch, before = TagScene(np.random.default_rng([seed, n])), TagWatch(), False
-        watch, check = watch_tags(watch, scene.frame(), settings)
+            scene, watch, before = TagScene(np.random.default_rng([seed, n])), TagMoveDetector(), False
+        watch, check = detect_tag_move(watch, scene.frame(), settings)
         alarms += check.alarm and not before
         before = check.alarm
         highest.append(check.motion.chi2 if check.motion is not None else 0.0)
@@ -111,13 +111,13 @@ def tags_shifts(count: int, seed: int) -> None:
         found: list[int] = []
         for s in range(count):
             rng = np.random.default_rng([seed, s])
-            scene, watch = TagScene(rng), TagWatch()
+            scene, watch = TagScene(rng), TagMoveDetector()
             for _ in range(60):
-                watch, _ = watch_tags(watch, scene.frame(), settings)
+                watch, _ = detect_tag_move(watch, scene.frame(), settings)
             scene.move(shift_of(rng, mm, degrees))
             at = FRAMES_PER_PAIR + 1
             for n in range(1, FRAMES_PER_PAIR + 1):
-                watch, check = watch_tags(watch, scene.frame(), settings)
+                watch, check = detect_tag_move(watch, scene.frame(), settings)
                 if check.alarm:
                     at = n
                     break
@@ -154,8 +154,8 @@ def _used_again_after(seed: int, motion: FloatArray, steady: int, *, first_hit: 
     for index, event in events_in_order(measurements):
         estimate = engine.add(event)
         pairs += index is not None
-        if engine.returns or estimate.epoch > 1:
-            return pairs - steady if engine.returns else math.inf
+        if engine.loop_closures or estimate.epoch > 1:
+            return pairs - steady if engine.loop_closures else math.inf
     return math.inf
 
 

@@ -8,9 +8,10 @@ Kalman filter runs through them. Hypotheses:
 - moved at a split point: the registration is ``trus_T_camera * Exp(xi)`` from that PM on, xi about the camera with a
   zero-mean prior that mixes scales, from a nudge to a camera put back anywhere.
 
-Under each of them any PM may be an outlier: then it has a constant density (fgreg.registration.outliers.JUNK_DENSITY).
-So one gross outlier is an outlier, and several in a row that agree on one moved registration are a move. The likeliest
-few sequences of labels (inlier or outlier, PM by PM) are carried along: a Gaussian sum, cut down to its heaviest terms.
+Under each of them any PM may be an outlier, which has a constant density
+(fgreg.registration.outliers.OUTLIER_DENSITY). So one gross outlier is an outlier, and several in a row that agree on
+one moved registration are a move. The likeliest few sequences of labels (inlier or outlier, PM by PM) are carried
+along: a Gaussian sum, cut down to its heaviest terms.
 
 Large moves are not linear: moved hypotheses are linearised again about the registrations they lead to.
 """
@@ -29,7 +30,7 @@ from fgreg.graph.packing import PackedProblem
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.split_points import ALARM, MoveScales, default_scales, logsumexp
 from fgreg.model.sensitivity import interval_moments, log_interval
-from fgreg.registration.outliers import JUNK_DENSITY
+from fgreg.registration.outliers import OUTLIER_DENSITY
 
 BRANCHES = 4
 """Sequences of labels carried along per hypothesis."""
@@ -229,7 +230,7 @@ def _run(
     moved: _Groups | None = None
     born = 0
     for j in range(terms.count):
-        log_outlier = math.log(settings.outlier_probability) + 0.5 * int(terms.equations[j]) * math.log(JUNK_DENSITY)
+        log_outlier = math.log(settings.outlier_probability) + 0.5 * int(terms.equations[j]) * math.log(OUTLIER_DENSITY)
         log_inlier = math.log1p(-settings.outlier_probability)
         if born < len(splits) and splits[born] == j:
             new = none.moved(scales)

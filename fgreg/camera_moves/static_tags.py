@@ -67,20 +67,20 @@ class TagSettings:
     Attributes:
         windows: numbers of last frames that are averaged, each tested.
         reference_frames: frames at the epoch's start (those first seen later: from then) that it is compared with.
-        steady_share: of the detections' variance that stays from frame to frame.
+        constant_share: of the detections' variance that stays from frame to frame.
         p: probability of an alarm, per test, while nothing moves.
     """
 
     windows: tuple[int, ...] = (3, 10)
     reference_frames: int = 50
-    steady_share: float = 0.2
+    constant_share: float = 0.2
     p: float = 1e-5
 
     def __post_init__(self) -> None:
         if not self.windows or min(self.windows) < 1 or self.reference_frames < 1:
             raise ValueError("windows and reference_frames have to be numbers of frames >= 1")
-        if not 0.0 <= self.steady_share <= 1.0 or not 0.0 < self.p < 1.0:
-            raise ValueError("steady_share and p have to be between 0 and 1")
+        if not 0.0 <= self.constant_share <= 1.0 or not 0.0 < self.p < 1.0:
+            raise ValueError("constant_share and p have to be between 0 and 1")
 
     @property
     def threshold(self) -> float:
@@ -99,7 +99,7 @@ def usable_frame(frame: TagFrame) -> TagFrame:
     return TagFrame(frame.camera_T_tag, {tag: usable_covariance(c, POSE_FLOOR) for tag, c in frame.covariance.items()})
 
 
-def average_tags(frames: Sequence[TagFrame], steady_share: float) -> dict[int, TagPose]:
+def average_tags(frames: Sequence[TagFrame], constant_share: float) -> dict[int, TagPose]:
     """Each tag's mean pose over the frames that saw it; a few misread ones are left out by their median."""
     out = {}
     limit = float(chdtri(6, TAG_P * 0.1))
@@ -115,7 +115,7 @@ def average_tags(frames: Sequence[TagFrame], steady_share: float) -> dict[int, T
         if 2 * good.sum() <= len(seen):
             continue
         count = int(good.sum())
-        mean = covariance[good].mean(axis=0) * (steady_share + (1.0 - steady_share) / count)
+        mean = covariance[good].mean(axis=0) * (constant_share + (1.0 - constant_share) / count)
         out[tag] = TagPose(_moved(base, steps[good].mean(axis=0)), mean, count)
     return out
 
@@ -207,7 +207,7 @@ def _majority(both: _Both, limit: float) -> tuple[FloatArray, FloatArray, BoolAr
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TagWatch:
+class TagMoveDetector:
     """State of the watch: frames of the reference, and those since."""
 
     reference: tuple[TagFrame, ...] = ()
@@ -224,41 +224,43 @@ class TagCheck:
     frames: int
 
 
-def watch_tags(watch: TagWatch, frame: TagFrame, settings: TagSettings) -> tuple[TagWatch, TagCheck]:
-    """Take in a frame and test. After an alarm the caller goes on from :func:`restart_watch`."""
+def detect_tag_move(
+    detector: TagMoveDetector, frame: TagFrame, settings: TagSettings
+) -> tuple[TagMoveDetector, TagCheck]:
+    """Take in a frame and test. After an alarm the caller goes on from :func:`restart_detector`."""
     longest = max(settings.windows)
-    recent = (*watch.recent, usable_frame(frame))
-    reference, means = watch.reference, watch.means
+    recent = (*detector.recent, usable_frame(frame))
+    reference, means = detector.reference, detector.means
     if len(recent) > longest:
         if len(reference) < settings.reference_frames:
             reference = (*reference, recent[0])
-            means = average_tags(reference, settings.steady_share)
+            means = average_tags(reference, settings.constant_share)
         recent = recent[1:]
-    watch = TagWatch(reference, recent, means)
+    detector = TagMoveDetector(reference, recent, means)
     best: TagCheck = TagCheck(False, None, 0)
     if not means:
-        return watch, best
+        return detector, best
     for size in settings.windows:
         if size > len(recent):
             continue
-        motion = tag_motion(means, average_tags(recent[-size:], settings.steady_share))
+        motion = tag_motion(means, average_tags(recent[-size:], settings.constant_share))
         if motion is None or (best.motion is not None and motion.chi2 <= best.motion.chi2):
             continue
         best = TagCheck(motion.chi2 > settings.threshold, motion, size)
-    return watch, best if best.alarm else _on_its_way(means, recent, settings) or best
+    return detector, best if best.alarm else _on_its_way(means, recent, settings) or best
 
 
 def _on_its_way(means: Mapping[int, TagPose], recent: Sequence[TagFrame], settings: TagSettings) -> TagCheck | None:
     """An alarm where the last few frames do not agree with each other, and each of them alone is off its place."""
     few = recent[-min(settings.windows) :]
-    if len(few) < 2 or average_tags(few, settings.steady_share):
+    if len(few) < 2 or average_tags(few, settings.constant_share):
         return None
-    motions = [tag_motion(means, average_tags([frame], settings.steady_share)) for frame in few]
+    motions = [tag_motion(means, average_tags([frame], settings.constant_share)) for frame in few]
     off = [motion for motion in motions if motion is not None and motion.chi2 > settings.threshold]
     return TagCheck(True, off[-1], len(few)) if len(off) == len(few) else None
 
 
-def restart_watch(watch: TagWatch, frames: int, settings: TagSettings) -> TagWatch:
+def restart_detector(detector: TagMoveDetector, frames: int, settings: TagSettings) -> TagMoveDetector:
     """After an accepted move: the last ``frames`` frames become the reference of the new epoch."""
-    reference = watch.recent[-frames:] if frames else ()
-    return TagWatch(reference, (), average_tags(reference, settings.steady_share) if reference else {})
+    reference = detector.recent[-frames:] if frames else ()
+    return TagMoveDetector(reference, (), average_tags(reference, settings.constant_share) if reference else {})

@@ -17,7 +17,7 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Measurements, Pair
-from fgreg.registration.posterior_mean import answer
+from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register
 
 REFINEMENTS = 5
@@ -83,7 +83,7 @@ def resolve(case: Case, kept: Sequence[int], config: EvaluationConfig, held: Seq
         return Resolved(tuple(kept), failure=str(error))
     count = len(measurements.epochs)
     place = {epoch: index for index, epoch in enumerate(registration.epochs)}
-    centred = answer(registration, config.solve).registration
+    centred = posterior_mean(registration, config.solve).registration
     state = centred.optimum.state
     transforms = tuple(state.trus_T_camera(place[k])[0] if k in place else None for k in range(count))
     expected: list[float | None] = []

@@ -94,7 +94,8 @@ class Anchor:
 class PackedProblem:
     """All measurements of a session as arrays; indices say which PM and epoch each belongs to.
 
-    ``log_junk`` (J,): where PMs are doubted, the log density of what is junk there, over that of a good PM at its best.
+    ``log_outlier`` (J,): where each PM may be an inlier or an outlier, the log density of an outlier over that of an
+    inlier at its best.
     """
 
     columns: Columns
@@ -114,7 +115,7 @@ class PackedProblem:
     shapes: RotationShapes | None = None
     sound_speed_mean: float = 1.0
     anchor: Anchor | None = None
-    log_junk: FloatArray | None = None
+    log_outlier: FloatArray | None = None
 
 
 def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
@@ -295,7 +296,7 @@ def only_aims(problem: PackedProblem) -> PackedProblem:
         prior_information=np.zeros_like(problem.prior_information),
         shapes=None,
         anchor=None,
-        log_junk=None,
+        log_outlier=None,
     )
 
 

@@ -28,7 +28,7 @@ def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:
         look_beam=beam_place[problem.look_beam[looks]],
         looks=LookArrays(*(getattr(problem.looks, name)[looks] for name in LookArrays.__slots__)),
         shapes=None if problem.shapes is None else _select_shapes(problem.shapes, index, looks),
-        log_junk=None if problem.log_junk is None else problem.log_junk[index],
+        log_outlier=None if problem.log_outlier is None else problem.log_outlier[index],
     )
 
 

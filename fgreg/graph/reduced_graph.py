@@ -236,8 +236,8 @@ def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateSt
     """
     system = _system(problem, state, private)
     pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost.T
-    if problem.log_junk is not None:
-        pms = np.logaddexp(pms, problem.log_junk)
+    if problem.log_outlier is not None:
+        pms = np.logaddexp(pms, problem.log_outlier)
     return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=0) + system.prior_cost))
 
 

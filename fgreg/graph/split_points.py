@@ -88,7 +88,7 @@ def log_move_odds(
     return logsumexp(_log_factors(scales.covariance, information, pull) + np.log(scales.share), axis=1)
 
 
-def odds_in_epoch(
+def move_odds_in_epoch(
     problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
 ) -> tuple[tuple[int, ...], FloatArray]:
     """The n PMs of one epoch of a registration, in the order of time, and :func:`log_move_odds` (n - 1,) of them.

@@ -33,10 +33,10 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.event_checks import check
-from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent, StaticTags
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
 from fgreg.online.solver import Where, make_solver
-from fgreg.online.tag_check import TagGuard, TagsMoved, TagsRest, guarded
+from fgreg.online.tag_check import TagMonitor, TagsAtRest, TagsMoved, monitored
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.register import EpochSearch, Minimum, SoundSpeedPrior
 from fgreg.registration.solve import Solution, solve
@@ -112,9 +112,9 @@ class OnlineRegistration:
         self._surface: TissueSurface | None = None
         self._find_moves, self._verdicts = find_moves, verdicts
         self._move_failure = ""  # of the camera-move test
-        self._tags = TagGuard()
+        self._tags = TagMonitor()
         self._moves: list[DetectedMove] = []
-        self._returns: list[DetectedReturn] = []
+        self._loop_closures: list[DetectedLoopClosure] = []
         self._noticed: dict[int, str] = {}
         self._solver = make_solver(full_solve, model, self._config, sound_speed_prior, verdicts=verdicts)
         self._estimate = self._estimated(self._state, 0.0)
@@ -168,13 +168,13 @@ class OnlineRegistration:
             self._estimate = replace(self._estimate, nis=self._state.nis, used=self._state.used)
         return self._estimate
 
-    def _seen(self, event: OnlineEvent) -> tuple[TagGuard, TagsMoved | TagsRest | None]:
+    def _seen(self, event: OnlineEvent) -> tuple[TagMonitor, TagsMoved | TagsAtRest | None]:
         """What a frame of static tags says, and the tags' state after it."""
         if not (isinstance(event, StaticTags) and self._find_moves):
             return self._tags, None
-        return guarded(self._tags, event, TagSettings())
+        return monitored(self._tags, event, TagSettings())
 
-    def _next(self, event: OnlineEvent, found: TagsMoved | TagsRest | None) -> State:
+    def _next(self, event: OnlineEvent, found: TagsMoved | TagsAtRest | None) -> State:
         state, setting = self._state, self._setting
         if isinstance(event, Pair):
             return with_pair(state, event, setting)
@@ -184,13 +184,13 @@ class OnlineRegistration:
             start = EpochStart(event.t, event.camera_new_T_camera_old, event.covariance)
             if event.since_t is not None:
                 return with_move(state, replace(start, t=event.since_t), setting, self._pairs_since(event.since_t))
-            if self._noticed.get(state.epoch) and (state.window is None or not state.epoch_pairs):
+            if self._noticed.get(state.epoch) and (state.active_window is None or not state.epoch_pairs):
                 # Whether this is the move that was detected, or another, is not known: the motion of neither is.
                 start = EpochStart(event.t)
             return with_move(state, start, setting)
         if isinstance(found, TagsMoved):
             return with_move(state, EpochStart(found.since_t), setting, self._pairs_since(found.since_t))
-        if isinstance(found, TagsRest):
+        if isinstance(found, TagsAtRest):
             start = EpochStart(state.now.start.t, found.camera_new_T_camera_old, found.covariance)
             return with_motion(state, start, setting)
         return replace(state, nis=None, used=False)
@@ -208,11 +208,11 @@ class OnlineRegistration:
         self._division += 1
         self._misplaced = frozenset()
         if not by_tags:
-            self._tags = TagGuard()
+            self._tags = TagMonitor()
 
     # --- the full solve ---------------------------------------------------------------------------------------------
 
-    def _want(self, event: OnlineEvent, found: TagsMoved | TagsRest | None, misplaced: frozenset[int]) -> None:
+    def _want(self, event: OnlineEvent, found: TagsMoved | TagsAtRest | None, misplaced: frozenset[int]) -> None:
         """What the full solve is to do after an event."""
         state = self._state
         if self._solver.failure and state.epoch_pairs:  # what the last full solve was to say has not been said
@@ -220,12 +220,12 @@ class OnlineRegistration:
         if isinstance(event, Pair):
             self._move_wanted = self._find_moves
             rejected = state.nis is not None and not state.used
-            no_estimate = state.window is None or state.is_open
+            no_estimate = state.active_window is None or state.is_open
             due = is_due(state.epoch_pairs) or state.epoch_pms <= FIRST_PMS
             if no_estimate or rejected or due or not misplaced <= self._misplaced:
                 self._solve_wanted = True
         elif isinstance(event, Aim):
-            if state.epoch_pairs and (state.window is None or state.epoch_pairs <= FIRST_PAIRS):
+            if state.epoch_pairs and (state.active_window is None or state.epoch_pairs <= FIRST_PAIRS):
                 self._solve_wanted = True
         elif (found is not None or isinstance(event, CameraMoved)) and state.epoch_pairs:
             self._solve_wanted = True
@@ -242,7 +242,7 @@ class OnlineRegistration:
                 self._asked, self._solve_wanted, self._move_wanted = self._division, False, False
                 self._move_untested = case.move is not None and case.move.known is None
                 self._solver.submit(case)
-                if self._solver.busy and case.measurements is not None and self._state.window is None:
+                if self._solver.busy and case.measurements is not None and self._state.active_window is None:
                     self._state = replace(self._state, why_none="its pairs are being registered")
                     self._estimate = self._estimated(self._state, self._estimate.t)
             if not self._fetch(t):
@@ -292,7 +292,7 @@ class OnlineRegistration:
     @property
     def _solvable(self) -> bool:
         """Whether the current epoch can have a registration."""
-        return self._state.window is not None or self._state.epoch_pms >= LEAST_PMS
+        return self._state.active_window is not None or self._state.epoch_pms >= LEAST_PMS
 
     def _known(self) -> dict[int, EpochSearch]:
         """Minima of earlier epochs: theirs are not searched for again."""
@@ -305,7 +305,7 @@ class OnlineRegistration:
         return out
 
     def _move_case(self) -> MoveCase | None:
-        state, window = self._state, self._state.window
+        state, active = self._state, self._state.active_window
         looks = looks_by_pm(state.current, state.now.first)
         # Two minima among many PMs are what a move leaves: the pairs of either side are the outliers of the other.
         sound = state.carried is not None and (not state.is_open or state.epoch_pms >= 2 * MIN_KNOWN)
@@ -314,8 +314,8 @@ class OnlineRegistration:
             pms=tuple(tuple(state.shots[place].pair for place in places) for places in looks.values()),
             places=tuple(places[0] for places in looks.values()),
             inlier=np.array([state.shots[places[0]].inlier for places in looks.values()], dtype=bool),
-            state=window.state if window is not None and sound else None,
-            known=state.carried.at(window.state, self._setting.columns) if window and state.carried and sound else None,
+            state=active.state if active is not None and sound else None,
+            known=state.carried.at(active.state, self._setting.columns) if active and state.carried and sound else None,
             aims=state.aims,
             earlier=self._earlier(state.epoch) if state.epoch_pairs <= MOST_LOOKS else {},
         )
@@ -346,7 +346,7 @@ class OnlineRegistration:
                 self._move_wanted, self._move_untested = self._move_wanted or self._move_untested, False
                 self._misplaced = misplaced_pms(self._state, self._setting)
             elif found.why_none:
-                self._state = replace(self._state, window=None, why_none=found.why_none)
+                self._state = replace(self._state, active_window=None, why_none=found.why_none)
             self._estimate = self._estimated(self._state, self._estimate.t)
         except Exception as error:
             self._state, self._misplaced, self._report, self._surface = before
@@ -372,7 +372,7 @@ class OnlineRegistration:
             estimate = self._estimated(state, self._estimate.t)
         except Exception:  # it is the same camera epoch without it, only less well known
             return
-        self._returns.append(DetectedReturn(before.epoch, found.to, t, found.log_bayes))
+        self._loop_closures.append(DetectedLoopClosure(before.epoch, found.to, t, found.log_bayes))
         self._state, self._estimate = state, estimate
         self._serial += 1
         self._division += 1
@@ -421,7 +421,7 @@ class OnlineRegistration:
 
     def _close_loops_again(self) -> bool:
         """Close the loops that were closed when the pairs came: no event says so. Whether there are any."""
-        state, before = self._state, len(self._returns)
+        state, before = self._state, len(self._loop_closures)
         for epoch in range(1, len(state.epochs)):
             earlier = self._earlier(epoch)
             shots = [shot for shot in state.shots if shot.pair.epoch == epoch][:MOST_LOOKS]
@@ -433,10 +433,12 @@ class OnlineRegistration:
                 if isinstance(found, LoopClosure):
                     epochs = list(self._state.epochs)
                     epochs[epoch] = replace(epochs[epoch], start=back_to(epochs[epoch].start, found.to))
-                    self._state = replace(self._state, epochs=tuple(epochs), window=None)
-                    self._returns.append(DetectedReturn(epoch, found.to, pms[size - 1][0].t, found.log_bayes))
+                    self._state = replace(self._state, epochs=tuple(epochs), active_window=None)
+                    self._loop_closures.append(
+                        DetectedLoopClosure(epoch, found.to, pms[size - 1][0].t, found.log_bayes)
+                    )
                     break
-        return len(self._returns) > before
+        return len(self._loop_closures) > before
 
     # --- what is known ----------------------------------------------------------------------------------------------
 
@@ -457,9 +459,9 @@ class OnlineRegistration:
         return tuple(self._moves)
 
     @property
-    def returns(self) -> tuple[DetectedReturn, ...]:
+    def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:
         """Epochs in which the camera was found to be back where it was, in the order of time."""
-        return tuple(self._returns)
+        return tuple(self._loop_closures)
 
     @property
     def state(self) -> State:
@@ -467,7 +469,7 @@ class OnlineRegistration:
         return self._state
 
     @property
-    def kept(self) -> tuple[bool, ...]:
+    def inliers(self) -> tuple[bool, ...]:
         """Whether each pair is an inlier, in the order in which they came."""
         return tuple(shot.inlier for shot in self._state.shots)
 
@@ -477,9 +479,9 @@ class OnlineRegistration:
 
     def marker_T_laser(self) -> FloatArray | None:
         """(4, 4) the beam as the present estimate has it, origin by its chart; None where there is none yet."""
-        if self._state.window is None:
+        if self._state.active_window is None:
             return None
-        shared = self._state.window.state
+        shared = self._state.active_window.state
         return make_transform(rotation_to_direction(shared.beam_direction()[0]), shared.beam_origin()[0])
 
     def settle(self) -> OnlineEstimate:
@@ -506,8 +508,8 @@ class OnlineRegistration:
     def snapshot(self) -> Snapshot:
         """All that queries need of the estimate as it is; made once per event, on demand."""
         if self._snapshot is None or self._snapshot[0] is not self._estimate:
-            window = self._state.window
-            optimum = None if window is None else (window.state, window.covariance, self._setting.columns)
+            active = self._state.active_window
+            optimum = None if active is None else (active.state, active.covariance, self._setting.columns)
             made = online_snapshot(self._model, self._config, self._estimate, optimum, self._surface)
             self._snapshot = (self._estimate, made)
         return self._snapshot[1]
@@ -532,20 +534,20 @@ class OnlineRegistration:
         report = self._report
         if report is not None and report.epoch != state.epoch:
             report = None
-        window = state.window
-        optimum = None if window is None else window.state.trus_T_camera()[0]
-        count = state.epoch_pairs if window is None else sum(shot.inlier for shot in state.current)
+        active = state.active_window
+        optimum = None if active is None else active.state.trus_T_camera()[0]
+        count = state.epoch_pairs if active is None else sum(shot.inlier for shot in state.current)
         if report is not None and report.serial == self._serial and state is self._state:
             return OnlineEstimate(
                 t, state.epoch, report.trus_T_camera, report.covariance, report.predicted_tre, state.nis, state.used,
                 report.verdict, report.reasons, report.pairs, optimum, True,
             )  # fmt: skip
-        if window is None or optimum is None:
+        if active is None or optimum is None:
             reason = f"{NO_REGISTRATION}: {state.why_none}"
             return OnlineEstimate(
                 t, state.epoch, None, None, None, state.nis, state.used, Verdict.REFUSED, (reason,), count, None, False
             )
-        covariance = window.covariance[POSE, POSE]
+        covariance = active.covariance[POSE, POSE]
         pose = optimum
         verdict: Verdict = Verdict.WARNING
         reasons: tuple[str, ...] = (NOT_SOLVED,)

@@ -22,7 +22,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import DetectedMove, DetectedReturn, OnlineEvent
+from fgreg.online.events import DetectedLoopClosure, DetectedMove, OnlineEvent
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import Layout
 from fgreg.registration.register import SoundSpeedPrior
@@ -34,7 +34,7 @@ ANSWER_S, END_S = 60.0, 5.0
 
 Call = tuple[str, tuple[Any, ...]]
 """What the engine is to do, and the arguments."""
-After = tuple[str | None, Any, OnlineEstimate | None, tuple[DetectedMove, ...], tuple[DetectedReturn, ...]]
+After = tuple[str | None, Any, OnlineEstimate | None, tuple[DetectedMove, ...], tuple[DetectedLoopClosure, ...]]
 """Why an event was refused, what the call returned, and the engine's estimate, moves and returns."""
 
 REMEDY = "open the session again"
@@ -58,7 +58,7 @@ class EngineProcess:
         self._turn = threading.Lock()
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
-        self._returns: tuple[DetectedReturn, ...] = ()
+        self._loop_closures: tuple[DetectedLoopClosure, ...] = ()
         self._worker: WorkerProcess[Call, After] = WorkerProcess(
             _registering,
             model,
@@ -105,7 +105,7 @@ class EngineProcess:
             if after is None:
                 failure = self._worker.failure
                 raise EngineGone(f"{failure}: {REMEDY}") if self._worker.lost else FgregError(failure)
-            refused, value, self._estimate, self._moves, self._returns = after
+            refused, value, self._estimate, self._moves, self._loop_closures = after
         if refused is not None:
             raise EventRefused(refused)
         return value
@@ -169,9 +169,9 @@ class EngineProcess:
         return self._moves
 
     @property
-    def returns(self) -> tuple[DetectedReturn, ...]:
+    def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:
         """Epochs in which the camera is back where it was, as of the last call."""
-        return self._returns
+        return self._loop_closures
 
     def close(self) -> None:
         """End the process."""
@@ -205,7 +205,7 @@ class _Registering:
             refused = error.reason
         finally:
             self._publish()
-        return refused, value, self._engine.estimate, self._engine.moves, self._engine.returns
+        return refused, value, self._engine.estimate, self._engine.moves, self._engine.loop_closures
 
     def idle(self) -> None:
         """What the full solve has found, while no event comes."""

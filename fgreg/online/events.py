@@ -72,7 +72,7 @@ class DetectedMove:
 
 
 @dataclass(frozen=True, slots=True)
-class DetectedReturn:
+class DetectedLoopClosure:
     """A camera that came back to where an earlier epoch had it, as the pairs say.
 
     Attributes:

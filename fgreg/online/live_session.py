@@ -32,7 +32,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
@@ -62,7 +62,7 @@ class Engine(Protocol):
     @property
     def moves(self) -> tuple[DetectedMove, ...]: ...
     @property
-    def returns(self) -> tuple[DetectedReturn, ...]: ...
+    def loop_closures(self) -> tuple[DetectedLoopClosure, ...]: ...
 
 
 MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engine]
@@ -211,7 +211,7 @@ class LiveSession:
         if self.estimate is not None:
             self.estimate = self._engine.estimate
         self.engine = self._engine
-        self._tell_moves()
+        self._record_moves()
         self._write_waiting()
 
     def add(self, event: Estimating) -> OnlineEstimate | None:
@@ -284,7 +284,7 @@ class LiveSession:
         if self.estimate is not None or estimate.epoch > before:
             self.estimate = estimate
         self._feed.notice(estimate)
-        self._tell_moves()
+        self._record_moves()
         self._write_waiting()
         return self.estimate
 
@@ -332,7 +332,7 @@ class LiveSession:
             self._untaken.remove(event)
             raise
         self._untaken.remove(event)
-        self._tell_moves()
+        self._record_moves()
 
     def _take(self, event: Event) -> None:
         """A recorded event into the estimate.
@@ -362,7 +362,7 @@ class LiveSession:
         if estimate is not None:
             self.estimate = estimate
 
-    def _tell_moves(self) -> None:
+    def _record_moves(self) -> None:
         """Moves that the engine found out by itself become events: the epochs are then the same for every reader."""
         count, self._feed.noticed = self._feed.noticed, 0
         t = self.journal.last_t

@@ -11,7 +11,7 @@ from fgreg.model.measurements import EpochStart, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.events import CameraMoved, DetectedMove, DetectedReturn, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
 from fgreg.registration.register import SoundSpeedPrior
 
 
@@ -20,12 +20,12 @@ class EpochsFound:
     """What nobody told of the camera's epochs: moves, and that it is back (its epochs with the moves counted in)."""
 
     moves: tuple[DetectedMove, ...] = ()
-    returns: tuple[DetectedReturn, ...] = ()
+    loop_closures: tuple[DetectedLoopClosure, ...] = ()
 
     @property
     def texts(self) -> tuple[str, ...]:
         """What to tell the user."""
-        return (*(move.text for move in self.moves), *(back.text for back in self.returns))
+        return (*(move.text for move in self.moves), *(back.text for back in self.loop_closures))
 
 
 def find_moves(measurements: Measurements, model: SessionModel, config: SolveConfig) -> tuple[DetectedMove, ...]:
@@ -61,7 +61,7 @@ def find_epochs(
     for move in engine.moves:
         since = index_of[move.since]
         found.append(replace(move, since=since, epoch=pairs[since].epoch))
-    return EpochsFound(tuple(found), engine.returns)
+    return EpochsFound(tuple(found), engine.loop_closures)
 
 
 def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, OnlineEvent]]:
@@ -77,7 +77,7 @@ def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, On
 
 
 def split_epochs(
-    measurements: Measurements, moves: Sequence[DetectedMove], returns: Sequence[DetectedReturn] = ()
+    measurements: Measurements, moves: Sequence[DetectedMove], loop_closures: Sequence[DetectedLoopClosure] = ()
 ) -> Measurements:
     """The measurements with an epoch more for every move found; motions told before stay between their sides.
 
@@ -89,7 +89,7 @@ def split_epochs(
     for epoch, start in enumerate(measurements.epochs):
         starts.append(start)
         starts.extend(EpochStart(move.since_t) for move in moves if move.epoch == epoch)
-    for back in returns:
+    for back in loop_closures:
         starts[back.epoch] = back_to(starts[back.epoch], back.to)
     first: dict[tuple[int, int], int] = {}
     for index, pair in enumerate(measurements.pairs):

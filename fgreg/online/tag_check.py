@@ -14,14 +14,14 @@ from scipy.special import chdtri
 
 from fgreg.camera_moves.static_tags import (
     TagFrame,
+    TagMoveDetector,
     TagPose,
     TagSettings,
-    TagWatch,
     average_tags,
-    restart_watch,
+    detect_tag_move,
+    restart_detector,
     tag_motion,
     usable_frame,
-    watch_tags,
 )
 from fgreg.geometry.transforms import FloatArray
 from fgreg.online.events import StaticTags
@@ -40,7 +40,7 @@ class TagsMoved:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TagsRest:
+class TagsAtRest:
     """The camera stands again: its motion (4, 4) since the alarm's epoch began, and its covariance (6, 6)."""
 
     camera_new_T_camera_old: FloatArray
@@ -48,7 +48,7 @@ class TagsRest:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TagGuard:
+class TagMonitor:
     """State of the guard, a value.
 
     Attributes:
@@ -58,7 +58,7 @@ class TagGuard:
         moving: frames since then.
     """
 
-    watch: TagWatch = field(default_factory=TagWatch)
+    detector: TagMoveDetector = field(default_factory=TagMoveDetector)
     times: tuple[float, ...] = ()
     before: Mapping[int, TagPose] = field(default_factory=dict)
     moving: tuple[TagFrame, ...] = ()
@@ -69,32 +69,34 @@ class TagGuard:
         return bool(self.before)
 
 
-def guarded(guard: TagGuard, event: StaticTags, settings: TagSettings) -> tuple[TagGuard, TagsMoved | TagsRest | None]:
+def monitored(
+    monitor: TagMonitor, event: StaticTags, settings: TagSettings
+) -> tuple[TagMonitor, TagsMoved | TagsAtRest | None]:
     """Take in one frame, and what it says."""
     frame = TagFrame(event.camera_T_tag, event.covariance)
-    if guard.is_moving:
-        return _until_rest(guard, frame, settings)
-    watch, check = watch_tags(guard.watch, frame, settings)
-    times = (*guard.times, event.t)[-len(watch.recent) :]
+    if monitor.is_moving:
+        return _until_rest(monitor, frame, settings)
+    detector, check = detect_tag_move(monitor.detector, frame, settings)
+    times = (*monitor.times, event.t)[-len(detector.recent) :]
     if not check.alarm:
-        return TagGuard(watch, times), None
+        return TagMonitor(detector, times), None
     since = times[-min(check.frames, len(times))]
-    return TagGuard(before=watch.means, moving=(usable_frame(frame),)), TagsMoved(since)
+    return TagMonitor(before=detector.means, moving=(usable_frame(frame),)), TagsMoved(since)
 
 
-def _until_rest(guard: TagGuard, frame: TagFrame, settings: TagSettings) -> tuple[TagGuard, TagsRest | None]:
-    moving = (*guard.moving, usable_frame(frame))[-REST:]
-    going_on = TagGuard(before=guard.before, moving=moving)
+def _until_rest(monitor: TagMonitor, frame: TagFrame, settings: TagSettings) -> tuple[TagMonitor, TagsAtRest | None]:
+    moving = (*monitor.moving, usable_frame(frame))[-REST:]
+    going_on = TagMonitor(before=monitor.before, moving=moving)
     if len(moving) < REST:
         return going_on, None
-    share = settings.steady_share
+    share = settings.constant_share
     # What stays of the detections' errors is common to both halves: only the rest may make them differ.
     first, second = (average_tags(half, 0.0) for half in (moving[: REST // 2], moving[REST // 2 :]))
     between = tag_motion(first, second)
     if between is None or between.chi2 > float(chdtri(6, REST_P)):
         return going_on, None
-    motion = tag_motion(guard.before, average_tags(moving, share))
+    motion = tag_motion(monitor.before, average_tags(moving, share))
     if motion is None:
         return going_on, None
-    watch = restart_watch(TagWatch(recent=moving), len(moving), settings)
-    return TagGuard(watch), TagsRest(motion.camera_new_T_camera_old, motion.covariance)
+    detector = restart_detector(TagMoveDetector(recent=moving), len(moving), settings)
+    return TagMonitor(detector), TagsAtRest(motion.camera_new_T_camera_old, motion.covariance)

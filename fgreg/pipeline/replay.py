@@ -273,7 +273,7 @@ class _Player:
         """What the engine found out and the session does not tell."""
         told = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
         moves = tuple(move for move in self._engine.moves if move.since_t not in told)
-        return EpochsFound(moves, self._engine.returns)
+        return EpochsFound(moves, self._engine.loop_closures)
 
     def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
         """One per track event, in order; ``unanswered`` has the reasons of those that were not put to the engine."""

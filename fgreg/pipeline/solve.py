@@ -175,7 +175,7 @@ def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
     tracks = zip(recognised.track_events, recognised.tracks, strict=True)
     return replace(
         recognised,
-        measurements=split_epochs(recognised.measurements, found.moves, found.returns),
+        measurements=split_epochs(recognised.measurements, found.moves, found.loop_closures),
         tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
         epoch_of=epoch_of,
     )

@@ -26,11 +26,11 @@ from fgreg.registration.initialization import beam_starts, registration_starts
 from fgreg.registration.minimal_set_consensus import consensus_beams, consensus_starts
 from fgreg.registration.outliers import (
     RobustOptimum,
-    deviant,
+    beyond_limit,
     graduated,
     innovations_at,
     plausible_cost,
-    sort_shots,
+    select_inliers,
 )
 
 SEARCH_PAIRS = 40
@@ -42,8 +42,8 @@ SAME_MINIMUM_MM = 1.5
 """Minima whose registrations move no target by more than this are one."""
 BEAM_CHI2 = 30.0
 """Beams of calibrations worse than the best by more than this are not tried."""
-MIN_KEPT_PMS = 7
-MIN_KEPT_AIMS = 5
+MIN_INLIER_PMS = 7
+MIN_INLIER_AIMS = 5
 """Nothing is left out where fewer shots than these would be left: so few could be made to fit anything."""
 SPOT_DISTANCE_MM = 45.0
 """Typical distance of a spot from the marker: what scales the beam's error in scoring consensus."""
@@ -87,7 +87,7 @@ class Calibration:
     """The beam from the aims: candidates for ``marker_T_nominal`` (z along it), best first; and which aims fit (A,)."""
 
     frames: tuple[FloatArray, ...]
-    aim_kept: BoolArray
+    aim_inlier: BoolArray
 
 
 def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibration:
@@ -109,12 +109,12 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
         return Calibration(tuple(candidates), everything)
     alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model)
     found = optimize(alone, _beam_states(candidates, model))
-    if len(aims) > MIN_KEPT_AIMS and not _is_clean(alone, found):
+    if len(aims) > MIN_INLIER_AIMS and not _is_clean(alone, found):
         candidates += [nominal_frame(origin, direction) for origin, direction in consensus_beams(aims)]
         robust = graduated(alone, _beam_states(candidates, model), robust_aims=True)
         none = np.zeros(0, dtype=bool)
-        kept = sort_shots(alone, robust.state.take([0]), none, robust.aim_kept[0]).aim_kept
-        if MIN_KEPT_AIMS <= kept.sum() < len(aims):
+        kept = select_inliers(alone, robust.state.take([0]), none, robust.aim_inlier[0]).aim_inlier
+        if MIN_INLIER_AIMS <= kept.sum() < len(aims):
             fitting = tuple(aim for aim, keep in zip(aims, kept, strict=True) if keep)
             alone = pack(Measurements(fitting, (), measurements.epochs[:1]), model)
             found = optimize(alone, _beam_states(candidates, model))
@@ -149,7 +149,7 @@ def _is_clean(problem: PackedProblem, found: Optimum) -> bool:
         return False
     state, private = found.state.take([best]), found.evaluation.private.take([best])
     pm, aim = np.ones(len(problem.pms), dtype=bool), np.ones(len(problem.aims.rotation), dtype=bool)
-    beyond = deviant(problem, innovations_at(problem, state, pm, aim, private), pm)
+    beyond = beyond_limit(problem, innovations_at(problem, state, pm, aim, private), pm)
     return not (beyond.pm.any() or beyond.aim.any())
 
 
@@ -223,8 +223,8 @@ def search_epoch(
     problem = pack(subset, model)
     found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
     minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
-    if len(problem.pms) > MIN_KEPT_PMS and not _is_clean(problem, found):
-        return _search_among_junk(subset, problem, model, frames, minima, keep_within)
+    if len(problem.pms) > MIN_INLIER_PMS and not _is_clean(problem, found):
+        return _search_with_outliers(subset, problem, model, frames, minima, keep_within)
     mirrored_problem = _mirrored(problem)
     # How much worse it fits does not matter where it does by far.
     mirrored = optimize(
@@ -260,7 +260,7 @@ def from_outside(problem: PackedProblem, state: SharedState) -> BoolArray:
     return np.asarray(np.mean(np.sum(trus_d[..., 1:] * radial, axis=-1), axis=1) < 0.0)
 
 
-def _search_among_junk(
+def _search_with_outliers(
     measurements: Measurements,
     problem: PackedProblem,
     model: SessionModel,
@@ -280,8 +280,8 @@ def _search_among_junk(
     other_way = other(_other_way(problem)) if problem.looks.edge_gain.any() else None
     aims = np.ones(len(problem.aims.rotation), dtype=bool)
     best = robust.state.take([0])
-    kept = sort_shots(problem, best, robust.pm_kept[0], aims, doubt_aims=False).pm_kept
-    if kept.sum() < MIN_KEPT_PMS:
+    kept = select_inliers(problem, best, robust.pm_inlier[0], aims, select_aims=False).pm_inlier
+    if kept.sum() < MIN_INLIER_PMS:
         kept = np.ones(len(problem.pms), dtype=bool)
     names = {pm for pm, keep in zip(problem.pms, kept, strict=True) if keep}
     fitting = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm in names))
@@ -291,8 +291,8 @@ def _search_among_junk(
     all_minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
     level = all_minima[0].cost
     # Another set of shots that fit each other as well as these do is as good an answer.
-    for index, of_it in enumerate(robust.pm_kept):
-        both, either = (of_it & robust.pm_kept[0]).sum(), (of_it | robust.pm_kept[0]).sum()
+    for index, of_it in enumerate(robust.pm_inlier):
+        both, either = (of_it & robust.pm_inlier[0]).sum(), (of_it | robust.pm_inlier[0]).sum()
         if both < RIVAL_OVERLAP * either:
             all_minima += (Minimum(level + float(robust.cost[index]) - base, robust.state.take([index])),)
     # The pairs without the aims: a marker swapped or knocked between calibration and registration.

@@ -36,9 +36,9 @@ from fgreg.graph.reduced_graph import (
 from fgreg.graph.reduced_solver import distinct, optimize
 from fgreg.graph.shared_state import SharedState
 
-JUNK_P = 1e-3
+OUTLIER_P = 1e-3
 """A shot is junk where a good one would deviate as much this rarely."""
-JUNK_DENSITY = 0.012
+OUTLIER_DENSITY = 0.012
 """Density of junk, over that of good shots at their middle: false PMs are everywhere in the image."""
 FEW = 0.05
 """So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
@@ -51,7 +51,7 @@ MAX_STEPS = 30
 SETTLE_ROUNDS = 8
 TOLERANCE = 1e-4
 """Newton decrement (chi square) at which a descent ends."""
-WANDERS_MM, WANDERING_CHI2 = 1.0, 1e4
+DIVERGED_MM, DIVERGED_CHI2 = 1.0, 1e4
 """A PM that moves by more in one step, after several, has no place that fits; it counts as so far off."""
 UNKNOWN = 1e-9
 """Correlation eigenvalue below which the rest of the shots leaves a direction open."""
@@ -64,45 +64,45 @@ def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
     return np.asarray(2 * beams + 3 * np.bincount(problem.look_pm, minlength=pms) - 3)
 
 
-def pm_limits(problem: PackedProblem, p: float = JUNK_P) -> FloatArray:
+def pm_limits(problem: PackedProblem, p: float = OUTLIER_P) -> FloatArray:
     """(J,) chi square beyond which a PM is junk."""
     return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), p))
 
 
-def limits_among(problem: PackedProblem, pm_kept: BoolArray, kept: int, count: int) -> FloatArray:
-    """(J,) chi square beyond which PMs, of which ``pm_kept`` count, are junk, where ``kept`` of ``count`` PMs count.
+def limits_among(problem: PackedProblem, pm_inlier: BoolArray, kept: int, count: int) -> FloatArray:
+    """(J,) chi square beyond which PMs, of which ``pm_inlier`` count, are junk, where ``kept`` of ``count`` PMs count.
 
     One that does not count is judged as if it did: one at the border is in, whether it was in before or not.
     """
-    inside, outside = pm_limits(problem, junk_p_of(kept, count)), pm_limits(problem, junk_p_of(kept + 1, count))
-    return np.where(pm_kept, inside, outside)
+    inside, outside = pm_limits(problem, outlier_p_of(kept, count)), pm_limits(problem, outlier_p_of(kept + 1, count))
+    return np.where(pm_inlier, inside, outside)
 
 
-AIM_LIMIT = float(chdtri(2, JUNK_P))
+AIM_LIMIT = float(chdtri(2, OUTLIER_P))
 
 
-def junk_p(pm_kept: BoolArray) -> float:
+def outlier_p(pm_inlier: BoolArray) -> float:
     """How rare a good shot's deviation has to be for junk, given which PMs (J,) are kept.
 
     Of two degrees of freedom a good shot's density falls as exp(-d / 2), and so does the share p that deviates by more
     than d: junk and good are equally likely where p is junk's density times the odds of junk.
     """
-    return junk_p_of(int(pm_kept.sum()), len(pm_kept))
+    return outlier_p_of(int(pm_inlier.sum()), len(pm_inlier))
 
 
-def junk_p_of(kept: int, count: int) -> float:
-    """:func:`junk_p` where so many of ``count`` PMs are kept."""
-    return max(JUNK_P, JUNK_DENSITY * min((count - kept) / max(kept, 1), 1.0))
+def outlier_p_of(kept: int, count: int) -> float:
+    """:func:`outlier_p` where so many of ``count`` PMs are kept."""
+    return max(OUTLIER_P, OUTLIER_DENSITY * min((count - kept) / max(kept, 1), 1.0))
 
 
-def log_junk(problem: PackedProblem, pm_kept: BoolArray) -> FloatArray:
+def log_outlier(problem: PackedProblem, pm_inlier: BoolArray) -> FloatArray:
     """(J,) log density of junk over that of a good PM at its best, times the odds of junk; see :func:`log_posterior`.
 
     Windows in their own shape are densities of the rotation, one over their width inside: so is what they are beside.
     """
-    kept = int(pm_kept.sum())
-    odds = (len(pm_kept) - kept + 0.5) / (kept + 0.5)
-    log = 0.5 * pm_degrees_of_freedom(problem) * np.log(JUNK_DENSITY) + np.log(odds)
+    kept = int(pm_inlier.sum())
+    odds = (len(pm_inlier) - kept + 0.5) / (kept + 0.5)
+    log = 0.5 * pm_degrees_of_freedom(problem) * np.log(OUTLIER_DENSITY) + np.log(odds)
     if problem.shapes is None:
         return np.asarray(log)
     windows = problem.shapes.windows
@@ -129,14 +129,14 @@ class RobustOptimum:
     Attributes:
         state: of each hypothesis.
         cost: (S,) truncated chi square. aim_cost: (S, A) chi square of each aim.
-        pm_kept (S, J), aim_kept (S, A): which shots count in full.
+        pm_inlier (S, J), aim_inlier (S, A): which shots count in full.
     """
 
     state: SharedState
     cost: FloatArray
     aim_cost: FloatArray
-    pm_kept: BoolArray
-    aim_kept: BoolArray
+    pm_inlier: BoolArray
+    aim_inlier: BoolArray
 
 
 def _hessian_of(parts: Parts, pm: BoolArray, aim: BoolArray) -> FloatArray:
@@ -162,27 +162,27 @@ def _truncated(costs: Costs, limit: FloatArray, aim_limit: float) -> Weights:
     return Weights((costs.pm <= limit).astype(float), (costs.aim <= aim_limit).astype(float), total)
 
 
-def _fixed(costs: Costs, pm_kept: BoolArray, aim_kept: BoolArray) -> Weights:
-    pm, aim = pm_kept + np.zeros_like(costs.pm), aim_kept + np.zeros_like(costs.aim)
+def _fixed(costs: Costs, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Weights:
+    pm, aim = pm_inlier + np.zeros_like(costs.pm), aim_inlier + np.zeros_like(costs.aim)
     return Weights(pm, aim, costs.prior + (pm * costs.pm).sum(axis=1) + (aim * costs.aim).sum(axis=1))
 
 
 def _settled(problem: PackedProblem, state: SharedState, loss: Loss) -> Evaluation:
     """The starts as they are, in which a PM that still wanders counts as far off, whatever it passes on its way."""
 
-    def honest(costs: Costs) -> Weights:
-        far = np.where(costs.moved_mm > WANDERS_MM, np.maximum(costs.pm, WANDERING_CHI2), costs.pm)
+    def with_diverged(costs: Costs) -> Weights:
+        far = np.where(costs.moved_mm > DIVERGED_MM, np.maximum(costs.pm, DIVERGED_CHI2), costs.pm)
         return loss(replace(costs, pm=far))
 
-    return evaluate(problem, state, private_at(problem, state), honest)
+    return evaluate(problem, state, private_at(problem, state), with_diverged)
 
 
 def _settled_parts(problem: PackedProblem, state: SharedState) -> Parts:
     """What each shot adds at shared variables (one hypothesis); a PM that wanders counts as far off."""
     before = private_at(problem, state)
     parts = contributions(problem, state, before)
-    wanders = np.linalg.norm(parts.private.trus_p_pm - before.trus_p_pm, axis=-1) > WANDERS_MM
-    cost = np.where(wanders, np.maximum(parts.pm.cost, WANDERING_CHI2), parts.pm.cost)
+    diverged = np.linalg.norm(parts.private.trus_p_pm - before.trus_p_pm, axis=-1) > DIVERGED_MM
+    cost = np.where(diverged, np.maximum(parts.pm.cost, DIVERGED_CHI2), parts.pm.cost)
     return replace(parts, pm=replace(parts.pm, cost=cost))
 
 
@@ -269,14 +269,14 @@ class Innovations:
     aim: FloatArray
 
 
-def innovations(parts: Parts, pm_kept: BoolArray, aim_kept: BoolArray) -> Innovations:
+def innovations(parts: Parts, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Innovations:
     """Innovations of all shots at an optimum of the kept ones (one hypothesis), in closed form.
 
     With total Hessian H, leaving a shot of cost c, gradient g, Hessian A out moves the optimum to where the rest costs
     g' (H - A)^-1 g less: the innovation is c + g' (H - A)^-1 g. For a shot that was not in it is c - g' (H + A)^-1 g.
     """
-    hessian = _hessian_of(parts, pm_kept, aim_kept)
-    return Innovations(_innovation(parts.pm, hessian, pm_kept), _innovation(parts.aim, hessian, aim_kept))
+    hessian = _hessian_of(parts, pm_inlier, aim_inlier)
+    return Innovations(_innovation(parts.pm, hessian, pm_inlier), _innovation(parts.aim, hessian, aim_inlier))
 
 
 def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
@@ -304,8 +304,8 @@ def innovations_of(part: Contributions, hessian: FloatArray, kept: BoolArray) ->
 def innovations_at(
     problem: PackedProblem,
     state: SharedState,
-    pm_kept: BoolArray,
-    aim_kept: BoolArray,
+    pm_inlier: BoolArray,
+    aim_inlier: BoolArray,
     private: PrivateState | None = None,
 ) -> Innovations:
     """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the kept shots.
@@ -313,80 +313,80 @@ def innovations_at(
     ``private`` where its private variables are known, else they are found.
     """
     parts = _settled_parts(problem, state) if private is None else contributions(problem, state, private)
-    return innovations(parts, pm_kept, aim_kept)
+    return innovations(parts, pm_inlier, aim_inlier)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Deviants:
+class BeyondLimit:
     """Shots beyond their limits: PMs (J,), aims (A,)."""
 
     pm: BoolArray
     aim: BoolArray
 
 
-def deviant(problem: PackedProblem, found: Innovations, pm_kept: BoolArray) -> Deviants:
+def beyond_limit(problem: PackedProblem, found: Innovations, pm_inlier: BoolArray) -> BeyondLimit:
     """Shots that deviate more than a good one may, where these PMs (J,) count.
 
     Infinite innovations say nothing: the rest predicted nothing.
     """
-    limits = limits_among(problem, pm_kept, int(pm_kept.sum()), len(pm_kept))
+    limits = limits_among(problem, pm_inlier, int(pm_inlier.sum()), len(pm_inlier))
     pm, aim = found.pm > limits, found.aim > AIM_LIMIT
-    return Deviants(pm & np.isfinite(found.pm), aim & np.isfinite(found.aim))
+    return BeyondLimit(pm & np.isfinite(found.pm), aim & np.isfinite(found.aim))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sorted:
+class InlierSelection:
     """Which shots are kept, PMs (J,) and aims (A,), at the least squares optimum of those kept (one hypothesis).
 
     ``settled``: every shot kept, and none of the others, is within its limit; False with borderline shots kept.
     """
 
     state: SharedState
-    pm_kept: BoolArray
-    aim_kept: BoolArray
+    pm_inlier: BoolArray
+    aim_inlier: BoolArray
     settled: bool
 
 
-def sort_shots(
+def select_inliers(
     problem: PackedProblem,
     state: SharedState,
-    pm_kept: BoolArray,
-    aim_kept: BoolArray,
+    pm_inlier: BoolArray,
+    aim_inlier: BoolArray,
     *,
-    doubt_aims: bool = True,
-) -> Sorted:
+    select_aims: bool = True,
+) -> InlierSelection:
     """Least squares on those kept and innovations of all, in turn, until who is kept no longer changes.
 
     Args:
         problem: the packed measurements.
         state: one hypothesis.
-        pm_kept (J,), aim_kept (A,): where to begin.
-        doubt_aims: False leaves ``aim_kept`` as it is.
+        pm_inlier (J,), aim_inlier (A,): where to begin.
+        select_aims: False leaves ``aim_inlier`` as it is.
     """
     seen: set[bytes] = set()
     settled = False
     for _ in range(SETTLE_ROUNDS):
-        loss = partial(_fixed, pm_kept=pm_kept, aim_kept=aim_kept)
+        loss = partial(_fixed, pm_inlier=pm_inlier, aim_inlier=aim_inlier)
         state = optimize(problem, state, max_iterations=MAX_STEPS, tolerance=TOLERANCE, loss=loss).state
-        found = innovations(_settled_parts(problem, state), pm_kept, aim_kept)
-        beyond = deviant(problem, found, pm_kept)
-        pm_next = ~beyond.pm & (pm_kept | np.isfinite(found.pm))
-        aim_next = ~beyond.aim & (aim_kept | np.isfinite(found.aim)) if doubt_aims else aim_kept
-        settled = bool((pm_next == pm_kept).all() and (aim_next == aim_kept).all())
+        found = innovations(_settled_parts(problem, state), pm_inlier, aim_inlier)
+        beyond = beyond_limit(problem, found, pm_inlier)
+        pm_next = ~beyond.pm & (pm_inlier | np.isfinite(found.pm))
+        aim_next = ~beyond.aim & (aim_inlier | np.isfinite(found.aim)) if select_aims else aim_inlier
+        settled = bool((pm_next == pm_inlier).all() and (aim_next == aim_inlier).all())
         if settled:
             break
-        seen.add(pm_kept.tobytes() + aim_kept.tobytes())
+        seen.add(pm_inlier.tobytes() + aim_inlier.tobytes())
         if pm_next.tobytes() + aim_next.tobytes() in seen:  # a borderline shot: in when out, out when in
-            pm_kept, aim_kept = pm_kept | pm_next, aim_kept | aim_next
+            pm_inlier, aim_inlier = pm_inlier | pm_next, aim_inlier | aim_next
             break
-        pm_kept, aim_kept = pm_next, aim_next
-    return Sorted(state, pm_kept, aim_kept, settled)
+        pm_inlier, aim_inlier = pm_next, aim_next
+    return InlierSelection(state, pm_inlier, aim_inlier, settled)
 
 
-def predicted_pms(others: PackedProblem, problem: PackedProblem, judged: Sorted) -> BoolArray:
+def predicted_pms(others: PackedProblem, problem: PackedProblem, selection: InlierSelection) -> BoolArray:
     """Whether PMs that are not in ``problem``, over the same shared variables, fit what is kept of it (J,)."""
-    hessian = _hessian_of(_settled_parts(problem, judged.state), judged.pm_kept, judged.aim_kept)
+    hessian = _hessian_of(_settled_parts(problem, selection.state), selection.pm_inlier, selection.aim_inlier)
     none = np.zeros(len(others.pms), dtype=bool)
-    innovation = _innovation(_settled_parts(others, judged.state).pm, hessian, none)
-    limits = limits_among(others, none, int(judged.pm_kept.sum()), len(judged.pm_kept))
+    innovation = _innovation(_settled_parts(others, selection.state).pm, hessian, none)
+    limits = limits_among(others, none, int(selection.pm_inlier.sum()), len(selection.pm_inlier))
     return np.asarray(innovation <= limits)

@@ -68,8 +68,8 @@ class Posterior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubted:
-    """The problem with all PMs, those left out and those kept, each good or junk (``problem.log_junk``).
+class OutlierMixture:
+    """The problem with all PMs, those left out and those kept, each good or junk (``problem.log_outlier``).
 
     ``private`` and ``point_gain`` (1, J, 3, D) are at the optimum of a mode.
     """
@@ -89,7 +89,7 @@ class Mode:
     problem: PackedProblem
     optimum: Optimum
     covariance: FloatArray
-    doubted: Doubted | None = None
+    mixture: OutlierMixture | None = None
 
 
 def _expmap_gain(omega: FloatArray) -> FloatArray:
@@ -152,11 +152,11 @@ def light(mode: Mode) -> Mode:
     lighter = without_aims(problem, anchor)
     private = replace(at.private, aim_error=at.private.aim_error[:, :0], aim_shift=at.private.aim_shift[:, :0])
     evaluation = replace(at, private=private)
-    doubted = mode.doubted
-    if doubted is not None:
-        private = replace(doubted.private, aim_error=private.aim_error, aim_shift=private.aim_shift)
-        doubted = replace(doubted, problem=without_aims(doubted.problem, anchor), private=private)
-    return Mode(lighter, replace(mode.optimum, evaluation=evaluation), mode.covariance, doubted)
+    mixture = mode.mixture
+    if mixture is not None:
+        private = replace(mixture.private, aim_error=private.aim_error, aim_shift=private.aim_shift)
+        mixture = replace(mixture, problem=without_aims(mixture.problem, anchor), private=private)
+    return Mode(lighter, replace(mode.optimum, evaluation=evaluation), mode.covariance, mixture)
 
 
 def _repeat(state: SharedState, count: int) -> SharedState:
@@ -165,11 +165,11 @@ def _repeat(state: SharedState, count: int) -> SharedState:
 
 def log_density(mode: Mode, step: FloatArray) -> FloatArray:
     """(S,) log density at steps (S, D) from a mode's optimum, up to a constant common to a session's modes."""
-    problem = mode.problem if mode.doubted is None else mode.doubted.problem
+    problem = mode.problem if mode.mixture is None else mode.mixture.problem
     state = _repeat(mode.optimum.state, len(step)).retract(step, problem.columns)
     private = moved_private(mode, step)
     with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
-        if len(problem.pms) < REFINED_PMS or mode.doubted is not None:
+        if len(problem.pms) < REFINED_PMS or mode.mixture is not None:
             _, private = refine(problem, state, private)
         log = log_posterior(problem, state, private)
         near = (np.linalg.norm(state.translation_mm, axis=-1) <= MOST_TRANSLATION_MM).all(axis=1)
@@ -178,7 +178,7 @@ def log_density(mode: Mode, step: FloatArray) -> FloatArray:
 
 def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
     """Private variables of the density's problem at steps (S, D) from the mode's optimum, to first order."""
-    at = mode.optimum.evaluation if mode.doubted is None else mode.doubted
+    at = mode.optimum.evaluation if mode.mixture is None else mode.mixture
     private = at.private.take(np.zeros(len(step), dtype=np.int64))
     return replace(private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
 

@@ -21,11 +21,11 @@ from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.multistart import targets_moved
-from fgreg.registration.outliers import log_junk
+from fgreg.registration.outliers import log_outlier
 from fgreg.registration.posterior import (
     MOST_TRANSLATION_MM,
-    Doubted,
     Mode,
+    OutlierMixture,
     Posterior,
     gaussian_posterior,
     sample_posterior,
@@ -42,7 +42,7 @@ FREE_SOUND_SPEED = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Answer:
+class PosteriorMean:
     """The session's estimate: ``registration`` with its optimum moved to the posterior's mean, and the posterior.
 
     ``registration.problem`` has the windows' Gaussian sites where they settled, ``registration.covariance`` is the
@@ -54,7 +54,7 @@ class Answer:
     modes: tuple[Mode, ...]
 
 
-def answer(registration: Registration, config: SolveConfig) -> Answer:
+def posterior_mean(registration: Registration, config: SolveConfig) -> PosteriorMean:
     """Sample the posterior of a registration and centre the estimate on it."""
     modes = _modes(registration)
     if len(registration.problem.look_pm) > config.posterior_looks:
@@ -66,7 +66,7 @@ def answer(registration: Registration, config: SolveConfig) -> Answer:
     problem = modes[0].problem
     moved = _evaluated(problem, posterior.mean, modes[0].optimum)
     shots = _moved_shots(registration.shots, problem, moved)
-    return Answer(
+    return PosteriorMean(
         replace(registration, problem=problem, optimum=moved, covariance=posterior.covariance, shots=shots),
         posterior,
         modes,
@@ -75,7 +75,7 @@ def answer(registration: Registration, config: SolveConfig) -> Answer:
 
 def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
     """All shots at the moved estimate, those kept with the stand-ins of ``problem``; innovations stay as judged."""
-    if shots.pm_kept.all() and shots.aim_kept.all():
+    if shots.pm_inlier.all() and shots.aim_inlier.all():
         return replace(shots, problem=problem, evaluation=moved.evaluation)
     whole = _with_all_pms(shots, problem)
     return replace(shots, problem=whole, evaluation=evaluate(whole, moved.state, _settled(whole, moved.state)))
@@ -83,7 +83,7 @@ def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
 
 def _with_all_pms(shots: Shots, problem: PackedProblem) -> PackedProblem:
     """All shots, those kept with the stand-ins of ``problem``."""
-    looks, kept = shots.problem.looks, shots.pm_kept[shots.problem.look_pm]
+    looks, kept = shots.problem.looks, shots.pm_inlier[shots.problem.look_pm]
     weight, centre = looks.weight.copy(), looks.centre_rad.copy()
     weight[kept], centre[kept] = problem.looks.weight, problem.looks.centre_rad
     return replace(shots.problem, looks=replace(looks, weight=weight, centre_rad=centre))
@@ -96,9 +96,9 @@ def _settled(problem: PackedProblem, state: SharedState) -> PrivateState:
     return private
 
 
-def _with_doubts(shots: Shots, mode: Mode) -> Mode:
+def _with_outlier_mixture(shots: Shots, mode: Mode) -> Mode:
     """The mode with all PMs in its density, each good or junk: which they are is not known for certain."""
-    if shots.pm_kept.all():
+    if shots.pm_inlier.all():
         return mode
     problem, state = mode.problem, mode.optimum.state
     whole = replace(
@@ -107,9 +107,9 @@ def _with_doubts(shots: Shots, mode: Mode) -> Mode:
         aim_spot_mm=problem.aim_spot_mm,
         aim_spot_covariance=problem.aim_spot_covariance,
     )
-    whole = replace(whole, log_junk=log_junk(whole, shots.pm_kept))
+    whole = replace(whole, log_outlier=log_outlier(whole, shots.pm_inlier))
     at = evaluate(whole, state, _settled(whole, state))
-    return replace(mode, doubted=Doubted(whole, at.private, at.point_gain))
+    return replace(mode, mixture=OutlierMixture(whole, at.private, at.point_gain))
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +185,7 @@ def _modes(registration: Registration) -> tuple[Mode, ...]:
             others = [mode.optimum.state.trus_T_camera(place)[0] for mode in modes]
             if all(targets_moved(o, found.state.trus_T_camera(place)[0], targets) > 1.0 for o in others):
                 modes.append(_with_sites(problem, found, inverse))
-    return tuple(_with_doubts(registration.shots, mode) for mode in modes)
+    return tuple(_with_outlier_mixture(registration.shots, mode) for mode in modes)
 
 
 def _evaluated(problem: PackedProblem, state: SharedState, near: Optimum) -> Optimum:

@@ -79,7 +79,7 @@ def read_pairs(
     state = registration.optimum.state
     gain, points = at.point_gain[0], at.private.trus_p_pm[0]
     covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
-    nis, kept = shots.innovations.pm, shots.pm_kept
+    nis, kept = shots.innovations.pm, shots.pm_inlier
     looks = problem.looks
     radius, ratio = float(state.radius_mm[0]), float(state.sound_speed_ratio[0])
     out: list[PairEstimate] = []
@@ -100,7 +100,7 @@ def read_pairs(
                 pm=pair.pm,
                 epoch=pair.epoch,
                 used=bool(kept[pm]),
-                reason="" if kept[pm] else junk_reason(float(nis[pm])),
+                reason="" if kept[pm] else outlier_reason(float(nis[pm])),
                 lambda_mm=float(at.lambda_mm[0, problem.look_beam[look]]) - origin_shift_mm,
                 theta_rad=scan + delta,
                 rotation_rad=model.stage.direction * rotation,
@@ -114,7 +114,7 @@ def read_pairs(
     return tuple(out)
 
 
-def junk_reason(nis: float) -> str:
+def outlier_reason(nis: float) -> str:
     """Why a shot was left out, with the figure."""
     return f"junk: it does not fit the other shots (nis {nis:.1f})"
 
@@ -130,12 +130,12 @@ def read_aims(
     square = np.sum(residual**2, axis=1) - (residual @ slope) ** 2 / (1.0 + slope @ slope)
     out = []
     for index, aim in enumerate(measurements.aims):
-        nis, kept = float(shots.innovations.aim[index]), bool(shots.aim_kept[index])
+        nis, kept = float(shots.innovations.aim[index]), bool(shots.aim_inlier[index])
         out.append(
             AimEstimate(
                 t=aim.t,
                 used=kept,
-                reason="" if kept else junk_reason(nis),
+                reason="" if kept else outlier_reason(nis),
                 lambda_mm=float(at.aim_lambda_mm[0, index]) - origin_shift_mm,
                 residual_mm=float(np.sqrt(square[index])),
                 nis=nis,

@@ -25,8 +25,8 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import epoch_chains, restrict_epochs, solvable_epochs
 from fgreg.registration.multistart import (
-    MIN_KEPT_AIMS,
-    MIN_KEPT_PMS,
+    MIN_INLIER_AIMS,
+    MIN_INLIER_PMS,
     SAME_MINIMUM_MM,
     EpochSearch,
     Minimum,
@@ -37,14 +37,14 @@ from fgreg.registration.multistart import (
 )
 from fgreg.registration.outliers import (
     FEW,
+    InlierSelection,
     Innovations,
-    Sorted,
-    deviant,
+    beyond_limit,
     graduated_or_near,
     innovations_at,
     plausible_cost,
     predicted_pms,
-    sort_shots,
+    select_inliers,
 )
 
 __all__ = [
@@ -76,18 +76,19 @@ class Shots:
     Attributes:
         problem: all of them packed; a registration's own problem where all are kept.
         evaluation: at the registration's optimum (one hypothesis).
-        pm_kept (J,), aim_kept (A,): over ``problem``'s PMs and aims.
+        pm_inlier (J,), aim_inlier (A,): over ``problem``'s PMs and aims.
         innovations: likewise: how far each is from what the others predict.
-        pm_deviant (J,), aim_deviant (A,): those beyond the limit, also where too few shots are there to leave one out.
+        pm_beyond_limit (J,), aim_beyond_limit (A,): shots beyond their limit, also where there are too few to leave one
+            out.
     """
 
     problem: PackedProblem
     evaluation: Evaluation
-    pm_kept: BoolArray
-    aim_kept: BoolArray
+    pm_inlier: BoolArray
+    aim_inlier: BoolArray
     innovations: Innovations
-    pm_deviant: BoolArray
-    aim_deviant: BoolArray
+    pm_beyond_limit: BoolArray
+    aim_beyond_limit: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +181,7 @@ def _best_start(
     return min(found, key=lambda optimum: float(optimum.evaluation.cost[0])).state
 
 
-def _told_apart(
+def _open_minima(
     measurements: Measurements,
     searches: tuple[EpochSearch, ...],
     is_open: set[int],
@@ -236,34 +237,36 @@ def pack_session(
     )
 
 
-def _keep(measurements: Measurements, pms: tuple[int, ...], pm_kept: BoolArray, aim_kept: BoolArray) -> Measurements:
-    names = {pm for pm, keep in zip(pms, pm_kept, strict=True) if keep}
+def _keep(
+    measurements: Measurements, pms: tuple[int, ...], pm_inlier: BoolArray, aim_inlier: BoolArray
+) -> Measurements:
+    names = {pm for pm, keep in zip(pms, pm_inlier, strict=True) if keep}
     return replace(
         measurements,
-        aims=tuple(aim for aim, keep in zip(measurements.aims, aim_kept, strict=True) if keep),
+        aims=tuple(aim for aim, keep in zip(measurements.aims, aim_inlier, strict=True) if keep),
         pairs=tuple(pair for pair in measurements.pairs if pair.pm in names),
     )
 
 
-def _enough(problem: PackedProblem, pm_kept: BoolArray, aim_kept: BoolArray) -> tuple[BoolArray, BoolArray]:
+def _enough(problem: PackedProblem, pm_inlier: BoolArray, aim_inlier: BoolArray) -> tuple[BoolArray, BoolArray]:
     """Who is kept, where an epoch with too few left (or the aims) takes all of its own back."""
-    pm_kept = pm_kept.copy()
+    pm_inlier = pm_inlier.copy()
     epoch_of = np.zeros(len(problem.pms), dtype=np.int64)
     epoch_of[problem.beam_pm] = problem.beam_epoch
     for epoch in range(problem.columns.epochs):
         mine = epoch_of == epoch
-        if (pm_kept & mine).sum() < MIN_KEPT_PMS:
-            pm_kept |= mine
-    if aim_kept.sum() < MIN_KEPT_AIMS:
-        aim_kept = np.ones_like(aim_kept)
-    return pm_kept, aim_kept
+        if (pm_inlier & mine).sum() < MIN_INLIER_PMS:
+            pm_inlier |= mine
+    if aim_inlier.sum() < MIN_INLIER_AIMS:
+        aim_inlier = np.ones_like(aim_inlier)
+    return pm_inlier, aim_inlier
 
 
 def _split_looks(
     measurements: Measurements,
     whole: PackedProblem,
     kept: tuple[BoolArray, BoolArray],
-    judged: Sorted,
+    selection: InlierSelection,
     packed: Pack,
 ) -> tuple[Measurements, BoolArray] | None:
     """Several looks at a PM of which one is junk: that one becomes a PM of its own, and the others are kept.
@@ -273,8 +276,8 @@ def _split_looks(
     Returns:
         the measurements with the junk looks under PM numbers of their own, and which of their PMs are kept.
     """
-    pm_kept, _ = kept
-    out = {pm for pm, keep in zip(whole.pms, pm_kept, strict=True) if not keep}
+    pm_inlier, _ = kept
+    out = {pm for pm, keep in zip(whole.pms, pm_inlier, strict=True) if not keep}
     looks: dict[int, list[int]] = {}
     for index, pair in enumerate(measurements.pairs):
         if pair.pm in out:
@@ -289,26 +292,26 @@ def _split_looks(
         for index in looks[pm]
         if index != left
     ]
-    fits = predicted_pms(packed(replace(measurements, pairs=tuple(variants))), whole, judged)
+    fits = predicted_pms(packed(replace(measurements, pairs=tuple(variants))), whole, selection)
     single: dict[int, list[int]] = {}
     for (pm, left), good in zip(trials, fits, strict=True):
         if good:
             single.setdefault(pm, []).append(left)
-    junk = {lefts[0] for lefts in single.values() if len(lefts) == 1}
-    if not junk:
+    outliers = {lefts[0] for lefts in single.values() if len(lefts) == 1}
+    if not outliers:
         return None
     spare = min(whole.pms) - 1
     pairs = tuple(
-        replace(pair, pm=spare - index) if index in junk else pair for index, pair in enumerate(measurements.pairs)
+        replace(pair, pm=spare - index) if index in outliers else pair for index, pair in enumerate(measurements.pairs)
     )
-    rescued = {measurements.pairs[index].pm for index in junk}
+    rescued = {measurements.pairs[index].pm for index in outliers}
     names = dict.fromkeys(pair.pm for pair in pairs)
-    before = dict(zip(whole.pms, pm_kept, strict=True))
+    before = dict(zip(whole.pms, pm_inlier, strict=True))
     return replace(measurements, pairs=pairs), np.array([name in rescued or before.get(name, False) for name in names])
 
 
 def _solve_jointly(
-    measurements: Measurements, packed: Pack, start: SharedState, aim_kept: BoolArray, *, clean: bool
+    measurements: Measurements, packed: Pack, start: SharedState, aim_inlier: BoolArray, *, clean: bool
 ) -> tuple[Measurements, PackedProblem, Optimum, Shots]:
     """What is kept, packed, its optimum, and all shots judged by it.
 
@@ -316,40 +319,40 @@ def _solve_jointly(
         measurements: of the epochs to be solved.
         packed: lays measurements out as arrays.
         start: one hypothesis.
-        aim_kept: (A,) aims that fitted when looked at alone.
+        aim_inlier: (A,) aims that fitted when looked at alone.
         clean: whether no PM has deviated so far.
     """
     whole = packed(measurements)
     everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
-    if clean and aim_kept.all():
+    if clean and aim_inlier.all():
         optimum = optimize(whole, start, tolerance=1e-8)
         found = innovations_at(whole, optimum.state, *everyone, optimum.evaluation.private)
-        beyond = deviant(whole, found, everyone[0])
+        beyond = beyond_limit(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
         if plausible and not (beyond.pm.any() or beyond.aim.any()):
             shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
             return measurements, whole, optimum, shots
         start = optimum.state
         clean = bool(plausible and beyond.pm.mean() <= FEW and beyond.aim.sum() <= 1)
-    if clean and aim_kept.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
+    if clean and aim_inlier.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
         first = _enough(whole, ~beyond.pm, ~beyond.aim)
     else:
         robust = graduated_or_near(whole, start, robust_aims=True)
         start = robust.state
-        first = _enough(whole, robust.pm_kept[0], robust.aim_kept[0])
-    judged = sort_shots(whole, start, *first)
-    kept = _enough(whole, judged.pm_kept, judged.aim_kept)
-    apart = _split_looks(measurements, whole, kept, judged, packed)
+        first = _enough(whole, robust.pm_inlier[0], robust.aim_inlier[0])
+    selection = select_inliers(whole, start, *first)
+    kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
+    apart = _split_looks(measurements, whole, kept, selection, packed)
     if apart is not None:
-        measurements, pm_kept = apart
+        measurements, pm_inlier = apart
         whole = packed(measurements)
-        judged = sort_shots(whole, judged.state, pm_kept, kept[1])
-        kept = _enough(whole, judged.pm_kept, judged.aim_kept)
+        selection = select_inliers(whole, selection.state, pm_inlier, kept[1])
+        kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
     chosen = _keep(measurements, whole.pms, *kept)
     problem = packed(chosen)
-    optimum = optimize(problem, judged.state, tolerance=1e-8)
+    optimum = optimize(problem, selection.state, tolerance=1e-8)
     found = innovations_at(whole, optimum.state, *kept)
-    deviants = deviant(whole, found, kept[0])
+    deviants = beyond_limit(whole, found, kept[0])
     private = initial_private(whole, optimum.state)
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)
@@ -373,7 +376,7 @@ def register(
         EstimationError: no beam to start from, or no epoch with three PMs.
     """
     beam = calibrate_beam(measurements, model)
-    trusted = _keep(measurements, (), np.zeros(0, dtype=bool), beam.aim_kept).aims
+    trusted = _keep(measurements, (), np.zeros(0, dtype=bool), beam.aim_inlier).aims
     fitting = replace(measurements, aims=trusted)
     known = searched or {}
     searches = tuple(
@@ -391,18 +394,18 @@ def register(
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
     start = _best_start(measurements, chosen, solvable, model, config)
     is_open = {k for k, (_, undecided) in choices.items() if undecided}
-    start, is_open = _told_apart(fitting, searches, is_open, solvable, start, model, config)
+    start, is_open = _open_minima(fitting, searches, is_open, solvable, start, model, config)
     clean = all(search.clean for search in searches)
 
     def packed(of: Measurements) -> PackedProblem:
         return pack_session(of, model, config, sound_speed)
 
     epochs = restrict_epochs(measurements, solvable)
-    kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+    kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
     if _points_backwards(optimum):
         # A nominal beam given the wrong way round, and no aim to tell: +z is where the spots are.
         start = _turned(optimum.state, model)
-        kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_kept, clean=clean)
+        kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
     return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), (kept, problem, optimum, shots))
 
 

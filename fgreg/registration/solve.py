@@ -15,7 +15,7 @@ from fgreg.graph.gtsam_solver import newton_step
 from fgreg.graph.gtsam_values import PrivateValues, SharedValues, values_at
 from fgreg.graph.reduced_blocks import moved_markers
 from fgreg.graph.shared_state import SharedState
-from fgreg.graph.split_points import logsumexp, odds_in_epoch
+from fgreg.graph.split_points import logsumexp, move_odds_in_epoch
 from fgreg.model.estimate import (
     AimEstimate,
     EpochEstimate,
@@ -31,9 +31,9 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
 from fgreg.registration.posterior import Posterior, predicted_tre
 from fgreg.registration.posterior_mean import (
-    answer,
     estimated_radius,
     estimated_sound_speed,
+    posterior_mean,
     sound_speed_from_residuals,
 )
 from fgreg.registration.readout import read_aims, read_laser, read_pairs
@@ -50,6 +50,7 @@ from fgreg.registration.verdict import (
     estimated,
     hypotheses,
     left_out,
+    possible_camera_move,
     repeated_markers,
     sampling,
     sound_speed_condition,
@@ -57,7 +58,6 @@ from fgreg.registration.verdict import (
     sweeps,
     too_few_to_tell,
     understated_noise,
-    unsteady,
     verdict_of,
 )
 from fgreg.tracking import Snapshot, make_snapshot, track
@@ -117,8 +117,8 @@ def solve(
     try:
         registration = register(measurements, model, config, sound_speed_prior, known)
     except EstimationError as error:
-        return _nothing(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
-    answered = answer(registration, config)
+        return _no_solution(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
+    answered = posterior_mean(registration, config)
     posterior, centred = answered.posterior, answered.registration
     readout = read_laser(centred, model)
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
@@ -130,7 +130,7 @@ def solve(
         *_variable_conditions(centred, sound_speed_prior, config),
     ]
     steady = {k: _move_odds(registration, place) for place, k in enumerate(registration.epochs)}
-    epochs, found = _judge_epochs(measurements, centred, posterior, pairs, model, config, common, steady)
+    epochs, found = _epoch_verdicts(measurements, centred, posterior, pairs, model, config, common, steady)
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
     # The last epoch is where the camera stands; an earlier one that failed is told, and no more than a warning.
@@ -151,7 +151,7 @@ def solve(
     )
 
 
-def _nothing(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:
+def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:
     """A refusal where nothing could be computed."""
     reasons = tuple(condition.text for condition in conditions)
     why = reasons[-1]
@@ -174,8 +174,8 @@ def _common_conditions(
 ) -> list[Condition]:
     """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
-    shots, kept_aims = registration.shots, len(registration.measurements.aims)
-    equations = 2 * kept_aims + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
+    shots, inlier_aims = registration.shots, len(registration.measurements.aims)
+    equations = 2 * inlier_aims + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
     unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
     lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
     lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]
@@ -186,11 +186,13 @@ def _common_conditions(
     found.extend(repeated_markers(registration.measurements.pairs))
     nis = shots.innovations
     if aims:
-        found.extend(left_out(shots.aim_kept, nis.aim, "aims", SURE_OF_AIMS))
+        found.extend(left_out(shots.aim_inlier, nis.aim, "aims", SURE_OF_AIMS))
         found.extend(
-            too_few_to_tell(shots.aim_deviant, shots.aim_kept, nis.aim, [f"the aim at {a.t:.1f} s" for a in aims])
+            too_few_to_tell(
+                shots.aim_beyond_limit, shots.aim_inlier, nis.aim, [f"the aim at {a.t:.1f} s" for a in aims]
+            )
         )
-    deviant = np.concatenate([shots.pm_deviant, shots.aim_deviant])
+    deviant = np.concatenate([shots.pm_beyond_limit, shots.aim_beyond_limit])
     found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
     if problem.columns.sound_speed is None:
         asked = sound_speed_from_residuals(registration)
@@ -263,7 +265,7 @@ def distance_to_explicit(registration: Registration) -> float:
     return float(np.sqrt(apart @ np.linalg.solve(poses, apart)))
 
 
-def _judge_epochs(
+def _epoch_verdicts(
     measurements: Measurements,
     registration: Registration,
     posterior: Posterior,
@@ -329,7 +331,7 @@ def _epoch_conditions(
         config=config,
     )
     found.extend(hypotheses(search, config))
-    found.extend(_junk_conditions(registration, place))
+    found.extend(_outlier_conditions(registration, place))
     if mine:
         directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
         points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.used and e.trus_p_pm_mm is not None])
@@ -341,23 +343,26 @@ def _epoch_conditions(
 
 def _move_odds(registration: Registration, place: int) -> list[Condition]:
     """Whether the inliers of one epoch fit one registration, before and after every split point."""
-    pms, log = odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
+    pms, log = move_odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
     if not len(log):
         return []
     best = int(np.argmax(log))
-    return unsteady(float(logsumexp(log)), pms[best], pms[best + 1], len(pms))
+    return possible_camera_move(float(logsumexp(log)), pms[best], pms[best + 1], len(pms))
 
 
-def _junk_conditions(registration: Registration, place: int) -> list[Condition]:
+def _outlier_conditions(registration: Registration, place: int) -> list[Condition]:
     """PMs of one epoch that were left out, or should have been."""
     shots = registration.shots
     mine = np.zeros(len(shots.problem.pms), dtype=bool)
     mine[shots.problem.beam_pm[shots.problem.beam_epoch == place]] = True
     if not mine.any():
         return []
-    kept, nis = shots.pm_kept[mine], shots.innovations.pm[mine]
+    kept, nis = shots.pm_inlier[mine], shots.innovations.pm[mine]
     names = [f"PM {pm}" for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
-    return [*left_out(kept, nis, "pairs", SURE_OF_PAIRS), *too_few_to_tell(shots.pm_deviant[mine], kept, nis, names)]
+    return [
+        *left_out(kept, nis, "pairs", SURE_OF_PAIRS),
+        *too_few_to_tell(shots.pm_beyond_limit[mine], kept, nis, names),
+    ]
 
 
 def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:

@@ -14,7 +14,7 @@ from fgreg.graph.split_points import ALARM
 from fgreg.model.estimate import PredictedTre, Verdict, worst_verdict
 from fgreg.model.measurements import Pair
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.outliers import JUNK_P
+from fgreg.registration.outliers import OUTLIER_P
 from fgreg.registration.register import EpochSearch, Registration
 
 SUSPICIOUS_P = 1e-3
@@ -25,14 +25,14 @@ REFUSE_LEFT_OUT = 0.5
 SURE_OF_PAIRS = 9
 SURE_OF_AIMS = 6
 """Shots that have to agree before those that do not are safely junk: half as many again as a solution takes."""
-JUNK_CAUTION = 2
+OUTLIER_CAUTION = 2
 """Where shots were left out other hypotheses have more freedom to fit by chance: so many times the gap is needed."""
 CERTAIN_NIS = 30.0
 """Innovation of one shot that noise does not explain, nor a bad estimate from few others."""
 MIRROR_CHANCE = 2.0
 """By no more than this a mirrored session fits better by chance: what is told wrongly here costs centimetres."""
 MILD_NIS = 60.0
-MILD_JUNK = 0.1
+MILD_OUTLIERS = 0.1
 """Junk is mostly farther off than this; so large a share is not."""
 MOST_SOUND_SPEED = 0.1
 """No medium is farther off than this: the cause is another."""
@@ -100,7 +100,7 @@ def mirrored(search: EpochSearch, config: SolveConfig) -> list[Condition]:
     if search.mirrored_cost is None or not search.minima:
         return []
     cost, rival = search.minima[0].cost, search.mirrored_cost
-    caution = 1 if search.clean else JUNK_CAUTION
+    caution = 1 if search.clean else OUTLIER_CAUTION
     needed = MIRROR_CHANCE * caution if search.outside else -config.second_minimum_chi2
     if search.mirrored_outside_cost is not None and search.mirrored_outside_cost < cost - needed:
         rival = search.mirrored_outside_cost
@@ -127,7 +127,10 @@ def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
         return []
     cost = search.minima[0].cost
     # With all sweeps one way the sign does not show, and a small gap is chance.
-    if search.other_way_cost is not None and search.other_way_cost < cost - JUNK_CAUTION * config.second_minimum_chi2:
+    if (
+        search.other_way_cost is not None
+        and search.other_way_cost < cost - OUTLIER_CAUTION * config.second_minimum_chi2
+    ):
         text = (
             f"the sweeps fit better with their signs turned round (chi square {search.other_way_cost:.1f} against "
             f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it"
@@ -167,11 +170,11 @@ def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Con
     ]
 
 
-def understated_noise(deviant: BoolArray, nis: FloatArray) -> list[Condition]:
+def understated_noise(beyond_limit: BoolArray, nis: FloatArray) -> list[Condition]:
     """Several shots beyond their limit, but not by far: that is noise larger than stated rather than junk."""
-    mild = deviant & (nis < MILD_NIS)
-    share_of_junk = float(np.mean(deviant & ~mild))
-    expected = min(JUNK_P + MILD_JUNK * share_of_junk, 1.0)
+    mild = beyond_limit & (nis < MILD_NIS)
+    share_of_outliers = float(np.mean(beyond_limit & ~mild))
+    expected = min(OUTLIER_P + MILD_OUTLIERS * share_of_outliers, 1.0)
     if float(bdtrc(int(mild.sum()) - 1, len(nis), expected)) >= SUSPICIOUS_P:
         return []
     return [
@@ -184,9 +187,9 @@ def understated_noise(deviant: BoolArray, nis: FloatArray) -> list[Condition]:
     ]
 
 
-def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names: Sequence[str]) -> list[Condition]:
+def too_few_to_tell(beyond_limit: BoolArray, kept: BoolArray, nis: FloatArray, names: Sequence[str]) -> list[Condition]:
     """Shots that do not fit where there are too few to leave one out."""
-    suspects = np.flatnonzero(deviant & kept)
+    suspects = np.flatnonzero(beyond_limit & kept)
     if not len(suspects):
         return []
     worst = int(suspects[np.argmax(nis[suspects])])
@@ -199,7 +202,7 @@ def too_few_to_tell(deviant: BoolArray, kept: BoolArray, nis: FloatArray, names:
     ]
 
 
-def unsteady(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
+def possible_camera_move(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
     """Odds of a camera move among ``pms`` PMs (fgreg.graph.split_points), likeliest between two.
 
     No registration is of both sides: what they are registered to lies anywhere between, and the predicted error does

@@ -11,7 +11,7 @@ from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Measurements
 from fgreg.registration.register import Registration
 from fgreg.smoother.innovation import sigma_distance
-from fgreg.smoother.isam_window import Change, Group, Window, free_number, open_window, prepare
+from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare
 from fgreg.smoother.marginal_prior import one_epoch
 from fgreg.smoother.shared_variables import Layout, Quadratic
 from fgreg.smoother.state import Setting, Shot, State, carried_prior, looks_by_pm, own_prior, total_prior
@@ -49,14 +49,14 @@ def initial_of(found: Registration, measurements: Measurements, epoch: int) -> I
     for pair in measurements.pairs:
         pm = next(look_pm) if pair.epoch in found.epochs else None
         labels.append(pair.pm if pm is None else shots.problem.pms[pm])
-        inlier.append(pm is not None and bool(shots.pm_kept[pm]))
+        inlier.append(pm is not None and bool(shots.pm_inlier[pm]))
     return Initial(
         found.epochs,
         found.optimum.state,
         found.covariance,
         tuple(labels),
         tuple(inlier),
-        tuple(bool(kept) for kept in shots.aim_kept),
+        tuple(bool(kept) for kept in shots.aim_inlier),
         epoch in found.ambiguous,
     )
 
@@ -81,15 +81,15 @@ def initialised(state: State, found: Initial, setting: Setting) -> State:
 
 
 def _is_same(state: State, found: Initial, setting: Setting) -> bool:
-    window, layout = state.window, state.layout
-    if window is None or layout is None or state.epoch not in found.epochs:
+    active, layout = state.active_window, state.layout
+    if active is None or layout is None or state.epoch not in found.epochs:
         return False
     mine = tuple((shot.label, shot.inlier) for shot in state.shots)
     if mine != tuple(zip(found.labels, found.inlier, strict=True)) or state.aim_inlier != found.aim_inlier:
         return False
     there = _here(found, state)
     there = layout.in_chart(there)
-    return sigma_distance(there, window.state, window.covariance, setting.columns) < SAME_SIGMA
+    return sigma_distance(there, active.state, active.covariance, setting.columns) < SAME_SIGMA
 
 
 def _here(found: Initial, state: State) -> SharedState:
@@ -120,7 +120,7 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
         aim_inlier=found.aim_inlier,
         shots=shots,
         layout=layout,
-        window=None,
+        active_window=None,
         is_open=found.is_open,
         why_none="",
     )
@@ -135,8 +135,9 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
     try:
         opened = _opened(state, recent, here, layout, setting)
         stays = (
-            opened.window is not None
-            and sigma_distance(here, opened.window.state, opened.window.covariance, setting.columns) < SAME_SIGMA
+            opened.active_window is not None
+            and sigma_distance(here, opened.active_window.state, opened.active_window.covariance, setting.columns)
+            < SAME_SIGMA
         )
     except (ArithmeticError, RuntimeError):
         stays = False
@@ -151,7 +152,9 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
     rest = Quadratic(here, 0.0, -carried.gradient, information - carried.hessian)
     state = replace(state, marginalised=older, older=rest)
     try:
-        return _with_window(state, open_window((), total_prior(state, here, setting), layout, state.epoch))
+        return _with_active_window(
+            state, open_active_window((), total_prior(state, here, setting), layout, state.epoch)
+        )
     except ArithmeticError:  # as three pairs can leave it
         return replace(state, why_none="these pairs leave the registration undetermined: take more")
 
@@ -162,9 +165,9 @@ def _inverse(covariance: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (information + information.T))
 
 
-def _with_window(state: State, window: Window) -> State:
-    now = replace(state.now, state=window.state, covariance=window.covariance)
-    return replace(state, window=window, epochs=(*state.epochs[:-1], now))
+def _with_active_window(state: State, active: ActiveWindow) -> State:
+    now = replace(state.now, state=active.state, covariance=active.covariance)
+    return replace(state, active_window=active, epochs=(*state.epochs[:-1], now))
 
 
 def _opened(state: State, recent: list[int], here: SharedState, layout: Layout, setting: Setting) -> State:
@@ -180,5 +183,5 @@ def _opened(state: State, recent: list[int], here: SharedState, layout: Layout, 
         number = free_number(groups, len(pairs))
         prepared = prepare(pairs, layout, here, state.epoch, setting.model, number)
         groups.append(Group(label, places, pairs, prepared))
-    window = open_window(groups, total_prior(state, here, setting), layout, state.epoch)
-    return settled(state, window, layout, Change(), setting)
+    active = open_active_window(groups, total_prior(state, here, setting), layout, state.epoch)
+    return settled(state, active, layout, Change(), setting)

@@ -16,8 +16,15 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import Parts, contributions, refine
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements
-from fgreg.registration.outliers import AIM_LIMIT, WANDERING_CHI2, WANDERS_MM, innovations_of, junk_p_of, limits_among
-from fgreg.smoother.isam_window import Prepared, Window
+from fgreg.registration.outliers import (
+    AIM_LIMIT,
+    DIVERGED_CHI2,
+    DIVERGED_MM,
+    innovations_of,
+    limits_among,
+    outlier_p_of,
+)
+from fgreg.smoother.isam_window import ActiveWindow, Prepared
 from fgreg.smoother.shared_variables import Quadratic, small_step
 from fgreg.smoother.state import Setting, State, pairs_of_epoch
 
@@ -36,7 +43,7 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 
 def limit_of(degrees_of_freedom: int, inliers: int, count: int) -> float:
     """Chi square beyond which a PM is an outlier, where ``inliers`` of ``count`` are inliers, the PM among them."""
-    return float(chdtri(max(degrees_of_freedom, 1), junk_p_of(inliers, count)))
+    return float(chdtri(max(degrees_of_freedom, 1), outlier_p_of(inliers, count)))
 
 
 def innovation(prepared: Prepared, covariance: FloatArray, before: Quadratic | None = None) -> float:
@@ -62,28 +69,28 @@ def innovation(prepared: Prepared, covariance: FloatArray, before: Quadratic | N
 
 def misplaced_pms(state: State, setting: Setting) -> frozenset[int]:
     """Labels of the current epoch's PMs that are inliers though they deviate, or outliers though they fit."""
-    window = state.window
-    if window is None or not state.current:
+    active = state.active_window
+    if active is None or not state.current:
         return frozenset()
     measurements = Measurements((), pairs_of_epoch(state.current), (EpochStart(0.0),))
-    parts, problem = _parts(measurements, window.state, setting)
+    parts, problem = _parts(measurements, active.state, setting)
     is_inlier = {shot.label: shot.inlier for shot in state.current}
     inlier = np.array([is_inlier[label] for label in problem.pms])
-    found = innovations_of(parts.pm, _information(window), inlier)
+    found = innovations_of(parts.pm, _information(active), inlier)
     limits = limits_among(problem, inlier, *state.counts())
     misplaced = np.isfinite(found) & (inlier == (found > limits))
     return frozenset(label for label, wrong in zip(problem.pms, misplaced, strict=True) if wrong)
 
 
-def aim_fits(aim: Aim, window: Window, setting: Setting) -> bool:
+def aim_fits(aim: Aim, active: ActiveWindow, setting: Setting) -> bool:
     """Whether a calibration shot agrees with the estimate."""
-    parts, _ = _parts(Measurements((aim,), (), (EpochStart(0.0),)), window.state, setting)
-    found = innovations_of(parts.aim, _information(window), np.zeros(1, dtype=bool))
+    parts, _ = _parts(Measurements((aim,), (), (EpochStart(0.0),)), active.state, setting)
+    found = innovations_of(parts.aim, _information(active), np.zeros(1, dtype=bool))
     return bool(found[0] <= AIM_LIMIT)
 
 
-def _information(window: Window) -> FloatArray:
-    return np.asarray(np.linalg.inv(window.covariance), dtype=np.float64)
+def _information(active: ActiveWindow) -> FloatArray:
+    return np.asarray(np.linalg.inv(active.covariance), dtype=np.float64)
 
 
 def _parts(measurements: Measurements, state: SharedState, setting: Setting) -> tuple[Parts, PackedProblem]:
@@ -94,6 +101,6 @@ def _parts(measurements: Measurements, state: SharedState, setting: Setting) -> 
         for _ in range(PRIVATE_ROUNDS):
             _, private = refine(problem, state, private)
         parts = contributions(problem, state, private)
-    wanders = np.linalg.norm(parts.private.trus_p_pm - private.trus_p_pm, axis=-1) > WANDERS_MM
-    cost = np.where(wanders, np.maximum(parts.pm.cost, WANDERING_CHI2), parts.pm.cost)
+    diverged = np.linalg.norm(parts.private.trus_p_pm - private.trus_p_pm, axis=-1) > DIVERGED_MM
+    cost = np.where(diverged, np.maximum(parts.pm.cost, DIVERGED_CHI2), parts.pm.cost)
     return replace(parts, pm=replace(parts.pm, cost=cost)), problem

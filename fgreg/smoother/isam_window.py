@@ -286,7 +286,7 @@ def _settle(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class ActiveWindow:
     """iSAM2 with the recent pairs in it, and the shared variables' Gaussian.
 
     Attributes:
@@ -331,7 +331,7 @@ class Change:
     prior: Quadratic | None = None
 
 
-def open_window(groups: Sequence[Group], prior: Quadratic, layout: Layout, epoch: int) -> Window:
+def open_active_window(groups: Sequence[Group], prior: Quadratic, layout: Layout, epoch: int) -> ActiveWindow:
     """A new window of these groups and a marginal prior, whose state is the start.
 
     Raises:
@@ -351,28 +351,28 @@ def open_window(groups: Sequence[Group], prior: Quadratic, layout: Layout, epoch
     return _read(isam, theta, layout, epoch, placed, slots[0], prior.state)
 
 
-def updated(window: Window, change: Change, layout: Layout) -> Window:
+def updated(active: ActiveWindow, change: Change, layout: Layout) -> ActiveWindow:
     """The window after one update of iSAM2; the window given is left as it was.
 
     Raises:
         ArithmeticError: an indeterminate system, or a result that is not finite.
         RuntimeError: another failure of GTSAM.
     """
-    isam = gtsam.ISAM2(window.isam)
+    isam = gtsam.ISAM2(active.isam)
     theta = isam.getLinearizationPoint()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    removed = [slot for group in window.groups if group.label in change.remove for slot in group.slots]
+    removed = [slot for group in active.groups if group.label in change.remove for slot in group.slots]
     if change.prior is not None:
-        graph.add(marginal_prior_factor(change.prior, layout, window.epoch))
-        removed.append(window.prior_slot)
+        graph.add(marginal_prior_factor(change.prior, layout, active.epoch))
+        removed.append(active.prior_slot)
     for group in change.add:
         graph.push_back(group.prepared.graph)
         values.insert(group.prepared.values)
     slots = _update(isam, graph, values, removed)
-    prior_slot = window.prior_slot if change.prior is None else slots.pop(0)
-    stay = [group for group in window.groups if group.label not in change.remove]
+    prior_slot = active.prior_slot if change.prior is None else slots.pop(0)
+    stay = [group for group in active.groups if group.label not in change.remove]
     groups = (*stay, *_placed(change.add, slots))
-    return _read(isam, theta, layout, window.epoch, groups, prior_slot, window.state)
+    return _read(isam, theta, layout, active.epoch, groups, prior_slot, active.state)
 
 
 def _update(
@@ -405,9 +405,9 @@ def _read(
     groups: tuple[Group, ...],
     prior_slot: int,
     like: SharedState,
-) -> Window:
+) -> ActiveWindow:
     state = layout.read(isam, epoch, like)
     covariance = np.asarray(isam.jointMarginalCovariance(list(layout.keys(epoch))).fullMatrix())
     if not (finite(state) and np.isfinite(covariance).all() and (np.diag(covariance) > 0).all()):
         raise ArithmeticError("the estimate or its covariance is not finite")
-    return Window(isam, theta, epoch, groups, prior_slot, state, covariance)
+    return ActiveWindow(isam, theta, epoch, groups, prior_slot, state, covariance)

@@ -19,7 +19,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import restrict_epochs
 from fgreg.registration.register import SoundSpeedPrior, pack_session
-from fgreg.smoother.isam_window import Window
+from fgreg.smoother.isam_window import ActiveWindow
 from fgreg.smoother.marginal_prior import marginal_prior, one_epoch, with_registrations
 from fgreg.smoother.shared_variables import Layout, Quadratic
 
@@ -105,7 +105,7 @@ class State:
         aims, aim_inlier: calibration shots, and which of them count.
         shots: pairs, in the session's order.
         layout: None until a first registration.
-        window: None where the current epoch has no registration (yet).
+        active_window: None where the current epoch has no registration (yet).
         carried: prior on the current epoch's shared variables from the aims, the earlier epochs and what is known
             beforehand; older: from the epoch's own pairs that have left the window. Their sum is the window's prior.
         marginalised: labels of the PMs in ``older``.
@@ -119,7 +119,7 @@ class State:
     aim_inlier: tuple[bool, ...] = ()
     shots: tuple[Shot, ...] = ()
     layout: Layout | None = None
-    window: Window | None = None
+    active_window: ActiveWindow | None = None
     carried: Quadratic | None = None
     older: Quadratic | None = None
     marginalised: frozenset[int] = frozenset()

@@ -7,7 +7,7 @@ from dataclasses import replace
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Aim, EpochStart, Pair
 from fgreg.smoother.innovation import aim_fits, innovation, limit_of, sigma_distance
-from fgreg.smoother.isam_window import Change, Group, Window, free_number, open_window, prepare, updated
+from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare, updated
 from fgreg.smoother.marginal_prior import carried_over, has_moved
 from fgreg.smoother.shared_variables import Layout
 from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, own_prior, total_prior
@@ -33,33 +33,33 @@ def with_pair(state: State, pair: Pair, setting: Setting) -> State:
     """
     shot = Shot(replace(pair, epoch=state.epoch), pair.pm, inlier=False)
     joined = replace(state, shots=(*state.shots, shot), nis=None, used=False)
-    if state.window is None or state.layout is None:
+    if state.active_window is None or state.layout is None:
         return joined
     try:
-        return _one_more(joined, state.window, state.layout, setting)
+        return _one_more(joined, state.active_window, state.layout, setting)
     except ArithmeticError as error:  # full steps may lead anywhere among few pairs that contradict each other
         if sum(other.inlier for other in state.current) > FIRST_PAIRS:
             raise
-        return replace(joined, window=None, why_none=f"the pairs contradict each other ({error})")
+        return replace(joined, active_window=None, why_none=f"the pairs contradict each other ({error})")
 
 
-def _one_more(state: State, window: Window, layout: Layout, setting: Setting) -> State:
+def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setting) -> State:
     """:func:`with_pair` where there is a registration; the pair is the state's last shot, an outlier so far."""
     place, shot = len(state.shots) - 1, state.shots[-1]
     label = shot.label
     places = [state.now.first + i for i, other in enumerate(state.current) if other.label == label]
     if label in state.marginalised:  # an older PM is looked at again: all its looks come back into the window
         state = replace(state, marginalised=state.marginalised - {label})
-        state = replace(state, older=own_prior(state, state.marginalised, window.state, setting))
-        change = Change(prior=total_prior(state, window.state, setting))
-        state = settled(state, window, layout, change, setting)
-        window = _window(state)
+        state = replace(state, older=own_prior(state, state.marginalised, active.state, setting))
+        change = Change(prior=total_prior(state, active.state, setting))
+        state = settled(state, active, layout, change, setting)
+        active = _active_window(state)
     pairs = tuple(replace(state.shots[p].pair, pm=label) for p in places)
-    number = free_number(window.groups, len(pairs))
-    prepared = prepare(pairs, layout, window.state, state.epoch, setting.model, number)
-    same = next((group for group in window.groups if group.label == label), None)
-    known = None if same is None else same.prepared.quadratic.at(window.state, layout.columns)
-    nis = innovation(prepared, window.covariance, known)
+    number = free_number(active.groups, len(pairs))
+    prepared = prepare(pairs, layout, active.state, state.epoch, setting.model, number)
+    same = next((group for group in active.groups if group.label == label), None)
+    known = None if same is None else same.prepared.quadratic.at(active.state, layout.columns)
+    nis = innovation(prepared, active.covariance, known)
     inliers, count = state.counts()
     fits = nis <= limit_of(len(prepared.rows), inliers + (same is None), count)
     state = replace(state, nis=nis, used=fits)
@@ -71,8 +71,8 @@ def _one_more(state: State, window: Window, layout: Layout, setting: Setting) ->
         shots[p] = replace(shots[p], inlier=True)
     state = replace(state, shots=tuple(shots))
     change = Change((Group(label, tuple(places), pairs, prepared),), () if same is None else (label,))
-    state, change = _marginalised(state, window, change, setting)
-    return settled(state, window, layout, change, setting)
+    state, change = _marginalised(state, active, change, setting)
+    return settled(state, active, layout, change, setting)
 
 
 def _split_off(state: State, place: int) -> State:
@@ -83,29 +83,29 @@ def _split_off(state: State, place: int) -> State:
     return replace(state, shots=tuple(shots))
 
 
-def _window(state: State) -> Window:
-    if state.window is None:
+def _active_window(state: State) -> ActiveWindow:
+    if state.active_window is None:
         raise ValueError("there is no registration")
-    return state.window
+    return state.active_window
 
 
-def _marginalised(state: State, window: Window, change: Change, setting: Setting) -> tuple[State, Change]:
+def _marginalised(state: State, active: ActiveWindow, change: Change, setting: Setting) -> tuple[State, Change]:
     """The oldest PMs become part of the marginal prior, where the window is full, in the update that is due."""
-    stay = [group for group in window.groups if group.label not in change.remove]
+    stay = [group for group in active.groups if group.label not in change.remove]
     if len(stay) < MOST:
         return state, change
     oldest = frozenset(group.label for group in stay[:LEAVE])
-    more = own_prior(state, oldest, window.state, setting)
+    more = own_prior(state, oldest, active.state, setting)
     if more is None:
         return state, change
-    older = more if state.older is None else state.older.at(window.state, setting.columns).plus(more)
+    older = more if state.older is None else state.older.at(active.state, setting.columns).plus(more)
     state = replace(state, older=older, marginalised=state.marginalised | oldest)
-    prior = total_prior(state, window.state, setting)
+    prior = total_prior(state, active.state, setting)
     return state, replace(change, remove=(*change.remove, *oldest), prior=prior)
 
 
 def settled(
-    state: State, window: Window, layout: Layout, change: Change, setting: Setting, limit: float = SETTLED_SIGMA
+    state: State, active: ActiveWindow, layout: Layout, change: Change, setting: Setting, limit: float = SETTLED_SIGMA
 ) -> State:
     """Update the window until the estimate stands still, with the marginal prior linearised again on the way.
 
@@ -114,14 +114,14 @@ def settled(
         RuntimeError: another failure of GTSAM.
     """
     for _ in range(MOST_UPDATES):
-        before = window.state
-        window = updated(window, change, layout)
-        state, again = _relinearised(state, window.state, setting)
-        if not again and sigma_distance(before, window.state, window.covariance, setting.columns) < limit:
+        before = active.state
+        active = updated(active, change, layout)
+        state, again = _relinearised(state, active.state, setting)
+        if not again and sigma_distance(before, active.state, active.covariance, setting.columns) < limit:
             break
-        change = Change(prior=total_prior(state, window.state, setting)) if again else Change()
-    now = replace(state.now, state=window.state, covariance=window.covariance)
-    return replace(state, window=window, epochs=(*state.epochs[:-1], now))
+        change = Change(prior=total_prior(state, active.state, setting)) if again else Change()
+    now = replace(state.now, state=active.state, covariance=active.covariance)
+    return replace(state, active_window=active, epochs=(*state.epochs[:-1], now))
 
 
 def _relinearised(state: State, at: SharedState, setting: Setting) -> tuple[State, bool]:
@@ -137,16 +137,16 @@ def _relinearised(state: State, at: SharedState, setting: Setting) -> tuple[Stat
 
 def with_aim(state: State, aim: Aim, setting: Setting) -> State:
     """The state with one calibration shot more, which counts where it agrees with the estimate."""
-    window, layout = state.window, state.layout
-    fits = window is None or aim_fits(aim, window, setting)
+    active, layout = state.active_window, state.layout
+    fits = active is None or aim_fits(aim, active, setting)
     aims, inlier = (*state.aims, aim), (*state.aim_inlier, fits)
     state = replace(state, aims=aims, aim_inlier=inlier, nis=None, used=False)
-    if window is None or layout is None or not fits:
+    if active is None or layout is None or not fits:
         return state
-    state, carried = carried_prior(state, window.state, setting)
+    state, carried = carried_prior(state, active.state, setting)
     state = replace(state, carried=carried)
-    change = Change(prior=total_prior(state, window.state, setting))
-    return settled(state, window, layout, change, setting)
+    change = Change(prior=total_prior(state, active.state, setting))
+    return settled(state, active, layout, change, setting)
 
 
 def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) -> State:
@@ -169,7 +169,7 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
         state,
         epochs=(*state.epochs, Epoch(start, first)),
         shots=tuple(shots),
-        window=None,
+        active_window=None,
         carried=None,
         older=None,
         marginalised=frozenset(),
@@ -192,9 +192,11 @@ def tied(state: State, setting: Setting) -> State:
         return state
     at = carried_over(before, start)
     state, carried = carried_prior(state, at, setting)
-    window = open_window((), carried, layout, state.epoch)
-    now = replace(state.now, state=window.state, covariance=window.covariance)
-    return replace(state, carried=carried, window=window, epochs=(*state.epochs[:-1], now), why_none="", is_open=False)
+    active = open_active_window((), carried, layout, state.epoch)
+    now = replace(state.now, state=active.state, covariance=active.covariance)
+    return replace(
+        state, carried=carried, active_window=active, epochs=(*state.epochs[:-1], now), why_none="", is_open=False
+    )
 
 
 def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
@@ -204,9 +206,9 @@ def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
     """
     now = replace(state.now, start=start)
     state = replace(state, epochs=(*state.epochs[:-1], now), nis=None, used=False)
-    window, layout = state.window, state.layout
-    if window is None or layout is None:
+    active, layout = state.active_window, state.layout
+    if active is None or layout is None:
         return state if state.epoch_pairs else tied(state, setting)
-    state, carried = carried_prior(state, window.state, setting)
+    state, carried = carried_prior(state, active.state, setting)
     state = replace(state, carried=carried)
-    return settled(state, window, layout, Change(prior=total_prior(state, window.state, setting)), setting)
+    return settled(state, active, layout, Change(prior=total_prior(state, active.state, setting)), setting)
