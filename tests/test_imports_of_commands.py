@@ -22,7 +22,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "solve --help": ("numpy", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "check POSES": ("rich", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "schema events": ("rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
-    "solve POSES": (*SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "solve POSES": ("scipy.linalg", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve POSES --quiet": ("rich", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve FRAMES": (*SLOW[1:], *OTHER_COMMANDS, *DRAWING, *PROCESSES),
     "replay POSES": (*SLOW, *DETECTORS, "fgreg.simulation", "fgreg.evaluation", "fgreg.convert"),
@@ -62,6 +62,17 @@ def test_a_command_loads_nothing_that_it_does_not_use(
     loaded = set(done.stderr.splitlines())
     assert "fgreg.cli.main" in loaded
     assert sorted(loaded & set(FORBIDDEN[command])) == []
+
+
+def test_packages_load_nothing_by_themselves() -> None:
+    """What imports one module of a package gets no other one with it, but for two packages that hand names on."""
+    folder = Path(__file__).parent.parent / "fgreg"
+    packages = sorted({path.parent.name for path in folder.glob("*/__init__.py")} - {"online", "tracking"})
+    assert {"graph", "detection", "session"} <= set(packages)
+    code = f"import sys, {', '.join(f'fgreg.{name}' for name in packages)}\nprint(*sys.modules, sep=chr(10))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=60)
+    below = [name for name in done.stdout.splitlines() if name.startswith("fgreg.") and name.count(".") > 1]
+    assert below == []
 
 
 def test_what_is_forbidden_exists() -> None:
