@@ -11,7 +11,9 @@ from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.model.measurements import EpochStart, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import CameraMoved, OnlineEstimate, OnlineEvent, OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.events import CameraMoved, OnlineEvent
 from fgreg.registration.posterior import pose_tangent
 from fgreg.registration.register import Registration, register
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera

@@ -33,7 +33,7 @@ from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.time_sync import PairRefused, PoseHistory, TimedPose
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.session.setup_reader import read_setup
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room

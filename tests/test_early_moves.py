@@ -20,7 +20,7 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve

@@ -16,10 +16,11 @@ from fgreg.errors import EventRefused
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration, engine_process
+from fgreg.online import engine_process
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.events import OnlineEvent
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from tests.forward import make_measurements
 from tests.online_streams import restored
 

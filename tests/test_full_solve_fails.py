@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgreg.model.estimate import Verdict
-from fgreg.online import OnlineRegistration
 from fgreg.online import full_solve as full_solve_module
+from fgreg.online.engine import OnlineRegistration
 from tests.forward import make_measurements
 from tests.online_streams import first, restored
 

@@ -16,7 +16,8 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import CameraMoved, OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.events import CameraMoved
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult
 from fgreg.online.solver import InProcessSolver, WorkerSolver
 from fgreg.workers.worker_process import WorkerProcess

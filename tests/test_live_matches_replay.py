@@ -10,7 +10,7 @@ import numpy as np
 
 from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.live_session import LiveSession
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.registration.posterior import pose_tangent

@@ -125,7 +125,7 @@ def test_a_marker_lost_during_a_search_ends_it() -> None:
 
 def test_after_a_told_move_it_searches_again_and_halts_first(whole: Rehearsal) -> None:
     # last of the tests that use the session: it changes it
-    from fgreg.online import CameraMoved
+    from fgreg.online.events import CameraMoved
 
     whole.room.bump(whole.now_s)
     whole.run(1.0)

@@ -14,7 +14,7 @@ from fgreg.geometry.transforms import FloatArray, inverse, make_transform
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.recorded_moves import events_in_order, find_epochs, split_epochs
 from fgreg.registration.register import register
 from fgreg.registration.solve import distance_to_explicit

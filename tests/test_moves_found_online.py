@@ -19,8 +19,9 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import CameraMoved, OnlineRegistration, StaticTags
 from fgreg.online import full_solve as full_solve_module
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.events import CameraMoved, StaticTags
 from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
 from tests.forward import Truth, make_measurements
 from tests.online_streams import first, restored, sigmas_between, unreported_move

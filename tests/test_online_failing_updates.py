@@ -20,8 +20,9 @@ from fgreg.factors.adapter import FactorError
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.measurements import Aim, Measurements, Pair
 from fgreg.model.session_model import SessionModel
-from fgreg.online import CameraMoved, OnlineEstimate, OnlineRegistration, StaticTags
-from fgreg.online.estimate import gaussian_tre
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.estimate import OnlineEstimate, gaussian_tre
+from fgreg.online.events import CameraMoved, StaticTags
 from fgreg.smoother.updates import LEAVE, MOST
 from tests.forward import make_measurements
 from tests.online_streams import batch, first, restored, sigmas_apart

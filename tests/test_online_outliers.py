@@ -10,7 +10,7 @@ import pytest
 from fgreg.graph.packing import pack
 from fgreg.model.measurements import Measurements, Pair
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.registration.outliers import limits_among
 from fgreg.registration.register import register, register_near
 from fgreg.smoother.updates import LEAVE, MOST

@@ -10,9 +10,10 @@ import pytest
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import CameraMoved, OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.events import CameraMoved
 from fgreg.registration.solve import solve
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from tests.forward import make_measurements
 from tests.online_streams import restored
 from tests.track_cases import held_out, query_of

@@ -22,7 +22,8 @@ from fgreg.model.estimate import TrackEstimate
 from fgreg.model.measurements import Track
 from fgreg.online.shared_snapshot import SharedSnapshot
 from fgreg.online.snapshot_record import Layout
-from fgreg.tracking import Snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import Snapshot
 from query_codec import (
     QueryError,
     decode_answer,

@@ -16,7 +16,9 @@ from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent, RefusedEve
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import CameraMoved, OnlineEstimate, OnlineEvent, OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.events import CameraMoved, OnlineEvent
 from fgreg.online.live_session import LiveSession
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.session_reader import check_session, read_session

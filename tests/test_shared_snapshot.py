@@ -22,8 +22,8 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import EPOCHS_KEPT, Layout
-from fgreg.tracking import EpochSnapshot, track
-from fgreg.tracking.snapshot import SHARED
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import SHARED, EpochSnapshot
 from tests.forward import make_measurements, make_session
 from tests.test_track_surface import some_surface
 from tests.track_cases import held_out, is_whole, marked_snapshot, plain_snapshot, query_of, solved

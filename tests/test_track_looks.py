@@ -11,7 +11,8 @@ import pytest
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import Track
 from fgreg.model.solve_config import SolveConfig
-from fgreg.tracking import make_snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import make_snapshot
 from tests import tracking_reference
 from tests.forward import make_measurements, make_session
 from tests.track_cases import Solved, held_out, query_of, solved

@@ -8,7 +8,7 @@ import pytest
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface, fit_surface
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from tests import tracking_reference
 from tests.test_tracking import surface_case
 from tests.track_cases import solved_of

@@ -23,7 +23,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
 from fgreg.registration.solve import Solution, solve
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from tests.forward import Truth, hear, make_measurements
 
 

@@ -13,8 +13,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 from fgreg.registration.posterior import Posterior
 from fgreg.registration.solve import Solution, solve
-from fgreg.tracking import EpochSnapshot, Snapshot
-from fgreg.tracking.snapshot import SHARED
+from fgreg.tracking.snapshot import SHARED, EpochSnapshot, Snapshot
 
 
 def held_out(measurements: Measurements, count: int) -> tuple[Measurements, list[list[Pair]]]:

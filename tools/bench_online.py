@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from fgreg.model.measurements import Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.full_solve import FullSolveCase
 from fgreg.online.solver import InProcessSolver
 from fgreg.smoother.updates import FIRST_PAIRS

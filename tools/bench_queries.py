@@ -40,11 +40,12 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import Layout
 from fgreg.online.solver import Where
-from fgreg.tracking import Snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import Snapshot
 from query_codec import QueryError
 from query_server import QueryAddress, QueryClient, QueryServer
 from tests.forward import make_measurements, make_session

@@ -28,7 +28,7 @@ import numpy as np
 
 from fgreg.live.launch import OneProcess
 from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.live_session import LiveSession
 from fgreg.session.journal import Journal
 from fgreg.session.session_reader import read_session

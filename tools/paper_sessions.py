@@ -39,7 +39,7 @@ from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 
 HELD = 10
 """PMs of every session that no registration sees: pair residuals are theirs."""

@@ -25,7 +25,7 @@ from typing import Any
 from fgreg.model.estimate import TrackEstimate
 from fgreg.model.measurements import Track
 from fgreg.online.shared_snapshot import NoSnapshotError, SnapshotReader
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from fgreg.workers.worker_process import Work, WorkerProcess
 from query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
 

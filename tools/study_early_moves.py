@@ -27,7 +27,8 @@ import numpy as np
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import Verdict
-from fgreg.online import OnlineEstimate, OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
+from fgreg.online.estimate import OnlineEstimate
 from move_streams import CONFIG, bump_of, shift_of, two_epochs
 
 AFTER = 20

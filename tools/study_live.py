@@ -47,7 +47,7 @@ from fgreg.session.session_reader import read_session
 from fgreg.session.yaml_loader import load_yaml
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from tests.rehearsal import Rehearsal
 
 SAME_SIGMA = 0.05

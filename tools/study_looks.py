@@ -36,7 +36,8 @@ from fgreg.registration.posterior import target_errors
 from fgreg.registration.posterior_mean import PosteriorMean, posterior_mean, sound_speed_from_residuals
 from fgreg.registration.register import SoundSpeedPrior, register
 from fgreg.registration.verdict import sound_speed_condition
-from fgreg.tracking import make_snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import make_snapshot
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from tests.forward import Truth, make_measurements, make_session

@@ -32,7 +32,7 @@ from fgreg.graph.reduced_graph import log_posterior, refine
 from fgreg.graph.shared_state import make_state
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import DetectedMove
 from fgreg.online.recorded_moves import events_in_order
 from fgreg.registration.register import pack_session

@@ -27,7 +27,7 @@ from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3
 from fgreg.model.measurements import Measurements, Pair
 from fgreg.model.session_model import SessionModel
-from fgreg.online import OnlineRegistration
+from fgreg.online.engine import OnlineRegistration
 from tests.forward import make_measurements
 from tests.online_streams import batch, events, first, sigmas_apart
 

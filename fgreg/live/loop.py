@@ -47,7 +47,8 @@ from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Latencies, TimedPose
 from fgreg.online.shared_snapshot import NoSnapshotError, Received
-from fgreg.tracking import Snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import Snapshot
 
 IDLE_S = 0.002
 """Between looks for a frame."""

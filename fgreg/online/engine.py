@@ -46,7 +46,8 @@ from fgreg.smoother.innovation import misplaced_pms
 from fgreg.smoother.shared_variables import POSE, Quadratic
 from fgreg.smoother.state import Epoch, State, looks_by_pm, make_setting
 from fgreg.smoother.updates import FIRST_PAIRS, with_aim, with_motion, with_move, with_pair
-from fgreg.tracking import Snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import Snapshot
 
 NOT_SOLVED = "this camera epoch has not been through the full solve yet: take the estimate as preliminary"
 NO_REGISTRATION = "no registration of this camera epoch"

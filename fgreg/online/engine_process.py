@@ -26,7 +26,7 @@ from fgreg.online.events import DetectedLoopClosure, DetectedMove, OnlineEvent
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import Layout
 from fgreg.registration.register import SoundSpeedPrior
-from fgreg.tracking import track
+from fgreg.tracking.query import track
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S, END_S = 60.0, 5.0

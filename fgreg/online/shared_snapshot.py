@@ -29,7 +29,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import IntArray
 from fgreg.online.snapshot_record import Layout, SnapshotDecoder, encode_snapshot
-from fgreg.tracking import Snapshot
+from fgreg.tracking.snapshot import Snapshot
 
 MAGIC: Final = 0x6667726567_01
 SLOTS = 4

@@ -10,8 +10,7 @@ import numpy as np
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import SensitivityModel, SessionModel, StageModel
 from fgreg.model.tissue_surface import MOST_POINTS, TissueSurface
-from fgreg.tracking import EpochSnapshot, Snapshot
-from fgreg.tracking.snapshot import SHARED
+from fgreg.tracking.snapshot import SHARED, EpochSnapshot, Snapshot
 
 Record = np.ndarray[Any, np.dtype[Any]]
 """A structured array of shape ()."""

@@ -16,7 +16,7 @@ from fgreg.model.tissue_surface import TissueSurface
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.registration.posterior import pose_tangent, step_of_tangent
 from fgreg.registration.readout import beam_origin_shift
-from fgreg.tracking import Snapshot, make_snapshot
+from fgreg.tracking.snapshot import Snapshot, make_snapshot
 
 POSE = slice(0, 6)
 

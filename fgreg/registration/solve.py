@@ -60,7 +60,8 @@ from fgreg.registration.verdict import (
     understated_noise,
     verdict_of,
 )
-from fgreg.tracking import Snapshot, make_snapshot, track
+from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import Snapshot, make_snapshot
 
 GRAPH_PAIRS = 200
 """Up to so many pairs the explicit graph is solved as well, and has to agree."""
