@@ -8,7 +8,7 @@ motion):
 Noise: the motion's covariance over its own right tangent, ``measured = motion * Expmap(xi)``; then e = -xi exactly.
 
 Residual: (6,), rotation (rad) then translation (mm). Jacobians: (6, 6) for each pose. This is GTSAM's native between
-factor, from k+1 to k (its Jacobians have been exact since 4.3). Source: design.md, section 2.
+factor, from k+1 to k (its Jacobians have been exact since 4.3). Source: docs/model.md, section 4.
 """
 
 from __future__ import annotations

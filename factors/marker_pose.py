@@ -12,7 +12,7 @@ derivative of Log at what it is applied to; (6, 3) marker_bias, its translation 
 moving the observation by -db along the camera's axes is moving the pose by +db.
 
 Without a bias this is GTSAM's native prior on a Pose3 (its Jacobian has been exact since 4.3).
-Source: design.md, section 2; :class:`fgreg.model.measurements.MarkerObservation`.
+Source: docs/model.md, section 4; :class:`fgreg.model.measurements.MarkerObservation`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Point on arc: a PM lies on the arc that a look at it left open.
 
-Equation (Song et al.'s arc; design.md, Geometry), with t the look's stage angle, R the probe's radius, r the range:
+Equation (Song et al.'s arc; docs/model.md, section 2), t the look's stage angle, R the probe's radius, r the range:
 
     element centre  o = (x, R sin t, R cos t)
     arc point       a(theta) = o + c r (0, sin theta, cos theta)

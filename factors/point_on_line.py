@@ -1,6 +1,6 @@
 """Point on line: the PM of a pair, or the aimed-at spot of a calibration shot, lies on the laser's beam.
 
-Equation (the beam of Song et al.'s arc-to-line registration; design.md, Geometry):
+Equation (the beam of Song et al.'s arc-to-line registration; docs/model.md, section 2):
 
     pair:  e = trus_T_camera * camera_T_marker * marker_p(lam) - trus_p_pm
     aim:   e = camera_T_marker * marker_p(lam) - camera_p_spot

@@ -1,6 +1,6 @@
 """Sensitivity prior: what having heard the PM at stage angle t says about where off the plane it lies.
 
-Equation (design.md, Geometry). With delta = theta - t, R the probe's radius and r the observed range:
+Equation (docs/model.md, section 2). With delta = theta - t, R the probe's radius and r the observed range:
 
     rotation = atan2(c r sin delta, R + c r cos delta)      the *stage* rotation that brings the PM into the plane
     e = rotation - centre - gain * window_edge

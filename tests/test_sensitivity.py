@@ -70,7 +70,7 @@ def test_rotation_out_of_reach_gives_the_arc_angle_that_comes_nearest() -> None:
 
 
 def test_first_hit_is_five_degrees_ahead_not_zero() -> None:
-    # design.md: 6 deg and 2 deg steps, 5 +- 0.6 deg, not 0 +- 3.5.
+    # docs/model.md, section 2: 6 deg and 2 deg steps, 5 +- 0.6 deg, not 0 +- 3.5.
     probe = make_session().probe
     for sweep in (1, -1):
         prior = sensitivity_prior(look(30.0, sweep, 0.0), probe.sensitivity, 2.0 * DEG)

@@ -1,4 +1,4 @@
-"""The explicit graph of a session: every variable and factor of design.md, section 2, as they stand there.
+"""The explicit graph of a session: the variables and factors of docs/model.md, sections 3 and 4.
 
 This is the reference. The reduced problem, with everything private eliminated in closed form, has to reach the same
 optimum and is what bulk work uses. Solving is in
@@ -32,7 +32,7 @@ from fgreg.model.session_model import SessionModel
 
 
 class Variable(Enum):
-    """The variables of the graph, by design.md's names; the value is the letter of the GTSAM symbol."""
+    """The variables of the graph, by their names in docs/model.md; the value is the letter of the GTSAM symbol."""
 
     trus_T_camera = "T"
     marker_laser = "B"
@@ -51,7 +51,7 @@ class Variable(Enum):
 
 
 def variable_name(key: int) -> str:
-    """A key as design.md writes it, e.g. ``theta[3]``."""
+    """A key as docs/model.md writes it, e.g. ``theta[3]``."""
     symbol = gtsam.Symbol(key)
     return f"{Variable(chr(symbol.chr())).name}[{symbol.index()}]"
 

@@ -123,7 +123,7 @@ class Measurements:
 
 
 def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) -> FloatArray:
-    """(6, 6) right-tangent covariance of a marker pose that came without one (session-format, ``noise``)."""
+    """(6, 6) right-tangent covariance of a marker pose that came without one (``noise`` of session.yaml)."""
     sigma = np.array([*noise.marker_rotation_rad, *noise.marker_translation_mm])
     return right_from_parent_covariance(camera_T_marker[:3, :3], np.diag(sigma**2))
 

@@ -1,4 +1,4 @@
-"""What the probe's sensitivity window says about a look, in terms of stage rotation (design.md, Geometry).
+"""What the probe's sensitivity window says about a look, in terms of stage rotation (docs/model.md, section 2).
 
 A PM at range r from the element, delta off the plane on its arc, comes into the plane when the stage turns by
 

@@ -388,7 +388,7 @@ class BoardModel:
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Standard deviations to assume where an observation brings no covariance of its own (session-format)."""
+    """Standard deviations to assume where an observation brings no covariance of its own (sessions/README.md)."""
 
     marker_translation_mm: Annotated[
         tuple[float, float, float], Key("along the camera's x, y, z", NumberTuple(3, NOISE_MM))
