@@ -36,7 +36,8 @@ RIVALS = 3
 """At most so many other minima enter the posterior."""
 RIVAL_CHI2 = 14.0
 """Minima whose chi square is larger by more than this hold too little of the posterior to matter."""
-
+OPEN_PMS = 5
+"""Fewer PMs leave a registration open, whatever samples say: a third of the draws has to do."""
 FREE_SOUND_SPEED = 0.1
 """Prior sigma of a sound speed ratio that only the residuals are to determine."""
 
@@ -60,9 +61,9 @@ def posterior_mean(registration: Registration, config: SolveConfig) -> Posterior
     if len(registration.problem.look_pm) > config.posterior_looks:
         posterior = gaussian_posterior(modes[0], count=round(config.posterior_effective), seed=config.seed)
     else:
-        posterior = sample_posterior(
-            modes, goal=config.posterior_effective, most=config.posterior_samples, seed=config.seed
-        )
+        few = len(registration.problem.pms) < OPEN_PMS
+        most = config.posterior_samples // 3 if few else config.posterior_samples
+        posterior = sample_posterior(modes, goal=config.posterior_effective, most=most, seed=config.seed)
     problem = modes[0].problem
     moved = _evaluated(problem, posterior.mean, modes[0].optimum)
     shots = _moved_shots(registration.shots, problem, moved)
