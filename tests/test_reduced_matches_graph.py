@@ -15,9 +15,9 @@ from fgreg.graph.gtsam_solver import optimize as optimize_graph
 from fgreg.graph.gtsam_values import SharedValues, initial_values, read_shared
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import contributions, evaluate, log_posterior, refine
-from fgreg.graph.reduced_solver import Optimum, optimize
-from fgreg.graph.shared_state import SharedState, make_state, pose_difference
+from fgreg.graph.reduced_graph import Costs, Weights, contributions, evaluate, log_posterior, private_at, refine
+from fgreg.graph.reduced_solver import Optimum, distinct, optimize
+from fgreg.graph.shared_state import SharedState, make_state, pose_difference, stack_states
 from fgreg.model.session_model import NoiseModel
 from graph_covariance import GraphCovariance
 from tests.forward import make_measurements, make_session
@@ -140,3 +140,57 @@ def test_hypotheses_side_by_side_do_not_touch_each_other() -> None:
     for i in range(3):
         one = many.take([i])
         assert log_posterior(problem, one, initial_private(problem, one))[0] == pytest.approx(together[i], rel=1e-12)
+
+
+def test_hypotheses_that_have_come_together_go_on_as_one() -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(7), pairs=8)
+    problem = pack(measurements, model)
+    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0))
+    root = np.linalg.cholesky(np.linalg.inv(found.evaluation.hessian[0]))
+    steps: FloatArray = np.array([0.0, 0.3, 20.0, 0.2])[:, None] * root[:, [0, 0, 0, 3]].T
+    many = found.state.take([0, 0, 0, 0]).retract(steps, problem.columns)
+    at = evaluate(problem, many, private_at(problem, many))
+    assert list(distinct(problem, many, at)) == [0, 2]
+    turned = replace(many, marker_T_nominal=many.marker_T_nominal @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    both = stack_states([many, turned])
+    assert len(distinct(problem, both, evaluate(problem, both, private_at(problem, both)))) >= 3
+
+
+def test_a_hypothesis_that_will_not_come_below_what_is_wanted_is_left() -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(8), pairs=10)
+    problem = pack(measurements, model)
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
+    start = start.retract(np.full((1, problem.columns.size), 0.02), problem.columns)
+    free = optimize(problem, start)
+    least = float(free.evaluation.cost[0])
+    within = optimize(problem, start, wanted=least + 1.0)
+    assert within.evaluation.cost[0] == pytest.approx(least, abs=1e-6)
+    beyond = optimize(problem, start, wanted=least - 1.0)
+    assert beyond.iterations < free.iterations
+    assert beyond.evaluation.cost[0] > least
+
+
+def test_a_loss_weighs_as_shots_left_out_do() -> None:
+    model, measurements, truth = make_measurements(np.random.default_rng(9), pairs=9, looks_per_pm=2)
+    problem = pack(measurements, model)
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
+    private = private_at(problem, state)
+    kept = np.arange(9) != 4
+
+    def without_one(costs: Costs) -> Weights:
+        pm = kept * np.ones_like(costs.pm)
+        return Weights(pm, np.ones_like(costs.aim), (pm * costs.pm).sum(axis=1) + costs.aim.sum(axis=1) + costs.prior)
+
+    weighted = evaluate(problem, state, private, without_one)
+    parts = contributions(problem, state, private)
+    left = [parts.prior.hessian[0, 0], parts.pm.hessian[0, kept].sum(axis=0), parts.aim.hessian[0].sum(axis=0)]
+    np.testing.assert_allclose(weighted.hessian[0], sum(left), rtol=1e-6, atol=1e-6)
+    rest = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm != problem.pms[4]))
+    alone = pack(rest, model)
+    there = evaluate(
+        alone,
+        state,
+        replace(private, trus_p_pm=private.trus_p_pm[:, kept], beam_error=private.beam_error[:, kept[problem.beam_pm]]),
+    )
+    np.testing.assert_allclose(weighted.gradient, there.gradient, rtol=1e-9, atol=1e-9)
+    assert weighted.cost[0] == pytest.approx(there.cost[0], rel=1e-12)

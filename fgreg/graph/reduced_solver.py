@@ -21,7 +21,7 @@ LONG_STEP = 0.1
 """Newton decrement (chi square) above which the private variables are refined before a step is judged."""
 STALLED = 1e-6
 """Newton decrement (chi square) at which a step that gains nothing is the last: private variables lag by as much."""
-CREEPING = 10.0
+CREEPING = 30.0
 """At most so many times what one step promised is what all the steps after it may still gain."""
 
 
@@ -43,7 +43,7 @@ def optimize(
     max_iterations: int = 60,
     tolerance: float = 1e-6,
     keep_within: float | None = None,
-    best_cost: float = np.inf,
+    wanted: float = np.inf,
     loss: Loss = least_squares,
     start: Evaluation | None = None,
 ) -> Optimum:
@@ -57,8 +57,7 @@ def optimize(
         tolerance: a hypothesis has converged when the Newton decrement (in chi square) falls below this; the default is
             a thousandth of a standard deviation.
         keep_within: stop early on hypotheses whose cost exceeds the best converged one by more than this.
-        best_cost: a cost that is known to be reached otherwise: hypotheses that will not come to within ``keep_within``
-            of it are left where they are.
+        wanted: hypotheses whose cost will not come below this are left where they are.
         loss: of each PM's and aim's chi square: iteratively reweighted least squares.
         start: the evaluation at the starts, where that is known.
     """
@@ -93,11 +92,10 @@ def optimize(
             state, current = _merged(state, moved, index[good], good), _merged(current, trial, index[good], good)
         damping[index] = np.clip(np.where(good, damping[index] * 0.1, damping[index] * 8.0), 1e-9, 1e12)
         active[index[(good & (decrement < tolerance)) | stalled | (damping[index] > 1e9)]] = False
-        if keep_within is not None:
-            if not active.all():
-                active &= current.cost <= current.cost[~active].min() + keep_within
-            hopeless = current.cost[index] - CREEPING * np.maximum(decrement, 0.0) > best_cost + keep_within
-            active[index[good & hopeless]] = False
+        hopeless = current.cost[index] - CREEPING * np.maximum(decrement, 0.0) > wanted
+        active[index[good & hopeless]] = False
+        if keep_within is not None and not active.all():
+            active &= current.cost <= current.cost[~active].min() + keep_within
         if not active.any():
             break
     return Optimum(state, current, ~active, iteration)

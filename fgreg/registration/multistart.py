@@ -231,8 +231,8 @@ def search_epoch(
         mirrored_problem,
         _starts(mirrored_problem, frames, model),
         tolerance=OTHERS_TOLERANCE,
-        keep_within=OTHERS_WITHIN,
-        best_cost=minima[0].cost,
+        keep_within=keep_within,
+        wanted=minima[0].cost + OTHERS_WITHIN,
     )
     cost = mirrored.evaluation.cost
     return EpochSearch(
@@ -274,7 +274,8 @@ def _search_with_outliers(
     base, aims_cost = float(robust.cost[0]), float(robust.aim_cost[0].sum())
 
     def other(of: PackedProblem) -> RobustOptimum:
-        return graduated(of, _robust_starts(of, frames, model, []), keep_within=OTHERS_WITHIN, best_cost=base)
+        starts = _robust_starts(of, frames, model, [])
+        return graduated(of, starts, keep_within=keep_within, wanted=base + OTHERS_WITHIN)
 
     mirrored = other(_mirrored(problem))
     other_way = other(_other_way(problem)) if problem.looks.edge_gain.any() else None
@@ -297,7 +298,7 @@ def _search_with_outliers(
             all_minima += (Minimum(level + float(robust.cost[index]) - base, robust.state.take([index])),)
     # The pairs without the aims: a marker swapped or knocked between calibration and registration.
     alone = pack(replace(measurements, aims=()), model)
-    free = graduated(alone, robust.state, keep_within=OTHERS_WITHIN, best_cost=base - aims_cost)
+    free = graduated(alone, robust.state, keep_within=keep_within, wanted=base - aims_cost + OTHERS_WITHIN)
     return EpochSearch(
         tuple(sorted(all_minima, key=lambda minimum: minimum.cost)),
         level + float(mirrored.cost.min()) - base,

@@ -192,7 +192,7 @@ def graduated(
     *,
     robust_aims: bool = False,
     keep_within: float | None = None,
-    best_cost: float = np.inf,
+    wanted: float = np.inf,
 ) -> RobustOptimum:
     """Local minima of the truncated cost from S starts, by way of narrowing Cauchy losses.
 
@@ -200,7 +200,7 @@ def graduated(
         problem: the packed measurements.
         state: S starts.
         robust_aims: doubt the aims, too; else they count in full.
-        keep_within, best_cost: of the truncated cost, as of :func:`fgreg.graph.reduced_solver.optimize`.
+        keep_within, wanted: of the truncated cost, as of :func:`fgreg.graph.reduced_solver.optimize`.
     """
     start: Evaluation | None = None
     private: PrivateState | None = None
@@ -213,7 +213,7 @@ def graduated(
         # Most starts have come together by then.
         index = distinct(problem, found.state, found.evaluation)
         state, private = found.state.take(index), found.evaluation.private.take(index)
-    return _truncated_minima(problem, state, robust_aims=robust_aims, keep_within=keep_within, best_cost=best_cost)
+    return _truncated_minima(problem, state, robust_aims=robust_aims, keep_within=keep_within, wanted=wanted)
 
 
 def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
@@ -232,7 +232,7 @@ def _truncated_minima(
     *,
     robust_aims: bool,
     keep_within: float | None = None,
-    best_cost: float = np.inf,
+    wanted: float = np.inf,
 ) -> RobustOptimum:
     limit, aim_limit = pm_limits(problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
     loss = partial(_truncated, limit=limit, aim_limit=aim_limit)
@@ -243,7 +243,7 @@ def _truncated_minima(
             max_iterations=MAX_STEPS,
             tolerance=TOLERANCE,
             keep_within=keep_within,
-            best_cost=best_cost,
+            wanted=wanted,
             loss=loss,
             start=_settled(problem, state, loss),
         )
