@@ -54,9 +54,7 @@ def move_case(measurements: Measurements, model: SessionModel) -> MoveCase:
         pms=tuple(tuple(measurements.pairs[place] for place in places) for places in pms.values()),
         places=tuple(places[0] for places in pms.values()),
         inlier=np.array([inlier[pm] for pm in pms], dtype=bool),
-        state=state,
         known=None if state is None else aims_about(aims, state, model),
-        aims=measurements.aims,
     )
 
 

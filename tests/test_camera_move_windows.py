@@ -158,15 +158,14 @@ def test_screening_is_the_full_test_where_all_is_gaussian() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(10), pairs=18)
     case = move_case(measurements, model)
     assert case.inlier.all()
-    assert case.state is not None
     assert case.known is not None
     problem = pack_session(replace(measurements, aims=()), model, PLAIN)
-    parts = contributions(problem, case.state, settled_private(problem, case.state)).pm
+    parts = contributions(problem, case.known.state, settled_private(problem, case.known.state)).pm
     screened = screening(parts, case.inlier, case.known, pm_limits(problem))
     hessian = case.known.hessian + parts.hessian[0, :8].sum(axis=0)
     gradient = case.known.gradient + parts.gradient[0, :8].sum(axis=0)
     before = gaussian_of(hessian, gradient, problem.columns)
     assert before is not None
-    terms = linearise(select_pms(problem, np.arange(8, 18)), case.state)
+    terms = linearise(select_pms(problem, np.arange(8, 18)), case.known.state)
     full = move_evidence(before, terms, np.arange(10), MoveSettings(outlier_probability=1e-9))
     np.testing.assert_allclose(screened[7:], full.log_bayes, atol=1e-3)

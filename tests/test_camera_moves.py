@@ -123,17 +123,17 @@ def test_what_was_known_of_the_registration_beforehand_holds_for_the_first_pms_o
     """A motion prior on the epoch's registration must not hide an early move, whose first side it is about."""
     model, measurements, truth = moved_session(3, SHIFT, 5, 13)
     case = move_case(measurements, model)
-    assert case.state is not None
     assert case.known is not None
+    state = case.known.state
     information = np.diag([1.0 / 0.002**2] * 3 + [1.0 / 0.3**2] * 3)
-    prior = replace(case.state, rotation=truth[0].trus_T_camera[0][None, None, :3, :3])
+    prior = replace(state, rotation=truth[0].trus_T_camera[0][None, None, :3, :3])
     prior = replace(prior, translation_mm=truth[0].trus_T_camera[0][None, None, :3, 3])
     hessian, gradient = case.known.hessian.copy(), case.known.gradient.copy()
-    back = case.state.rotation[0, 0].T
+    back = state.rotation[0, 0].T
     turn = back @ prior.rotation[0, 0]
     step = np.r_[
         0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]),
-        back @ (prior.translation_mm[0, 0] - case.state.translation_mm[0, 0]),
+        back @ (prior.translation_mm[0, 0] - state.translation_mm[0, 0]),
     ]
     hessian[:6, :6] += information
     gradient[:6] -= information @ step

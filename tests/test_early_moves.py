@@ -118,7 +118,7 @@ def test_as_few_pms_on_both_sides_as_no_registration_takes_are_not_tested() -> N
 
 def test_without_an_estimate_there_is_nothing_to_test() -> None:
     model, measurements, _ = moved_session(3, BUMP, 4, 12)
-    case = replace(move_case(measurements, model), state=None, known=None)
+    case = replace(move_case(measurements, model), known=None)
     assert find_camera_move(case, model, SolveConfig()) is None
 
 

@@ -33,7 +33,7 @@ def _case(seed: int, motion: FloatArray, pairs: int, *, spoil: bool = False) -> 
     state = found.optimum.state
     known = everything_about(pack_session(found.measurements, model, replace(CONFIG, window_shape=False)), state)
     here = move_case(replace(whole, pairs=tuple(later)), model)
-    return replace(here, epoch=1, earlier={0: (state, known)}), model
+    return replace(here, epoch=1, earlier={0: known}), model
 
 
 def _closure(
@@ -79,9 +79,9 @@ def test_few_pairs_close_no_loop() -> None:
 
 def test_of_several_epochs_that_fit_the_best_known_is_used() -> None:
     case, model = _case(1, np.eye(4), 15)
-    state, known = case.earlier[0]
+    known = case.earlier[0]
     vague = replace(known, hessian=0.1 * known.hessian)
-    several = replace(case, epoch=3, earlier={0: (state, vague), 1: (state, known), 2: (state, vague)})
+    several = replace(case, epoch=3, earlier={0: vague, 1: known, 2: vague})
     found = find_camera_move(several, model, CONFIG, closure=ANY)
     assert isinstance(found, LoopClosure)
     assert (found.epoch, found.to) == (3, 1)

@@ -13,7 +13,7 @@ from fgreg.camera_moves.static_tags import (
     TagSettings,
     average_tags,
     detect_tag_move,
-    restart_detector,
+    detector_from,
     tag_motion,
 )
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform
@@ -126,7 +126,7 @@ def test_a_shift_is_found_within_ten_frames_and_its_frames_start_the_new_referen
         count += 1
     assert check.alarm
     assert check.motion is not None
-    detector = restart_detector(detector, min(count, check.frames), SETTINGS)
+    detector = detector_from(detector.recent[-min(count, check.frames) :], SETTINGS)
     for _ in range(40):
         detector, check = detect_tag_move(detector, _frame(rng, moved), SETTINGS)
         assert not check.alarm

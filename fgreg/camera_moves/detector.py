@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -34,16 +34,13 @@ from fgreg.camera_moves.whitened import POSE, gaussian_of, linearise, settled_pr
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_graph import Contributions, contributions
-from fgreg.graph.shared_state import SharedState
 from fgreg.graph.split_points import GATE, log_move_odds, logsumexp
-from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.outliers import pm_limits
 from fgreg.registration.register import SoundSpeedPrior, pack_session
-
-if TYPE_CHECKING:
-    from fgreg.smoother.shared_variables import Quadratic
+from fgreg.smoother.shared_variables import Quadratic
 
 MIN_KNOWN = 6
 """PMs that a registration takes: with fewer on either side of a split point there is nothing that could have moved."""
@@ -61,23 +58,19 @@ class MoveCase:
             its own.
         places: of each PM's first look in the session's order of pairs.
         inlier: (n,) which PMs count in the estimate.
-        state: the epoch's optimum, one hypothesis of one epoch; None where there is none, or two that cannot be told
-            apart.
-        known: what everything but this epoch's pairs says of the shared variables, priors included, about ``state``;
-            None where that is None.
-        aims: calibration shots.
-        earlier: earlier epochs that a loop may be closed to: registration when each ended, and what was known of it.
-            Empty where the motion since is known.
+        known: what everything but this epoch's pairs says of the shared variables, priors included, about the epoch's
+            optimum (one hypothesis); None where it has none, or two that cannot be told apart: only a loop is closed
+            then.
+        earlier: of the epochs that a loop may be closed to, what was known of the shared variables when each ended,
+            about its optimum. Empty where the motion since is known.
     """
 
     epoch: int
     pms: tuple[tuple[Pair, ...], ...]
     places: tuple[int, ...]
     inlier: BoolArray
-    state: SharedState | None
     known: Quadratic | None
-    aims: tuple[Aim, ...] = ()
-    earlier: dict[int, tuple[SharedState, Quadratic]] = field(default_factory=dict)
+    earlier: dict[int, Quadratic] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,12 +235,12 @@ def _loop_closure(case: MoveCase, packed: Pack, settings: LoopClosureSettings) -
     problem = packed(case.pms, shapes=True)
     best: LoopClosure | None = None
     for epoch in sorted(case.earlier)[-CANDIDATES:]:
-        state, known = case.earlier[epoch]
+        known = case.earlier[epoch]
         earlier = gaussian_of(known.hessian, known.gradient, problem.columns)
         if earlier is None:
             continue
         log_bayes = log_bayes_of_same_place(
-            earlier, linearise(problem, state), settings, relinearisation(problem, state)
+            earlier, linearise(problem, known.state), settings, relinearisation(problem, known.state)
         )
         if log_bayes >= settings.accept and (best is None or log_bayes > best.log_bayes):
             best = LoopClosure(case.epoch, epoch, log_bayes)

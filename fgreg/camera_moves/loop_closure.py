@@ -14,6 +14,7 @@ import numpy as np
 
 from fgreg.camera_moves.bayes_filter import MoveSettings, Relinearise, move_evidence
 from fgreg.camera_moves.whitened import POSE, Gaussian, WhitenedPms
+from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.split_points import MoveScales
 from fgreg.model.measurements import EpochStart
 
@@ -68,9 +69,8 @@ def log_bayes_of_same_place(
     covariance = earlier.covariance.copy()
     covariance[POSE, POSE] += _spread(settings)
     before = replace(earlier, covariance=covariance)
-    return -float(
-        move_evidence(before, terms, np.zeros(1, dtype=np.int64), settings.elsewhere, relinearise).log_bayes[0]
-    )
+    first = np.zeros(1, dtype=np.int64)
+    return -float(move_evidence(before, terms, first, settings.elsewhere, relinearise).log_bayes[0])
 
 
 def back_to(start: EpochStart, epoch: int, settings: LoopClosureSettings | None = None) -> EpochStart:
@@ -78,5 +78,5 @@ def back_to(start: EpochStart, epoch: int, settings: LoopClosureSettings | None 
     return EpochStart(start.t, np.eye(4), _spread(settings or LoopClosureSettings()), epoch)
 
 
-def _spread(settings: LoopClosureSettings) -> np.ndarray:
-    return np.diag(np.repeat(settings.tolerance, 3) ** 2)
+def _spread(settings: LoopClosureSettings) -> FloatArray:
+    return np.asarray(np.diag(np.repeat(settings.tolerance, 3) ** 2))

@@ -7,6 +7,10 @@ by its chi square of 6 degrees of freedom, given the covariance of the detection
 Detection errors are not independent from frame to frame: a share of their variance (lens, print, view) stays while
 nothing moves. Averaging n frames leaves ``share + (1 - share) / n`` of the variance, on either side of the comparison.
 Errors common to all tags look like a motion; nothing here can tell them from one.
+
+While a camera is being moved, frames show it anywhere on its way. So an alarm only ends the epoch, which makes the
+estimate say that it has no registration; the motion that ties the new epoch to the old one is measured on frames that
+agree with each other, against the reference of before.
 """
 
 from __future__ import annotations
@@ -23,6 +27,10 @@ from fgreg.model.measurements import POSE_FLOOR, usable_covariance
 TAG_P = 1e-3
 """A tag that fits a common motion worse than this goes its own way."""
 ROUNDS = 4
+REST = 6
+"""Frames at rest that a motion is measured on."""
+REST_P = 0.05
+"""Two halves of these differ by more than chance has it with this probability: then it is not sure to rest yet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,7 +216,7 @@ def _majority(both: _Both, limit: float) -> tuple[FloatArray, FloatArray, BoolAr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagMoveDetector:
-    """State of the watch: frames of the reference, and those since."""
+    """Frames of the epoch's start with the tags' mean poses in them, and the last frames."""
 
     reference: tuple[TagFrame, ...] = ()
     recent: tuple[TagFrame, ...] = ()
@@ -227,7 +235,7 @@ class TagCheck:
 def detect_tag_move(
     detector: TagMoveDetector, frame: TagFrame, settings: TagSettings
 ) -> tuple[TagMoveDetector, TagCheck]:
-    """Take in a frame and test. After an alarm the caller goes on from :func:`restart_detector`."""
+    """Take in a frame and test. After an alarm the caller goes on from :func:`detector_from`."""
     longest = max(settings.windows)
     recent = (*detector.recent, usable_frame(frame))
     reference, means = detector.reference, detector.means
@@ -260,7 +268,76 @@ def _on_its_way(means: Mapping[int, TagPose], recent: Sequence[TagFrame], settin
     return TagCheck(True, off[-1], len(few)) if len(off) == len(few) else None
 
 
-def restart_detector(detector: TagMoveDetector, frames: int, settings: TagSettings) -> TagMoveDetector:
-    """After an accepted move: the last ``frames`` frames become the reference of the new epoch."""
-    reference = detector.recent[-frames:] if frames else ()
-    return TagMoveDetector(reference, (), average_tags(reference, settings.constant_share) if reference else {})
+def detector_from(frames: Sequence[TagFrame], settings: TagSettings) -> TagMoveDetector:
+    """The detector of an epoch that begins with some frames."""
+    return TagMoveDetector(tuple(frames), (), average_tags(frames, settings.constant_share))
+
+
+# --- epochs by tags ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class TagsMoved:
+    """The camera has left its place: at ``since_t`` or a frame before."""
+
+    since_t: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagsAtRest:
+    """The camera stands again: its motion (4, 4) since the alarm's epoch began, and its covariance (6, 6)."""
+
+    camera_new_T_camera_old: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TagMonitor:
+    """What is carried from frame to frame, a value.
+
+    Attributes:
+        detector: of the current epoch.
+        times: of its recent frames.
+        before: mean poses of the epoch before, while the camera has not come to rest since an alarm.
+        moving: frames since then.
+    """
+
+    detector: TagMoveDetector = field(default_factory=TagMoveDetector)
+    times: tuple[float, ...] = ()
+    before: Mapping[int, TagPose] = field(default_factory=dict)
+    moving: tuple[TagFrame, ...] = ()
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether an alarm's motion is still to be measured."""
+        return bool(self.before)
+
+
+def monitored(
+    monitor: TagMonitor, t: float, frame: TagFrame, settings: TagSettings
+) -> tuple[TagMonitor, TagsMoved | TagsAtRest | None]:
+    """Take in one frame, and what it says: an alarm at once, the motion as soon as the camera stands still again."""
+    if monitor.is_moving:
+        return _until_rest(monitor, frame, settings)
+    detector, check = detect_tag_move(monitor.detector, frame, settings)
+    times = (*monitor.times, t)[-len(detector.recent) :]
+    if not check.alarm:
+        return TagMonitor(detector, times), None
+    since = times[-min(check.frames, len(times))]
+    return TagMonitor(before=detector.means, moving=(usable_frame(frame),)), TagsMoved(since)
+
+
+def _until_rest(monitor: TagMonitor, frame: TagFrame, settings: TagSettings) -> tuple[TagMonitor, TagsAtRest | None]:
+    moving = (*monitor.moving, usable_frame(frame))[-REST:]
+    going_on = TagMonitor(before=monitor.before, moving=moving)
+    if len(moving) < REST:
+        return going_on, None
+    # What stays of the detections' errors is common to both halves: only the rest may make them differ.
+    first, second = (average_tags(half, 0.0) for half in (moving[: REST // 2], moving[REST // 2 :]))
+    between = tag_motion(first, second)
+    if between is None or between.chi2 > float(chdtri(6, REST_P)):
+        return going_on, None
+    motion = tag_motion(monitor.before, average_tags(moving, settings.constant_share))
+    if motion is None:
+        return going_on, None
+    return TagMonitor(detector_from(moving, settings)), TagsAtRest(motion.camera_new_T_camera_old, motion.covariance)

@@ -116,7 +116,7 @@ def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -
     bordered[..., 6, 6] = bound
     try:  # a third of the time that solving takes; the last pivot is what the form leaves of its bound
         pivot = np.linalg.cholesky(bordered).diagonal(axis1=-2, axis2=-1)
-    except np.linalg.LinAlgError:  # rows that were linearised elsewhere can say more than is known
+    except np.linalg.LinAlgError:  # where hardly anything is known, F is a small difference of large numbers
         spread = np.eye(6) + prior @ information[:, None]
         shrunk = np.linalg.solve(spread, prior @ pull[:, None, :, None])[..., 0]
         return np.asarray(0.5 * (np.sum(pull[:, None] * shrunk, axis=-1) - np.linalg.slogdet(spread)[1]))

@@ -22,10 +22,9 @@ import numpy as np
 
 from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase, find_camera_move
 from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
-from fgreg.camera_moves.static_tags import TagSettings
+from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, make_transform, rotation_to_direction
-from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
@@ -36,7 +35,6 @@ from fgreg.online.event_checks import check
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
 from fgreg.online.solver import Where, make_solver
-from fgreg.online.tag_check import TagMonitor, TagsAtRest, TagsMoved, monitored
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.register import EpochSearch, Minimum, SoundSpeedPrior
 from fgreg.registration.solve import Solution, solve
@@ -173,7 +171,7 @@ class OnlineRegistration:
         """What a frame of static tags says, and the tags' state after it."""
         if not (isinstance(event, StaticTags) and self._find_moves):
             return self._tags, None
-        return monitored(self._tags, event, TagSettings())
+        return monitored(self._tags, event.t, TagFrame(event.camera_T_tag, event.covariance), TagSettings())
 
     def _next(self, event: OnlineEvent, found: TagsMoved | TagsAtRest | None) -> State:
         state, setting = self._state, self._setting
@@ -315,13 +313,11 @@ class OnlineRegistration:
             pms=tuple(tuple(state.shots[place].pair for place in places) for places in looks.values()),
             places=tuple(places[0] for places in looks.values()),
             inlier=np.array([state.shots[places[0]].inlier for places in looks.values()], dtype=bool),
-            state=active.state if active is not None and sound else None,
             known=state.carried.at(active.state, self._setting.columns) if active and state.carried and sound else None,
-            aims=state.aims,
             earlier=self._earlier(state.epoch) if state.epoch_pairs <= MOST_LOOKS else {},
         )
 
-    def _earlier(self, to: int) -> dict[int, tuple[SharedState, Quadratic]]:
+    def _earlier(self, to: int) -> dict[int, Quadratic]:
         """Registrations of the epochs before one, that the camera may be back to; none where the motion is known."""
         state = self._state
         if state.epochs[to].start.motion_known:
@@ -331,7 +327,7 @@ class OnlineRegistration:
             pms = {shot.label for shot in state.shots if shot.pair.epoch == k}
             if epoch.state is not None and epoch.covariance is not None and len(pms) >= MIN_EARLIER:
                 information = np.asarray(np.linalg.inv(epoch.covariance))
-                out[k] = (epoch.state, Quadratic(epoch.state, 0.0, np.zeros(len(information)), information))
+                out[k] = Quadratic(epoch.state, 0.0, np.zeros(len(information)), information)
         return out
 
     def _take_over(self, found: FullSolveResult) -> None:
@@ -429,7 +425,7 @@ class OnlineRegistration:
             pms = [tuple(shots[place].pair for place in places) for places in looks_by_pm(shots).values()]
             for size in sorted({min(count, len(pms)) for count in LOOP_PMS}, reverse=True) if earlier else ():
                 inlier = np.ones(size, dtype=bool)
-                case = MoveCase(epoch, tuple(pms[:size]), tuple(range(size)), inlier, None, None, state.aims, earlier)
+                case = MoveCase(epoch, tuple(pms[:size]), tuple(range(size)), inlier, None, earlier)
                 found = find_camera_move(case, self._model, self._config, self._prior)
                 if isinstance(found, LoopClosure):
                     epochs = list(self._state.epochs)

@@ -1,4 +1,4 @@
-"""Untold camera moves in a recorded session: what the online engine finds out, going through it event by event."""
+"""Unreported camera moves in a recorded session: what the online engine finds, event by event."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fgreg.registration.register import SoundSpeedPrior
 
 @dataclass(frozen=True, slots=True)
 class EpochsFound:
-    """What nobody told of the camera's epochs: moves, and that it is back (its epochs with the moves counted in)."""
+    """Unreported camera moves, and loop closures (their epochs count with the moves)."""
 
     moves: tuple[DetectedMove, ...] = ()
     loop_closures: tuple[DetectedLoopClosure, ...] = ()
@@ -39,7 +39,7 @@ def find_epochs(
     config: SolveConfig,
     sound_speed_prior: SoundSpeedPrior | None = None,
 ) -> EpochsFound:
-    """What nobody told, in the order of time: what the online engine finds in the same events.
+    """Unreported moves and loop closures in the order of time: what the online engine finds in the same events.
 
     None are found in sessions that there is no online form of (``config.estimate_radius``).
     """
@@ -65,7 +65,7 @@ def find_epochs(
 
 
 def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, OnlineEvent]]:
-    """Aims, pairs (with their index) and told moves in the order of time; a move before what happened at its time."""
+    """Aims, pairs (with their index) and reported moves in the order of time; of the same time moves first."""
     timed: list[tuple[float, int, int, int | None, OnlineEvent]] = []
     for place, start in enumerate(measurements.epochs[1:]):
         moved = CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance)
@@ -79,7 +79,7 @@ def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, On
 def split_epochs(
     measurements: Measurements, moves: Sequence[DetectedMove], loop_closures: Sequence[DetectedLoopClosure] = ()
 ) -> Measurements:
-    """The measurements with an epoch more for every move found; motions told before stay between their sides.
+    """The measurements with an epoch more for every move found; reported motions stay between their sides.
 
     Epochs in which the camera is back are tied to those that it is back to.
 
@@ -102,15 +102,15 @@ def split_epochs(
 
 
 def _with_moves(epoch: int, index: int, places: Sequence[tuple[int, int]]) -> int:
-    """Epoch of what happened at ``index``, counting moves told as (epoch, index) too."""
+    """Epoch of what happened at ``index``, counting also moves given as (epoch, index)."""
     return epoch + sum(of < epoch or (of == epoch and at <= index) for of, at in places)
 
 
 def renumbered(epoch_of: Sequence[int], shots: Sequence[int], moves: Sequence[DetectedMove]) -> tuple[int, ...]:
-    """Epochs of all events of a session with the moves told.
+    """Epochs of all events of a session with the moves that were found.
 
     Args:
-        epoch_of: epoch of every event, as told.
+        epoch_of: epoch of every event, as reported.
         shots: index among the events of every pair that was measured.
         moves: found among those pairs.
     """
