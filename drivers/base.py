@@ -21,9 +21,10 @@ programs turn it through ``fgreg.stage.client.StageLink``.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,6 +40,7 @@ __all__ = [
     "BmodeSource",
     "CommandKind",
     "DeviceLost",
+    "DriverContext",
     "MotionSample",
     "MotionSource",
     "Operator",
@@ -241,3 +243,22 @@ class TransformSink(Device, Protocol):
 
     def send(self, registration: Registration) -> None:
         """Hand it on; where the receiver is slow only the newest is kept. Raises DeviceLost."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriverContext:
+    """What drivers are given besides their options.
+
+    Attributes:
+        say: shows one line to the operator.
+        corners: columns and rows of the board's inner corners.
+        rectified: fgreg.drivers.rectification.Rectification of the endoscope's pictures, where that is wanted.
+        room: socket of the simulated room, where there is one.
+        paces: of recordings that play together; filled by the drivers.
+    """
+
+    say: Callable[[str], None]
+    corners: tuple[int, int] | None = None
+    rectified: Any = None
+    room: Path | None = None
+    paces: dict[tuple[Path, float], Any] = field(default_factory=dict)

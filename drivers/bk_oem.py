@@ -17,7 +17,7 @@ import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,10 @@ from fgreg.drivers.base import BmodeFrame, Stamp
 from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
 from fgreg.errors import InputError, one_line
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import BmodeSource, DriverContext
+    from fgreg.drivers.options import BkOptions
 
 PORT = 7915
 START, END, ESCAPE = b"\x01", b"\x04", b"\x1b"
@@ -273,3 +277,8 @@ def _numbers(text: str, count: int) -> tuple[float, ...]:
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"not {count} numbers: {one_line(text, 60)}")
     return numbers
+
+
+def open_scanner(_context: DriverContext, options: BkOptions) -> BmodeSource:
+    """Pictures of a BK scanner."""
+    return BkOemScanner(Endpoint(options.host, options.port), options.rate_hz, options.silent_s, options.flip)

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -29,6 +30,10 @@ from fgreg.drivers.rectification import Rectification
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Origin, Timing, VideoInput
 from fgreg.errors import InputError
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import DriverContext, StereoCamera
+    from fgreg.drivers.options import EndoscopeOptions
 
 _VIDEO_DEVICE = re.compile(r"/dev/video[0-9]+")
 _STREAM = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://")
@@ -342,3 +347,33 @@ def video_devices(known: Path = Path("/sys/class/video4linux")) -> list[tuple[st
             label = ""
         out.append((f"/dev/{entry.name}", label))
     return out
+
+
+def endoscope_config(options: EndoscopeOptions) -> EndoscopeConfig:
+    """The endoscope's configuration. Raises ValueError: values that do not fit together."""
+
+    def one(source: str) -> InputConfig:
+        return InputConfig(
+            source,
+            options.width,
+            options.height,
+            options.fps,
+            options.fourcc,
+            options.loop,
+            options.delay_s,
+            options.silence_s,
+        )
+
+    right = None if options.right is None else one(options.right)
+    layout = Layout(options.layout) if options.layout else (Layout.MONO if right is None else Layout.SEPARATE)
+    if options.swap and layout in (Layout.MONO, Layout.SEPARATE):
+        raise ValueError(f"swap is for frames that hold both views; layout is {layout}")
+    fields = Fields(options.fields)
+    return EndoscopeConfig(
+        one(options.left), right, layout, options.swap, fields, options.max_gap_s, options.by_arrival
+    )
+
+
+def open_endoscope(context: DriverContext, options: EndoscopeOptions) -> StereoCamera:
+    """One or two video inputs."""
+    return Endoscope(endoscope_config(options), context.rectified)

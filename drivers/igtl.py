@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,10 @@ from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import inverse, is_rigid, make_transform, nearest_rotation
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import BmodeSource, DriverContext, MotionSource, PhotoacousticSource, TransformSink
+    from fgreg.drivers.options import Connection, IgtlBmodeOptions, IgtlMotionOptions, IgtlProbeOptions, IgtlSinkOptions
 
 SILENT_S = 0.8
 """A stream that stops for this long counts as lost, unless told otherwise: it is said within a second."""
@@ -244,3 +249,30 @@ class IgtlTransformSink(_IgtlDevice):
 
 def _stamp(message: Message) -> Stamp:
     return Stamp(message.host_s if message.sent_s is None else message.sent_s, message.host_s)
+
+
+def open_photoacoustic(_context: DriverContext, options: IgtlProbeOptions) -> PhotoacousticSource:
+    """Images over OpenIGTLink, one for each laser pulse."""
+    return IgtlPhotoacoustic(endpoint(options), options.device, options.transposed, options.silent_s)
+
+
+def open_bmode(_context: DriverContext, options: IgtlBmodeOptions) -> BmodeSource:
+    """B-mode images over OpenIGTLink."""
+    origin_mm = None if options.x_mm is None else (options.depth_mm, options.x_mm)
+    return IgtlBmode(endpoint(options), options.device, options.silent_s, origin_mm, options.flip)
+
+
+def open_motion(_context: DriverContext, options: IgtlMotionOptions) -> MotionSource:
+    """Transforms of the endoscope's holder."""
+    return IgtlMotion(endpoint(options), options.device, options.inverted, options.silent_s)
+
+
+def open_sink(_context: DriverContext, options: IgtlSinkOptions) -> TransformSink:
+    """Whoever takes the registration."""
+    names = DeviceNames(options.registration, options.plane, options.status, options.verdict)
+    return IgtlTransformSink(endpoint(options), names, options.header_version)
+
+
+def endpoint(options: Connection) -> Endpoint:
+    """Where the peer is, or where to wait for it."""
+    return Endpoint(options.host, options.port, options.listen)

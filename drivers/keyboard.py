@@ -12,9 +12,14 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand
 from fgreg.drivers.operator_words import asked, understand
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import DriverContext, Operator
+    from fgreg.drivers.options import NoOptions
 
 MOST_WAITING = 64
 MAX_LINE_BYTES = 1000
@@ -144,3 +149,16 @@ def _in_foreground(fd: int) -> bool:
         return not os.isatty(fd) or os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:  # a terminal that does not control this program, or has hung up: reading does no harm
         return True
+
+
+def open_keyboard(context: DriverContext, _options: NoOptions) -> Operator:
+    """Whoever sits at the terminal."""
+    return KeyboardOperator(context.say, corners=context.corners)
+
+
+def ask_keyboard(_context: DriverContext, _options: NoOptions) -> str:
+    """What standard input is; nothing is read. Raises DeviceLost where it is closed."""
+    fd = standard_input()
+    if fd is None:
+        raise DeviceLost("standard input is closed")
+    return "standard input, a terminal" if os.isatty(fd) else "standard input, not a terminal"

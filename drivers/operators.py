@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand
-from fgreg.drivers.igtl import IgtlReceiver
+from fgreg.drivers.igtl import IgtlReceiver, endpoint
 from fgreg.drivers.igtl_messages import Text, check_name, pack_text
 from fgreg.drivers.operator_words import asked, understand
 from fgreg.drivers.tcp_link import Endpoint
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import DriverContext
+    from fgreg.drivers.options import IgtlOperatorOptions
 
 
 class IgtlOperator(IgtlReceiver):
@@ -109,3 +114,8 @@ class Operators:
         """Let go of all."""
         for operator in self._operators:
             operator.close()
+
+
+def open_operator(context: DriverContext, options: IgtlOperatorOptions) -> Operator:
+    """Texts over OpenIGTLink."""
+    return IgtlOperator(endpoint(options), options.device, options.answers, context.corners)

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import Grabbed
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, adjoint, as_float_array, inverse
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import DriverContext, MotionSource, StereoCamera
+    from fgreg.drivers.options import RecordedCameraOptions, RecordedMotionOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,3 +230,34 @@ class RecordedCamera:
     def close(self) -> None:
         """Close the file."""
         self._player.close()
+
+
+def check_camera(options: RecordedCameraOptions) -> None:
+    """Raises InputError: no recording, or no such images in it."""
+    RecordedCamera(options.path, options.left, options.right, max_gap_s=options.max_gap_s).close()
+
+
+def open_camera(context: DriverContext, options: RecordedCameraOptions) -> StereoCamera:
+    """Images of a ROS 2 recording."""
+    pace = _pace(context, options.path, options.speed)
+    return RecordedCamera(options.path, options.left, options.right, pace, options.max_gap_s)
+
+
+def check_motion(options: RecordedMotionOptions) -> None:
+    """Raises InputError: no recording, or no such poses in it."""
+    RecordedMotion(options.path, options.topic, options.tip_T_camera).close()
+
+
+def open_motion(context: DriverContext, options: RecordedMotionOptions) -> MotionSource:
+    """Poses of a ROS 2 recording."""
+    pace = _pace(context, options.path, options.speed)
+    return RecordedMotion(options.path, options.topic, options.tip_T_camera, pace)
+
+
+def _pace(context: DriverContext, path: Path, speed: float) -> Pace:
+    """One for all that play a recording, from the first of them on."""
+    key = (path.resolve(), speed)
+    if key not in context.paces:
+        context.paces[key] = Pace.of(path, speed)
+    pace: Pace = context.paces[key]
+    return pace

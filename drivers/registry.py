@@ -1,6 +1,7 @@
-"""The drivers that a configuration can name, by role: options, factory, and the extra that their library comes with.
+"""The registry of drivers: what a configuration can name, by role, with options, factory, and the extra it needs.
 
-A driver's module is imported when it is opened, not before: nothing here needs a device library.
+CONFIG.yaml, its example, its JSON Schema, README's table and ``fgreg devices`` are made from :data:`ENTRIES`. A
+driver's module is imported when it is opened, not before: nothing here needs a device library.
 """
 
 from __future__ import annotations
@@ -8,12 +9,13 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, cast
 
 from fgreg.drivers import options
+from fgreg.drivers.base import DriverContext
 from fgreg.errors import InputError, MissingExtraError, one_line
 from fgreg.schema.kinds import JsonSchema, Kind, Text
 from fgreg.schema.problems import FieldError, Problem, nearest, shown
@@ -44,25 +46,6 @@ _DISTRIBUTIONS = {"serial": "pyserial"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DriverContext:
-    """What drivers are given besides their options.
-
-    Attributes:
-        say: shows one line to the operator.
-        corners: columns and rows of the board's inner corners.
-        rectified: fgreg.drivers.rectification.Rectification of the endoscope's pictures, where that is wanted.
-        room: socket of the simulated room, where there is one.
-        paces: of recordings that play together; filled by the drivers.
-    """
-
-    say: Callable[[str], None]
-    corners: tuple[int, int] | None = None
-    rectified: Any = None
-    room: Path | None = None
-    paces: dict[tuple[Path, float], Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class DriverEntry:
     """One driver of one role.
 
@@ -70,13 +53,13 @@ class DriverEntry:
         role, name: what a configuration calls it.
         help: one line.
         options: class of its keys (fgreg.drivers.options).
-        factory: ``package.module:function``, called with DriverContext and the options; of a stage, as
+        factory: ``module:function`` in fgreg.drivers, called with DriverContext and the options; of a stage, as
             ``fgreg.stage.watchdog`` calls it.
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
-        check: ``package.module:function``, called with the options: raises InputError, ValueError, opens no device.
-        ask: ``package.module:function``, called with DriverContext and the options: says what is there, or raises; of
-            devices that are not to be opened only to see whether they answer.
+        check: ``module:function``, called with the options: raises InputError, ValueError, opens no device.
+        ask: ``module:function``, called with DriverContext and the options: says what is there, or raises; of devices
+            that are not to be opened only to see whether they answer.
     """
 
     role: Role
@@ -125,119 +108,160 @@ def distribution(extra: str) -> str:
     return _DISTRIBUTIONS.get(module, module)
 
 
-def load(dotted: str) -> Callable[..., Any]:
-    """The function that ``package.module:name`` names."""
-    module, _, name = dotted.partition(":")
-    return cast("Callable[..., Any]", getattr(importlib.import_module(module), name))
-
-
-_HERE = "fgreg.drivers.factories"
-
-
-def _simulated(role: Role, help_text: str, factory: str, ask: str | None = None) -> DriverEntry:
-    keys = options.RoomStageOptions if role is Role.STAGE else options.NoOptions
-    return DriverEntry(role, "simulated", help_text, keys, factory, room=True, ask=ask)
+def load(place: str) -> Callable[..., Any]:
+    """The function that ``module:name`` names, a module of fgreg.drivers."""
+    module, _, name = place.partition(":")
+    return cast("Callable[..., Any]", getattr(importlib.import_module(f"fgreg.drivers.{module}"), name))
 
 
 ENTRIES: tuple[DriverEntry, ...] = (
     DriverEntry(
         Role.CAMERA,
         "endoscope",
-        "one or two video inputs",
+        "one or two video inputs: V4L2 devices, streams, files, picture folders",
         options.EndoscopeOptions,
-        f"{_HERE}:endoscope",
-        check=f"{_HERE}:check_endoscope",
+        "endoscope:open_endoscope",
+        check="endoscope:endoscope_config",
     ),
     DriverEntry(
         Role.CAMERA,
         "recorded",
         "images of a ROS 2 recording",
         options.RecordedCameraOptions,
-        f"{_HERE}:recorded_camera",
-        "ros",
-        check=f"{_HERE}:check_recorded_camera",
+        "recorded_devices:open_camera",
+        extra="ros",
+        check="recorded_devices:check_camera",
     ),
-    _simulated(Role.CAMERA, "of the simulated room", f"{_HERE}:simulated_camera"),
+    DriverEntry(
+        Role.CAMERA,
+        "simulated",
+        "of the simulated room",
+        options.NoOptions,
+        "simulated:open_camera",
+        room=True,
+    ),
     DriverEntry(
         Role.PHOTOACOUSTIC,
         "igtl",
         "images of PLUS or a scanner over OpenIGTLink, one for each laser pulse",
         options.IgtlProbeOptions,
-        f"{_HERE}:igtl_photoacoustic",
-        "igtl",
+        "igtl:open_photoacoustic",
+        extra="igtl",
     ),
-    _simulated(Role.PHOTOACOUSTIC, "of the simulated room", f"{_HERE}:simulated_probe"),
+    DriverEntry(
+        Role.PHOTOACOUSTIC,
+        "simulated",
+        "of the simulated room",
+        options.NoOptions,
+        "simulated:open_probe",
+        room=True,
+    ),
     DriverEntry(
         Role.STAGE,
         "thorlabs",
         "PRM1Z8 on a KDC101 or TDC001",
         options.ThorlabsOptions,
-        "fgreg.drivers.thorlabs_stage:open_stage",
-        "stage",
-        ask=f"{_HERE}:ask_thorlabs",
+        "thorlabs_stage:open_stage",
+        extra="stage",
+        ask="thorlabs_identify:ask_stage",
     ),
-    _simulated(Role.STAGE, "of the simulated room", "fgreg.drivers.simulated:open_stage", f"{_HERE}:ask_room_stage"),
+    DriverEntry(
+        Role.STAGE,
+        "simulated",
+        "of the simulated room",
+        options.RoomStageOptions,
+        "simulated:open_stage",
+        room=True,
+        ask="simulated:ask_stage",
+    ),
     DriverEntry(
         Role.STAGE,
         "stand-in",
         "a simulated stage beside real devices, for rehearsals: nothing turns",
         options.StandInOptions,
-        "fgreg.drivers.simulated_stage:open_stage",
-        ask=f"{_HERE}:ask_stand_in",
+        "simulated_stage:open_stage",
+        ask="simulated_stage:ask_stage",
     ),
     DriverEntry(
         Role.MOTION,
         "igtl",
         "transforms of the endoscope's holder over OpenIGTLink",
         options.IgtlMotionOptions,
-        f"{_HERE}:igtl_motion",
-        "igtl",
+        "igtl:open_motion",
+        extra="igtl",
     ),
     DriverEntry(
         Role.MOTION,
         "recorded",
         "poses of a ROS 2 recording",
         options.RecordedMotionOptions,
-        f"{_HERE}:recorded_motion",
-        "ros",
-        check=f"{_HERE}:check_recorded_motion",
+        "recorded_devices:open_motion",
+        extra="ros",
+        check="recorded_devices:check_motion",
     ),
-    _simulated(Role.MOTION, "the endoscope's holder in the simulated room", f"{_HERE}:simulated_motion"),
+    DriverEntry(
+        Role.MOTION,
+        "simulated",
+        "the endoscope's holder in the simulated room",
+        options.NoOptions,
+        "simulated:open_motion",
+        room=True,
+    ),
     DriverEntry(
         Role.BMODE,
         "igtl",
         "B-mode images over OpenIGTLink",
         options.IgtlBmodeOptions,
-        f"{_HERE}:igtl_bmode",
-        "igtl",
+        "igtl:open_bmode",
+        extra="igtl",
     ),
-    DriverEntry(Role.BMODE, "bk", "a BK scanner over its OEM interface", options.BkOptions, f"{_HERE}:bk_bmode"),
-    _simulated(Role.BMODE, "of the simulated room", f"{_HERE}:simulated_scanner"),
+    DriverEntry(
+        Role.BMODE,
+        "bk",
+        "a BK scanner over its OEM interface",
+        options.BkOptions,
+        "bk_oem:open_scanner",
+    ),
+    DriverEntry(
+        Role.BMODE,
+        "simulated",
+        "of the simulated room",
+        options.NoOptions,
+        "simulated:open_scanner",
+        room=True,
+    ),
     DriverEntry(
         Role.SINKS,
         "igtl",
         "3D Slicer, PLUS: takes the registration over OpenIGTLink",
         options.IgtlSinkOptions,
-        f"{_HERE}:igtl_sink",
-        "igtl",
+        "igtl:open_sink",
+        extra="igtl",
     ),
     DriverEntry(
         Role.OPERATOR,
         "keyboard",
         "whoever sits at the terminal",
         options.NoOptions,
-        f"{_HERE}:keyboard",
-        ask=f"{_HERE}:ask_keyboard",
+        "keyboard:open_keyboard",
+        ask="keyboard:ask_keyboard",
     ),
     DriverEntry(
         Role.OPERATOR,
         "igtl",
         "texts over OpenIGTLink: a foot switch, a button in 3D Slicer",
         options.IgtlOperatorOptions,
-        f"{_HERE}:igtl_operator",
-        "igtl",
+        "operators:open_operator",
+        extra="igtl",
     ),
-    _simulated(Role.OPERATOR, "the surgeon of the simulated room", f"{_HERE}:simulated_operator"),
+    DriverEntry(
+        Role.OPERATOR,
+        "simulated",
+        "the surgeon of the simulated room",
+        options.NoOptions,
+        "simulated:open_operator",
+        room=True,
+    ),
 )
 """All of them; the first of a role is the one that examples show."""
 

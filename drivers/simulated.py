@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 
@@ -40,9 +40,21 @@ from fgreg.errors import FgregError
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.session_model import StageModel
 from fgreg.model.time_sync import Stamp
+from fgreg.simulation.config import default_stage
 from fgreg.simulation.room import BUMP_EVERY_S
 from fgreg.stage.interface import MAX_CALL_S, StageLost, StageStatus
 from fgreg.workers.worker_process import Work, WorkerProcess
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import (
+        BmodeSource,
+        DriverContext,
+        MotionSource,
+        Operator,
+        PhotoacousticSource,
+        StereoCamera,
+    )
+    from fgreg.drivers.options import NoOptions, RoomStageOptions
 
 AGAIN_S = 0.2
 """Between attempts to connect."""
@@ -355,3 +367,45 @@ def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:
             return False
         time.sleep(0.01)
     return True
+
+
+def open_camera(context: DriverContext, _options: NoOptions) -> StereoCamera:
+    """The simulated room's endoscope."""
+    return SimulatedCamera(_room(context))
+
+
+def open_probe(context: DriverContext, _options: NoOptions) -> PhotoacousticSource:
+    """The simulated room's laser and ultrasound machine."""
+    return SimulatedProbe(_room(context))
+
+
+def open_motion(context: DriverContext, _options: NoOptions) -> MotionSource:
+    """The simulated room's endoscope holder."""
+    return SimulatedMotion(_room(context))
+
+
+def open_scanner(context: DriverContext, _options: NoOptions) -> BmodeSource:
+    """The simulated room's ultrasound pictures."""
+    return SimulatedScanner(_room(context))
+
+
+def open_operator(context: DriverContext, _options: NoOptions) -> Operator:
+    """The simulated room's surgeon."""
+    return SimulatedOperator(_room(context))
+
+
+def ask_stage(context: DriverContext, _options: RoomStageOptions) -> str:
+    """Where the simulated room's stage stands. Raises StageLost."""
+    stage = RoomStage(default_stage(), _room(context))
+    try:
+        status = stage.status()
+    finally:
+        stage.close()
+    zero = "knows its zero position" if status.homed else "has to find its zero position"
+    return f"stands at {math.degrees(status.scan_rad):.1f} deg by its own account, {zero}"
+
+
+def _room(context: DriverContext) -> Path:
+    if context.room is None:
+        raise AssertionError("a device of the simulated room, and no room")
+    return context.room

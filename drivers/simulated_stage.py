@@ -10,10 +10,15 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from fgreg.model.session_model import StageModel
 from fgreg.model.time_sync import Stamp
 from fgreg.stage.interface import StageLost, StageStatus
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import DriverContext
+    from fgreg.drivers.options import StandInOptions
 
 _STEP_S = 1e-3
 _STANDS_RAD_S = 1e-9
@@ -154,3 +159,8 @@ def open_stage(model: StageModel, **options: float) -> SimulatedStage:
         acceleration_rad_s2=math.radians(options.pop("acceleration_deg_s2", 25.0)),
         **options,  # type: ignore[arg-type]
     )
+
+
+def ask_stage(_context: DriverContext, _options: StandInOptions) -> str:
+    """Nobody is there."""
+    return "simulated: nothing turns"

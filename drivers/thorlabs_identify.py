@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from fgreg.drivers import thorlabs_apt
-from fgreg.drivers.thorlabs_stage import ASK_AGAIN_S, COUNTS_PER_RAD, MODELS, open_port
+from fgreg.drivers.thorlabs_stage import ASK_AGAIN_S, COUNTS_PER_RAD, MODELS, only_port, open_port
 from fgreg.stage.interface import StageError, StageLost
+
+if TYPE_CHECKING:
+    from fgreg.drivers.base import DriverContext
+    from fgreg.drivers.options import ThorlabsOptions
 
 ANSWER_S = 1.0
 """How long a cube may take for both answers."""
@@ -78,3 +83,8 @@ def identify(port: str) -> CubeIdentity:
         angle,
         bool(status.bits & thorlabs_apt.HOMED_BIT),
     )
+
+
+def ask_stage(_context: DriverContext, options: ThorlabsOptions) -> str:
+    """What a cube says of itself; nothing moves. Raises StageError: nobody answers, or somebody else."""
+    return str(identify(options.port or only_port()))

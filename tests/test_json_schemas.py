@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
 from fgreg.cli.schema import Document, document_schema
+from fgreg.drivers.registry import ENTRIES
 from fgreg.errors import InputError
 from fgreg.live.config import read_config
 from fgreg.live.config_keys import example_config
@@ -29,7 +30,7 @@ SCHEMAS = {document: document_schema(document) for document in Document}
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "sessions"
 TABLES = runpy.run_path(str(ROOT / "tools" / "make_format_tables.py"))
-PAGE: Path = TABLES["PAGE"]
+PAGE: Path = TABLES["PAGES"][1]
 
 
 def accepts(document: Document, value: Any) -> bool:
@@ -176,6 +177,12 @@ def test_no_config_that_the_reader_takes_is_refused(tmp_path_factory: Any, data:
     path = live_configs.write(tmp_path_factory.mktemp("live"), dumped(data).decode())
     if not isinstance(outcome(lambda: read_config(path)), InputError) and taken(data, dumped(data)):
         assert accepts(Document.LIVE, data)
+
+
+def test_the_readme_has_the_drivers_of_today() -> None:
+    page = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert TABLES["with_tables"](page) == page, "run python tools/make_format_tables.py"
+    assert all(f"| `{entry.role}` | `{entry.name}` |" in page for entry in ENTRIES)
 
 
 def test_the_format_page_has_the_tables_of_today() -> None:

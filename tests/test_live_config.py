@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import math
 import socket
 import subprocess
@@ -16,8 +17,9 @@ import numpy as np
 import pytest
 import yaml
 
+from fgreg.drivers.base import DriverContext
 from fgreg.drivers.options import RecordedMotionOptions
-from fgreg.drivers.registry import ENTRIES, DriverContext, Role, load
+from fgreg.drivers.registry import ENTRIES, Role, load
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.live.config import LiveConfig, read_config
 from fgreg.live.config_keys import RoomOptions, example_config, example_line
@@ -386,8 +388,12 @@ def test_the_example_has_every_driver_and_every_key() -> None:
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.role}-{entry.name}")
 def test_every_driver_of_the_example_is_one_that_can_be_named_and_has_its_factory(entry: Any) -> None:
-    for dotted in (entry.factory, entry.check, entry.ask):
-        assert dotted is None or callable(load(dotted))
+    for place in (entry.factory, entry.check, entry.ask):
+        if place is None:
+            continue
+        *_, last = inspect.signature(load(place)).parameters.values()
+        if (entry.role, place) != (Role.STAGE, entry.factory):  # which is called with the options' own keys
+            assert last.annotation == entry.options.__name__
     keys = [key for key in entry.record.fields if key.name != "limits"]
     assert set(yaml.safe_load("\n".join(map(example_line, keys))) or {}) == {key.name for key in keys}
 

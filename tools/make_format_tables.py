@@ -1,4 +1,4 @@
-"""Writes the tables of sessions/README.md from the classes that describe the documents; to be run when one changes.
+"""Write the tables of README.md and sessions/README.md from what they describe; to be run when that changes.
 
     python tools/make_format_tables.py
 
@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fgreg.convert.mapping import MAPPING
+from fgreg.drivers.registry import ENTRIES
 from fgreg.model.estimate import RESULT
 from fgreg.model.events import EVENTS, MarkerRecord, TrusRecord
 from fgreg.model.session_model import SESSION
@@ -21,7 +22,8 @@ from fgreg.schema.record import Field, Record, record
 from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.ground_truth import GROUND_TRUTH
 
-PAGE = Path(__file__).parents[1] / "sessions" / "README.md"
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", ROOT / "sessions" / "README.md")
 _PARTS = {MarkerRecord: "marker", TrusRecord: "trus"}
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -32,6 +34,10 @@ def with_tables(page: str) -> str:
 
 
 def _table(name: str) -> str:
+    if name == "drivers":
+        drivers = [(f"`{e.role}`", f"`{e.name}`", e.help, f"`{e.extra}`" if e.extra else "") for e in ENTRIES]
+        lines = [f"| {' | '.join(cells)} |" for cells in drivers]
+        return "\n".join(["| role | driver | device | extra |", "|---|---|---|---|", *lines]) + "\n"
     if name == "events":
         lines = [f"| `{kind}` | {line}" for kind, of in EVENTS.records.items() for line in _rows(of, nested=False)]
         lines = [line for line in lines if "| `t` |" not in line]
@@ -92,4 +98,5 @@ def _default(field: Field) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from fgreg.convert.write import camera_yaml
-from fgreg.drivers.base import Operator
+from fgreg.drivers.base import DriverContext, Operator
 from fgreg.drivers.options import Connection, EndoscopeOptions, NoOptions
-from fgreg.drivers.registry import DriverContext, DriverEntry, Role, drivers_of
+from fgreg.drivers.registry import DriverEntry, Role, drivers_of
 from fgreg.errors import InputError
 from fgreg.live.config_keys import LIVE, CalibrationOptions, LiveDocument, LiveSettings, RoomOptions
 from fgreg.live.launch import LiveSetup, StageSetup, setup_text
@@ -135,7 +135,7 @@ class LiveConfig:
         limits = dict(self.stage_limits)
         if (acceleration := own.get("acceleration_deg_s2")) is not None:
             limits["deceleration"] = math.radians(acceleration)  # what a driver is told to use is what it brakes with
-        return StageSetup(chosen[0].entry.factory, options, limits)
+        return StageSetup(f"fgreg.drivers.{chosen[0].entry.factory}", options, limits)
 
 
 _ONE_EACH = (Role.CAMERA, Role.PHOTOACOUSTIC, Role.MOTION, Role.BMODE)

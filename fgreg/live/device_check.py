@@ -9,10 +9,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
-from fgreg.drivers.base import BmodeFrame, DeviceLost, PaFrame, Stamp, StereoFrame
-from fgreg.drivers.factories import endoscope
+from fgreg.drivers.base import BmodeFrame, DeviceLost, DriverContext, PaFrame, Stamp, StereoFrame
 from fgreg.drivers.options import Connection, EndoscopeOptions
-from fgreg.drivers.registry import EXTRAS, DriverContext, Role, distribution, installed, load
+from fgreg.drivers.registry import EXTRAS, Role, distribution, installed, load
 from fgreg.errors import FgregError, MissingExtraError, one_line
 from fgreg.live.config import Chosen, LiveConfig
 from fgreg.model.session_model import SessionModel
@@ -58,14 +57,14 @@ def extras() -> Iterator[Answer]:
 
 def video(listen_s: float = LISTEN_S) -> Iterator[Answer]:
     """The video devices of this machine; each is opened unless ``listen_s`` is 0."""
-    from fgreg.drivers.endoscope import video_devices
+    from fgreg.drivers.endoscope import open_endoscope, video_devices
 
     for path, label in video_devices():
         if listen_s == 0:
             yield Answer("video", "", path, True, label)
             continue
         with ExitStack() as stack:
-            device = endoscope(_alone(), EndoscopeOptions(left=path))
+            device = open_endoscope(_alone(), EndoscopeOptions(left=path))
             stack.callback(device.close)
             found = _listened(device, None, listen_s)
         yield Answer("video", "", path, found.answers, f"{label}: {found.says}" if label else found.says)
