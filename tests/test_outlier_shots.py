@@ -82,7 +82,7 @@ def test_left_out_pairs_say_why_and_keep_their_figures() -> None:
         pair = solution.pairs[i]
         assert pair.nis is not None
         assert pair.nis > 25.0
-        assert pair.reason == f"junk: it does not fit the other shots (nis {pair.nis:.1f})"
+        assert pair.reason == f"outlier: it does not fit the other shots (nis {pair.nis:.1f})"
         assert pair.trus_p_pm_mm is not None
         assert pair.lambda_mm is not None
         assert pair.residual_mm is not None
@@ -109,7 +109,7 @@ def test_flipped_markers_in_calibration_are_left_out() -> None:
     ]
     solution = solve(replace(clean, aims=tuple(aims)), [], model, SolveConfig())
     assert [i for i, aim in enumerate(solution.aims) if not aim.used] == list(bad)
-    assert all("junk" in solution.aims[i].reason for i in bad)
+    assert all("outlier" in solution.aims[i].reason for i in bad)
     assert solution.laser is not None
     direction = solution.laser.marker_T_laser[:3, 2]
     assert float(direction @ truth.marker_T_laser[:3, 2]) > np.cos(0.03)

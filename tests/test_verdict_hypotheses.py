@@ -30,7 +30,7 @@ def test_sweep_signs_turned_round_are_named_in_a_two_way_session(seed: int) -> N
     pairs = tuple(replace(pair, look=replace(pair.look, sweep=-pair.look.sweep)) for pair in clean.pairs)
     solution = solve(replace(clean, pairs=pairs), [], model, SolveConfig())
     assert solution.verdict is Verdict.REFUSED
-    assert any("signs turned round" in reason and "sweep in events.jsonl" in reason for reason in solution.reasons)
+    assert any("signs reversed" in reason and "sweep in events.jsonl" in reason for reason in solution.reasons)
 
 
 def test_a_marker_swapped_after_calibration_is_named() -> None:

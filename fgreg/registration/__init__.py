@@ -1,1 +1,1 @@
-"""Registration from no first guess: minima, outliers, posterior, verdict, and which shot comes next."""
+"""Registration without an initial guess: multi-start minima, outliers, posterior, verdict, and the next shot."""

@@ -1,4 +1,4 @@
-"""Camera epochs by the measured motions between them: which can be solved, which hang together, some of them alone."""
+"""Camera epochs and the measured motions between them: which can be solved, which are linked, and subsets of them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from fgreg.registration.multistart import EpochSearch
 
 
 def solvable_epochs(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
-    """Epochs with minima of their own or tied to such a one by measured camera motions."""
+    """Epochs with minima of their own, and those that measured camera motions link to one."""
     known = {k for k, search in enumerate(searches) if search.minima}
-    tied = {k: epoch.old(k) for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
+    linked = {k: epoch.old(k) for k, epoch in enumerate(measurements.epochs) if k and epoch.motion_known}
     for _ in range(len(searches)):
-        known |= {k for k, old in tied.items() if old in known} | {old for k, old in tied.items() if k in known}
+        known |= {k for k, old in linked.items() if old in known} | {old for k, old in linked.items() if k in known}
     return sorted(known)
 
 
@@ -31,7 +31,7 @@ def epoch_chains(measurements: Measurements, solvable: list[int]) -> list[list[i
 
 
 def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measurements:
-    """The measurements of some epochs only, renumbered in order; a motion is kept where both its sides are."""
+    """The measurements of some epochs, renumbered in order; a motion stays where both of its epochs are among them."""
     place = {k: i for i, k in enumerate(epochs)}
     starts = tuple(
         replace(start, after=place[start.old(k)] if start.after is not None else None)

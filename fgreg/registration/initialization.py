@@ -1,8 +1,8 @@
-"""Starts from no guess: the beam from the aims, the registration from lines and arc points.
+"""Starts without an initial guess: the beam from the aims, the registration from lines and arc points.
 
-The beam: aimed-at spots, carried into the marker frame, lie on one line. The registration: each PM, put on its arc at
-the centre of the sensitivity prior, should lie on its beam; with the translation eliminated the sum of squared
-distances is a quadratic form in the nine entries of the rotation, descended on SO(3) from many rotations at once.
+The beam: aimed-at spots, transformed into the marker frame, lie on one line. The registration: each PM, placed on its
+arc at the centre of the sensitivity prior, should lie on its beam. With the translation eliminated the sum of squared
+distances is a quadratic form in the nine entries of the rotation; it is minimised on SO(3) from many rotations at once.
 For few pairs the minimal solver (three points on three lines; gp3p of poselib, after Kneip et al. and Kukelova et
 al.) over triples adds starts that the descent can miss.
 """
@@ -22,16 +22,16 @@ SEED = 20260
 TRIPLES = 24
 DESCENT_STEPS = 25
 SETTLED_RAD = 1e-3
-"""A descent ends where no start turns by more than this in a step."""
+"""The descent ends when no start rotates by more than this in a step."""
 SAME_START_RAD = 0.1
-"""Rotations no farther apart than this are one start."""
+"""Rotations no farther apart than this are the same start."""
 CLEAR_AXIS = 0.4
-"""A second axis of the spots this much shorter than the first cannot be the beam's."""
+"""Ratio of the second to the first axis of the spots below which the first one is the beam's."""
 
 
 @cache
 def cube_rotations() -> FloatArray:
-    """The 24 rotations of the cube, (24, 3, 3): starts no further than 62.8 deg from any rotation."""
+    """The 24 rotations of the cube, (24, 3, 3): any rotation is within 62.8 deg of one of them."""
     out = []
     for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2)):
         for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -45,8 +45,9 @@ def cube_rotations() -> FloatArray:
 def beam_starts(aims: tuple[Aim, ...]) -> list[tuple[FloatArray, FloatArray]]:
     """Candidate beams (origin mm, unit direction) in the marker frame, likeliest first; empty without aims.
 
-    The principal axis of the spots; where the distances hardly vary noise decides which axis is the beam's, so all
-    long ones and the line from the marker's origin. Directions point from the marker to the spots.
+    The candidate is the principal axis of the spots. Where the distances hardly vary noise decides which axis is the
+    longest, so all long axes and the line from the marker's origin are candidates. Directions point from the marker to
+    the spots.
     """
     if not aims:
         return []
@@ -70,7 +71,7 @@ def beam_starts(aims: tuple[Aim, ...]) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def distinct_rotations(rotation: FloatArray, order: IntArray, keep: int) -> IntArray:
-    """Which of rotations (n, 3, 3), taken in this order, are ``SAME_START_RAD`` from all before; at most ``keep``."""
+    """Indices of up to ``keep`` rotations (n, 3, 3), in this order, each ``SAME_START_RAD`` from all before it."""
     flat = rotation[order].reshape(-1, 9)
     near = flat @ flat.T > 1.0 + 2.0 * np.cos(SAME_START_RAD)
     free = np.ones(len(order), dtype=bool)
@@ -88,9 +89,9 @@ def registration_starts(origin_mm: FloatArray, direction: FloatArray, trus_p: Fl
     """Distinct registrations that bring points onto lines, best first.
 
     Args:
-        origin_mm, direction: (n, 3) a point on, and the unit direction of, each line in camera axes.
+        origin_mm, direction: (n, 3) a point on each line, and its unit direction, in camera axes.
         trus_p: (n, 3) the point of each line in TRUS.
-        keep: at most so many.
+        keep: largest number of them.
 
     Returns:
         (m, 4, 4) ``trus_T_camera``.
@@ -115,9 +116,9 @@ def _best_translation(rotation: FloatArray, origin: FloatArray, across: FloatArr
 def _descend(
     rotation: FloatArray, origin: FloatArray, across: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Damped Gauss-Newton on SO(3) from rotations (S, 3, 3) with the translation eliminated; and the costs (S,)."""
+    """Damped Gauss-Newton on SO(3) from rotations (S, 3, 3), translation eliminated: rotations and costs (S,)."""
     total_inverse = np.linalg.inv(across.sum(axis=0) + 1e-9 * np.eye(3))
-    # Squared distance is vec(R)' A vec(R) - 2 b' vec(R) + c: fold all lines into A once, so that steps cost nothing.
+    # The squared distance is vec(R)' A vec(R) - 2 b' vec(R) + c: all lines enter A once, so that steps are cheap.
     n = len(points)
     design = np.einsum("nij,nk->nijk", across, points).reshape(n, 3, 9)
     offset = np.einsum("nij,nj->ni", across, origin)

@@ -1,7 +1,7 @@
-"""Starts that most shots agree on, whatever the others are: consensus of minimal sets.
+"""Starts by consensus of minimal sets: most shots agree on them, and outliers do not matter.
 
-The minimal solver (three points on three lines) over random triples, each solution scored by all lines with a
-truncated cost (MSAC; Torr and Zisserman, 2000). For the beam: the lines through two aimed-at spots.
+The minimal solver (three points on three lines) runs over random triples; all lines score each solution with a
+truncated cost (MSAC; Torr and Zisserman, 2000). For the beam the minimal sets are two aimed-at spots.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from fgreg.model.measurements import Aim
 from fgreg.registration.initialization import distinct_rotations
 
 TRIPLES = 160
-"""Random triples of the consensus: at 60 % junk still ten of good pairs only."""
+"""Random triples of the consensus: with 60 % outliers ten of them still have inliers only."""
 STARTS = 24
-"""Distinct ones of their solutions to descend from: fewer miss the deepest minimum where only the window is known."""
+"""Distinct solutions used as starts: fewer miss the deepest minimum where only the window is known."""
 SEED = 40961
 SCORE_LIMIT = 13.8
-"""Square of a deviation, over its variance, from where on it costs no more."""
+"""Squared deviation over its variance at which the score is truncated."""
 
 
 def consensus_starts(
@@ -35,7 +35,7 @@ def consensus_starts(
         problem: packed; the first look of each PM is used.
         marker_T_beam: (4, 4), z along the beam.
         lambda_mm: typical distance of a spot from the frame's origin, at which the beam's uncertainty is taken.
-        keep: at most so many distinct ones.
+        keep: largest number of distinct ones.
 
     Returns:
         (m, 4, 4) ``trus_T_camera``; empty for fewer than three PMs.
@@ -54,7 +54,7 @@ def consensus_starts(
     if not len(found):
         return np.zeros((0, 4, 4))
     camera_R_trus, camera_t = found[:, :3, :3], found[:, :3, 3]
-    # Across the beam a PM is off by the beam's error and its own; along its arc by what the window leaves open.
+    # Across the beam a PM's deviation is the beam's error and its own; along its arc it is the width of the window.
     covariance = problem.beams.covariance[beam]
     reach = np.sqrt(lambda_mm**2 + float(marker_T_beam[:3, 3] @ marker_T_beam[:3, 3]))
     variance = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3

@@ -1,9 +1,9 @@
-"""All minima worth knowing of one camera epoch, from no guess; and the beam of the aims before that.
+"""The multi-start minima of one camera epoch, without an initial guess; before that the beam from the aims.
 
-Levenberg-Marquardt on the reduced graph from all starts at once (fgreg.registration.initialization); distinct minima
-are kept with their costs, and the mirrored hypothesis is searched the same way. Where a shot does not fit, all this is
-done with consensus starts and a truncated cost, and other hypotheses are tried, so that the verdict can name what is
-wrong.
+Levenberg-Marquardt on the reduced graph runs from all starts at once (fgreg.registration.initialization). The result is
+the distinct minima with their costs. The mirrored hypothesis is searched in the same way. Where a shot does not fit,
+the search uses consensus starts and a truncated cost, and tries other hypotheses, so that the verdict can name the
+cause.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from fgreg.registration.outliers import (
 )
 
 SEARCH_PAIRS = 40
-"""The search for minima looks at no more pairs than this, spread over the session; all are used from there on."""
+"""Largest number of pairs, spread over the session, in the search for minima; the joint solve uses all pairs."""
 OTHERS_TOLERANCE, OTHERS_WITHIN = 1e-2, 15.0
-"""Of other hypotheses (mirrored, ...) only the cost matters: Newton decrement at which their search stops, and by how
-much chi square above the best fit they are given up."""
+"""Of other hypotheses (mirrored, ...) only the cost matters: Newton decrement at which their search stops, and chi
+square above the best fit beyond which they are dropped."""
 SAME_MINIMUM_MM = 1.5
-"""Minima whose registrations move no target by more than this are one."""
+"""Minima whose registrations differ at no target by more than this are the same."""
 BEAM_CHI2 = 30.0
-"""Beams of calibrations worse than the best by more than this are not tried."""
+"""Beams whose calibration has a chi square larger than the best by more than this are not tried."""
 MIN_INLIER_PMS = 7
 MIN_INLIER_AIMS = 5
-"""Nothing is left out where fewer shots than these would be left: so few could be made to fit anything."""
+"""No outliers are rejected where fewer inliers than these would be left: so few shots can fit almost anything."""
 SPOT_DISTANCE_MM = 45.0
-"""Typical distance of a spot from the marker: what scales the beam's error in scoring consensus."""
+"""Typical distance of a spot from the marker, which scales the beam's error in the consensus score."""
 RIVAL_OVERLAP = 0.7
-"""Robust minima that share a larger part of the shots they keep are one: they differ by a borderline shot."""
+"""Robust minima that share a larger part of their inliers are the same: they differ by a borderline shot."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,15 +61,15 @@ class Minimum:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochSearch:
-    """What the search of one epoch found.
+    """Result of the search of one epoch. All costs are comparable with that of the first minimum.
 
     Attributes:
-        minima: best first, with the chi square of the shots that fit.
-        mirrored_cost: best cost of the mirrored hypothesis, comparable with that of the first minimum.
-        mirrored_outside_cost: likewise of those of its minima whose beams come from outside the probe; None without.
-        outside: whether the first minimum's beams do.
-        other_way_cost: likewise with every sweep's sign turned round; None where all fitted and that was not tried.
-        own_beam_cost: likewise with a beam of the pairs' own, whatever the aims say; None where not tried.
+        minima: best first, with the chi square of the inliers.
+        mirrored_cost: best cost of the mirrored hypothesis.
+        mirrored_outside_cost: best cost of its minima whose beams come from outside the probe; None without any.
+        outside: whether the beams of the first minimum come from outside the probe.
+        other_way_cost: best cost with the sign of every sweep reversed; None where every shot fits (not tried).
+        own_beam_cost: best cost with a beam from the pairs alone, without the aims; None where not tried.
         clean: whether every shot fits.
     """
 
@@ -84,14 +84,14 @@ class EpochSearch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """The beam from the aims: candidates for ``marker_T_nominal`` (z along it), best first; and which aims fit (A,)."""
+    """The beam from the aims: candidates for ``marker_T_nominal`` (z along it), best first; the inlier aims (A,)."""
 
     frames: tuple[FloatArray, ...]
     aim_inlier: BoolArray
 
 
 def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibration:
-    """Candidate beams from the aims, and from ``initial``; aims that do not fit the others are left out.
+    """Candidate beams from the aims, and from ``initial``; outliers among the aims are left out.
 
     Raises:
         EstimationError: no aims and no initial beam.
@@ -102,9 +102,7 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
     if model.initial_marker_T_laser is not None:
         candidates.append(model.initial_marker_T_laser)
     if not candidates:
-        raise EstimationError(
-            "no aims and no initial.marker_T_laser: the beam has nowhere to start; take at least 6 aim shots"
-        )
+        raise EstimationError("no aims and no initial.marker_T_laser: the beam has no start; take at least 6 aim shots")
     if not aims:
         return Calibration(tuple(candidates), everything)
     alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model)
@@ -143,7 +141,7 @@ def _beams(found: Optimum) -> list[FloatArray]:
 
 
 def _is_clean(problem: PackedProblem, found: Optimum) -> bool:
-    """Whether each shot and all together fit at the best of the least squares optima of all."""
+    """Whether each shot fits, and all of them together, at the best least squares optimum."""
     best = int(np.argmin(found.evaluation.cost))
     if found.evaluation.cost[best] > plausible_cost(problem):
         return False
@@ -162,20 +160,20 @@ def _search_subset(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
 def _mirrored(problem: PackedProblem) -> PackedProblem:
     """The same data with lateral positions counted from the other end.
 
-    A stage that turns the other way gives this, too, but for half a turn of the TRUS frame about z: one hypothesis
-    stands for both.
+    A stage that turns the other way gives the same, apart from half a turn of the TRUS frame about z. So one hypothesis
+    covers both.
     """
     return replace(problem, looks=replace(problem.looks, x_mm=-problem.looks.x_mm))
 
 
 def _other_way(problem: PackedProblem) -> PackedProblem:
-    """The same data with the sign of every sweep turned round."""
+    """The same data with the sign of every sweep reversed."""
     looks = problem.looks
     return replace(problem, looks=replace(looks, centre_rad=-looks.centre_rad, edge_gain=-looks.edge_gain))
 
 
 def _starts(problem: PackedProblem, frames: Sequence[FloatArray], model: SessionModel) -> SharedState:
-    """Starts of a one-epoch problem: for each beam the registrations that bring its lines to the arc points."""
+    """Starts of a one-epoch problem: for each beam the registrations that bring its lines close to the arc points."""
     arcs = arc_points(problem, np.zeros(1))[0]
     states = []
     for frame in frames:
@@ -190,7 +188,7 @@ def _starts(problem: PackedProblem, frames: Sequence[FloatArray], model: Session
 
 
 def targets_moved(first: FloatArray, second: FloatArray, targets_mm: FloatArray) -> float:
-    """Largest distance (mm) between where two registrations (4, 4) put the camera points under the targets."""
+    """Largest distance (mm) at a target: ``second`` applied to the camera points that ``first`` maps to the targets."""
     camera_p = transform_points(inverse(first), targets_mm)
     return float(np.linalg.norm(transform_points(second, camera_p) - targets_mm, axis=1).max())
 
@@ -215,7 +213,7 @@ def search_epoch(
     *,
     keep_within: float = 60.0,
 ) -> EpochSearch:
-    """All minima of one epoch's pairs with the aims; none where it has fewer than three pairs."""
+    """All minima of one epoch's pairs with the aims; none where it has fewer than three PMs."""
     pairs = tuple(replace(pair, epoch=0) for pair in measurements.pairs if pair.epoch == epoch)
     if len({pair.pm for pair in pairs}) < 3:
         return EpochSearch((), None)
@@ -226,7 +224,7 @@ def search_epoch(
     if len(problem.pms) > MIN_INLIER_PMS and not _is_clean(problem, found):
         return _search_with_outliers(subset, problem, model, frames, minima, keep_within)
     mirrored_problem = _mirrored(problem)
-    # How much worse it fits does not matter where it does by far.
+    # Where it fits far worse its exact cost does not matter.
     mirrored = optimize(
         mirrored_problem,
         _starts(mirrored_problem, frames, model),
@@ -248,9 +246,9 @@ def _least(cost: FloatArray, among: BoolArray) -> float | None:
 
 
 def from_outside(problem: PackedProblem, state: SharedState) -> BoolArray:
-    """(S,) whether most beams of a one-epoch problem run towards the probe: the fibre is outside, the probe inside.
+    """(S,) whether most beams of a one-epoch problem point towards the probe, as they do with the fibre outside.
 
-    PMs on a nearly flat surface fit their mirror image as well, with the beams coming from behind it: from where the
+    PMs on a nearly flat surface fit their mirror image as well. The beams then come from behind the surface, where the
     probe is.
     """
     points = arc_points(problem, np.zeros(1))[0]
@@ -268,7 +266,7 @@ def _search_with_outliers(
     minima: tuple[Minimum, ...],
     keep_within: float,
 ) -> EpochSearch:
-    """As :func:`search_epoch`, where a PM deviates: consensus, truncated cost, then the minima of what is kept."""
+    """As :func:`search_epoch`, where a PM does not fit: consensus, truncated cost, then the minima of the inliers."""
     plain = [minimum.state for minimum in minima]
     robust = graduated(problem, _robust_starts(problem, frames, model, plain), keep_within=keep_within)
     base, aims_cost = float(robust.cost[0]), float(robust.aim_cost[0].sum())
@@ -291,12 +289,12 @@ def _search_with_outliers(
     found = optimize(reduced, stack_states(states), keep_within=keep_within)
     all_minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
     level = all_minima[0].cost
-    # Another set of shots that fit each other as well as these do is as good an answer.
+    # Another set of shots that fit each other equally well gives an equally good registration.
     for index, of_it in enumerate(robust.pm_inlier):
         both, either = (of_it & robust.pm_inlier[0]).sum(), (of_it | robust.pm_inlier[0]).sum()
         if both < RIVAL_OVERLAP * either:
             all_minima += (Minimum(level + float(robust.cost[index]) - base, robust.state.take([index])),)
-    # The pairs without the aims: a marker swapped or knocked between calibration and registration.
+    # The pairs without the aims show a marker that was swapped or moved between calibration and registration.
     alone = pack(replace(measurements, aims=()), model)
     free = graduated(alone, robust.state, keep_within=keep_within, wanted=base - aims_cost + OTHERS_WITHIN)
     return EpochSearch(
@@ -317,7 +315,7 @@ def _shifted(cost: float | None, by: float) -> float | None:
 def _robust_starts(
     problem: PackedProblem, frames: Sequence[FloatArray], model: SessionModel, others: list[SharedState]
 ) -> SharedState:
-    """Starts of a one-epoch problem by consensus, and others."""
+    """Consensus starts of a one-epoch problem, and the other starts given."""
     states = list(others)
     for frame in frames:
         starts = consensus_starts(problem, frame, SPOT_DISTANCE_MM)
@@ -330,10 +328,11 @@ def _robust_starts(
 
 
 def choose_minimum(search: EpochSearch, model: SessionModel, config: SolveConfig) -> tuple[Minimum, bool]:
-    """The minimum to use, and whether the choice is open.
+    """The minimum to use, and whether the choice is ambiguous.
 
-    Open: another minimum's cost lies within ``second_minimum_chi2`` of the best and ``initial.trus_T_camera`` does not
-    clearly favour one of them (at most half as far from it, at the worst target, as the next).
+    It is ambiguous where another minimum's cost lies within ``second_minimum_chi2`` of the best and
+    ``initial.trus_T_camera`` does not clearly favour one of them (at the worst target at most half as far from it as
+    the next).
     """
     rivals = [m for m in search.minima if m.cost - search.minima[0].cost < config.second_minimum_chi2]
     if len(rivals) == 1:

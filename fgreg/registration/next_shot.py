@@ -1,13 +1,13 @@
-"""Where the next shot helps most: candidate beams and spots, ranked by the drop of the predicted target error.
+"""Where the next shot helps most: candidate beams and spots, ranked by the decrease of the predicted target error.
 
-Candidates: spots on the tissue that the PMs so far trace, each hit from directions about the mean beam. What a
-candidate would tell is known before it is taken: a noise-free virtual pair, built at the estimate, adds its Hessian A
-to the information H of the shared variables, and the covariance there would be is (H + A)^-1.
+Candidates are spots on the tissue surface that the measured PMs trace, each hit from directions about the mean beam.
+The information of a candidate is known before it is taken: a noise-free virtual pair at the estimate adds its Hessian A
+to the information H of the shared variables, so the covariance after it is (H + A)^-1.
 
-While two registrations cannot be told apart that is not all: a shot also separates them. A virtual pair that the better
-one explains costs the other D chi square (at its own best), and the chance of ending with the wrong one is at most
-sqrt(p q) exp(-D / 8) (Chernoff), p and q their posterior weights. What is ranked is the expected squared error with
-both in it.
+While two registrations fit equally well a shot also separates them. A virtual pair that fits the better registration
+raises the chi square of the other by D (at its own optimum). The probability of choosing the wrong one is then at most
+sqrt(p q) exp(-D / 8) (Chernoff), p and q their posterior weights. Candidates are ranked by the expected squared error,
+which includes both.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from fgreg.registration.register import Minimum, Registration
 
 TILT_RAD = math.radians(25.0)
 TILT_STEPS = 5
-"""Directions lean from the mean beam by up to this to either side, about two axes, in so many steps."""
+"""Directions are tilted from the mean beam by up to this to either side, about two axes; number of steps."""
 SPOT_STEP_MM = 4.0
 MOST_SPOTS = 60
 APART_MM = 8.0
 APART_RAD = math.radians(12.0)
-"""Of advised shots less than both of these apart only the better is listed."""
+"""Of two advised shots that are closer than both of these only the better is listed."""
 IMAGE_MARGIN = 0.04
-"""Share of the image's width that spots and markers keep from its edge."""
+"""Smallest distance of spots and markers from the image's edge, as a share of its width."""
 RIVAL_CHI2 = 14.0
-"""Other registrations whose cost is within this of the best are worth separating."""
+"""Other registrations whose cost is within this of the best are to be separated from it."""
 FEW_PAIRS = 6
 REFINEMENTS = 4
 
@@ -61,9 +61,9 @@ class Candidates:
     """n shots that could be taken.
 
     Attributes:
-        camera_p_spot_mm: (n, 3) where to point. camera_d: (n, 3) unit direction of the beam.
-        camera_T_marker: (n, 4, 4) where the marker would be. trus_p_mm: (n, 3) the PM expected.
-        tilt_rad: (n, 2) lean from the mean beam towards the image's right and its lower edge.
+        camera_p_spot_mm: (n, 3) spot to aim at. camera_d: (n, 3) unit direction of the beam.
+        camera_T_marker: (n, 4, 4) expected marker pose. trus_p_mm: (n, 3) expected PM.
+        tilt_rad: (n, 2) tilt from the mean beam towards the image's right and its lower edge.
         scan_rad: (n,) plane angle at which the PM would be heard first. sweep: +1 or -1 (plane), 0 where not swept.
         pairs: the noise-free virtual pairs, each of a PM of its own.
     """
@@ -80,16 +80,16 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdvisedShot:
-    """One shot worth taking.
+    """One advised shot.
 
     Attributes:
         candidate: its number among the candidates.
-        camera_p_spot_mm: (3,) where to point the beam. camera_d: (3,) its direction.
-        tilt_right_rad, tilt_down_rad: lean from the mean beam so far, towards the image's right and lower edge.
-        trus_p_mm: (3,) where the PM is expected.
-        device_rad: stage angle at which it would be heard. sweep: +1 or -1, the device's turn to find it with; 0: none.
+        camera_p_spot_mm: (3,) spot to aim at. camera_d: (3,) direction of the beam.
+        tilt_right_rad, tilt_down_rad: tilt from the mean of the beams up to now, to the image's right and lower edge.
+        trus_p_mm: (3,) expected PM.
+        device_rad: stage angle at which it would be heard. sweep: +1 or -1, direction of the device's sweep; 0: none.
         expected_mm: predicted TRE after it (mean over targets of the root of the expected square).
-        separation: chi square by which it would tell the rival registration apart; None without a rival.
+        separation: chi square by which it would separate the rival registration; None without a rival.
     """
 
     candidate: int
@@ -111,8 +111,8 @@ class Advice:
     Attributes:
         epoch: of the camera. pairs: PMs taken in it.
         expected_mm: predicted TRE now (mean over targets of the root of the expected square).
-        shots: distinct ones. candidates: all, as ``order`` (n,) ranks them.
-        notes: what to bear in mind.
+        shots: distinct ones. candidates: all of them; ``order`` (n,) is their ranking.
+        notes: sentences for the user.
     """
 
     epoch: int
@@ -125,15 +125,15 @@ class Advice:
 
 
 def advise(registration: Registration, *, epoch: int | None = None, count: int = 5) -> Advice:
-    """Rank what could be shot next.
+    """Rank the candidates for the next shot.
 
     Args:
-        registration: of the session so far.
-        epoch: the session's camera epoch to advise on; the last that has a registration where None.
-        count: how many shots to list.
+        registration: of the session up to now.
+        epoch: the session's camera epoch to advise on; None: the last one with a registration.
+        count: number of shots to list.
 
     Raises:
-        EstimationError: the epoch has no registration, or there is nothing that could be shot.
+        EstimationError: the epoch has no registration, or there is no candidate.
     """
     model = registration.model
     epoch = registration.epochs[-1] if epoch is None else epoch
@@ -184,7 +184,7 @@ def _notes(pms: int, separation: _Separation | None, found: Candidates) -> tuple
     if separation is not None and separation.weight > 0.01:
         notes.append(
             f"another registration explains the {pms} pairs nearly as well ({separation.gap:.1f} chi square apart, "
-            f"{math.sqrt(separation.distance2_mm2):.0f} mm at the targets): shots that tell them apart come first"
+            f"{math.sqrt(separation.distance2_mm2):.0f} mm at the targets): shots that separate them come first"
         )
     elif pms < FEW_PAIRS:
         notes.append(
@@ -217,10 +217,10 @@ def _distinct(found: Candidates, order: IntArray, count: int) -> list[int]:
 
 
 def propose(registration: Registration, place: int) -> Candidates:
-    """All shots worth considering in one of the solved epochs (its place among them).
+    """All candidates in one of the solved epochs (``place`` is its index among them).
 
     Raises:
-        EstimationError: none is within the probe's, the stage's and the camera's reach.
+        EstimationError: none is within the reach of probe, stage and camera.
     """
     model, problem = registration.model, registration.problem
     state, at = registration.optimum.state, registration.optimum.evaluation
@@ -234,7 +234,7 @@ def propose(registration: Registration, place: int) -> Candidates:
     trus_p_spot = np.repeat(spots, len(directions), axis=0)
     d = np.tile(directions, (len(spots), 1))
     camera_p = transform_points(inverse(transform), trus_p_spot)
-    # Each is held as the shot so far whose beam is nearest to it, turned by the least that makes up the difference.
+    # Each marker is held as in the measured shot of the nearest beam, with the smallest rotation to the new direction.
     nearest = beams[np.argmax(d @ camera_d.T, axis=1)]
     turned = np.stack(
         [
@@ -285,7 +285,7 @@ def propose(registration: Registration, place: int) -> Candidates:
 
 
 def _spots(registration: Registration, place: int, trus_p_pm: FloatArray, trus_d: FloatArray) -> FloatArray:
-    """(m, 3) TRUS points of the traced tissue, on a grid out to ``REACH_MM`` from the PMs."""
+    """(m, 3) TRUS points of the tissue surface, on a grid up to ``REACH_MM`` from the PMs."""
     problem, at = registration.problem, registration.optimum.evaluation
     pms = np.unique(problem.beam_pm[problem.beam_epoch == place])
     surface = fit_surface(trus_p_pm, at.point_covariance[0, pms], trus_d[: len(pms)])
@@ -296,7 +296,7 @@ def _spots(registration: Registration, place: int, trus_p_pm: FloatArray, trus_d
 
 
 def _grid(place: FloatArray, step_mm: float = SPOT_STEP_MM) -> FloatArray:
-    """(m, 2) grid points within reach of places (n, 2)."""
+    """(m, 2) grid points within ``REACH_MM`` of places (n, 2)."""
     low, high = place.min(axis=0) - REACH_MM, place.max(axis=0) + REACH_MM
     axes = [np.arange(a, b + step_mm, step_mm) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -311,7 +311,7 @@ def _grid_on(surface: TissueSurface) -> FloatArray:
 
 
 def _grid_about(trus_p: FloatArray) -> FloatArray:
-    """Where the PMs trace no surface yet: depths weighted by inverse square distance along x and around the axis."""
+    """Points where the PMs trace no surface yet: depths by inverse square distance, along x and about the axis."""
     reach = np.hypot(trus_p[:, 1], trus_p[:, 2])
     angle = np.arctan2(trus_p[:, 1], trus_p[:, 2])
     middle = float(reach.mean())
@@ -324,7 +324,7 @@ def _grid_about(trus_p: FloatArray) -> FloatArray:
 
 
 def _directions(camera_d: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Directions (k, 3) about the mean of (n, 3), and their lean (k, 2) towards the image's right and lower edge."""
+    """Directions (k, 3) about the mean of (n, 3), and their tilt (k, 2) towards the image's right and lower edge."""
     mean = camera_d.mean(axis=0)
     mean = mean / np.linalg.norm(mean)
     turn = rotation_to_direction(mean)
@@ -335,13 +335,13 @@ def _directions(camera_d: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _sweep_side(registration: Registration, place: int) -> int:
-    """The plane's direction of sweep that was used less; 0 where the session does not sweep."""
+    """The less used sweep direction of the plane; 0 where the session does not sweep."""
     sides = [pair.look.sweep for pair in registration.measurements.pairs if pair.epoch == place and pair.look.sweep]
     return 0 if not sides else 1 if sides.count(1) <= sides.count(-1) else -1
 
 
 def _heard_at(trus_p: FloatArray, sweep: int, model: SessionModel) -> float:
-    """Plane angle of the look to expect: in the middle of what a first hit, or the window, leaves open."""
+    """Expected plane angle of the look: the middle of the interval that a first hit, or the window, allows."""
     bearing, radius = math.atan2(float(trus_p[1]), float(trus_p[2])), model.probe.radius_mm
     scan = bearing
     for _ in range(4):  # the window depends on the range, the range (a little) on the angle
@@ -376,14 +376,14 @@ def _in_view(camera: CameraModel, camera_p: FloatArray) -> BoolArray:
     return np.asarray((camera_p[:, 2] > 1.0) & (pixel > margin).all(axis=1) & (pixel < size - margin).all(axis=1))
 
 
-# ---- what they would tell ----
+# ---- information of the candidates ----
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Separation:
-    """What tells the best registration from its likeliest rival.
+    """Separation of the best registration from its likeliest rival.
 
-    ``weight`` of the rival now, cost ``gap``, mean square distance of the targets, and each candidate's chi square.
+    Posterior ``weight`` of the rival now, cost ``gap``, mean square distance at the targets, chi square per candidate.
     """
 
     weight: float
@@ -404,7 +404,7 @@ def _contributions(
 
 
 def _separate(registration: Registration, epoch: int, found: Candidates) -> _Separation | None:
-    """Compare with the likeliest other minimum of the epoch's own search; None where there is none near."""
+    """Compare with the likeliest other minimum of the epoch's own search; None where no other has a similar cost."""
     search, model = registration.searches[epoch], registration.model
     place = registration.epochs.index(epoch)
     here = registration.optimum.state.trus_T_camera(place)[0]
@@ -431,7 +431,7 @@ def _separate(registration: Registration, epoch: int, found: Candidates) -> _Sep
     log_ratio = -0.5 * (rival_cost - cost) - 0.5 * (np.linalg.slogdet(rival_hessian)[1] - np.linalg.slogdet(hessian)[1])
     weight = float(1.0 / (1.0 + np.exp(-np.clip(log_ratio, -30.0, 30.0))))
     virtual = pack(Measurements((), tuple(replace(pair, epoch=0) for pair in found.pairs), (EpochStart(0.0),)), model)
-    # The looks are what the best registration expects, so the PMs start there for the rival, too.
+    # The looks are those that the best registration predicts, so the rival's PMs start there, too.
     c, g, a = _contributions(virtual, rival.state, found.trus_p_mm)
     chi2 = c - np.sum(g * np.linalg.solve(rival_hessian + a, g[..., None])[..., 0], axis=-1)
     return _Separation(weight, rival_cost - cost, apart(rival), np.maximum(chi2, 0.0))

@@ -1,14 +1,15 @@
-"""Junk among the shots: graduated truncated loss, and who is in or out by innovation.
+"""Outlier rejection: graduated truncated loss, then inlier selection by innovation.
 
 A false PM or a flipped marker is not noise: one such shot moves a least squares estimate by centimetres. Three steps:
 
-1. Consensus of minimal sets: where to start (fgreg.registration.minimal_set_consensus).
-2. Graduated loss: the chi square of each PM (and aim) on the reduced graph under a Cauchy loss that narrows, then a
-   truncated one, by iteratively reweighted least squares from all starts side by side.
-3. Innovation: each shot against the estimate *without* it, in closed form. Chi square of known degrees of freedom
-   under the stated noise, so the share of good shots lost is known; those wrongly left out come back in.
+1. Consensus of minimal sets gives starts (fgreg.registration.minimal_set_consensus).
+2. Graduated loss: the chi square of each PM (and aim) on the reduced graph under a narrowing Cauchy loss, then under a
+   truncated one, by iteratively reweighted least squares from all starts in parallel.
+3. Innovation: each shot is tested against the estimate *without* it, in closed form. Under the stated noise this is a
+   chi square of known degrees of freedom, so the share of inliers lost is known. Inliers that were wrongly left out
+   are selected again.
 
-What is kept is then solved by plain least squares: a session without junk is answered as if none of this were there.
+The inliers are then solved by plain least squares. A session without outliers has the result of plain least squares.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ from fgreg.graph.reduced_solver import distinct, optimize
 from fgreg.graph.shared_state import SharedState
 
 OUTLIER_P = 1e-3
-"""A shot is junk where a good one would deviate as much this rarely."""
+"""A shot is an outlier where an inlier would deviate as much with at most this probability."""
 OUTLIER_DENSITY = 0.012
-"""Density of junk, over that of good shots at their middle: false PMs are everywhere in the image."""
+"""Density of outliers over the peak density of inliers: false PMs are anywhere in the image."""
 FEW = 0.05
-"""So small a share of deviating PMs does not mislead a least squares optimum whose cost is plausible."""
+"""Share of outlier PMs up to which a least squares optimum of plausible cost is not misled."""
 TYPICAL_P = 3e-3
 IMPLAUSIBLE_P = 1e-4
 CAUCHY_SCALES = (100.0, 20.0, 4.0)
@@ -52,27 +53,28 @@ SETTLE_ROUNDS = 8
 TOLERANCE = 1e-4
 """Newton decrement (chi square) at which a descent ends."""
 DIVERGED_MM, DIVERGED_CHI2 = 1.0, 1e4
-"""A PM that moves by more in one step, after several, has no place that fits; it counts as so far off."""
+"""A PM that moves by more (mm) in one step, after several, does not converge; its chi square is then at least this."""
 UNKNOWN = 1e-9
-"""Correlation eigenvalue below which the rest of the shots leaves a direction open."""
+"""Correlation eigenvalue below which the other shots do not determine a direction."""
 
 
 def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
-    """(J,) equations that each PM leaves over: 2 per beam and 3 per look less its 3 coordinates."""
+    """(J,) degrees of freedom of each PM: 2 equations per beam and 3 per look, less its 3 coordinates."""
     pms = len(problem.pms)
     beams = np.bincount(problem.beam_pm, minlength=pms)
     return np.asarray(2 * beams + 3 * np.bincount(problem.look_pm, minlength=pms) - 3)
 
 
 def pm_limits(problem: PackedProblem, p: float = OUTLIER_P) -> FloatArray:
-    """(J,) chi square beyond which a PM is junk."""
+    """(J,) chi square beyond which a PM is an outlier."""
     return np.asarray(chdtri(np.maximum(pm_degrees_of_freedom(problem), 1), p))
 
 
 def limits_among(problem: PackedProblem, pm_inlier: BoolArray, kept: int, count: int) -> FloatArray:
-    """(J,) chi square beyond which PMs, of which ``pm_inlier`` count, are junk, where ``kept`` of ``count`` PMs count.
+    """(J,) chi square beyond which PMs are outliers, where ``kept`` of ``count`` PMs are inliers.
 
-    One that does not count is judged as if it did: one at the border is in, whether it was in before or not.
+    A PM that is not in ``pm_inlier`` has the limit that it would have as an inlier. So a borderline PM is an inlier,
+    whether it was one before or not.
     """
     inside, outside = pm_limits(problem, outlier_p_of(kept, count)), pm_limits(problem, outlier_p_of(kept + 1, count))
     return np.where(pm_inlier, inside, outside)
@@ -82,23 +84,24 @@ AIM_LIMIT = float(chdtri(2, OUTLIER_P))
 
 
 def outlier_p(pm_inlier: BoolArray) -> float:
-    """How rare a good shot's deviation has to be for junk, given which PMs (J,) are kept.
+    """Tail probability p of an inlier's deviation below which a shot is an outlier, given the inlier PMs (J,).
 
-    Of two degrees of freedom a good shot's density falls as exp(-d / 2), and so does the share p that deviates by more
-    than d: junk and good are equally likely where p is junk's density times the odds of junk.
+    With two degrees of freedom an inlier's density falls as exp(-d / 2), and so does the share p that deviates by more
+    than d. Inlier and outlier are equally likely where p is the outlier density times the odds of an outlier.
     """
     return outlier_p_of(int(pm_inlier.sum()), len(pm_inlier))
 
 
 def outlier_p_of(kept: int, count: int) -> float:
-    """:func:`outlier_p` where so many of ``count`` PMs are kept."""
+    """:func:`outlier_p` where ``kept`` of ``count`` PMs are inliers."""
     return max(OUTLIER_P, OUTLIER_DENSITY * min((count - kept) / max(kept, 1), 1.0))
 
 
 def log_outlier(problem: PackedProblem, pm_inlier: BoolArray) -> FloatArray:
-    """(J,) log density of junk over that of a good PM at its best, times the odds of junk; see :func:`log_posterior`.
+    """(J,) log of the outlier density over an inlier's peak density, times the odds; see :func:`log_posterior`.
 
-    Windows in their own shape are densities of the rotation, one over their width inside: so is what they are beside.
+    A window in its own shape is a density of the rotation, one over its width inside; the outlier density then has the
+    same factor.
     """
     kept = int(pm_inlier.sum())
     odds = (len(pm_inlier) - kept + 0.5) / (kept + 0.5)
@@ -112,9 +115,9 @@ def log_outlier(problem: PackedProblem, pm_inlier: BoolArray) -> FloatArray:
 
 
 def plausible_cost(problem: PackedProblem) -> float:
-    """Chi square of all shots beyond which they do not fit, whatever their innovations say."""
+    """Chi square of all shots beyond which they do not fit together, whatever their innovations."""
     unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
-    seen = unknowns if len(problem.pms) else 4  # aims alone see the beam only
+    seen = unknowns if len(problem.pms) else 4  # aims alone determine the beam only
     equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
     return float(chdtri(max(equations - seen, 1), IMPLAUSIBLE_P))
 
@@ -129,7 +132,7 @@ class RobustOptimum:
     Attributes:
         state: of each hypothesis.
         cost: (S,) truncated chi square. aim_cost: (S, A) chi square of each aim.
-        pm_inlier (S, J), aim_inlier (S, A): which shots count in full.
+        pm_inlier (S, J), aim_inlier (S, A): which shots have full weight.
     """
 
     state: SharedState
@@ -140,7 +143,7 @@ class RobustOptimum:
 
 
 def _hessian_of(parts: Parts, pm: BoolArray, aim: BoolArray) -> FloatArray:
-    """Hessian (D, D) of the parts that are kept, one hypothesis."""
+    """Hessian (D, D) of the prior and the inliers, one hypothesis."""
     return np.asarray(
         parts.prior.hessian[0, 0] + parts.pm.hessian[0, pm].sum(axis=0) + parts.aim.hessian[0, aim].sum(axis=0)
     )
@@ -168,7 +171,7 @@ def _fixed(costs: Costs, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Weights
 
 
 def _settled(problem: PackedProblem, state: SharedState, loss: Loss) -> Evaluation:
-    """The starts as they are, in which a PM that still wanders counts as far off, whatever it passes on its way."""
+    """The evaluation at the starts; a PM that does not converge gets a large cost, whatever its residual is."""
 
     def with_diverged(costs: Costs) -> Weights:
         far = np.where(costs.moved_mm > DIVERGED_MM, np.maximum(costs.pm, DIVERGED_CHI2), costs.pm)
@@ -178,7 +181,7 @@ def _settled(problem: PackedProblem, state: SharedState, loss: Loss) -> Evaluati
 
 
 def _settled_parts(problem: PackedProblem, state: SharedState) -> Parts:
-    """What each shot adds at shared variables (one hypothesis); a PM that wanders counts as far off."""
+    """Contributions of the shots at a state (one hypothesis); a PM that does not converge gets a large cost."""
     before = private_at(problem, state)
     parts = contributions(problem, state, before)
     diverged = np.linalg.norm(parts.private.trus_p_pm - before.trus_p_pm, axis=-1) > DIVERGED_MM
@@ -194,12 +197,12 @@ def graduated(
     keep_within: float | None = None,
     wanted: float = np.inf,
 ) -> RobustOptimum:
-    """Local minima of the truncated cost from S starts, by way of narrowing Cauchy losses.
+    """Local minima of the truncated cost from S starts, after a series of narrowing Cauchy losses.
 
     Args:
         problem: the packed measurements.
         state: S starts.
-        robust_aims: doubt the aims, too; else they count in full.
+        robust_aims: aims may be outliers, too; else they have full weight.
         keep_within, wanted: of the truncated cost, as of :func:`fgreg.graph.reduced_solver.optimize`.
     """
     start: Evaluation | None = None
@@ -210,16 +213,16 @@ def graduated(
         found = optimize(
             problem, state, private, max_iterations=STEPS_PER_SCALE, tolerance=TOLERANCE, loss=loss, start=start
         )
-        # Most starts have come together by then.
+        # Most starts have reached the same optima by then.
         index = distinct(problem, found.state, found.evaluation)
         state, private = found.state.take(index), found.evaluation.private.take(index)
     return _truncated_minima(problem, state, robust_aims=robust_aims, keep_within=keep_within, wanted=wanted)
 
 
 def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
-    """The better of :func:`graduated` and of the descent on the truncated cost alone, from one start.
+    """The better of :func:`graduated` and a descent on the truncated cost alone, from one start.
 
-    The wide losses may lead away from a start that is good already, and into another minimum.
+    From a good start the wide losses may lead into another minimum.
     """
     far = graduated(problem, state, robust_aims=robust_aims)
     near = _truncated_minima(problem, state, robust_aims=robust_aims)
@@ -259,10 +262,10 @@ def _truncated_minima(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovations:
-    """Squared deviation of each shot from what the *other* kept shots predict, over its predicted covariance.
+    """Squared deviation of each shot from what the *other* inliers predict, over its predicted covariance.
 
-    ``pm`` (J,) and ``aim`` (A,): chi square of the shot's degrees of freedom. Infinite where the rest leaves the
-    prediction open.
+    ``pm`` (J,) and ``aim`` (A,): chi square with the shot's degrees of freedom. Infinite where the other inliers do not
+    determine the prediction.
     """
 
     pm: FloatArray
@@ -270,10 +273,10 @@ class Innovations:
 
 
 def innovations(parts: Parts, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Innovations:
-    """Innovations of all shots at an optimum of the kept ones (one hypothesis), in closed form.
+    """Innovations of all shots at the optimum of the inliers (one hypothesis), in closed form.
 
-    With total Hessian H, leaving a shot of cost c, gradient g, Hessian A out moves the optimum to where the rest costs
-    g' (H - A)^-1 g less: the innovation is c + g' (H - A)^-1 g. For a shot that was not in it is c - g' (H + A)^-1 g.
+    Let H be the total Hessian. Without an inlier of cost c, gradient g, Hessian A the cost of the rest has its optimum
+    g' (H - A)^-1 g lower, so the innovation is c + g' (H - A)^-1 g. That of an outlier is c - g' (H + A)^-1 g.
     """
     hessian = _hessian_of(parts, pm_inlier, aim_inlier)
     return Innovations(_innovation(parts.pm, hessian, pm_inlier), _innovation(parts.aim, hessian, aim_inlier))
@@ -282,7 +285,7 @@ def innovations(parts: Parts, pm_inlier: BoolArray, aim_inlier: BoolArray) -> In
 def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
     sign = np.where(kept, -1.0, 1.0)
     cost, gradient, own = part.cost[0], part.gradient[0], part.hessian[0]
-    seen = np.diag(hessian + own.sum(axis=0)) > UNKNOWN  # what no shot sees (the pose, of aims alone) does not matter
+    seen = np.diag(hessian + own.sum(axis=0)) > UNKNOWN  # variables that no shot observes (the pose, of aims) do not matter
     gradient = gradient[:, seen]
     rest = (hessian + sign[:, None, None] * own)[:, seen][:, :, seen]
     scale = np.sqrt(np.maximum(np.diagonal(rest, axis1=1, axis2=2), 0.0))
@@ -297,7 +300,7 @@ def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> Fl
 
 
 def innovations_of(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
-    """Innovations (n,) of shots, one hypothesis, at an optimum whose Hessian (D, D) holds those kept (n,)."""
+    """Innovations (n,) of shots, one hypothesis, at the optimum of the inliers (n,), whose Hessian (D, D) is given."""
     return _innovation(part, hessian, kept)
 
 
@@ -308,9 +311,9 @@ def innovations_at(
     aim_inlier: BoolArray,
     private: PrivateState | None = None,
 ) -> Innovations:
-    """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the kept shots.
+    """:func:`innovations` at shared variables (one hypothesis) that are the optimum of the inliers.
 
-    ``private`` where its private variables are known, else they are found.
+    ``private``: the private variables there; they are optimised where None.
     """
     parts = _settled_parts(problem, state) if private is None else contributions(problem, state, private)
     return innovations(parts, pm_inlier, aim_inlier)
@@ -325,9 +328,9 @@ class BeyondLimit:
 
 
 def beyond_limit(problem: PackedProblem, found: Innovations, pm_inlier: BoolArray) -> BeyondLimit:
-    """Shots that deviate more than a good one may, where these PMs (J,) count.
+    """Shots whose innovation is beyond their limit, given the inlier PMs (J,).
 
-    Infinite innovations say nothing: the rest predicted nothing.
+    A shot of infinite innovation is not beyond its limit: the others predict nothing for it.
     """
     limits = limits_among(problem, pm_inlier, int(pm_inlier.sum()), len(pm_inlier))
     pm, aim = found.pm > limits, found.aim > AIM_LIMIT
@@ -336,9 +339,9 @@ def beyond_limit(problem: PackedProblem, found: Innovations, pm_inlier: BoolArra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InlierSelection:
-    """Which shots are kept, PMs (J,) and aims (A,), at the least squares optimum of those kept (one hypothesis).
+    """Inlier PMs (J,) and aims (A,), and their least squares optimum (one hypothesis).
 
-    ``settled``: every shot kept, and none of the others, is within its limit; False with borderline shots kept.
+    ``settled``: all inliers are within their limits, and no outlier is; False where borderline shots are inliers.
     """
 
     state: SharedState
@@ -355,12 +358,12 @@ def select_inliers(
     *,
     select_aims: bool = True,
 ) -> InlierSelection:
-    """Least squares on those kept and innovations of all, in turn, until who is kept no longer changes.
+    """Alternate least squares of the inliers and innovations of all shots until the inliers no longer change.
 
     Args:
         problem: the packed measurements.
         state: one hypothesis.
-        pm_inlier (J,), aim_inlier (A,): where to begin.
+        pm_inlier (J,), aim_inlier (A,): first inliers.
         select_aims: False leaves ``aim_inlier`` as it is.
     """
     seen: set[bytes] = set()
@@ -384,7 +387,7 @@ def select_inliers(
 
 
 def predicted_pms(others: PackedProblem, problem: PackedProblem, selection: InlierSelection) -> BoolArray:
-    """Whether PMs that are not in ``problem``, over the same shared variables, fit what is kept of it (J,)."""
+    """(J,) whether PMs that are not in ``problem``, over the same shared variables, fit its inliers."""
     hessian = _hessian_of(_settled_parts(problem, selection.state), selection.pm_inlier, selection.aim_inlier)
     none = np.zeros(len(others.pms), dtype=bool)
     innovation = _innovation(_settled_parts(others, selection.state).pm, hessian, none)

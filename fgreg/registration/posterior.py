@@ -1,12 +1,12 @@
-"""Samples of the posterior of the shared variables, and what they say: the estimate, its covariance, regions, errors.
+"""Samples of the posterior of the shared variables; from them the estimate, its covariance, and predicted errors.
 
-The Gaussian at the optimum is overconfident at few pairs, where the problem is visibly nonlinear, and the windows are
-intervals. So the density of the shared variables (fgreg.graph.reduced_graph.log_posterior) is sampled by adaptive
-multiple importance sampling (Cornuet et al., 2012): Student densities about the minima first, then about what the
-samples so far show, all samples weighted by the mixture of all proposals. Deterministic by seed.
+With few pairs the Gaussian at the optimum is overconfident: the problem is nonlinear, and the windows are intervals. So
+the density of the shared variables (fgreg.graph.reduced_graph.log_posterior) is sampled by adaptive multiple importance
+sampling (Cornuet et al., 2012). The first proposals are Student densities about the minima, later ones are fitted to
+the samples drawn up to then. All samples are weighted by the mixture of all proposals. Deterministic by seed.
 
-Chart: ``trus_T_camera = estimate * Expmap(xi)``, GTSAM's tangent. In it a turn about any point of the scene is a
-straight line, where (rotation, translation) apart bend: the lever from camera to tissue is long.
+Chart: ``trus_T_camera = estimate * Expmap(xi)``, GTSAM's tangent. In it a rotation about any point of the scene is a
+straight line; in separate (rotation, translation) it is curved, since the camera is far from the tissue.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from fgreg.graph.split_points import logsumexp
 from fgreg.model.estimate import PredictedTre
 
 DEGREES_OF_FREEDOM = 6.0
-"""Of the Student proposals: heavier tails than the posterior's, or rare samples would carry all the weight."""
+"""Of the Student proposals: tails heavier than the posterior's, else rare samples would have all the weight."""
 QUANTILE = 0.95
 MOST_TRANSLATION_MM = 2000.0
-"""No camera is farther from a probe (the session format's bound): far out, rounding alone may look like a fit."""
+"""Largest distance from camera to probe (the session format's bound): beyond it rounding may look like a fit."""
 CHUNK = 4000
-"""Samples times PMs that are evaluated at once: what stays in the cache."""
+"""Samples times PMs that are evaluated at once: the arrays then stay in the processor's cache."""
 REFINED_PMS = 8
-"""With fewer PMs the samples reach so far that the private variables are refined once more for each."""
+"""With fewer PMs the samples spread so widely that the private variables are refined once more for each."""
 FITTING, TAILS = 0.4, 4.0
-"""Share of effective samples in the first round below which the posterior has tails that take more samples to find."""
+"""Share of effective samples in the first round below which the posterior has long tails; factor on the goal then."""
 KERNELS = 40
-"""Proposals of a later round that sit on samples of the earlier ones."""
+"""Number of kernels of a later proposal that are centred on samples of earlier rounds."""
 WIDE, SHARES = 1.8, (0.4, 0.1, 0.5)
-"""Scale of a wide proposal that looks for arms; shares of draws about the mean, as wide as that, and on samples."""
+"""Scale of the wide component, which finds curved tails; shares of draws: about the mean, wide, and on samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,13 +47,13 @@ class Posterior:
     """Weighted samples of the shared variables.
 
     Attributes:
-        columns: where each shared variable sits in ``step``.
-        mean: the estimate they are centred on (one hypothesis).
+        columns: places of the shared variables in ``step``.
+        mean: the estimate, about which they are centred (one hypothesis).
         step: (S, D) deviations of the samples from it, as :meth:`SharedState.retract` takes them.
         tangent: (S, D) the same with registrations in GTSAM's tangent.
         weight: (S,) sums to 1.
         log_density: (S,) of the samples, up to a constant; see :meth:`contains`.
-        effective: number of independent samples they are worth.
+        effective: effective number of independent samples.
         covariance: (D, D) second moment of ``tangent`` about the estimate.
     """
 
@@ -69,7 +69,7 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutlierMixture:
-    """The problem with all PMs, those left out and those kept, each good or junk (``problem.log_outlier``).
+    """The problem with all PMs, each either inlier or outlier (``problem.log_outlier``).
 
     ``private`` and ``point_gain`` (1, J, 3, D) are at the optimum of a mode.
     """
@@ -81,7 +81,7 @@ class OutlierMixture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mode:
-    """Where to look for probability: an optimum of a problem (one hypothesis) and the covariance (D, D) about it.
+    """A mode of the posterior: an optimum of a problem (one hypothesis) and the covariance (D, D) about it.
 
     ``doubted``: the density to sample where shots were left out; the problem's own where None.
     """
@@ -136,10 +136,9 @@ def _log_volume(tangent: FloatArray, columns: Columns) -> FloatArray:
 
 
 def light(mode: Mode) -> Mode:
-    """The mode with its calibration shots summed up: a Gaussian of the beam (and bias), on which alone they depend.
+    """The mode with its calibration shots replaced by a Gaussian of the beam (and bias), the variables they depend on.
 
-    In the beam's chart they are next to quadratic, and leaving them out of every sample saves most of its time at few
-    pairs.
+    In the beam's chart their cost is almost quadratic. At few pairs this saves most of the time of a sample.
     """
     problem, at = mode.problem, mode.optimum.evaluation
     if not len(problem.aims.rotation) or problem.anchor is not None:
@@ -168,7 +167,7 @@ def log_density(mode: Mode, step: FloatArray) -> FloatArray:
     problem = mode.problem if mode.mixture is None else mode.mixture.problem
     state = _repeat(mode.optimum.state, len(step)).retract(step, problem.columns)
     private = moved_private(mode, step)
-    with np.errstate(all="ignore"):  # far out a sample may be anything: it then has no density
+    with np.errstate(all="ignore"):  # numbers of a sample far off may overflow: its density is then zero
         if len(problem.pms) < REFINED_PMS or mode.mixture is not None:
             _, private = refine(problem, state, private)
         log = log_posterior(problem, state, private)
@@ -185,11 +184,11 @@ def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Students:
-    """Mixture of multivariate Student densities, grouped by shape: roots (G, D, D), of which each has scales.
+    """Mixture of K multivariate Student densities, grouped by shape.
 
     Attributes:
-        centre: (K, D). group: (K,) which root each has. scale: (K,) what multiplies it. share: (K,).
-        root: (G, D, D) lower triangular.
+        centre: (K, D). group: (K,) number of each one's root. scale: (K,) factor on it. share: (K,).
+        root: (G, D, D) lower triangular Cholesky factors of the shapes.
     """
 
     centre: FloatArray
@@ -214,7 +213,7 @@ class _Students:
         out = np.empty((len(self.root), len(x)))
         for group, root in enumerate(self.root):
             mine = np.flatnonzero(self.group == group)
-            # About the group's first centre: squares of small numbers only.
+            # Distances from the group's first centre keep the squares small, which is more accurate.
             origin = self.centre[mine[0]]
             at = np.linalg.solve(root, (x - origin).T)
             centre = np.linalg.solve(root, (self.centre[mine] - origin).T)
@@ -234,7 +233,7 @@ def _effective(log_weight: FloatArray) -> float:
 
 
 def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights (S,), flattened by a power where they would be worth fewer than ``least`` samples."""
+    """Weights (S,), tempered by a power where their effective number of samples is below ``least``."""
     power = 1.0
     while _effective(power * log_weight) < min(least, 0.5 * len(log_weight)) and power > 1e-3:
         power *= 0.8
@@ -242,7 +241,7 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
 
 
 def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: np.random.Generator) -> _Students:
-    """A proposal for the next round: about the samples' mean, and about some of the samples themselves."""
+    """The next round's proposal: Students about the samples' mean and about some of the samples."""
     size = x.shape[1]
     weight = _tempered(log_weight, 3.0 * size)
     effective = 1.0 / float(np.sum(weight**2))
@@ -251,7 +250,7 @@ def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: 
     trust = effective / (effective + size)
     moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * fallback
     root = _root(moment)
-    # Kernels as wide as a density estimate from so many samples would have them.
+    # Kernel width of a density estimate from this many samples (Silverman).
     width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
     at = x[rng.choice(len(x), KERNELS, p=weight)]
     return _Students(
@@ -299,12 +298,12 @@ class _Target:
 
 
 def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: int) -> Posterior:
-    """Weighted samples of the posterior, about its mean (of the part that is nearest to the weightiest mode).
+    """Weighted samples of the posterior, about the mean of those nearest to the mode of most weight.
 
     Args:
         modes: minima of one session, the best first.
-        goal: effective samples to go for.
-        most: draws after which to be content with less.
+        goal: effective samples after which it stops.
+        most: draws after which it stops with fewer.
         seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
@@ -343,10 +342,10 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         counts.append(draws)
         share = np.log(np.array(counts) / sum(counts))
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
-        if not np.isfinite(log_weight).any():  # the optimum itself is nowhere that a camera may be
+        if not np.isfinite(log_weight).any():  # the optimum itself is where no camera can be
             break
         if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
-            goal = TAILS * goal  # far from Gaussian: what has not been drawn does not lower the count
+            goal = TAILS * goal  # far from Gaussian: tails not drawn yet do not lower the effective number
         if _effective(log_weight) >= goal or len(x) >= most:
             break
         proposals.append(_refitted(x, log_weight, fallback, rng))
@@ -361,17 +360,17 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
 
 
 ENOUGH_SAMPLES = 60.0
-"""Independent samples from which moments stand on their own."""
+"""Effective samples from which the samples' moments are used alone."""
 LEAST_SAMPLES = 5.0
-"""Fewer say nothing, and would seem certain of it: the Gaussian at the optimum stands in for them."""
+"""With fewer effective samples, whose spread is far too small, the Gaussian at the optimum is used instead."""
 
 
 def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
-    """Samples of the Gaussian at a mode: what the posterior is with many pairs."""
+    """Samples of the Gaussian at a mode, which the posterior approaches with many pairs."""
     x = np.random.default_rng(seed).standard_normal((count, len(mode.covariance)))
-    x = np.concatenate([x, -x])  # in pairs about the mode, which so stays the mean
+    x = np.concatenate([x, -x])  # in pairs about the mode, so that it is the mean
     weight = np.full(len(x), 1.0 / len(x))
-    # Stretched to have the mode's covariance exactly.
+    # Scaled to have exactly the mode's covariance.
     x = np.linalg.solve(_root(x.T @ x / len(x)), x.T).T @ _root(mode.covariance).T
     log = -0.5 * np.sum(np.linalg.solve(_root(mode.covariance), x.T) ** 2, axis=0)
     return _about_mean(_Target((mode,)), x, weight, weight, log, float(count))
@@ -384,11 +383,11 @@ def _about_mean(
     centre = main @ x
     spread = x - centre
     moment = (spread * main[:, None]).T @ spread
-    # A few heavy samples span no volume: the optimum's own covariance stands in for what they cannot tell.
+    # A few samples of large weight span too little: the optimum's own covariance is added for what is missing.
     missing = max(0.0, 1.0 - effective / ENOUGH_SAMPLES) + 1e-9
     moment = moment + missing * target.modes[0].covariance
-    # The mean is known to a sampling error of moment / effective: James and Stein's shrinkage towards the optimum takes
-    # out what is no more than that, so that many pairs, or exact measurements, report the optimum itself.
+    # The mean has a sampling error of moment / effective. James and Stein's shrinkage towards the optimum removes a
+    # shift that is no larger than that. So many pairs, or exact measurements, give the optimum itself.
     square = float(centre @ np.linalg.solve(moment, centre)) * effective if len(x) else 0.0
     keep = max(0.0, 1.0 - (len(centre) - 2.0) / max(square, 1e-12))
     shift = step_of_tangent(keep * centre[None], columns)
@@ -416,7 +415,7 @@ def weighted_quantile(values: FloatArray, weight: FloatArray, quantile: float) -
 
 
 def target_errors(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> FloatArray:
-    """(S, n) distances (mm) by which each sample moves the camera points that the estimate puts at the targets."""
+    """(S, n) errors (mm): by how far each sample moves the camera points that the estimate maps to the targets."""
     estimate = posterior.mean.trus_T_camera(epoch)[0]
     camera_p = transform_points(inverse(estimate), targets_mm)
     twist = posterior.step[:, 6 * epoch : 6 * epoch + 6]

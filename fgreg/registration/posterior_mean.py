@@ -1,9 +1,8 @@
-"""From the optimum to the answer: the posterior around it, and the session's estimate at the posterior's mean.
+"""From the optimum to the posterior mean, which is the session's estimate.
 
-The optimum of the graph with Gaussian windows (fgreg.registration.register) is where the search ends, what the explicit
-graph is compared with and what residuals are judged at. What is reported is the mean of the posterior, in which windows
-have
-their own shape and the geometry its nonlinearity: a smaller expected error, and the point its moments are about.
+The search ends at the optimum of the graph with Gaussian windows (fgreg.registration.register). There the explicit
+graph is compared, and residuals are evaluated. The reported estimate is the mean of the posterior, which has the
+windows' own shapes and the nonlinear geometry: its expected error is smaller, and the posterior's moments are about it.
 """
 
 from __future__ import annotations
@@ -33,21 +32,22 @@ from fgreg.registration.posterior import (
 from fgreg.registration.register import Registration, Shots
 
 RIVALS = 3
-"""At most so many other minima enter the posterior."""
+"""Largest number of other minima that enter the posterior."""
 RIVAL_CHI2 = 14.0
-"""Minima whose chi square is larger by more than this hold too little of the posterior to matter."""
+"""Minima whose chi square is larger by more than this have too small a share of the posterior to matter."""
 OPEN_PMS = 5
 """Fewer PMs leave a registration open, whatever samples say: a third of the draws has to do."""
 FREE_SOUND_SPEED = 0.1
-"""Prior sigma of a sound speed ratio that only the residuals are to determine."""
+"""Prior sigma of the sound speed ratio where only the residuals should determine it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorMean:
-    """The session's estimate: ``registration`` with its optimum moved to the posterior's mean, and the posterior.
+    """The session's estimate: ``registration`` with its optimum moved to the posterior mean, and the posterior.
 
-    ``registration.problem`` has the windows' Gaussian sites where they settled, ``registration.covariance`` is the
-    posterior's second moment about the estimate. ``modes`` are what the posterior was sampled from.
+    ``registration.problem`` has the windows' expectation propagation sites where these converged.
+    ``registration.covariance`` is the posterior's second moment about the estimate. The posterior was sampled about
+    ``modes``.
     """
 
     registration: Registration
@@ -75,7 +75,7 @@ def posterior_mean(registration: Registration, config: SolveConfig) -> Posterior
 
 
 def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
-    """All shots at the moved estimate, those kept with the stand-ins of ``problem``; innovations stay as judged."""
+    """All shots at the moved estimate, inliers with the sites of ``problem``; innovations stay those of the optimum."""
     if shots.pm_inlier.all() and shots.aim_inlier.all():
         return replace(shots, problem=problem, evaluation=moved.evaluation)
     whole = _with_all_pms(shots, problem)
@@ -83,7 +83,7 @@ def _moved_shots(shots: Shots, problem: PackedProblem, moved: Optimum) -> Shots:
 
 
 def _with_all_pms(shots: Shots, problem: PackedProblem) -> PackedProblem:
-    """All shots, those kept with the stand-ins of ``problem``."""
+    """All shots, inliers with the sites of ``problem``."""
     looks, kept = shots.problem.looks, shots.pm_inlier[shots.problem.look_pm]
     weight, centre = looks.weight.copy(), looks.centre_rad.copy()
     weight[kept], centre[kept] = problem.looks.weight, problem.looks.centre_rad
@@ -98,7 +98,7 @@ def _settled(problem: PackedProblem, state: SharedState) -> PrivateState:
 
 
 def _with_outlier_mixture(shots: Shots, mode: Mode) -> Mode:
-    """The mode with all PMs in its density, each good or junk: which they are is not known for certain."""
+    """The mode with all PMs in its density, each either inlier or outlier: which of them is not certain."""
     if shots.pm_inlier.all():
         return mode
     problem, state = mode.problem, mode.optimum.state
@@ -122,9 +122,9 @@ class Estimated:
 
 
 def sound_speed_from_residuals(registration: Registration) -> Estimated:
-    """The ratio of true to assumed sound speed that the pairs ask for, next to no prior on it.
+    """The ratio of true to assumed sound speed that fits the pairs best, with a very weak prior.
 
-    For a registration in which it is no variable: one Gauss-Newton step from its optimum with the ratio set free.
+    For a registration in which it is not a variable: one Gauss-Newton step from its optimum with the ratio added.
     """
     free = pack(registration.measurements, registration.model, sound_speed_sigma=FREE_SOUND_SPEED)
     optimum, column = registration.optimum, free.columns.sound_speed
@@ -150,20 +150,20 @@ def estimated_radius(found: Registration) -> Estimated | None:
 
 
 def _with_sites(problem: PackedProblem, optimum: Optimum, covariance: FloatArray) -> Mode:
-    """A mode of the posterior: the windows' sites where they settle, the Gaussian windows where not."""
+    """A mode of the posterior: with the windows' sites where they converge, else with Gaussian windows."""
     found = propagate(problem, optimum)
     if found is None:
         return Mode(problem, optimum, covariance)
     sites, there = found
     inverse = inverse_hessian(there.evaluation.hessian[0])
     away = np.linalg.norm(there.state.translation_mm, axis=-1).max()
-    if inverse is None or not away <= MOST_TRANSLATION_MM:  # at few pairs the sites may let the optimum run away
+    if inverse is None or not away <= MOST_TRANSLATION_MM:  # at few pairs the sites may let the optimum diverge
         return Mode(problem, optimum, covariance)
     return Mode(sites, there, inverse)
 
 
 def _modes(registration: Registration) -> tuple[Mode, ...]:
-    """The optimum's mode first, then those of other minima that hold a share of the posterior."""
+    """The optimum's mode first, then those of other minima that have a share of the posterior."""
     problem, best = registration.problem, registration.optimum
     modes = [_with_sites(problem, best, registration.covariance)]
     targets = registration.model.targets_mm
@@ -190,7 +190,7 @@ def _modes(registration: Registration) -> tuple[Mode, ...]:
 
 
 def _evaluated(problem: PackedProblem, state: SharedState, near: Optimum) -> Optimum:
-    """The problem at a state, private variables at their optimum there."""
+    """The problem evaluated at a state, with the private variables at their optimum."""
     private = near.evaluation.private
     for start in (private, initial_private(problem, state)):
         private = start

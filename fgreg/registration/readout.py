@@ -1,4 +1,4 @@
-"""From the optimum to what is reported: the laser line, each pair, each aim."""
+"""Per-shot results from the optimum: the laser line, each pair, each aim."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ class LaserReadout:
 
 
 def beam_origin_shift(state: SharedState, model: SessionModel) -> float:
-    """Lambda (mm) in the beam chart of the laser frame's origin: the nominal tip's foot, else nearest the marker's."""
+    """Lambda (mm) in the beam chart of the laser frame's origin.
+
+    The origin is the point on the beam nearest to the nominal tip, else nearest to the marker's origin.
+    """
     direction, start = state.beam_direction()[0], state.beam_origin()[0]
     initial = model.initial_marker_T_laser
     return float(-start @ direction) if initial is None else float((initial[:3, 3] - start) @ direction)
 
 
 def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
-    """``marker_T_laser`` with +z along the beam; origin at the nominal tip's foot, else nearest the marker's origin.
+    """``marker_T_laser`` with +z along the beam, its origin as of :func:`beam_origin_shift`.
 
     Roll about the beam and shift along it are gauge: their variances are zero.
     """
@@ -41,8 +44,8 @@ def read_laser(registration: Registration, model: SessionModel) -> LaserReadout:
     if initial is None:
         rotation = rotation_to_direction(direction)
     else:
-        # The nominal frame turned by the least that brings its z onto the beam: its roll stays.
-        if initial[:3, 2] @ direction < 0:  # given the wrong way round
+        # The smallest rotation that brings the nominal z onto the beam: the roll of the nominal frame stays.
+        if initial[:3, 2] @ direction < 0:  # the given beam points backwards
             initial = initial @ np.diag([1.0, -1.0, -1.0, 1.0])
         axis = np.cross(initial[:3, 2], direction)
         sine, cosine = float(np.linalg.norm(axis)), float(initial[:3, 2] @ direction)
@@ -73,7 +76,7 @@ def read_pairs(
     model: SessionModel,
     origin_shift_mm: float,
 ) -> tuple[PairEstimate, ...]:
-    """One estimate per pair of ``measurements``, in order; those left out say why."""
+    """One estimate per pair of ``measurements``, in order; outliers have the reason why they were left out."""
     shots = registration.shots
     problem, at = shots.problem, shots.evaluation
     state = registration.optimum.state
@@ -115,8 +118,8 @@ def read_pairs(
 
 
 def outlier_reason(nis: float) -> str:
-    """Why a shot was left out, with the figure."""
-    return f"junk: it does not fit the other shots (nis {nis:.1f})"
+    """Why a shot was left out, with its innovation."""
+    return f"outlier: it does not fit the other shots (nis {nis:.1f})"
 
 
 def read_aims(
@@ -125,7 +128,7 @@ def read_aims(
     """One estimate per aim of ``measurements``, in order."""
     shots = registration.shots
     at = shots.evaluation
-    # In the plane across the chart's z axis; across the beam, which is next to it, they are a little shorter.
+    # The residuals lie in the plane across the chart's z axis; their parts across the beam are a little shorter.
     residual, slope = at.aim_residual[0], registration.optimum.state.beam[0, 2:]
     square = np.sum(residual**2, axis=1) - (residual @ slope) ** 2 / (1.0 + slope @ slope)
     out = []

@@ -1,9 +1,9 @@
-"""Calibration and registration in the one graph, from no guess: all minima worth knowing, best first.
+"""Calibration and registration in one graph, without an initial guess.
 
 1. Beam and minima of each camera epoch (fgreg.registration.multistart).
 2. All epochs together from the best of each: Levenberg-Marquardt on the reduced graph.
-3. Where a shot does not fit (its innovation is beyond what the stated noise explains), who is kept is settled on the
-   joint problem (fgreg.registration.outliers), and the answer is the plain least squares optimum of those.
+3. Where a shot does not fit (the stated noise does not explain its innovation), inliers are selected on the joint
+   problem (fgreg.registration.outliers). The result is the plain least squares optimum of the inliers.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class SoundSpeedPrior:
-    """What is known beforehand of the ratio of true to assumed sound speed."""
+    """Prior of the ratio of true to assumed sound speed."""
 
     mean: float
     sigma: float
@@ -71,13 +71,13 @@ class SoundSpeedPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shots:
-    """All shots of the epochs solved, at the optimum of those kept.
+    """All shots of the solved epochs, evaluated at the optimum of the inliers.
 
     Attributes:
-        problem: all of them packed; a registration's own problem where all are kept.
+        problem: all shots, packed; the registration's own problem where all are inliers.
         evaluation: at the registration's optimum (one hypothesis).
-        pm_inlier (J,), aim_inlier (A,): over ``problem``'s PMs and aims.
-        innovations: likewise: how far each is from what the others predict.
+        pm_inlier (J,), aim_inlier (A,): which of ``problem``'s PMs and aims are inliers.
+        innovations: of each PM and aim.
         pm_beyond_limit (J,), aim_beyond_limit (A,): shots beyond their limit, also where there are too few to leave one
             out.
     """
@@ -97,13 +97,13 @@ class Registration:
 
     Attributes:
         model: the session's set-up.
-        measurements: what entered: the shots kept of ``epochs``, with their epochs renumbered 0, 1, ...
-        epochs: the session's numbers of the epochs solved.
+        measurements: the inliers of ``epochs``, with their epochs renumbered 0, 1, ...
+        epochs: the session's numbers of the solved epochs.
         problem, optimum: packed measurements and the optimum of the reduced graph.
-        searches: of every epoch of the session; no minima where it had too few pairs of its own.
-        ambiguous: the session's epochs in which two minima cannot be told apart.
+        searches: one for each epoch of the session; without minima where the epoch has too few pairs of its own.
+        ambiguous: the session's epochs in which two minima fit equally well.
         covariance: (D, D) inverse Hessian of the shared variables (``problem.columns``).
-        shots: all shots of ``epochs``, also those left out.
+        shots: all shots of ``epochs``, inliers and outliers.
     """
 
     model: SessionModel
@@ -123,7 +123,7 @@ Pack = Callable[[Measurements], PackedProblem]
 def joint_start(
     measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
 ) -> SharedState:
-    """All solvable epochs in one state: from their own minima, else carried over by the measured motions."""
+    """One state with all solvable epochs: each from its own minimum, else from another one by the measured motions."""
     transforms = {k: minimum.state.trus_T_camera()[0] for k, minimum in chosen.items()}
     while len(transforms) < len(solvable):
         for k in solvable:
@@ -165,7 +165,11 @@ def _best_start(
     model: SessionModel,
     config: SolveConfig,
 ) -> SharedState:
-    """Each epoch from its own minimum, or all that are tied from the one with most pairs: which leads to less cost."""
+    """The better of two starts.
+
+    Either each epoch starts from its own minimum, or the epochs that measured motions link start from the one with
+    most pairs. The start that leads to the lower cost is returned.
+    """
     own = joint_start(measurements, chosen, solvable, model)
     count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
     leaders: dict[int, Minimum] = {}
@@ -190,10 +194,13 @@ def _open_minima(
     model: SessionModel,
     config: SolveConfig,
 ) -> tuple[SharedState, set[int]]:
-    """Minima that an epoch's own pairs cannot tell apart, judged with all epochs: the start, and what stays open.
+    """Choose between ambiguous minima of an epoch with the data of all epochs.
 
-    The other epochs know the beam and the window's edge better than the aims alone, and a measured motion rules out
-    all that is far from where it leads.
+    Together the epochs determine the beam and the window's edge better than the aims alone. A measured motion excludes
+    minima that are far from where it leads.
+
+    Returns:
+        the start, and the epochs that stay ambiguous.
     """
     if len(solvable) < 2 or not is_open:
         return start, is_open
@@ -249,7 +256,7 @@ def _keep(
 
 
 def _enough(problem: PackedProblem, pm_inlier: BoolArray, aim_inlier: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """Who is kept, where an epoch with too few left (or the aims) takes all of its own back."""
+    """The inliers, with outlier rejection undone for an epoch (or for the aims) that has too few inliers."""
     pm_inlier = pm_inlier.copy()
     epoch_of = np.zeros(len(problem.pms), dtype=np.int64)
     epoch_of[problem.beam_pm] = problem.beam_epoch
@@ -269,12 +276,12 @@ def _split_looks(
     selection: InlierSelection,
     packed: Pack,
 ) -> tuple[Measurements, BoolArray] | None:
-    """Several looks at a PM of which one is junk: that one becomes a PM of its own, and the others are kept.
+    """Split an outlier look off its PM, so that the PM's other looks are inliers.
 
-    Only where leaving out one look, and no other one, makes the rest fit. None where there is no such PM.
+    This is done only where exactly one look can be left out so that the rest of its PM fits. None without such a PM.
 
     Returns:
-        the measurements with the junk looks under PM numbers of their own, and which of their PMs are kept.
+        the measurements with each outlier look under a PM number of its own, and which of their PMs are inliers.
     """
     pm_inlier, _ = kept
     out = {pm for pm, keep in zip(whole.pms, pm_inlier, strict=True) if not keep}
@@ -285,7 +292,7 @@ def _split_looks(
     trials = [(pm, left) for pm, indices in looks.items() if len(indices) > 1 for left in indices]
     if not trials:
         return None
-    # Every trial as a PM of its own.
+    # Each trial is packed as a PM of its own.
     variants = [
         replace(measurements.pairs[index], pm=number)
         for number, (pm, left) in enumerate(trials)
@@ -313,14 +320,17 @@ def _split_looks(
 def _solve_jointly(
     measurements: Measurements, packed: Pack, start: SharedState, aim_inlier: BoolArray, *, clean: bool
 ) -> tuple[Measurements, PackedProblem, Optimum, Shots]:
-    """What is kept, packed, its optimum, and all shots judged by it.
+    """Select inliers and solve them.
 
     Args:
         measurements: of the epochs to be solved.
-        packed: lays measurements out as arrays.
+        packed: packs measurements as arrays.
         start: one hypothesis.
-        aim_inlier: (A,) aims that fitted when looked at alone.
-        clean: whether no PM has deviated so far.
+        aim_inlier: (A,) aims that fit in the calibration without pairs.
+        clean: whether every PM fitted in the searches of the epochs.
+
+    Returns:
+        the inliers, packed inliers, their optimum, and all shots evaluated there.
     """
     whole = packed(measurements)
     everyone = np.ones(len(whole.pms), dtype=bool), np.ones(len(measurements.aims), dtype=bool)
@@ -334,7 +344,7 @@ def _solve_jointly(
             return measurements, whole, optimum, shots
         start = optimum.state
         clean = bool(plausible and beyond.pm.mean() <= FEW and beyond.aim.sum() <= 1)
-    if clean and aim_inlier.all():  # a few of many, as chance has it: the estimate is good enough to judge them by
+    if clean and aim_inlier.all():  # few of many are beyond their limit: this estimate is good enough to test them
         first = _enough(whole, ~beyond.pm, ~beyond.aim)
     else:
         robust = graduated_or_near(whole, start, robust_aims=True)
@@ -369,8 +379,11 @@ def register(
 ) -> Registration:
     """Calibrate and register: the joint optimum over all epochs that can be solved.
 
-    ``sound_speed`` is what is known of the ratio where it is estimated; the configuration's prior where None.
-    ``searched``: epochs that need no search, with what is known of their minima.
+    Args:
+        measurements: aims, pairs, epochs.
+        model, config: of the session.
+        sound_speed: prior of the ratio where it is estimated; the configuration's prior where None.
+        searched: search results of epochs that are not searched again.
 
     Raises:
         EstimationError: no beam to start from, or no epoch with three PMs.
@@ -387,7 +400,7 @@ def register(
     if not solvable:
         counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
         raise EstimationError(
-            f"no camera epoch has the 3 photoacoustic markers that a first solution takes (found {counts}); "
+            f"no camera epoch has the 3 photoacoustic markers that a first solution needs (found {counts}); "
             "take at least 6 pairs without moving the camera"
         )
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
@@ -403,7 +416,7 @@ def register(
     epochs = restrict_epochs(measurements, solvable)
     kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
     if _points_backwards(optimum):
-        # A nominal beam given the wrong way round, and no aim to tell: +z is where the spots are.
+        # The given nominal beam points backwards and no aim shows it: +z points towards the spots.
         start = _turned(optimum.state, model)
         kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
     return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), (kept, problem, optimum, shots))
@@ -417,10 +430,10 @@ def register_near(
     epochs: Sequence[int],
     sound_speed: SoundSpeedPrior | None = None,
 ) -> Registration:
-    """:func:`register` where it is known about where the optimum is: who is kept is settled anew, without a search.
+    """:func:`register` from a start near the optimum, without a search; inliers are selected again.
 
-    What the wide losses and the narrow one lead to from ``start`` is what they lead :func:`register` to from the best
-    of all minima, where ``start`` is nearest to that one: which shots counted before has no say in it.
+    Which shots were inliers before does not matter. So the result is that of :func:`register`, if ``start`` is nearest
+    to the best of all minima.
 
     Args:
         measurements: of the session.
@@ -449,10 +462,10 @@ def _registration(
     ambiguous: tuple[int, ...],
     found: tuple[Measurements, PackedProblem, Optimum, Shots],
 ) -> Registration:
-    """What was found, with its covariance.
+    """A registration from the joint solve, with its covariance.
 
     Raises:
-        EstimationError: there is none.
+        EstimationError: the Hessian is singular.
     """
     kept, problem, optimum, shots = found
     hessian = optimum.evaluation.hessian[0]

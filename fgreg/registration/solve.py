@@ -64,17 +64,17 @@ from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot, make_snapshot
 
 GRAPH_PAIRS = 200
-"""Up to so many pairs the explicit graph is solved as well, and has to agree."""
+"""Largest number of pairs for which the explicit graph is solved as well; its optimum has to agree."""
 AGREEMENT_SIGMA = 0.05
 """Largest distance between the two optima, in units of the estimate's own standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """The answer for a session's measurements: everything but the session's name.
+    """The estimate for a session's measurements: everything but the session's name.
 
-    ``pairs``, ``tracks`` and ``aims`` are in the order of what was given. ``registration``, ``posterior`` and
-    ``snapshot`` (what queries are answered from) are None where nothing could be computed.
+    ``pairs``, ``tracks`` and ``aims`` are in the order of the measurements and queries. ``registration``, ``posterior``
+    and ``snapshot`` (which answers tracking queries) are None where nothing could be computed.
     """
 
     verdict: Verdict
@@ -104,16 +104,16 @@ def solve(
     sound_speed_prior: SoundSpeedPrior | None = None,
     known: Mapping[int, EpochSearch] | None = None,
 ) -> Solution:
-    """Calibrate, register, judge, and answer the tracking queries from all of it.
+    """Calibrate, register, decide on the verdict, and answer the tracking queries from the whole session.
 
     Args:
         measurements: aims, pairs, epochs.
         tracks: queries; they never enter the estimate.
         model: the session's set-up.
         config: limits of the verdict.
-        conditions: found before (detection), to be weighed with those found here.
-        sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
-        known: epochs whose minima are known and not searched for again.
+        conditions: of the detection, added to those found here.
+        sound_speed_prior: prior of the sound speed ratio, where the configuration makes it a variable.
+        known: search results of epochs that are not searched again.
     """
     try:
         registration = register(measurements, model, config, sound_speed_prior, known)
@@ -134,7 +134,7 @@ def solve(
     epochs, found = _epoch_verdicts(measurements, centred, posterior, pairs, model, config, common, steady)
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
-    # The last epoch is where the camera stands; an earlier one that failed is told, and no more than a warning.
+    # The camera is in the last epoch; an earlier epoch that failed gives only a warning.
     verdict = max(epochs[-1].verdict, verdict_of(common), key=lambda v: v.severity)
     if verdict is Verdict.OK and any(epoch.verdict is not Verdict.OK for epoch in epochs):
         verdict = Verdict.WARNING
@@ -153,7 +153,7 @@ def solve(
 
 
 def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:
-    """A refusal where nothing could be computed."""
+    """A refused solution: nothing could be computed."""
     reasons = tuple(condition.text for condition in conditions)
     why = reasons[-1]
     return Solution(
@@ -182,7 +182,7 @@ def _common_conditions(
     lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]
     found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
     if not registration.optimum.converged.all():
-        text = f"the solve had not settled after {registration.optimum.iterations} steps: take more pairs in each epoch"
+        text = f"the solve did not converge in {registration.optimum.iterations} steps: take more pairs in each epoch"
         found.append(Condition(Verdict.REFUSED, text))
     found.extend(repeated_markers(registration.measurements.pairs))
     nis = shots.innovations
@@ -199,14 +199,14 @@ def _common_conditions(
         asked = sound_speed_from_residuals(registration)
         found.extend(sound_speed_condition(asked.value, asked.sigma))
     if found and verdict_of(found) is Verdict.REFUSED:
-        return found  # what is inconsistent anyway says nothing about the two forms of the graph
-    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph knows its radius
+        return found  # inconsistent data cannot test whether the two forms of the graph agree
+    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph has no radius variable
         found.extend(_agreement(registration))
     return found
 
 
 def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, config: SolveConfig) -> list[Condition]:
-    """Sound speed and radius: what they came out as."""
+    """Estimated sound speed and radius, where they are variables."""
     found = []
     speed, radius = estimated_sound_speed(centred), estimated_radius(centred)
     if speed is not None:
@@ -219,7 +219,7 @@ def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, c
 
 
 def _agreement(registration: Registration) -> list[Condition]:
-    """The explicit graph has to have its optimum where the reduced one is: two derivations of one answer."""
+    """Explicit and reduced graph have to have the same optimum: both are forms of one model."""
     apart = distance_to_explicit(registration)
     if apart <= AGREEMENT_SIGMA:
         return []
@@ -228,10 +228,10 @@ def _agreement(registration: Registration) -> list[Condition]:
 
 
 def distance_to_explicit(registration: Registration) -> float:
-    """Mahalanobis distance between the registrations that the explicit graph and the reduced one lead to.
+    """Mahalanobis distance between the optima of the explicit and the reduced graph, over the registrations.
 
-    By the Gauss-Newton step of each from the reduced optimum, where its own is next to nothing; infinite where the
-    explicit graph, the reference, has none.
+    Both take one Gauss-Newton step from the reduced optimum (that of the reduced graph is almost zero). Infinite where
+    the step of the explicit graph, the reference, is undetermined.
     """
     state, problem, at = registration.optimum.state, registration.problem, registration.optimum.evaluation
     epochs = problem.columns.epochs
@@ -276,9 +276,9 @@ def _epoch_verdicts(
     common: Sequence[Condition],
     steady: Mapping[int, Sequence[Condition]],
 ) -> tuple[tuple[EpochEstimate, ...], list[Condition]]:
-    """Each epoch with its verdict, and the conditions found on the way (named by epoch where there are several).
+    """Each epoch with its verdict, and its conditions (with the epoch's number where there are several epochs).
 
-    ``steady``: conditions of each epoch that were found at the optimum.
+    ``steady``: camera-move conditions of each epoch, tested at the optimum.
     """
     several = len(measurements.epochs) > 1
     out: list[EpochEstimate] = []
@@ -343,7 +343,7 @@ def _epoch_conditions(
 
 
 def _move_odds(registration: Registration, place: int) -> list[Condition]:
-    """Whether the inliers of one epoch fit one registration, before and after every split point."""
+    """Camera-move condition of one epoch: whether its inliers fit one registration, over all split points."""
     pms, log = move_odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
     if not len(log):
         return []
@@ -352,7 +352,7 @@ def _move_odds(registration: Registration, place: int) -> list[Condition]:
 
 
 def _outlier_conditions(registration: Registration, place: int) -> list[Condition]:
-    """PMs of one epoch that were left out, or should have been."""
+    """Conditions on the outliers of one epoch, and on PMs that do not fit but were not left out."""
     shots = registration.shots
     mine = np.zeros(len(shots.problem.pms), dtype=bool)
     mine[shots.problem.beam_pm[shots.problem.beam_epoch == place]] = True
@@ -378,13 +378,13 @@ def track_snapshot(
     origin_shift_mm: float,
     refused: Mapping[int, str] | None = None,
 ) -> Snapshot:
-    """What queries about a solved session are answered from.
+    """The snapshot that answers tracking queries about a solved session.
 
     Args:
-        registration: at the posterior's mean, its covariance that of the posterior.
+        registration: at the posterior mean, with the posterior's covariance.
         model, config: of the session.
         origin_shift_mm: lambda of the laser frame's origin in the beam chart.
-        refused: the epochs refused, with the reason (which may be empty).
+        refused: the refused epochs, each with the reason (which may be empty).
     """
     problem, at = registration.problem, registration.optimum.evaluation
     gain = at.point_gain[0]

@@ -1,4 +1,4 @@
-"""Whether the answer may be used: conditions, each a sentence with its figure and what to do about it."""
+"""Whether the estimate may be used: conditions, each a sentence with its figure and what to do about it."""
 
 from __future__ import annotations
 
@@ -21,47 +21,49 @@ SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
 WARN_LEFT_OUT = 0.25
 REFUSE_LEFT_OUT = 0.5
-"""Shares of the shots that may be junk."""
+"""Shares of outliers beyond which there is a warning, and a refusal."""
 SURE_OF_PAIRS = 9
 SURE_OF_AIMS = 6
-"""Shots that have to agree before those that do not are safely junk: half as many again as a solution takes."""
+"""Inliers needed to be sure which shots are outliers: one and a half times what a solution needs."""
 OUTLIER_CAUTION = 2
-"""Where shots were left out other hypotheses have more freedom to fit by chance: so many times the gap is needed."""
+"""Factor on the gap in chi square that is needed where shots were left out: other hypotheses then fit more easily by
+chance."""
 CERTAIN_NIS = 30.0
-"""Innovation of one shot that noise does not explain, nor a bad estimate from few others."""
+"""Innovation of one shot that neither noise nor a poor estimate from few other shots explains."""
 MIRROR_CHANCE = 2.0
-"""By no more than this a mirrored session fits better by chance: what is told wrongly here costs centimetres."""
+"""Chi square by which a mirrored session may fit better by chance: a wrong decision here costs centimetres."""
 MILD_NIS = 60.0
 MILD_OUTLIERS = 0.1
-"""Junk is mostly farther off than this; so large a share is not."""
+"""Most outliers have a larger innovation than the first; this share of them has not."""
 MOST_SOUND_SPEED = 0.1
-"""No medium is farther off than this: the cause is another."""
+"""No medium's sound speed is farther off than this share: there is another cause."""
 TELLING_PMS = 6
-"""Fewer PMs know no registration, and say nothing of a second one."""
+"""Fewer PMs do not determine one registration, so they cannot show a second one."""
 FEW_PMS = 21
-"""PMs up to which those before a camera move are enough to spoil a registration, and have to be looked for there."""
+"""Up to this number of PMs, those before an unreported camera move are enough to spoil the registration."""
 ABOUT_EVEN = 0.6
-"""Bayes factor of a move before any of few PMs, each as likely, against none, from which it is to be reckoned with: one
-in twelve steady sessions of 10 to 20 PMs reaches it, and so does a move of 2 deg between 5 PMs and 6."""
+"""Bayes factor, among few PMs, of a move at any split point (all equally likely) against none from which there is a
+warning. One in twelve sessions of 10 to 20 PMs without a move reaches it, and so does a move of 2 deg between 5 PMs and
+6."""
 SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
-"""Share of the error's variance from which a cause is named."""
+"""Share of the error's variance above which a cause is named."""
 LEAST_EFFECTIVE = 60.0
-"""Independent samples of the posterior below which its 95 % quantiles are not worth much."""
+"""Effective samples of the posterior below which its 95 % quantiles are rough."""
 SUSPICIOUS_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One condition missed: how bad that is, and the sentence for ``reasons``."""
+    """One missed condition: its severity, and the sentence for ``reasons``."""
 
     verdict: Verdict
     text: str
 
 
 def verdict_of(conditions: Iterable[Condition]) -> Verdict:
-    """The most severe verdict of the conditions missed."""
+    """The most severe verdict of the missed conditions."""
     return worst_verdict(*(condition.verdict for condition in conditions))
 
 
@@ -94,8 +96,8 @@ def ambiguity(
 def mirrored(search: EpochSearch, config: SolveConfig) -> list[Condition]:
     """The mirrored hypothesis: a stage or probe wired the other way round.
 
-    A mirror image whose beams come from the probe's side is no rival unless it fits far better; where the session as it
-    stands has them come from there, the mirror image is the likelier one already where it fits as well.
+    A mirror image whose beams come from the probe's side counts only where it fits far better. Where the beams of the
+    session as recorded come from there, the mirror image is preferred already where it fits as well.
     """
     if search.mirrored_cost is None or not search.minima:
         return []
@@ -121,18 +123,18 @@ def mirrored(search: EpochSearch, config: SolveConfig) -> list[Condition]:
 
 
 def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
-    """Sweep signs turned round, and another beam in the pairs than in the aims; tried where something does not fit."""
+    """Reversed sweep signs, and another beam in the pairs than in the aims; tried where some shot does not fit."""
     found = []
     if not search.minima:
         return []
     cost = search.minima[0].cost
-    # With all sweeps one way the sign does not show, and a small gap is chance.
+    # Where all sweeps go one way the data do not determine the sign, and a small gap is chance.
     if (
         search.other_way_cost is not None
         and search.other_way_cost < cost - OUTLIER_CAUTION * config.second_minimum_chi2
     ):
         text = (
-            f"the sweeps fit better with their signs turned round (chi square {search.other_way_cost:.1f} against "
+            f"the sweeps fit better with their signs reversed (chi square {search.other_way_cost:.1f} against "
             f"{cost:.1f}): sweep in events.jsonl is +1 where the device's angle was increasing; correct it"
         )
         found.append(Condition(Verdict.REFUSED, text))
@@ -149,11 +151,11 @@ def hypotheses(search: EpochSearch, config: SolveConfig) -> list[Condition]:
 
 
 def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Condition]:
-    """Too large a share of the shots left out as junk, or fewer kept than it takes to be ``sure``."""
+    """Too large a share of outliers, or fewer inliers than the ``sure`` that are needed to be certain of them."""
     out = int(np.sum(~kept))
     if out and out <= WARN_LEFT_OUT * len(kept) and kept.sum() < sure:
         text = (
-            f"{out} of {len(kept)} {what} do not fit the others and are left out; the {kept.sum()} kept are few to be "
+            f"{out} of {len(kept)} {what} do not fit the others and are left out; {kept.sum()} inliers are few to be "
             f"sure which are wrong ({sure} needed): take more {what}"
         )
         return [Condition(Verdict.WARNING, text)]
@@ -165,13 +167,13 @@ def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Con
             Verdict.REFUSED if refuse else Verdict.WARNING,
             f"{out} of {len(kept)} {what} do not fit the others and are left out (nis {nis[~kept].min():.0f} to "
             f"{nis[~kept].max():.0f}, at most {WARN_LEFT_OUT:.0%} accepted): look at what was detected there, check "
-            f"noise, probe and marker in session.yaml, and take {out} {what} anew",
+            f"noise, probe and marker in session.yaml, and take {out} {what} again",
         )
     ]
 
 
 def understated_noise(beyond_limit: BoolArray, nis: FloatArray) -> list[Condition]:
-    """Several shots beyond their limit, but not by far: that is noise larger than stated rather than junk."""
+    """Several shots slightly beyond their limit: noise that is larger than stated, rather than outliers."""
     mild = beyond_limit & (nis < MILD_NIS)
     share_of_outliers = float(np.mean(beyond_limit & ~mild))
     expected = min(OUTLIER_P + MILD_OUTLIERS * share_of_outliers, 1.0)
@@ -181,14 +183,14 @@ def understated_noise(beyond_limit: BoolArray, nis: FloatArray) -> list[Conditio
         Condition(
             Verdict.WARNING,
             f"the residuals of {int(mild.sum())} of {len(nis)} shots are larger than the stated noise explains, though "
-            f"not by far (nis {nis[mild].min():.0f} to {nis[mild].max():.0f}): rather than junk that is noise; correct "
-            "noise in session.yaml, or the covariances of the detections",
+            f"not by far (nis {nis[mild].min():.0f} to {nis[mild].max():.0f}): that is noise rather than outliers; "
+            "correct noise in session.yaml, or the covariances of the detections",
         )
     ]
 
 
 def too_few_to_tell(beyond_limit: BoolArray, kept: BoolArray, nis: FloatArray, names: Sequence[str]) -> list[Condition]:
-    """Shots that do not fit where there are too few to leave one out."""
+    """Shots that do not fit, where there are too few shots to leave one out."""
     suspects = np.flatnonzero(beyond_limit & kept)
     if not len(suspects):
         return []
@@ -203,11 +205,11 @@ def too_few_to_tell(beyond_limit: BoolArray, kept: BoolArray, nis: FloatArray, n
 
 
 def possible_camera_move(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
-    """Odds of a camera move among ``pms`` PMs (fgreg.graph.split_points), likeliest between two.
+    """A camera move among ``pms`` PMs, by its log odds (fgreg.graph.split_points), most likely between two PMs.
 
-    No registration is of both sides: what they are registered to lies anywhere between, and the predicted error does
-    not know. Among few PMs neither side of a move tells it well, so it counts where a move somewhere among them is
-    about as likely as none; among many the wrong ones are left out, or found by --detect-moves.
+    One registration cannot fit both sides of a move. It lies somewhere between them, and the predicted error does not
+    include that. Few PMs do not show a move clearly, so there is a warning where a move at any split point is about as
+    likely as none. Among many PMs those on the wrong side become outliers, or --detect-moves finds the move.
     """
     few, alarm = pms <= FEW_PMS, log_odds > ALARM
     somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1)
@@ -218,7 +220,7 @@ def possible_camera_move(log_odds: float, before: int, after: int, pms: int) -> 
             Verdict.REFUSED if few and alarm else Verdict.WARNING,
             f"the pairs up to PM {before} and those from PM {after} {'do' if alarm else 'may'} not fit one "
             f"registration (odds {math.exp(min(log_odds, 20.0)):.0f} to 1): if the camera was moved between them, "
-            "tell it (camera_moved) or solve with --detect-moves; where it was not, take more pairs",
+            "report it (camera_moved) or solve with --detect-moves; where it was not, take more pairs",
         )
     ]
 
@@ -254,7 +256,7 @@ def spread(directions: FloatArray, points: FloatArray, config: SolveConfig) -> l
 
 
 def sweeps(pairs: Iterable[Pair], config: SolveConfig) -> list[Condition]:
-    """Sweeps from one side only: a wrong window edge or sweep sign would not show."""
+    """Sweeps from one side only, which cannot show a wrong window edge or sweep sign."""
     sides = [pair.look.sweep for pair in pairs if pair.look.sweep]
     up, down = sides.count(1), sides.count(-1)
     if not sides or min(up, down) >= config.min_sweeps_per_side:
@@ -270,7 +272,7 @@ def sweeps(pairs: Iterable[Pair], config: SolveConfig) -> list[Condition]:
 
 
 def repeated_markers(pairs: Iterable[Pair]) -> list[Condition]:
-    """One marker observation under several PM numbers: looks that count as independent and are not."""
+    """One marker observation under several PM numbers: the looks would count as independent but are not."""
     pms: dict[int, set[int]] = {}
     for pair in pairs:
         pms.setdefault(pair.marker.id, set()).add(pair.pm)
@@ -285,7 +287,7 @@ def repeated_markers(pairs: Iterable[Pair]) -> list[Condition]:
 
 
 def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
-    """Residuals against the noise that was stated."""
+    """Chi square of the residuals against the stated noise."""
     if degrees_of_freedom <= 0:
         return []
     p = float(chdtrc(degrees_of_freedom, cost))
@@ -302,7 +304,7 @@ def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
 
 
 def estimated(name: str, value: float, sigma: float, prior: float, prior_sigma: float, unit: str) -> Condition:
-    """What a session-wide variable came out as; a warning where it left its prior."""
+    """The estimate of a session-wide variable; a warning where it is outside its prior."""
     far = abs(value - prior) > SUSPICIOUS_SIGMAS * prior_sigma
     text = f"estimated {name} {value:.4g} +- {sigma:.2g}{unit} (given {prior:.4g} +- {prior_sigma:.2g}{unit})"
     if far:
@@ -311,7 +313,7 @@ def estimated(name: str, value: float, sigma: float, prior: float, prior_sigma: 
 
 
 def sampling(effective: float) -> list[Condition]:
-    """Too few independent samples of the posterior for the figures that rest on them."""
+    """Too few effective samples of the posterior for the predicted errors."""
     if effective >= LEAST_EFFECTIVE:
         return []
     text = (
@@ -323,14 +325,14 @@ def sampling(effective: float) -> list[Condition]:
 
 @dataclass(frozen=True, slots=True)
 class Causes:
-    """Share of the variance at the worst target that would go if the beam, or the window edge, were known."""
+    """Share of the variance at the worst target that would vanish if the beam, or the window edge, were known."""
 
     beam: float
     edge: float
 
 
 def accuracy(tre: PredictedTre, config: SolveConfig, causes: Causes | None = None) -> list[Condition]:
-    """Predicted error at the worst target against the limit, with what would lower it most."""
+    """Predicted error at the worst target against the limit, with the advice that would lower it most."""
     if tre.worst_mm <= config.limit_mm:
         return []
     far = tre.worst_mm > 2.0 * config.limit_mm
@@ -352,7 +354,7 @@ def accuracy(tre: PredictedTre, config: SolveConfig, causes: Causes | None = Non
 
 
 def causes_of_error(registration: Registration, place: int, targets_mm: FloatArray) -> Causes:
-    """What the error of an epoch (``place`` in ``registration.epochs``) comes from, by the Gaussian at the optimum."""
+    """Causes of the error of an epoch (``place`` in ``registration.epochs``), by the Gaussian at the optimum."""
     columns, covariance = registration.problem.columns, registration.covariance
     camera_p = transform_points(inverse(registration.optimum.state.trus_T_camera(place)[0]), targets_mm)
     # A right perturbation (omega, v) moves the camera point p by omega x p + v.
@@ -369,19 +371,19 @@ def causes_of_error(registration: Registration, place: int, targets_mm: FloatArr
 
 
 def sound_speed_condition(ratio: float, sigma: float) -> list[Condition]:
-    """Whether the pairs ask for another sound speed than they were given, from the ratio that they ask for."""
+    """Whether the pairs fit better with another sound speed than the given one; ``ratio`` is the one they fit best."""
     if not max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE) < abs(ratio - 1.0) < MOST_SOUND_SPEED:
         return []
     text = (
         f"the pairs fit better with sound at {ratio:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: measure the medium's "
-        "temperature or sound speed and correct it in session.yaml (with ranges computed anew), or solve with "
+        "temperature or sound speed and correct it in session.yaml (with ranges computed again), or solve with "
         "--estimate sound_speed"
     )
     return [Condition(Verdict.WARNING, text)]
 
 
 def beam_sides(lambda_mm: FloatArray) -> list[Condition]:
-    """Spots before and behind the laser's origin: the beam cannot point both ways."""
+    """Spots behind the laser's origin: the beam does not go there."""
     behind = int(np.sum(lambda_mm < 0))
     if behind == 0:
         return []
