@@ -264,7 +264,7 @@ def _spoil(pair: Pair, what: str) -> Any:
     ("what", "said"),
     [
         ("a pose that is not finite", "camera_T_marker has an entry that is not finite"),
-        ("a pose that is not rigid", "camera_T_marker is no rigid transform"),
+        ("a pose that is not rigid", "camera_T_marker is not a rigid transform"),
         ("a covariance that is not finite", "covariance of the marker has an entry"),
         ("a covariance of the wrong shape", "shape"),
         ("a covariance that is not symmetric", "not symmetric"),
@@ -275,7 +275,7 @@ def _spoil(pair: Pair, what: str) -> Any:
         ("a time before the last event's", "before the last event"),
         ("a time that is not finite", "its time is nan"),
         ("a PM number of more than 64 bits", "64 bits"),
-        ("no event at all", "no event of a registration"),
+        ("no event at all", "not an event of a registration"),
     ],
 )
 def test_bad_numbers_are_refused_before_the_graph_sees_them(what: str, said: str) -> None:

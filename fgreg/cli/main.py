@@ -137,7 +137,7 @@ def solve(
     ] = False,
     estimate: EstimateOption = "",
     detect_moves: Annotated[
-        bool, typer.Option("--detect-moves", help="Find camera moves that nobody told, by the pairs.")
+        bool, typer.Option("--detect-moves", help="Find unreported camera moves, by the pairs.")
     ] = False,
     as_json: JsonOption = False,
     quiet: QuietOption = False,

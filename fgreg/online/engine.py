@@ -1,12 +1,12 @@
 """The online registration: events in, estimates out.
 
 Recent pairs are factors in iSAM2, everything older is one marginal prior (fgreg.smoother). An event either becomes part
-of the state or, whatever fails on the way, leaves it as it was.
+of the state or, where the update fails, leaves the state as it was.
 
-Beside it the full solve (fgreg.online.full_solve) registers all measurements from no guess: while an epoch is young,
-when a shot does not fit, and from time to time. Its optimum and inliers are taken over, and it decides what is
-*reported*: the shift from optimum to posterior mean, the covariance at few pairs, the verdict and its reasons. Before
-it, every pair is tested for an unreported move of the camera.
+In addition the full solve (fgreg.online.full_solve) registers all measurements without an initial guess: at the first
+pairs of an epoch, when a shot does not fit, and from time to time. The engine takes over its optimum and inliers. The
+full solve also decides what is *reported*: the shift from optimum to posterior mean, the covariance at few pairs, the
+verdict and its reasons. Before it, every pair is tested for an unreported camera move.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ from fgreg.tracking.snapshot import Snapshot
 NOT_SOLVED = "this camera epoch has not been through the full solve yet: take the estimate as preliminary"
 NO_REGISTRATION = "no registration of this camera epoch"
 LEAST_PMS = 3
-"""PMs that an epoch needs to be registered at all."""
+"""Smallest number of PMs with which an epoch is registered."""
 FIRST_PMS = 8
-"""Up to so many PMs of an epoch, as up to its first pairs, the full solve runs at each pair."""
+"""Up to this number of PMs of an epoch the full solve runs at each pair."""
 LATER_PAIRS = (12, 15, 20, 25, 30, 40, 60, 80)
-"""After the first ones the full solve runs at so many pairs, and whenever they have doubled."""
+"""Numbers of pairs at which the full solve runs later; after the last one it runs whenever the pairs have doubled."""
 LOOP_PMS = (MOST_LOOKS, 18, 10)
-"""A loop that was closed at some pair is looked for again at so many PMs."""
+"""Numbers of PMs at which a loop closure of the recorded session is looked for when it is opened again."""
 MOST_ROUNDS = 4
-"""Full solves at one event: each camera move that one finds asks for another."""
+"""Largest number of full solves at one event: after each camera move that one finds another follows."""
 
 
 def is_due(pairs: int) -> bool:
-    """Whether the full solve runs because an epoch has come to so many pairs."""
+    """Whether the full solve runs because the epoch now has ``pairs`` pairs."""
     if pairs <= LATER_PAIRS[-1]:
         return pairs <= FIRST_PAIRS or pairs in LATER_PAIRS
     return bool(pairs % LATER_PAIRS[-1] == 0 and (pairs // LATER_PAIRS[-1]).bit_count() == 1)
@@ -74,15 +74,15 @@ class OnlineRegistration:
     Args:
         model: the session's set-up.
         config: settings of estimate and verdict.
-        full_solve: ``in_process`` within :meth:`add` (deterministic), ``worker`` in a process of its own, whose results
-            are taken over with the next event or by :meth:`refresh`.
+        full_solve: ``in_process`` runs it within :meth:`add` (deterministic), ``worker`` in a worker process, whose
+            results are taken over with the next event or by :meth:`refresh`.
         verdicts: False leaves posterior and verdict out of the full solve, which only registers.
         find_moves: whether unreported camera moves are looked for.
-        sound_speed_prior: what is known of the sound speed ratio, where the configuration makes it a variable.
+        sound_speed_prior: prior of the sound speed ratio, where the configuration makes it a variable.
         start: of the first epoch.
 
     Raises:
-        ValueError: the configuration asks for something that there is no online form of.
+        ValueError: the configuration has an option that the online registration does not support.
     """
 
     def __init__(
@@ -100,9 +100,9 @@ class OnlineRegistration:
         self._setting = make_setting(model, self._config, sound_speed_prior)
         self._state = State((Epoch(start or EpochStart(0.0), 0),))
         self._t = -math.inf
-        self._serial = 0  # of the measurements and their epochs
-        self._division = 0  # of the pairs into epochs
-        self._asked = 0  # division of the case that is under way
+        self._serial = 0  # changes with the measurements and their epochs
+        self._division = 0  # changes with the division of the pairs into epochs
+        self._asked = 0  # division of the submitted case
         self._solve_wanted = self._move_wanted = self._move_untested = False
         self._misplaced: frozenset[int] = frozenset()
         self._restoring = False
@@ -125,7 +125,7 @@ class OnlineRegistration:
         self.close()
 
     def close(self) -> None:
-        """End the worker process, where there is one; the estimate stays."""
+        """End the worker process, if there is one; the estimate stays."""
         self._solver.close()
 
     # --- events -----------------------------------------------------------------------------------------------------
@@ -133,13 +133,13 @@ class OnlineRegistration:
     def add(self, event: OnlineEvent) -> OnlineEstimate:
         """Take in one event.
 
-        A pair's own ``epoch`` is not looked at: it belongs to the current epoch.
+        A pair's own ``epoch`` is ignored: it belongs to the current epoch.
 
         Raises:
             EventRefused: the event cannot be taken in, or the update failed; everything is as it was before.
         """
         check(event, self._t)
-        if not isinstance(event, CameraMoved):  # what is reported comes before what is still being looked for
+        if not isinstance(event, CameraMoved):  # a reported move has priority over one that is still being tested for
             self._fetch()
         before = self._state
         try:
@@ -149,9 +149,9 @@ class OnlineRegistration:
             misplaced = self._misplaced if self._restoring else self._misplaced_now(state, event)
         except EventRefused:
             raise
-        except Exception as error:  # whatever failed, the state before still stands
+        except Exception as error:  # whatever failed, the state before stays valid
             raise EventRefused(f"the update failed: {type(error).__name__}: {error}") from error
-        # From here on nothing fails: what the event brought is kept.
+        # From here on nothing can fail: the event is taken in.
         self._state, self._t, self._estimate, self._tags = state, event.t, estimate, tags
         self._serial += 1
         if state.epoch != before.epoch:
@@ -168,7 +168,7 @@ class OnlineRegistration:
         return self._estimate
 
     def _seen(self, event: OnlineEvent) -> tuple[TagMonitor, TagsMoved | TagsAtRest | None]:
-        """What a frame of static tags says, and the tags' state after it."""
+        """The tag monitor after a frame of static tags, and what it detected."""
         if not (isinstance(event, StaticTags) and self._find_moves):
             return self._tags, None
         return monitored(self._tags, event.t, TagFrame(event.camera_T_tag, event.covariance), TagSettings())
@@ -184,7 +184,7 @@ class OnlineRegistration:
             if event.since_t is not None:
                 return with_move(state, replace(start, t=event.since_t), setting, self._pairs_since(event.since_t))
             if self._noticed.get(state.epoch) and (state.active_window is None or not state.epoch_pairs):
-                # Whether this is the move that was detected, or another, is not known: the motion of neither is.
+                # This may be the move that was detected, or another one, so the measured motion cannot be used.
                 start = EpochStart(event.t)
             return with_move(state, start, setting)
         if isinstance(found, TagsMoved):
@@ -195,15 +195,15 @@ class OnlineRegistration:
         return replace(state, nis=None, used=False)
 
     def _pairs_since(self, t: float) -> int:
-        """How many of the epoch's pairs were taken at a time or later."""
+        """Number of the epoch's pairs that were taken at ``t`` or later."""
         return sum(shot.pair.t >= t for shot in self._state.current)
 
     def _misplaced_now(self, state: State, event: OnlineEvent) -> frozenset[int]:
-        """PMs that the last full solve did not leave as inliers or outliers, but that the estimate now has so."""
+        """PMs of the state that are inliers beyond their limit, or outliers within it; none where no shot was added."""
         return misplaced_pms(state, self._setting) if isinstance(event, Pair | Aim) else frozenset()
 
     def _divided(self, *, by_tags: bool = False) -> None:
-        """The pairs have another division into epochs: what was asked before does not count."""
+        """Note that the division of the pairs into epochs has changed: results of earlier cases are invalid."""
         self._division += 1
         self._misplaced = frozenset()
         if not by_tags:
@@ -212,9 +212,9 @@ class OnlineRegistration:
     # --- the full solve ---------------------------------------------------------------------------------------------
 
     def _want(self, event: OnlineEvent, found: TagsMoved | TagsAtRest | None, misplaced: frozenset[int]) -> None:
-        """What the full solve is to do after an event."""
+        """Decide what the full solve has to do after an event."""
         state = self._state
-        if self._solver.failure and state.epoch_pairs:  # what the last full solve was to say has not been said
+        if self._solver.failure and state.epoch_pairs:  # the last full solve gave no result
             self._solve_wanted = True
         if isinstance(event, Pair):
             self._move_wanted = self._find_moves
@@ -230,7 +230,7 @@ class OnlineRegistration:
             self._solve_wanted = True
 
     def _solve(self, t: float) -> None:
-        """Hand over what is wanted, and take over what has come back."""
+        """Submit the wanted case, and take over a result."""
         if self._restoring:
             return
         for _ in range(MOST_ROUNDS):
@@ -250,10 +250,10 @@ class OnlineRegistration:
             self._estimate = self._estimated(self._state, self._estimate.t)
 
     def _fetch(self, t: float | None = None) -> bool:
-        """Take over a result that has come back; whether there was one."""
+        """Take over a result; whether there was one."""
         found = self._solver.fetch()
         if found is None:
-            if self._solver.lost:  # with its process: the next one is asked again
+            if self._solver.lost:  # the worker process ended: the case is submitted again
                 self._solver.lost, self._solve_wanted = False, True
             return False
         if self._asked != self._division or found.epoch != self._state.epoch:
@@ -271,13 +271,13 @@ class OnlineRegistration:
         return True
 
     def _case(self) -> FullSolveCase | None:
-        """What is wanted and possible now."""
+        """The case that is wanted and possible now."""
         state = self._state
         move = None
         if self._move_wanted:
             try:
                 move = self._move_case()
-            except Exception as error:  # the pair counts without it
+            except Exception as error:  # the pair is taken in without the test
                 self._move_failure = f"{type(error).__name__}: {error}"
         measurements = state.measurements() if self._solve_wanted and self._solvable else None
         if self._solve_wanted and not self._solvable and state.epoch_pairs:
@@ -294,7 +294,7 @@ class OnlineRegistration:
         return self._state.active_window is not None or self._state.epoch_pms >= LEAST_PMS
 
     def _known(self) -> dict[int, EpochSearch]:
-        """Minima of earlier epochs: theirs are not searched for again."""
+        """Minima of earlier epochs, which are not searched again."""
         out = {}
         for k, epoch in enumerate(self._state.epochs[:-1]):
             mine = [shot for shot in self._state.shots if shot.pair.epoch == k]
@@ -306,7 +306,7 @@ class OnlineRegistration:
     def _move_case(self) -> MoveCase | None:
         state, active = self._state, self._state.active_window
         looks = looks_by_pm(state.current, state.now.first)
-        # Two minima among many PMs are what a move leaves: the pairs of either side are the outliers of the other.
+        # Among many PMs a camera move leaves two minima: the pairs of either side are outliers of the other.
         sound = state.carried is not None and (not state.is_open or state.epoch_pms >= 2 * MIN_KNOWN)
         return MoveCase(
             epoch=state.epoch,
@@ -318,7 +318,7 @@ class OnlineRegistration:
         )
 
     def _earlier(self, to: int) -> dict[int, Quadratic]:
-        """Registrations of the epochs before one, that the camera may be back to; none where the motion is known."""
+        """Registrations of the epochs before ``to`` that a loop may be closed to; none where the motion is known."""
         state = self._state
         if state.epochs[to].start.motion_known:
             return {}
@@ -331,7 +331,7 @@ class OnlineRegistration:
         return out
 
     def _take_over(self, found: FullSolveResult) -> None:
-        """Optimum, inliers and report of a full solve; where that fails the incremental estimate stands without it."""
+        """Take over optimum, inliers and report of a full solve; where that fails the incremental estimate stays."""
         before = self._state, self._misplaced, self._report, self._surface
         try:
             if found.report is not None:
@@ -339,7 +339,7 @@ class OnlineRegistration:
                 self._surface = found.report.surface or self._surface
             if found.initial is not None:
                 self._state = initialised(self._state, found.initial, self._setting)
-                # Pairs that came before there was a registration could not be tested for a move.
+                # Pairs that came before the first registration have not been tested for a move yet.
                 self._move_wanted, self._move_untested = self._move_wanted or self._move_untested, False
                 self._misplaced = misplaced_pms(self._state, self._setting)
             elif found.why_none:
@@ -351,7 +351,7 @@ class OnlineRegistration:
             self._estimate = self._estimated(self._state, self._estimate.t)
 
     def _reassign(self, found: CameraMove, t: float) -> None:
-        """A new epoch from a pair on: the camera moved before it, unreported."""
+        """Begin a new epoch at the first pair after an unreported camera move."""
         before = self._state
         since_t = before.shots[found.first].pair.t
         self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - found.first)
@@ -361,13 +361,13 @@ class OnlineRegistration:
         self._note_move(before, found.first, since_t, t, found.log_bayes)
 
     def _close_loop(self, found: LoopClosure, t: float) -> None:
-        """The camera is where an earlier epoch had it: that one's registration counts again."""
+        """Close a loop: the earlier epoch's registration becomes a prior of the current epoch."""
         before = self._state
         try:
             state = with_motion(before, back_to(before.now.start, found.to), self._setting)
             state = replace(state, nis=before.nis, used=before.used)
             estimate = self._estimated(state, self._estimate.t)
-        except Exception:  # it is the same camera epoch without it, only less well known
+        except Exception:  # the epoch stays as it was, only its registration is less certain
             return
         self._loop_closures.append(DetectedLoopClosure(before.epoch, found.to, t, found.log_bayes))
         self._state, self._estimate = state, estimate
@@ -378,7 +378,7 @@ class OnlineRegistration:
     def _note_move(
         self, before: State, first: int, since_t: float, t: float, log_bayes: float | None, *, recorded: bool = False
     ) -> None:
-        """A move was detected, now or (``recorded``) when the session was recorded."""
+        """Note a move that was detected, now or (``recorded``) when the session was recorded."""
         last_t = before.shots[first - 1].pair.t if first else before.now.start.t
         move = DetectedMove(before.epoch - len(self._moves), first, since_t, last_t, t, log_bayes)
         if not recorded:
@@ -388,9 +388,9 @@ class OnlineRegistration:
 
     @contextmanager
     def restoring(self) -> Iterator[None]:
-        """While events of a recorded session are taken in again: nothing is estimated until the end, then all at once.
+        """While events of a recorded session are taken in again: everything is estimated once, at the end.
 
-        Camera moves that were detected then are among the events, and loops are closed again; new moves are looked for
+        Camera moves that were detected are among the recorded events. Loops are closed again. New moves are looked for
         in the current epoch only.
         """
         self._restoring = True
@@ -404,20 +404,20 @@ class OnlineRegistration:
             self._solve_all()
             if self._find_moves and self._close_loops_again():
                 self._solve_all()
-        except Exception as error:  # the events are there; the next one asks again
+        except Exception as error:  # the events are taken in; the next event requests the full solve again
             self._solver.failure = f"{type(error).__name__}: {error}"
             self._estimate = self._estimated(self._state, self._estimate.t)
         self._move_wanted = self._find_moves and bool(self._state.epoch_pairs)
-        self._solve_wanted = not self._solvable  # that says how many are too few
+        self._solve_wanted = not self._solvable  # the case then gives the reason why there is no registration
         self._solve(self._t)
 
     def _solve_all(self) -> None:
-        """The full solve of everything, here and now."""
+        """Run the full solve of everything in this process."""
         case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements(), None, None)
         self._take_over(full_solve(case, self._model, self._config, self._prior, verdicts=self._verdicts))
 
     def _close_loops_again(self) -> bool:
-        """Close the loops that were closed when the pairs came: no event says so. Whether there are any."""
+        """Close the loops that were closed during the session, of which there are no events; whether there are any."""
         state, before = self._state, len(self._loop_closures)
         for epoch in range(1, len(state.epochs)):
             earlier = self._earlier(epoch)
@@ -437,58 +437,58 @@ class OnlineRegistration:
                     break
         return len(self._loop_closures) > before
 
-    # --- what is known ----------------------------------------------------------------------------------------------
+    # --- estimate ---------------------------------------------------------------------------------------------------
 
     @property
     def estimate(self) -> OnlineEstimate:
-        """The latest."""
+        """The estimate after the last event or result."""
         return self._estimate
 
     def refresh(self) -> OnlineEstimate:
-        """Take over what the full solve has found since, without an event."""
+        """Take over a result of the full solve, without an event."""
         self._fetch()
         self._solve(self._t)
         return self._estimate
 
     @property
     def moves(self) -> tuple[DetectedMove, ...]:
-        """Camera moves that were detected, in the order of time; their epochs are numbered as reported."""
+        """Detected camera moves in the order of time; their epochs are numbered as reported."""
         return tuple(self._moves)
 
     @property
     def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:
-        """Epochs in which the camera was found to be back where it was, in the order of time."""
+        """Loop closures in the order of time."""
         return tuple(self._loop_closures)
 
     @property
     def state(self) -> State:
-        """The incremental state; a value, never changed in place."""
+        """The incremental state; it is never changed in place."""
         return self._state
 
     @property
     def inliers(self) -> tuple[bool, ...]:
-        """Whether each pair is an inlier, in the order in which they came."""
+        """Whether each pair is an inlier, in the order of the pairs."""
         return tuple(shot.inlier for shot in self._state.shots)
 
     def measurements(self) -> Measurements:
-        """All that was taken in, as the batch solve takes it."""
+        """All measurements, as the batch solve takes them."""
         return self._state.measurements()
 
     def marker_T_laser(self) -> FloatArray | None:
-        """(4, 4) the beam as the present estimate has it, origin by its chart; None where there is none yet."""
+        """(4, 4) the current estimate of the beam, origin by its chart; None where there is none yet."""
         if self._state.active_window is None:
             return None
         shared = self._state.active_window.state
         return make_transform(rotation_to_direction(shared.beam_direction()[0]), shared.beam_origin()[0])
 
     def settle(self) -> OnlineEstimate:
-        """Run the full solve of everything now, unless it is done; the estimate is then that solve's."""
+        """Run the full solve of everything now, unless it is up to date; the estimate is then that of the solve."""
         if not self._estimate.settled or self._known():
             self.solution()
         return self._estimate
 
     def solution(self) -> Solution:
-        """The full solve of everything, taken over as :meth:`settle` does."""
+        """The full solve of everything, taken over as by :meth:`settle`."""
         measurements = self.measurements()
         solution = solve(measurements, [], self._model, self._config, sound_speed_prior=self._prior)
         case = FullSolveCase(self._serial, self._state.epoch, measurements, None, None)
@@ -498,12 +498,12 @@ class OnlineRegistration:
         return solution
 
     def track(self, query: Track) -> TrackEstimate:
-        """Answer a query from the estimate as it is; the graph is not touched."""
+        """Answer a query from the current estimate; the graph does not change."""
         self._fetch()
         return track(query, self.snapshot())
 
     def snapshot(self) -> Snapshot:
-        """All that queries need of the estimate as it is; made once per event, on demand."""
+        """The current estimate for tracking queries; made at most once per event, on demand."""
         if self._snapshot is None or self._snapshot[0] is not self._estimate:
             active = self._state.active_window
             optimum = None if active is None else (active.state, active.covariance, self._setting.columns)
@@ -514,11 +514,11 @@ class OnlineRegistration:
     # --- reporting --------------------------------------------------------------------------------------------------
 
     def _estimated(self, state: State, t: float) -> OnlineEstimate:
-        """The estimate of a state, with what the full solve said of its epoch, and what is known of moves."""
+        """The estimate of a state, with the full solve's report of its epoch, and detected camera moves."""
         estimate = self._reported(state, t)
         known = [self._noticed.get(state.epoch, "")]
         if self._solver.failure:
-            known.append(f"the full solve failed: {self._solver.failure}: what it said before may hold no longer")
+            known.append(f"the full solve failed: {self._solver.failure}: its earlier result may be out of date")
         if self._move_failure:
             known.append(f"camera moves are not looked for: {self._move_failure}")
         texts = tuple(text for text in known if text)

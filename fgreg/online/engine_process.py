@@ -1,8 +1,8 @@
-"""The online registration in a process of its own: events go there, estimates come back, queries go to its snapshot.
+"""The online registration in a worker process: it takes events and returns estimates; queries read its snapshot.
 
-What registers holds its interpreter's lock for up to some tenths of a second at the first pairs of an epoch. A camera
-loop cannot wait for that: it reads the shared snapshot (:meth:`EngineProcess.reader`), while a thread of its own hands
-over the events and waits for what comes of them.
+At the first pairs of an epoch the registration holds its interpreter's lock for up to some tenths of a second. A camera
+loop cannot wait for that. It reads the shared snapshot (:meth:`EngineProcess.reader`), while another thread hands over
+the events and waits for the estimates.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ ANSWER_S, END_S = 60.0, 5.0
 """A process that takes longer for a call, or to end, is killed; the longest call restores a session in some seconds."""
 
 Call = tuple[str, tuple[Any, ...]]
-"""What the engine is to do, and the arguments."""
+"""Name of the engine's method, and the arguments."""
 After = tuple[str | None, Any, OnlineEstimate | None, tuple[DetectedMove, ...], tuple[DetectedLoopClosure, ...]]
-"""Why an event was refused, what the call returned, and the engine's estimate, moves and returns."""
+"""Why an event was refused, what the call returned, and the engine's estimate, moves and loop closures."""
 
 REMEDY = "open the session again"
 GONE = f"the registration's process has ended: {REMEDY}"
 
 
 class EngineGone(FgregError):  # noqa: N818
-    """The registration's process has ended; what is on disk is all there."""
+    """The registration's process has ended; every recorded event is on disk."""
 
 
 class EngineProcess:
     """The engine as :class:`fgreg.online.live_session.LiveSession` takes it. Use it as a context manager, or close it.
 
-    Calls wait for the process; they may come from several threads, one after another.
+    Calls wait for the process; they may come from several threads and then run one after another.
 
     Raises:
         EngineGone: the process did not start.
@@ -68,7 +68,7 @@ class EngineProcess:
             what="the registration's process",
             answer_s=ANSWER_S,
             end_s=END_S,
-            restart=False,  # the new one knows no event: who has them makes another engine
+            restart=False,  # a new process would have no events: the caller makes another engine from the journal
             daemon=False,
         )
         try:
@@ -84,7 +84,7 @@ class EngineProcess:
         self.close()
 
     def reader(self) -> SnapshotReader:
-        """A reader of the estimate as queries need it, for one thread of this or another process."""
+        """A reader of the shared snapshot, for one thread of this or another process."""
         return SnapshotReader(self._name)
 
     @property
@@ -94,7 +94,7 @@ class EngineProcess:
 
     @property
     def pid(self) -> int | None:
-        """Of the process; None where it has ended."""
+        """Process id; None where the process has ended."""
         return self._worker.pid
 
     def _call(self, name: str, *arguments: Any) -> Any:
@@ -119,7 +119,7 @@ class EngineProcess:
         return self._known(self._call("settle"))
 
     def refresh(self) -> OnlineEstimate:
-        """What was found since, without an event. Raises EngineGone."""
+        """As :meth:`fgreg.online.engine.OnlineRegistration.refresh`. Raises EngineGone."""
         return self._known(self._call("refresh"))
 
     @staticmethod
@@ -129,29 +129,29 @@ class EngineProcess:
         return estimate
 
     def measurements(self) -> Measurements:
-        """All that was taken in. Raises EngineGone."""
+        """All measurements. Raises EngineGone."""
         found = self._call("measurements")
         if not isinstance(found, Measurements):
             raise TypeError(f"the process answered with a {type(found).__name__}")
         return found
 
     def marker_T_laser(self) -> FloatArray | None:
-        """The beam, (4, 4). Raises EngineGone."""
+        """The beam, (4, 4); None where there is no estimate yet. Raises EngineGone."""
         return self._call("marker_T_laser")  # type: ignore[no-any-return]
 
     def track(self, query: Track) -> TrackEstimate:
-        """Answered here, from the snapshot."""
+        """Answer a query in this process, from the snapshot."""
         reader = self.reader()
         try:
             return track(query, reader.snapshot())
         except NoSnapshotError:
-            return TrackEstimate(query.t, None, None, None, causal=True, reason="nothing is known yet")
+            return TrackEstimate(query.t, None, None, None, causal=True, reason="there is no estimate yet")
         finally:
             reader.close()
 
     @contextmanager
     def restoring(self) -> Iterator[None]:
-        """As of the engine: judged once at the end. Raises EngineGone."""
+        """As :meth:`fgreg.online.engine.OnlineRegistration.restoring`. Raises EngineGone."""
         self._call("restore")
         try:
             yield
@@ -160,17 +160,17 @@ class EngineProcess:
 
     @property
     def estimate(self) -> OnlineEstimate | None:
-        """After the last call."""
+        """The estimate after the last call; None before the first."""
         return self._estimate
 
     @property
     def moves(self) -> tuple[DetectedMove, ...]:
-        """Camera moves that were found out, as of the last call."""
+        """Detected camera moves, as of the last call."""
         return self._moves
 
     @property
     def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:
-        """Epochs in which the camera is back where it was, as of the last call."""
+        """Loop closures, as of the last call."""
         return self._loop_closures
 
     def close(self) -> None:
@@ -208,7 +208,7 @@ class _Registering:
         return refused, value, self._engine.estimate, self._engine.moves, self._engine.loop_closures
 
     def idle(self) -> None:
-        """What the full solve has found, while no event comes."""
+        """Take over the full solve's result while no event comes."""
         if self._restoring is None:
             self._engine.refresh()
         self._publish()
@@ -230,6 +230,6 @@ class _Registering:
         if estimate is self._published:
             self._shared.touch()
             return
-        with suppress(ValueError):  # numbers that no reader could use: the snapshot before stays
+        with suppress(ValueError):  # a number is not finite: the snapshot before stays
             self._shared.publish(self._engine.snapshot())
         self._published = estimate

@@ -14,26 +14,26 @@ from fgreg.model.estimate import PredictedTre, Verdict
 QUANTILE = 0.95
 _FREEDOM = np.linspace(1.0, 3.0, 4001)
 _CHI2 = 2.0 * gammaincinv(0.5 * _FREEDOM, QUANTILE)
-"""Of chi squares of one to three degrees of freedom; read with linear interpolation, to 1e-7."""
+"""Quantiles of chi squares of one to three degrees of freedom; linear interpolation is accurate to 1e-7."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnlineEstimate:
-    """What is known after an event, about the camera epoch that lasts.
+    """The estimate after an event, for the current epoch.
 
     Attributes:
         t: of the event.
         epoch: index of the camera epoch.
-        trus_T_camera: (4, 4) as reported: the graph's optimum moved to the posterior's mean; None where there is none.
+        trus_T_camera: (4, 4) as reported: the graph's optimum moved to the posterior mean; None where there is none.
         covariance: (6, 6), GTSAM's tangent (rotation rad, translation mm), right perturbation.
         predicted_tre: from that covariance.
-        nis: of the pair just added: its squared deviation from what all others predict, over the predicted covariance;
-            None for other events, and where the others predict nothing.
-        used: whether the pair just added counts in the estimate.
-        verdict, reasons: as of a solve; at most a warning until this epoch was judged by the full solve.
-        pairs: looks of this epoch that count.
+        nis: innovation of the pair just added: its squared deviation from what all others predict, over the predicted
+            covariance; None for other events, and where the others predict nothing.
+        used: whether the pair just added is an inlier.
+        verdict, reasons: as of a solve; no better than a warning until the full solve has covered this epoch.
+        pairs: inlier looks of this epoch.
         optimum_trus_T_camera: (4, 4) the graph's optimum, comparable with :mod:`fgreg.registration.register`.
-        settled: judged by the full solve with exactly these measurements.
+        settled: whether the full solve has covered exactly these measurements.
     """
 
     t: float
@@ -53,8 +53,8 @@ class OnlineEstimate:
 def gaussian_quantile_mm(covariance: FloatArray) -> FloatArray:
     """(n,) 95 % quantiles of |e| for zero-mean Gaussian errors e of covariances (n, 3, 3).
 
-    |e|^2 is a sum of weighted chi squares; matched in its first four cumulants by one chi square (Liu, Tang and Zhang,
-    2009). Exact for one, two or three equal axes; within 1 % of |e| for all others.
+    |e|^2 is a weighted sum of chi squares. One chi square matches its first four cumulants (Liu, Tang and Zhang, 2009).
+    Exact for one, two or three equal axes; within 1 % of |e| for all others.
     """
     flat, square = covariance.reshape(-1, 9), (covariance @ covariance).reshape(-1, 9)
     c1 = flat[:, ::4].sum(axis=1)

@@ -1,4 +1,4 @@
-"""What must not reach the graph: numbers that are not finite, shapes, times that go back."""
+"""Checks of events before they reach the graph."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ INT64 = 2**63
 
 
 def check(event: OnlineEvent, after: float) -> None:
-    """Refuse what must not reach the graph: numbers that are not finite, shapes, times that go back.
+    """Check an event: finite numbers, shapes, transforms, covariances, and a time that does not go back.
+
+    ``after``: time (s) of the last event.
 
     Raises:
-        EventRefused: with what was found.
+        EventRefused: with the first fault found.
     """
     if not isinstance(event, Aim | Pair | CameraMoved | StaticTags):
-        raise EventRefused(f"a {type(event).__name__} is no event of a registration")
+        raise EventRefused(f"a {type(event).__name__} is not an event of a registration")
     if not math.isfinite(event.t):
         raise EventRefused(f"its time is {event.t}, expected a number")
     if event.t < after:
@@ -74,7 +76,7 @@ def _array(name: str, value: FloatArray, shape: tuple[int, ...]) -> None:
 def _transform(name: str, value: FloatArray) -> None:
     _array(name, value, (4, 4))
     if not is_rigid(value):
-        raise EventRefused(f"{name} is no rigid transform")
+        raise EventRefused(f"{name} is not a rigid transform")
 
 
 def _covariance(name: str, value: FloatArray, size: int) -> None:

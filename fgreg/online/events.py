@@ -1,4 +1,4 @@
-"""What the online registration takes in, beside the measurement types. Millimetres, radians, seconds."""
+"""Events of the online registration, in addition to the measurement types. Millimetres, radians, seconds."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from fgreg.model.measurements import Aim, Pair
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMoved:
-    """The camera moved: what follows belongs to a new epoch.
+    """The camera moved: a new epoch begins.
 
     Attributes:
-        t: when it was told, or found out.
-        camera_new_T_camera_old: (4, 4), where kinematics gave it.
-        covariance: (6, 6) over its right tangent; a motion without one says nothing to rely on.
-        detected: found out by the program itself.
-        since_t: where found out: pairs from this time on belong to the new epoch.
+        t: when it was reported, or detected.
+        camera_new_T_camera_old: (4, 4), where kinematics measured it.
+        covariance: (6, 6) over its right tangent; a motion without one is not used.
+        detected: whether the program detected the move.
+        since_t: of a detected move: pairs from this time on belong to the new epoch.
     """
 
     t: float
@@ -45,14 +45,14 @@ class StaticTags:
 
 @dataclass(frozen=True, slots=True)
 class DetectedMove:
-    """A move that nobody told.
+    """An unreported camera move that was detected.
 
     Attributes:
-        epoch: camera epoch (as told) that it divides.
-        since: index among all pairs of the first pair after it (where tags showed it, of the next one to come).
+        epoch: camera epoch (numbered as reported) that it divides.
+        since: index among all pairs of the first pair after it (where tags showed it: of the next pair).
         since_t: time of that pair, or of the first frame of tags after it. last_t: of the pair before.
-        alarm_t: of the event at which the evidence sufficed.
-        log_bayes: of the move there against none, when pairs showed it; None where tags did.
+        alarm_t: of the event at which it was detected.
+        log_bayes: of a move there against none, where pairs showed it; None where tags did.
     """
 
     epoch: int
@@ -64,20 +64,20 @@ class DetectedMove:
 
     @property
     def text(self) -> str:
-        """What to tell the user; pairs are counted from 1."""
+        """Sentence for the user; pairs are counted from 1."""
         return (
             f"the camera moved between pair {self.since} and {self.since + 1} "
-            f"({self.last_t:.1f} to {self.since_t:.1f} s), untold: solved as a camera epoch of its own from there"
+            f"({self.last_t:.1f} to {self.since_t:.1f} s), unreported: a camera epoch of its own begins there"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class DetectedLoopClosure:
-    """A camera that came back to where an earlier epoch had it, as the pairs say.
+    """A loop closure: by the pairs, the camera is back where an earlier epoch had it.
 
     Attributes:
         epoch: number of the epoch in which it is back. to: of the earlier one.
-        t: of the pair at which the evidence sufficed. log_bayes: of being back against being elsewhere.
+        t: of the pair at which it was detected. log_bayes: of the same place against elsewhere.
     """
 
     epoch: int
@@ -87,8 +87,8 @@ class DetectedLoopClosure:
 
     @property
     def text(self) -> str:
-        """What to tell the user."""
-        return f"in epoch {self.epoch} the camera is back where it was in epoch {self.to}: what that one knows counts"
+        """Sentence for the user."""
+        return f"in epoch {self.epoch} the camera is back where it was in epoch {self.to}: that registration is used"
 
 
 OnlineEvent = Aim | Pair | CameraMoved | StaticTags

@@ -1,9 +1,9 @@
 """The full solve: other minima, inliers, posterior, verdict, and unreported camera moves.
 
-The incremental estimate (fgreg.smoother) is one optimum and its Gaussian. The posterior's mean is off the optimum, its
-covariance is wider at few pairs, and whether two minima can be told apart, or something is suspicious, takes the search
-from no guess. All that is the batch solve's. It runs within the engine's calls, where everything has to be
-deterministic (replay, tests), or in a worker process, where no event waits for it.
+The incremental estimate (fgreg.smoother) is one optimum and its Gaussian. At few pairs the posterior mean differs from
+the optimum, and its covariance is wider. Ambiguous minima and other conditions show only in a search without an initial
+guess. All that is done by the batch solve. It runs within the engine's calls, where everything has to be deterministic
+(replay, tests), or in a worker process, where no event waits for it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from fgreg.smoother.initialise import Initial, initial_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FullSolveCase:
-    """What is to be solved.
+    """Input of the full solve.
 
     Attributes:
-        serial: which measurements these are. epoch: the current one.
+        serial: number of this version of the measurements. epoch: the current one.
         measurements: everything that was taken in; None where only a camera move is looked for.
         known: minima of earlier epochs, which are not searched for again.
         move: for the camera-move test; None where none is looked for.
@@ -47,15 +47,15 @@ class FullSolveCase:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """What the full solve said of the current epoch, in terms that carry over to the pairs that come after it.
+    """The full solve's result for the current epoch, in a form that can be applied to the estimate of later pairs.
 
     Attributes:
-        serial: of the case. epoch: that was current. pairs: looks that were inliers.
+        serial: of the case. epoch: the current one then. pairs: inlier looks.
         verdict, reasons: of the solve.
         trus_T_camera, covariance, predicted_tre: as the solve reports them; None where it has no registration.
         shift: (6,) from the optimum to the reported registration, in units of the optimum's Gaussian (its Cholesky
             factor). root, optimum_root: (6, 6) Cholesky factors of the reported covariance and of the optimum's.
-        surface: the tissue that the PMs trace, where they trace any.
+        surface: tissue surface that the PMs trace; None where they trace none.
     """
 
     serial: int
@@ -85,14 +85,14 @@ class Report:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FullSolveResult:
-    """What a case led to.
+    """Result of a case.
 
     Attributes:
         serial, epoch: of the case.
         move: an unreported camera move, or a loop closure; nothing else was computed then.
-        initial: the registration; None where there is none, for the reason ``why_none``, or none was asked for.
-        report: None where none was asked for.
-        move_failure: why the camera-move test failed, empty where it did not; None where none was asked for.
+        initial: the registration; None where there is none, for the reason ``why_none``, or none was wanted.
+        report: None where none was wanted.
+        move_failure: why the camera-move test failed, empty where it did not; None where no test was wanted.
     """
 
     serial: int
@@ -112,7 +112,7 @@ def full_solve(
     *,
     verdicts: bool = True,
 ) -> FullSolveResult:
-    """Look for a camera move; where there is none, register, and say how good that is.
+    """Test for a camera move; where there is none, register, and compute posterior and verdict.
 
     ``verdicts``: False leaves posterior and verdict out.
     """
@@ -150,7 +150,7 @@ def _solved(
 
 
 def result_of(case: FullSolveCase, measurements: Measurements, solution: Solution) -> FullSolveResult:
-    """What carries over of a batch solve of a case."""
+    """The result of a case, from its batch solve."""
     report = _report(solution, case.serial, case.epoch)
     if solution.registration is None:
         return FullSolveResult(case.serial, case.epoch, why_none=solution.reasons[-1], report=report)
@@ -165,7 +165,7 @@ def _registered(
 
 
 def _plain(values: FloatArray | None) -> FloatArray | None:
-    """A copy laid out row by row: the last digits of what is made of it depend on that."""
+    """A copy in row-major order: the last digits of results depend on the memory layout."""
     return None if values is None else np.array(values, dtype=np.float64, order="C")
 
 

@@ -1,4 +1,4 @@
-"""A session while it runs: every event on disk first, then into the estimate; opened again, it goes on as it was."""
+"""A live session: every event goes to disk first, then into the estimate. A session opened again goes on as it was."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ Estimating = AimEvent | PairEvent | CameraMovedEvent
 
 
 EARLIEST_S = 1e9
-"""Times before minus this are nobody's clock."""
+"""No clock gives a time before minus this."""
 MOST_DEATHS = 3
-"""An event at which an engine's process has ended so many times is refused: it may be the reason."""
+"""An event is refused after an engine's process has ended this many times at it: the event may be the cause."""
 
 
 class Engine(Protocol):
-    """What :class:`fgreg.online.engine.OnlineRegistration` offers, as far as it is needed here."""
+    """The part of :class:`fgreg.online.engine.OnlineRegistration` that a live session uses."""
 
     def add(self, event: OnlineEvent) -> OnlineEstimate: ...
     def track(self, query: Track) -> TrackEstimate: ...
@@ -69,11 +69,11 @@ MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engin
 
 
 class EpochFeed:
-    """Measurements into an engine, in the epoch that the camera is in, which the engine may find out by itself.
+    """Hands measurements to an engine in the current epoch; the engine may detect camera moves, too.
 
     Attributes:
-        epoch: number of the present camera epoch.
-        noticed: epochs that the engine began by itself and that no ``camera_moved`` event has told of yet.
+        epoch: number of the current epoch.
+        noticed: detected camera moves for which there is no ``camera_moved`` event yet.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -82,10 +82,10 @@ class EpochFeed:
         self.noticed = 0
 
     def add(self, event: Aim | Pair | CameraMovedEvent) -> OnlineEstimate | None:
-        """Take in one; None for a move that the engine knows of already.
+        """Take in one measurement or move; None for a move that the engine has detected already.
 
         Raises:
-            EventRefused: the engine could not; it is as it was.
+            EventRefused: the engine refused it; it is as it was.
         """
         if isinstance(event, CameraMovedEvent):
             if event.detected and self.noticed:
@@ -100,24 +100,24 @@ class EpochFeed:
         return estimate
 
     def notice(self, estimate: OnlineEstimate) -> None:
-        """Epochs that the engine began by itself."""
+        """Count the epochs that the engine began because it detected a move."""
         self.noticed += max(0, estimate.epoch - self.epoch)
         self.epoch = estimate.epoch
 
     def starts(self) -> tuple[EpochStart, ...]:
-        """Where the epochs begin, as the engine has it."""
+        """Starts of the engine's epochs."""
         return self._engine.measurements().epochs
 
 
 class LiveSession:
-    """A session that is recorded and estimated at once. Use as a context manager, or close it.
+    """A session that is recorded and estimated at the same time. Use as a context manager, or close it.
 
     Attributes:
-        journal: what is on disk.
+        journal: the recorded events.
         estimate: after the last event that was taken in; None before the first.
         config: of the estimate.
-        late: events may be handed over later than others that happened after them: they get the last one's time.
-        engine: that has taken in what is recorded; a revived session has another one.
+        late: whether events may come after others that happened later; they then get the time of the last event.
+        engine: the one that took in the recorded events; a revived session has another one.
     """
 
     engine: Engine
@@ -127,15 +127,15 @@ class LiveSession:
         self.estimate: OnlineEstimate | None = None
         self.late = False
         self._make_engine = make_engine
-        self._untaken: list[Event] = []  # on disk, not in the estimate yet: something came between
+        self._untaken: list[Event] = []  # on disk, not in the estimate yet, because of an interruption
         self._unwritten: list[Event] = []  # to be recorded as soon as the disk allows
-        self._gone = False  # the engine's process has ended: nothing goes into the estimate before a revival
+        self._gone = False  # the engine's process has ended: no event goes into the estimate before a revival
         self._ended_at: Event | None = None  # the event that it ended at
         self._deaths: dict[int, int] = {}  # ends of the engine's process while it took an event in, by its line
         self._begin_with(make_engine(journal.model, config, None))
 
     def _begin_with(self, engine: Engine) -> None:
-        """Nothing is taken in yet."""
+        """Start with an engine that has taken in nothing yet."""
         self._engine, self._feed = engine, EpochFeed(engine)
         self._recogniser = EventRecogniser(self.journal.model)
 
@@ -148,11 +148,11 @@ class LiveSession:
         *,
         late: bool = False,
     ) -> Self:
-        """Open a session's folder (with its ``session.yaml``); what was recorded before is taken in again.
+        """Open a session's folder (with its ``session.yaml``); recorded events are taken in again.
 
         Raises:
-            InputError: the session's files, or frames that they name, are not as they should be.
-            JournalError: another program records to it, or the disk refuses.
+            InputError: the session's files, or frames that they name, are invalid.
+            JournalError: another program records to it, or a write failed.
         """
         journal = Journal.open(Path(folder))
         try:
@@ -165,16 +165,16 @@ class LiveSession:
         return found
 
     def revive(self) -> OnlineEstimate | None:
-        """Go on with a new engine where the old one's process has ended: from what is on disk.
+        """Replace an engine whose process has ended by a new one, from the journal.
 
         Nothing is lost, and the session stays open. An event at which that has happened :data:`MOST_DEATHS` times is
         recorded as refused.
 
         Raises:
             EngineGone: the new one has ended too; try again.
-            FgregError: it did not start, or the disk refuses.
+            FgregError: it did not start, or a write failed.
         """
-        self._gone = True  # whatever goes wrong here: an engine that has taken in some of it is not gone on with
+        self._gone = True  # if something fails here, an engine that has taken in only some events is not used
         event, self._ended_at = self._ended_at, None
         if event is not None:
             self._deaths[event.line] = self._deaths.get(event.line, 0) + 1
@@ -201,12 +201,12 @@ class LiveSession:
         self.journal.close()
 
     def _take_up(self, events: Sequence[Event]) -> None:
-        """Take in what is recorded, estimated once at its end."""
+        """Take in recorded events, with one estimate at the end."""
         refused = refused_lines(events)
         with self._engine.restoring():
             for event in events:
                 if event.line not in refused:
-                    with contextlib.suppress(EventRefused):  # noted now: the time before did not get so far
+                    with contextlib.suppress(EventRefused):  # the refusal is noted now: it was not recorded before
                         self._take(event)
         if self.estimate is not None:
             self.estimate = self._engine.estimate
@@ -215,14 +215,14 @@ class LiveSession:
         self._write_waiting()
 
     def add(self, event: Estimating) -> OnlineEstimate | None:
-        """Record an event, take it in, and say what is known now.
+        """Record an event, take it in, and return the estimate.
 
         A shot in whose frames the marker or the PM is not found is recorded and changes nothing.
 
         Raises:
             InputError: not an event that a session may hold; recorded as refused.
             EventRefused: it could not be taken into the estimate; recorded as refused, later ones work.
-            JournalError: the disk refuses; neither recorded nor taken in. The estimate and :meth:`track` stay usable.
+            JournalError: a write failed; neither recorded nor taken in. The estimate and :meth:`track` stay usable.
             EngineGone: it is recorded, and will be taken in by :meth:`revive`, or when the session is opened again.
         """
         gone = self._catch_up_or_gone()
@@ -242,11 +242,13 @@ class LiveSession:
         return self.estimate
 
     def track(self, query: TrackEvent, *, record: bool = True) -> TrackEstimate:
-        """Answer where to turn the stage, recording the query first unless told not to (at camera rate, say).
+        """Answer where to turn the stage.
+
+        ``record``: whether the query is recorded first; False for queries at camera rate, for example.
 
         Raises:
             InputError: not a query that a session may hold.
-            JournalError: the disk refuses the record.
+            JournalError: a write failed.
             EngineGone: :meth:`revive` is due.
         """
         if record:
@@ -260,11 +262,11 @@ class LiveSession:
         return TrackEstimate(query.t, None, None, None, causal=True, reason=str(found))
 
     def record(self, event: NoteEvent | StageEvent) -> None:
-        """Record what the estimate does not depend on.
+        """Record an event that the estimate does not depend on.
 
         Raises:
             InputError: not an event that a session may hold.
-            JournalError: the disk refuses.
+            JournalError: a write failed.
             EngineGone: it is recorded, and :meth:`revive` is due.
         """
         gone = self._catch_up_or_gone()
@@ -273,7 +275,7 @@ class LiveSession:
             raise gone
 
     def refresh(self) -> OnlineEstimate | None:
-        """What the engine has found out since, without an event; a move of the camera that it found is recorded."""
+        """Take over the engine's results, without an event; a detected camera move is recorded."""
         self._catch_up()
         before = self._feed.epoch
         try:
@@ -289,20 +291,20 @@ class LiveSession:
         return self.estimate
 
     def settle(self) -> OnlineEstimate:
-        """The full judgement of all that was taken in, now."""
+        """Run the full solve of everything now."""
         self.estimate = self._engine.settle()
         return self.estimate
 
     def measurements(self) -> Measurements:
-        """All that was taken in."""
+        """All measurements that were taken in."""
         return self._engine.measurements()
 
     def marker_T_laser(self) -> FloatArray | None:
-        """The beam, (4, 4), as the estimate has it; None where there is none yet."""
+        """The estimated beam, (4, 4); None where there is none yet."""
         return self._engine.marker_T_laser()
 
     def _catch_up_or_gone(self) -> EngineGone | None:
-        """As :meth:`_catch_up`; where the engine is gone, that: what comes is recorded all the same."""
+        """As :meth:`_catch_up`; returns EngineGone instead of raising it, since events are recorded all the same."""
         try:
             self._catch_up()
         except EngineGone as gone:
@@ -310,10 +312,10 @@ class LiveSession:
         return None
 
     def _catch_up(self) -> None:
-        """What an interrupt or a full disk left undone comes before the next event.
+        """Finish what an interrupt or a full disk left undone, before the next event.
 
         Raises:
-            JournalError: the disk still refuses.
+            JournalError: writes still fail.
             EngineGone: :meth:`revive` is due.
         """
         if self._gone:
@@ -324,7 +326,7 @@ class LiveSession:
         self._write_waiting(patient=False)
 
     def _take_in(self) -> None:
-        """The oldest event that is on disk only into the estimate; raises as :meth:`_take`."""
+        """Take in the oldest event that is on disk but not in the estimate; raises as :meth:`_take`."""
         event = self._untaken[0]
         try:
             self._take(event)
@@ -335,10 +337,10 @@ class LiveSession:
         self._record_moves()
 
     def _take(self, event: Event) -> None:
-        """A recorded event into the estimate.
+        """Take a recorded event into the estimate.
 
         Raises:
-            EventRefused: it could not be; noted for the record.
+            EventRefused: the engine refused it; the refusal is noted for the record.
         """
         estimate: OnlineEstimate | None = None
         try:
@@ -347,7 +349,7 @@ class LiveSession:
                 if isinstance(found, Aim | Pair):
                     try:
                         estimate = self._feed.add(found)
-                    except BaseException:  # its frames must not count either: opened again, the session lacks them
+                    except BaseException:  # nor may its frames count: the session opened again would lack them
                         self._recogniser.take_back()
                         raise
             elif isinstance(event, CameraMovedEvent):
@@ -375,20 +377,20 @@ class LiveSession:
             self._unwritten.append(moved)
 
     def _refuse(self, event: Event, line: int | None, reason: str) -> None:
-        """Note a refusal, with the event's line where it is on disk, else with all of it that can be written."""
+        """Note a refusal, with the event's line if it is on disk, else with the event itself as far as possible."""
         t = self.journal.last_t
-        if t is None:  # the time of an event that is refused for what it is may be anything
+        if t is None:  # the time of a refused event may be any number
             t = min(0.0, event.t) if math.isfinite(event.t) and event.t > -EARLIEST_S else 0.0
         document: object = {"type": type_of(event), "t": event.t, "line": line}
         if line is None:
             try:
                 document = event_document(event, self.journal.folder)
-            except InputError:  # a frame from elsewhere has no name here
+            except InputError:  # a frame outside the session's folder has no name in it
                 document = {"type": type_of(event), "t": event.t}
         self._unwritten.append(RefusedEvent(t, 0, writable(document), reason))
 
     def _write_waiting(self, *, patient: bool = True) -> None:
-        """Record what waits for it; ``patient``: it waits on where the disk refuses."""
+        """Record the waiting events; ``patient``: where a write fails they go on waiting, else it raises."""
         while self._unwritten:
             event = self._unwritten[0]
             try:
@@ -400,7 +402,7 @@ class LiveSession:
             except InputError:
                 if not isinstance(event, RefusedEvent) or isinstance(event.event, str):
                     raise
-                # Too long a line: its beginning has to do.
+                # The line is too long: only its beginning is recorded.
                 self._unwritten[0] = replace(event, event=repr(event.event)[:1000])
                 continue
             self._unwritten.pop(0)
@@ -413,5 +415,5 @@ def online_engine(
     *,
     find_moves: bool = True,
 ) -> Engine:
-    """The incremental engine, its full solve in the same process: the same events always give the same estimates."""
+    """The engine with its full solve in the same process: the same events always give the same estimates."""
     return OnlineRegistration(model, config, find_moves=find_moves, sound_speed_prior=sound_speed_prior)

@@ -24,7 +24,7 @@ class EpochsFound:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """What to tell the user."""
+        """Sentences for the user."""
         return (*(move.text for move in self.moves), *(back.text for back in self.loop_closures))
 
 

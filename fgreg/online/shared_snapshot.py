@@ -1,14 +1,14 @@
-"""The latest snapshot in shared memory: one process writes, any number read, nobody waits.
+"""The latest snapshot in shared memory: one process writes, any number read, no one waits.
 
-Several slots hold the last versions. The writer fills the oldest and then moves ``latest`` on to it; a reader copies
-the latest slot out and takes the copy only if the slot's version, written before and after its contents, and its
-checksum say that it was whole. So a reader never holds the writer up, a writer that dies in the middle of a version
-leaves the one before, and on processors that reorder stores the checksum shows what the versions alone might miss.
+Several slots hold the last versions. The writer fills the oldest slot and then sets ``latest`` to it. A reader copies
+the latest slot and uses the copy only if it is complete: the slot's version is written before and after its contents,
+and there is a checksum. So a reader never blocks the writer, and a writer that dies in the middle of a version leaves
+the one before. On processors that reorder stores the checksum detects what the versions alone might miss.
 
-The memory is this user's only (mode 0600) under a name that nobody can guess. The writer removes it: when closed, when
-its process ends, and through multiprocessing's resource tracker when it is killed. Readers map it read-only and are not
-tracked, or the first of them to exit would remove it under all others; a mapping stays valid after removal, so that
-they can still tell the last estimate and its age.
+The memory belongs to this user only (mode 0600); its name cannot be guessed. The writer removes it when it is closed
+or its process ends, and multiprocessing's resource tracker removes it when the process is killed. Readers map it
+read-only and are not tracked, else the first reader to exit would remove it for all others. A mapping stays valid after
+removal, so that readers still have the last estimate and its age.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from fgreg.tracking.snapshot import Snapshot
 
 MAGIC: Final = 0x6667726567_01
 SLOTS = 4
-"""A reader would have to be overtaken by so many versions, less one, to find its slot written over."""
+"""A reader's slot is overwritten only if the writer publishes this number of versions, less one, while it copies."""
 TRIES = 100
 _MAGIC, _SIZE, _DEPTHS, _CURVE, _EPOCHS, _LATEST, _ALIVE, _CLOSED, _WRITER, _HEADER = range(10)
 _BEGIN, _END, _SUM, _TIME, _SLOT_HEADER = range(5)
@@ -46,9 +46,9 @@ class NoSnapshotError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
-    """A snapshot with its version (1, 2, ...), the seconds since it was published and since the writer last stirred.
+    """A snapshot with its version (1, 2, ...), and the seconds since it was published and since the writer's last sign.
 
-    ``closed``: whether the writer has said that there will be no more.
+    ``closed``: whether the writer has closed, so that there will be no more.
     """
 
     snapshot: Snapshot
@@ -59,7 +59,7 @@ class Received:
 
 
 def _checksum(payload: IntArray) -> int:
-    """Sum of the payload's words, modulo 2^64: any mixture of two versions gives another one, but for chance."""
+    """Sum of the payload's words, modulo 2^64: a mixture of two versions almost certainly has another sum."""
     return int(np.add.reduce(payload))
 
 
@@ -83,7 +83,7 @@ class SharedSnapshot:
         self._header: IntArray | None = cells[:header]
         self._slots: IntArray | None = cells[header:].reshape(SLOTS, words)
         self._version = 0
-        # A forked child has this object too, and must not remove what is not its own.
+        # A forked child has this object too, and must not remove its parent's memory.
         self._finalizer = weakref.finalize(self, _remove, self._memory, os.getpid())
         self._header[_SIZE], self._header[_WRITER] = record_type.itemsize, os.getpid()
         self._header[_DEPTHS], self._header[_CURVE], self._header[_EPOCHS] = layout.depths, layout.curve, layout.epochs
@@ -92,14 +92,14 @@ class SharedSnapshot:
 
     @property
     def name(self) -> str:
-        """By which readers find it."""
+        """Name of the memory, for readers."""
         return self._memory.name
 
     def publish(self, snapshot: Snapshot) -> int:
-        """Make a snapshot the latest; its version.
+        """Publish a snapshot as the latest; returns its version.
 
         Raises:
-            ValueError: it does not fit the layout, or a number is not finite; the latest stays what it was. Or: closed.
+            ValueError: it does not fit the layout, or a number is not finite (the latest stays); or this is closed.
         """
         if self._header is None or self._slots is None:
             raise ValueError("this shared snapshot is closed")
@@ -116,12 +116,12 @@ class SharedSnapshot:
         return version
 
     def touch(self) -> None:
-        """Tell readers that the writer is there although nothing has changed."""
+        """Show readers that the writer runs although nothing has changed."""
         if self._header is not None:
             self._header[_ALIVE] = time.monotonic_ns()
 
     def close(self) -> None:
-        """Tell readers that this was all, and remove the name; they keep what they have."""
+        """Mark it closed for readers, and remove the name; readers keep their mappings."""
         if self._header is not None:
             self._header[_CLOSED] = 1
             self._header = self._slots = None
@@ -141,7 +141,7 @@ def _remove(memory: SharedMemory, owner: int) -> None:
         memory.unlink()
     try:
         memory.close()
-    except BufferError:  # an array still refers to it: it goes with the process
+    except BufferError:  # an array still refers to it: it is freed when the process ends
         memory._buf = memory._mmap = None  # type: ignore[attr-defined]  # or its destructor would complain
 
 
@@ -149,8 +149,8 @@ class SnapshotReader:
     """A reader's end, read-only; one per thread.
 
     Raises:
-        FileNotFoundError: there is no such memory (any more).
-        ValueError: what is there is not a shared snapshot of this version of fgreg.
+        FileNotFoundError: there is no such memory, or not any more.
+        ValueError: it is not a shared snapshot of this version of fgreg.
     """
 
     def __init__(self, name: str) -> None:
@@ -179,7 +179,7 @@ class SnapshotReader:
         self._snapshot: Snapshot | None = None
 
     def clone(self) -> SnapshotReader:
-        """Another reader of the same memory, for another thread; possible also when its name is gone."""
+        """Another reader of the same memory, for another thread; also after its name was removed."""
         other = copy.copy(self)
         other._forget()
         return other
@@ -223,8 +223,8 @@ class SnapshotReader:
                 self._snapshot = self._decoder.decode(record)
                 self._version, self._published = latest, published
                 return
-        # Overtaken every time: what is at hand is whole, if older.
+        # The slot was overwritten every time: the last copy is complete, but older.
 
     def close(self) -> None:
-        """Let go of the memory; snapshots read before stay valid."""
-        del self._header, self._slots, self._memory  # unmapped with the last reader of it
+        """Release the memory; snapshots read before stay valid."""
+        del self._header, self._slots, self._memory  # unmapped with the last reference to it

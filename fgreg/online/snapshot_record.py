@@ -1,4 +1,4 @@
-"""Snapshots of fixed size: the estimate as one record of plain numbers, for memory that processes share."""
+"""Snapshots of fixed size: the estimate as one record of numbers, for shared memory."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from fgreg.tracking.snapshot import SHARED, EpochSnapshot, Snapshot
 Record = np.ndarray[Any, np.dtype[Any]]
 """A structured array of shape ()."""
 EPOCHS_KEPT = 8
-"""The newest epochs (and refusals) that a record holds: queries concern where the camera is now."""
+"""Number of newest epochs (also refused ones) in a record: queries concern where the camera is now."""
 REASON_BYTES = 240
 _VERDICTS = (Verdict.OK, Verdict.WARNING, Verdict.REFUSED)
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What decides a record's size: entries of the sensitivity table and of the amplitude curve (0: none)."""
+    """Sizes in a record: entries of the sensitivity table and of the amplitude curve (0: none), and epochs."""
 
     depths: int
     curve: int
@@ -30,7 +30,7 @@ class Layout:
 
     @classmethod
     def of(cls, model: SessionModel) -> Layout:
-        """That of a session."""
+        """The layout for a session."""
         return layout_of(model.probe.sensitivity)
 
     def dtype(self) -> np.dtype[np.void]:
@@ -102,7 +102,7 @@ _ARRAYS = ("marker_T_nominal", "beam", "bias_mm")
 
 
 def encode_snapshot(snapshot: Snapshot, record: Record) -> None:
-    """Write a snapshot into a record ``()`` of its layout's type; of more epochs than it holds, the newest.
+    """Write a snapshot into a record ``()`` of its layout's type; the newest epochs where it has too many.
 
     Raises:
         ValueError: the record is of another session's layout, or a number is not finite.
@@ -150,14 +150,14 @@ def _encode_session(snapshot: Snapshot, record: Record) -> None:
 
 
 class SnapshotDecoder:
-    """Snapshots from records; what a session never changes is made (and checked) once."""
+    """Reads snapshots from records; constants of the session are made (and checked) once."""
 
     def __init__(self) -> None:
         self._session_bytes = b""
         self._session: tuple[SensitivityModel, StageModel] | None = None
 
     def decode(self, record: Record) -> Snapshot:
-        """The snapshot in a record ``()``. Its arrays are views of the record, which must not change any more."""
+        """The snapshot in a record ``()``. Its arrays are views of the record, which must not change afterwards."""
         session = record["session"]
         sensitivity, stage = self._models(session)
         count = int(record["epoch_count"])

@@ -17,8 +17,8 @@ Where = Literal["in_process", "worker"]
 class Solver(Protocol):
     """Solves one case after another.
 
-    ``busy``: one is under way. ``failure``: why the last one could not be solved; empty where it could. ``lost``: it
-    was lost with the process that worked on it.
+    ``busy``: a case is being solved. ``failure``: why the last one failed; empty where it did not. ``lost``: whether it
+    was lost because its process ended.
     """
 
     failure: str
@@ -28,10 +28,10 @@ class Solver(Protocol):
     def busy(self) -> bool: ...
 
     def submit(self, case: FullSolveCase) -> None:
-        """Solve a case; not to be called while ``busy``."""
+        """Start on a case; not to be called while ``busy``."""
 
     def fetch(self) -> FullSolveResult | None:
-        """The result that has not been fetched yet."""
+        """A result that has not been fetched yet; None without one."""
 
     def close(self) -> None:
         """Stop."""
@@ -53,7 +53,7 @@ class InProcessSolver:
         self._found, self.failure = None, ""
         try:
             self._found = self._work(case)
-        except Exception as error:  # the incremental estimate stands without it
+        except Exception as error:  # the incremental estimate stays valid
             self.failure = f"{type(error).__name__}: {error}"
 
     def fetch(self) -> FullSolveResult | None:
@@ -77,12 +77,12 @@ class WorkerSolver:
 
     @property
     def busy(self) -> bool:
-        """Whether a case is under way."""
+        """Whether a case is being solved."""
         return self._worker.busy
 
     @property
     def failure(self) -> str:
-        """What went wrong with the last case."""
+        """Why the last case failed; empty where it did not."""
         return self._worker.failure
 
     @failure.setter
@@ -99,16 +99,16 @@ class WorkerSolver:
         self._worker.lost = value
 
     def submit(self, case: FullSolveCase) -> None:
-        """Hand a case over."""
+        """Send a case to the worker process."""
         self._worker.send(case)
 
     def fetch(self) -> FullSolveResult | None:
-        """The result that has come back."""
+        """The worker process's result; None while there is none."""
         found = self._worker.fetch()
         return None if found is None else found[0]
 
     def close(self) -> None:
-        """End the process."""
+        """End the worker process."""
         self._worker.close()
 
 
@@ -121,7 +121,7 @@ def _work(
 def make_solver(
     where: Where, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
 ) -> Solver:
-    """A solver of the kind.
+    """The solver for ``full_solve`` = ``where``.
 
     Raises:
         ValueError: there is no such kind.

@@ -24,10 +24,10 @@ POSE = slice(0, 6)
 def reported_shared(
     estimate: OnlineEstimate, state: SharedState, covariance: FloatArray, columns: Columns
 ) -> tuple[SharedState, FloatArray]:
-    """The shared variables and their covariance (D, D) as reported, from the graph's optimum and its Gaussian.
+    """The reported shared variables and their covariance (D, D), from the graph's optimum and its Gaussian.
 
-    What is reported is the registration: its mean is off the optimum and its covariance wider. The other variables
-    follow the registration's shift as the Gaussian says they do, and keep their correlations with it.
+    The reported registration is the posterior mean, with a wider covariance than the Gaussian's. The other variables
+    follow its shift by their regression on it in the Gaussian, and keep their correlations with it.
 
     Args:
         estimate: with a registration.
@@ -54,13 +54,13 @@ def online_snapshot(
     optimum: tuple[SharedState, FloatArray, Columns] | None,
     surface: TissueSurface | None,
 ) -> Snapshot:
-    """What queries are answered from after an event: the camera epoch that lasts, and no other.
+    """The snapshot for tracking queries after an event; it has the current epoch only.
 
     Args:
         model, config: of the session.
         estimate: after the event.
         optimum: the graph's shared variables, their covariance, its columns; None where there is no registration.
-        surface: as last made of the PMs.
+        surface: tissue surface of the last full solve.
     """
     epoch = estimate.epoch
     refused = {}

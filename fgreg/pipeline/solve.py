@@ -55,7 +55,7 @@ class SolveRequest:
     Attributes:
         folder: the session. out: where the result goes; ``result.yaml`` in the session's folder where None.
         rrd: the recording to write, if any. redetect: look at frames even where poses are recorded.
-        detect_moves: look for camera moves that nobody told, and solve what lies between as epochs.
+        detect_moves: look for unreported camera moves, and solve what lies between as epochs.
     """
 
     folder: Path

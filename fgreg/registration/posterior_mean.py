@@ -36,7 +36,7 @@ RIVALS = 3
 RIVAL_CHI2 = 14.0
 """Minima whose chi square is larger by more than this have too small a share of the posterior to matter."""
 OPEN_PMS = 5
-"""Fewer PMs leave a registration open, whatever samples say: a third of the draws has to do."""
+"""With fewer PMs the registration is undetermined, however many samples there are: a third of the draws is enough."""
 FREE_SOUND_SPEED = 0.1
 """Prior sigma of the sound speed ratio where only the residuals should determine it."""
 
