@@ -1,4 +1,4 @@
-"""The incremental estimate from a registration of all measurements: its optimum, and which shots it counts."""
+"""Start the incremental estimate from a registration of all measurements: its optimum and its inliers."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from fgreg.smoother.state import Setting, Shot, State, carried_prior, looks_by_p
 from fgreg.smoother.updates import LEAVE, MOST, settled, with_aim, with_pair
 
 SAME_SIGMA = 0.02
-"""Two estimates are the same where they are no farther apart, in their own standard deviations."""
+"""Largest distance of two estimates, in their standard deviations, that count as the same."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Initial:
-    """What a registration of all measurements up to an event says.
+    """Result of a registration of all measurements up to an event.
 
     Attributes:
-        epochs: numbers of those that were solved.
+        epochs: numbers of the solved ones.
         state: their registrations with the common variables (one hypothesis); covariance: (D, D).
         labels, inlier: of all pairs, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
-        is_open: the current epoch has two minima that cannot be told apart.
+        is_open: whether the current epoch is ambiguous: two minima fit equally well.
     """
 
     epochs: tuple[int, ...]
@@ -42,7 +42,7 @@ class Initial:
 
 
 def initial_of(found: Registration, measurements: Measurements, epoch: int) -> Initial:
-    """What carries over of a registration of the measurements, whose current epoch is given."""
+    """The part of a registration that the incremental estimate needs; ``epoch`` is the current one."""
     shots = found.shots
     look_pm = iter(shots.problem.look_pm.tolist())
     labels, inlier = [], []
@@ -62,9 +62,9 @@ def initial_of(found: Registration, measurements: Measurements, epoch: int) -> I
 
 
 def initialised(state: State, found: Initial, setting: Setting) -> State:
-    """The state with a registration of its measurements taken over; what came since is added to it.
+    """The state with a registration of its measurements taken over; later shots are added to it.
 
-    The state is as it was, where the same shots count and the estimate is the same.
+    The state is unchanged where inliers and estimate are the same.
     """
     count, aims = len(found.labels), len(found.aim_inlier)
     if count == len(state.shots) and aims == len(state.aims) and _is_same(state, found, setting):
@@ -125,7 +125,7 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
         why_none="",
     )
     if state.epoch not in found.epochs:
-        return replace(state, why_none="its pairs do not determine it: take more")
+        return replace(state, why_none="its pairs do not determine it: take more pairs")
     here = _here(found, state)
     state, carried = carried_prior(state, here, setting)
     state = replace(state, carried=carried)
@@ -143,8 +143,8 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
         stays = False
     if stays:
         return opened
-    # Among few pairs that contradict each other full Gauss-Newton steps lead away from the optimum that damped ones
-    # found. The optimum stands: all pairs are marginalised there, and the window starts empty.
+    # Among few pairs that contradict each other full Gauss-Newton steps diverge from the optimum that damped steps
+    # found. The optimum is used: all pairs are marginalised there, and the active window starts empty.
     older = frozenset(shot.label for shot in state.current if shot.inlier)
     covariance = state.now.covariance
     assert covariance is not None
@@ -155,7 +155,7 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
         return _with_active_window(
             state, open_active_window((), total_prior(state, here, setting), layout, state.epoch)
         )
-    except ArithmeticError:  # as three pairs can leave it
+    except ArithmeticError:  # possible with three pairs
         return replace(state, why_none="these pairs leave the registration undetermined: take more")
 
 
@@ -171,7 +171,7 @@ def _with_active_window(state: State, active: ActiveWindow) -> State:
 
 
 def _opened(state: State, recent: list[int], here: SharedState, layout: Layout, setting: Setting) -> State:
-    """The state with a window of some PMs, all other inliers marginalised."""
+    """The state with an active window of the ``recent`` PMs; all other inliers are marginalised."""
     looks = looks_by_pm(state.current, state.now.first)
     inliers = {shot.label for shot in state.current if shot.inlier}
     older = frozenset(inliers - set(recent))

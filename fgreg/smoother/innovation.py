@@ -1,4 +1,4 @@
-"""Innovations: how far a shot is from what the others predict, over the predicted covariance (a chi square)."""
+"""Innovations: squared deviation of a shot from what the others predict, over the predicted covariance."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 
 
 def limit_of(degrees_of_freedom: int, inliers: int, count: int) -> float:
-    """Chi square beyond which a PM is an outlier, where ``inliers`` of ``count`` are inliers, the PM among them."""
+    """Chi square beyond which a PM is an outlier; ``inliers`` of ``count`` PMs, including this one, are inliers."""
     return float(chdtri(max(degrees_of_freedom, 1), outlier_p_of(inliers, count)))
 
 
@@ -52,7 +52,7 @@ def innovation(prepared: Prepared, covariance: FloatArray, before: Quadratic | N
     Args:
         prepared: at the present estimate, which is the optimum of the others and, where given, of ``before``.
         covariance: (D, D) of the present estimate.
-        before: what the same PM says in the present estimate, about the same state.
+        before: contribution of the same PM to the present estimate, about the same state.
     """
     if prepared.far:
         return prepared.quadratic.cost
@@ -68,7 +68,7 @@ def innovation(prepared: Prepared, covariance: FloatArray, before: Quadratic | N
 
 
 def misplaced_pms(state: State, setting: Setting) -> frozenset[int]:
-    """Labels of the current epoch's PMs that are inliers though they deviate, or outliers though they fit."""
+    """Labels of the current epoch's PMs that are inliers beyond their limit, or outliers within it."""
     active = state.active_window
     if active is None or not state.current:
         return frozenset()
@@ -94,10 +94,10 @@ def _information(active: ActiveWindow) -> FloatArray:
 
 
 def _parts(measurements: Measurements, state: SharedState, setting: Setting) -> tuple[Parts, PackedProblem]:
-    """What shots of one epoch add to the reduced problem at a state; a PM that still wanders counts as far off."""
+    """Contributions of the shots of one epoch at a state; a PM that does not converge gets a large cost."""
     problem = setting.pack(measurements)
     private = initial_private(problem, state)
-    with np.errstate(all="ignore"):  # an outlier may be anywhere
+    with np.errstate(all="ignore"):  # numbers of an outlier may overflow
         for _ in range(PRIVATE_ROUNDS):
             _, private = refine(problem, state, private)
         parts = contributions(problem, state, private)

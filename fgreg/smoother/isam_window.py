@@ -1,13 +1,12 @@
 """The active window: recent pairs as factors in iSAM2, and one marginal prior of everything older.
 
-All variables of a recent pair are in the graph as they are in the reference (fgreg.graph.gtsam_graph): its marker pose,
-PM, lambda and theta' are *variables*, nothing is eliminated by hand. Two facts of GTSAM's Python wrapper rule how iSAM2
-is used here:
+All variables of a recent pair are in the graph as in the reference (fgreg.graph.gtsam_graph): its marker pose, PM,
+lambda and theta' are *variables*. Two facts of GTSAM's Python wrapper determine how iSAM2 is used here:
 
-- A Python factor is given all values by copy unless their C++ object has a live Python wrapper. So the linearisation
-  point is held as long as iSAM2 lives (``Window.theta``).
-- An update that throws leaves iSAM2 unusable. So every update works on a copy, and the copy becomes the window only
-  when it has succeeded and every number is finite.
+- A Python factor gets a copy of all values unless their C++ object has a live Python wrapper. So the linearisation
+  point is held as long as iSAM2 (``ActiveWindow.theta``).
+- An update that throws leaves iSAM2 unusable. So every update works on a copy, and the copy becomes the active window
+  only if the update succeeds and every number is finite.
 """
 
 from __future__ import annotations
@@ -44,13 +43,13 @@ THRESHOLDS: dict[Variable, tuple[float, ...]] = {
     Variable.lam: (0.15,),
     Variable.theta: (1.5e-3,),
 }
-"""Steps (rad, mm) beyond which a variable is linearised anew."""
+"""Steps (rad, mm) beyond which a variable is linearised again."""
 PRIVATE_STEPS = 10
 SETTLED_MM = 0.5
-"""A new pair's own variables have settled after a step that moves the PM by less: what is left is of second order, some
-hundredths of a millimetre."""
+"""The private variables of a new pair have converged after a step that moves the PM by less: the rest is of second
+order, some hundredths of a millimetre."""
 FAR_CHI2 = 1e4
-"""What a PM counts as that has no place where beam and arc meet."""
+"""Chi square of a PM whose beam and arc do not meet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,10 +58,10 @@ class Prepared:
 
     Attributes:
         graph: the factors. values: of the private variables.
-        rows, residual: (m, D) and (m,): what they say about the shared variables, private ones eliminated: the cost
-            ``|residual + rows d|^2`` of steps d from ``state``. m their degrees of freedom.
-        state: shared variables where that holds.
-        far: no place was found where they fit.
+        rows, residual: (m, D) and (m,): the factors linearised on the shared variables, private ones eliminated: the
+            cost ``|residual + rows d|^2`` of steps d from ``state``, with m degrees of freedom.
+        state: shared variables at the linearisation point.
+        far: whether no place was found where they fit.
         first: number of the first of the private variables.
     """
 
@@ -93,9 +92,9 @@ class Group:
     Attributes:
         label: PM number (one of its own where a look was split off as an outlier).
         places: of its pairs in the session's order.
-        pairs: themselves.
-        prepared: as factors, when the group came.
-        slots: where those are in iSAM2; empty before.
+        pairs: the pairs.
+        prepared: their factors, prepared when the group was added.
+        slots: of the factors in iSAM2; empty before they are in it.
     """
 
     label: int
@@ -114,9 +113,9 @@ def private_keys(pairs: Sequence[Pair], first: int) -> tuple[list[int], list[int
 
 
 def free_number(groups: Sequence[Group], count: int) -> int:
-    """The first of so many numbers in a row that no private variables of the groups have.
+    """The first of ``count`` consecutive numbers that no private variables of the groups have.
 
-    Numbers are used again, so that GTSAM's keys are few: a value of type double is made once for each, which is slow.
+    Numbers are used again, so that GTSAM has few keys: making a value of type double for each is slow.
     """
     free = 0
     for first, taken in sorted((group.prepared.first, len(group.pairs)) for group in groups):
@@ -129,7 +128,7 @@ def free_number(groups: Sequence[Group], count: int) -> int:
 def prepare(
     pairs: Sequence[Pair], layout: Layout, state: SharedState, epoch: int, model: SessionModel, first: int
 ) -> Prepared:
-    """Factors of the looks at one PM, and Gauss-Newton on its private variables with the shared ones held.
+    """Factors of the looks at one PM, and Gauss-Newton on its private variables with the shared ones fixed.
 
     Args:
         pairs: the looks.
@@ -137,7 +136,7 @@ def prepare(
         state: their values.
         epoch: index of the registration's variable.
         model: the session's set-up.
-        first: number of the first of its private variables; ``len(pairs)`` numbers are taken.
+        first: number of the first of its private variables; ``len(pairs)`` numbers are used.
 
     Raises:
         FactorError: a factor that cannot be computed here.
@@ -204,7 +203,7 @@ def factors_of(
 def _beginning(
     pairs: Sequence[Pair], windows: Windows, layout: Layout, state: SharedState, model: SessionModel, first: int
 ) -> gtsam.Values:
-    """Where the private variables begin: the PM on the first look's arc, in the middle of where it may be."""
+    """Starting values of the private variables: the PM on the first look's arc, at the centre of its prior."""
     markers, lambdas, point, thetas = private_keys(pairs, first)
     radius_mm = model.probe.radius_mm
     centres, gains, _ = windows
@@ -246,7 +245,7 @@ def _settle(
     layout: Layout,
     epoch: int,
 ) -> tuple[gtsam.Values, FloatArray, FloatArray, bool]:
-    """The private values at their optimum; the shared variables' rows and residual there, and whether it was found."""
+    """The private values at their optimum, the shared variables' rows and residual there, and whether it converged."""
     own = sum(sizes.values())
     there = set(graph.keyVector())
     shared = [(key, size) for key, size in zip(layout.keys(epoch), layout.sizes, strict=True)]
@@ -258,12 +257,12 @@ def _settle(
         system = graph.linearize(values).augmentedJacobian(ordering)
         if not math.isfinite(system.sum()):
             raise ArithmeticError("a pair's linear system is not finite")
-        # Triangular, the private variables first: theirs are the first rows, those below are what is left over.
+        # Triangular, with the private variables first: the rows below theirs depend on the shared variables only.
         turned = dgeqrf(system)[0]
         step, singular = dtrtrs(turned[:own, :own], turned[:own, -1])
         if singular:
             raise np.linalg.LinAlgError("a pair's linear system is singular")
-        # By retraction: setting a double anew goes through all of the wrapper's overloads, ten times as slow.
+        # By retraction: to set a double goes through all of the wrapper's overloads, ten times as slow.
         delta, at = gtsam.VectorValues(), 0
         for key, size in sizes.items():
             delta.insert(key, step[at : at + size])
@@ -273,7 +272,7 @@ def _settle(
         private = private.retract(delta)
         if not far:
             break
-    # What is left over after the private variables, on the shared ones; absent ones (the edge) get zeros.
+    # The rows on the shared variables; absent variables (the edge) get zeros.
     left = np.triu(turned[own:, own:])
     rows = np.zeros((len(left), layout.columns.size))
     at, column = 0, 0
@@ -290,11 +289,11 @@ class ActiveWindow:
     """iSAM2 with the recent pairs in it, and the shared variables' Gaussian.
 
     Attributes:
-        isam: never updated in place once it is in a window.
-        theta: its linearisation point, held so that Python factors are not given copies of it.
+        isam: never updated in place once it is here.
+        theta: its linearisation point, held so that Python factors do not get copies of it.
         epoch: index of the registration's variable.
         groups: oldest first.
-        prior_slot: where the marginal prior is.
+        prior_slot: of the marginal prior.
         state: the estimate (one hypothesis, one epoch).
         covariance: (D, D) of the shared variables.
     """
@@ -324,7 +323,7 @@ def empty_isam() -> gtsam.ISAM2:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """What an update does to a window: groups that come, labels of groups that leave, another marginal prior."""
+    """Change of an active window by an update: groups to add, labels of groups to remove, a new marginal prior."""
 
     add: tuple[Group, ...] = ()
     remove: tuple[int, ...] = ()
@@ -332,7 +331,7 @@ class Change:
 
 
 def open_active_window(groups: Sequence[Group], prior: Quadratic, layout: Layout, epoch: int) -> ActiveWindow:
-    """A new window of these groups and a marginal prior, whose state is the start.
+    """A new active window of these groups and a marginal prior, whose state is the start.
 
     Raises:
         ArithmeticError: an indeterminate system, or a result that is not finite.
@@ -352,7 +351,7 @@ def open_active_window(groups: Sequence[Group], prior: Quadratic, layout: Layout
 
 
 def updated(active: ActiveWindow, change: Change, layout: Layout) -> ActiveWindow:
-    """The window after one update of iSAM2; the window given is left as it was.
+    """The active window after one update of iSAM2; the given one does not change.
 
     Raises:
         ArithmeticError: an indeterminate system, or a result that is not finite.
@@ -378,7 +377,7 @@ def updated(active: ActiveWindow, change: Change, layout: Layout) -> ActiveWindo
 def _update(
     isam: gtsam.ISAM2, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, removed: Sequence[int] = ()
 ) -> list[int]:
-    """Update in place; slots of the new factors."""
+    """Update in place; returns the slots of the new factors."""
     try:
         return list(isam.update(graph, values, list(removed)).getNewFactorsIndices())
     except RuntimeError as error:
@@ -388,7 +387,7 @@ def _update(
 
 
 def _placed(groups: Sequence[Group], slots: Sequence[int]) -> tuple[Group, ...]:
-    """Groups with the slots of their factors, which come in their order."""
+    """Groups with the slots of their factors, which are in the same order."""
     out, at = [], 0
     for group in groups:
         size = group.prepared.graph.size()

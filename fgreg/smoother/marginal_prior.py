@@ -1,6 +1,6 @@
-"""The marginal prior: what all shots outside the active window say about the shared variables of the current epoch.
+"""The marginal prior of the current epoch's shared variables, from all shots outside the active window.
 
-It is made by the reduced graph (fgreg.graph.reduced_graph), where each shot's own variables are eliminated already. The
+It comes from the reduced graph (fgreg.graph.reduced_graph), in which the private variables are eliminated. The
 registrations of earlier epochs are eliminated here by the Schur complement.
 """
 
@@ -23,13 +23,13 @@ EARLIER_ROUNDS = 5
 EARLIER_SETTLED = 1e-4
 """Newton decrement (chi square) below which the earlier registrations are at their optimum."""
 UNSEEN = 1e-12
-"""Eigenvalue of a correlation matrix below which a direction of an earlier registration is left open by its pairs."""
+"""Eigenvalue of a correlation matrix below which its pairs do not determine a direction of an earlier registration."""
 FAR_RAD, FAR_MM, FAR_EDGE_RAD, FAR_RATIO = 2e-3, 0.2, 1e-3, 1e-3
 """Steps of the estimate from the linearisation point beyond which a marginal prior is linearised again."""
 
 
 def marginal_prior(problem: PackedProblem, state: SharedState) -> tuple[Quadratic, SharedState]:
-    """A problem's shots, priors and links, with all registrations eliminated but that of its last epoch.
+    """Quadratic of a problem's shots, priors and links, with all registrations but the last epoch's eliminated.
 
     Args:
         problem: inliers only; its last epoch is the current one.
@@ -67,7 +67,7 @@ def marginal_prior(problem: PackedProblem, state: SharedState) -> tuple[Quadrati
 
 
 def _settled(problem: PackedProblem, state: SharedState, private: PrivateState, rounds: int) -> PrivateState:
-    with np.errstate(all="ignore"):  # far from everything numbers may overflow: who sums them up looks at them
+    with np.errstate(all="ignore"):  # numbers may overflow far from the optimum: the caller checks them
         for _ in range(rounds):
             _, private = refine(problem, state, private)
     return private
@@ -84,16 +84,16 @@ def _moved(
 
 
 def _pseudo_inverse(hessian: FloatArray) -> FloatArray:
-    """Inverse over the directions that are seen: an epoch of one or two pairs leaves some of its registration open."""
+    """Inverse over the observed directions: one or two pairs do not determine the whole registration of an epoch."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     outer = np.outer(scale, scale)
     return np.asarray(np.linalg.pinv(hessian * outer, rcond=UNSEEN, hermitian=True) * outer)
 
 
 def has_moved(prior: Quadratic, state: SharedState, problem: PackedProblem) -> bool:
-    """Whether the estimate is so far from a prior's linearisation point that it is to be linearised again.
+    """Whether the estimate is too far from a prior's linearisation point, so that it has to be linearised again.
 
-    Only variables count that the prior knows anything of.
+    Only variables that the prior has information on count.
     """
     step = np.abs(small_step(prior.state, state, problem.columns))
     return bool(((step > _limits(problem)) & (np.diag(prior.hessian) > 0.0)).any())
@@ -116,7 +116,7 @@ def one_epoch(state: SharedState, place: int) -> SharedState:
 
 
 def with_registrations(common: SharedState, each: list[SharedState]) -> SharedState:
-    """The common variables of one state, and the registrations of several, in their order."""
+    """The common variables of one state with the registrations of several states, in their order."""
     return replace(
         common,
         rotation=np.concatenate([one.rotation for one in each], axis=1),
@@ -125,7 +125,7 @@ def with_registrations(common: SharedState, each: list[SharedState]) -> SharedSt
 
 
 def carried_over(state: SharedState, start: EpochStart) -> SharedState:
-    """The shared variables of a new epoch: its registration by the measured motion, else as it was."""
+    """The shared variables of a new epoch: the registration moved by the measured motion, unchanged without one."""
     motion = start.camera_new_T_camera_old
     if motion is None:
         return state

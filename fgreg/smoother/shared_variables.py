@@ -24,9 +24,9 @@ from fgreg.graph.shared_state import SharedState, nominal_frame, step_between
 
 POSE = slice(0, 6)
 LEAST_PIVOT = 1e-4
-"""Of a correlation matrix's Cholesky factor, down to which it is used."""
+"""Smallest pivot of a correlation matrix's Cholesky factor with which the factor is used."""
 LEAST_CORRELATION = 1e-12
-"""Eigenvalue of a correlation matrix below which a direction counts as not seen."""
+"""Eigenvalue of a correlation matrix below which a direction counts as not observed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +55,7 @@ class Quadratic:
 
 
 def small_step(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
-    """(D,) of :func:`step_between`, many times faster, for states so near that the turn's third order is nothing."""
+    """(D,) as :func:`step_between`, many times faster, for states so close that third order in rotation vanishes."""
     out = np.zeros(columns.size)
     back = first.rotation[0, 0].T
     turn = back @ second.rotation[0, 0]
@@ -85,7 +85,7 @@ def square_root(hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, 
     """Rows (m, D) and residual (m,) with ``rows' rows = hessian``, ``rows' residual = gradient``; m its rank."""
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     correlation = hessian / np.outer(scale, scale)
-    try:  # where all is seen well: a tenth of the time that eigenvalues take
+    try:  # where all directions are well observed: a tenth of the time of eigenvalues
         lower = np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
         pass
@@ -107,7 +107,7 @@ def _zero_at(key: int) -> gtsam.Values:
 
 
 def number_at(key: int, value: float) -> gtsam.Values:
-    """Values of one double. By retraction: to insert one goes through all of the wrapper's overloads, 40 us."""
+    """Values of one double, made by retraction: an insert goes through all of the wrapper's overloads (40 us)."""
     delta = gtsam.VectorValues()
     delta.insert(key, np.array([value]))
     return _zero_at(key).retract(delta)
@@ -115,9 +115,9 @@ def number_at(key: int, value: float) -> gtsam.Values:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Where the shared variables of an epoch are: columns of the reduced problem (one epoch) and GTSAM's keys.
+    """Places of an epoch's shared variables: columns of the reduced problem (one epoch) and GTSAM's keys.
 
-    ``marker_T_nominal`` (4, 4): fixed frame of the beam's chart. ``sound_speed_mean``: of its prior.
+    ``marker_T_nominal`` (4, 4): fixed frame of the beam's chart. ``sound_speed_mean``: prior mean of the ratio.
     """
 
     columns: Columns
@@ -149,7 +149,7 @@ class Layout:
         return replace(state, beam=chart[None], marker_T_nominal=self.marker_T_nominal[None])
 
     def insert(self, values: gtsam.Values, state: SharedState, epoch: int) -> None:
-        """Put a state into values."""
+        """Insert a state into values."""
         keys = self.keys(epoch)
         values.insert(keys[0], gtsam.Pose3(state.trus_T_camera()[0]))
         values.insert(keys[1], state.beam[0])
@@ -160,10 +160,10 @@ class Layout:
             values.insert(number_at(Variable.sound_speed_ratio.key(), float(state.sound_speed_ratio[0])))
 
     def read(self, isam: gtsam.ISAM2, epoch: int, like: SharedState) -> SharedState:
-        """The estimate of the shared variables; what is no variable is as in ``like``."""
+        """The estimate of the shared variables; quantities that are not variables are those of ``like``."""
         keys = self.keys(epoch)
         pose = isam.calculateEstimatePose3(keys[0]).matrix()
-        # Copies, laid out as all other arrays: the last digits of sums hang on that.
+        # Copies in row-major order: the last digits of sums depend on the memory layout.
         state = replace(
             like,
             rotation=pose[None, None, :3, :3].copy(),
@@ -180,15 +180,15 @@ class Layout:
 
 
 def finite(state: SharedState) -> bool:
-    """Whether every number of a state is finite (a sum is only if its terms are)."""
+    """Whether every number of a state is finite (a sum is finite only if its terms are)."""
     return math.isfinite(sum(float(getattr(state, name).sum()) for name in SharedState.__slots__))
 
 
 def marginal_prior_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> gtsam.CustomFactor:
     """A quadratic as a factor on the shared variables: ``rows * step + residual`` of unit noise.
 
-    GTSAM's own containers of linear factors hold at most three variables in Python, and take the registration's chart
-    as flat; here the step from the linearisation point is the reduced problem's, wherever it is evaluated.
+    In Python GTSAM's own containers of linear factors hold at most three variables, and they treat the registration's
+    chart as flat. Here the step from the linearisation point is that of the reduced problem everywhere.
     """
     rows, residual = square_root(quadratic.hessian, quadratic.gradient)
     keys, sizes = layout.keys(epoch), layout.sizes

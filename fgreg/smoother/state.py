@@ -1,6 +1,6 @@
-"""The incremental estimate as a value: what was taken in, which shots count, and the active window.
+"""The incremental estimate as an immutable value: measurements, inliers, and the active window.
 
-Nothing here changes a state: an update that fails on its way leaves the one before as it was.
+Nothing changes a state in place, so an update that fails leaves the state before as it was.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from fgreg.smoother.shared_variables import Layout, Quadratic
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """What does not change: the session's set-up, the configuration, what is known of the sound speed.
+    """The constants: the session's set-up, the configuration, the prior of the sound speed.
 
-    ``empty``: a problem of no shots and one epoch, for its columns.
+    ``empty``: a problem without shots and with one epoch, for its columns.
     """
 
     model: SessionModel
@@ -42,7 +42,7 @@ class Setting:
         return self.empty.columns
 
     def pack(self, measurements: Measurements) -> PackedProblem:
-        """Measurements as arrays, with the windows as Gaussians."""
+        """Measurements as arrays, with Gaussian sensitivity windows."""
         return pack_session(measurements, self.model, self.config, self.sound_speed)
 
 
@@ -50,7 +50,7 @@ def make_setting(model: SessionModel, config: SolveConfig, sound_speed: SoundSpe
     """The setting of a session.
 
     Raises:
-        ValueError: the configuration makes the probe's radius a variable, which the graph's factors do not know.
+        ValueError: the configuration makes the probe's radius a variable, which the graph's factors do not have.
     """
     if config.estimate_radius:
         raise ValueError("estimate_radius is set; online registration holds the probe's radius as the session gives it")
@@ -61,12 +61,12 @@ def make_setting(model: SessionModel, config: SolveConfig, sound_speed: SoundSpe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """A pair, and how it counts.
+    """A pair with its label, inlier or outlier.
 
     Attributes:
         pair: with the number of its camera epoch.
         label: number of its PM in the estimate: ``pair.pm``, or one of its own where it was split off as an outlier.
-        inlier: whether it counts.
+        inlier: whether it is an inlier.
     """
 
     pair: Pair
@@ -86,7 +86,7 @@ class Epoch:
     Attributes:
         start: with the measured motion, where there is one.
         first: place of its first pair in the session's order.
-        state: its registration with the common variables when last estimated; None where it was never registered.
+        state: its last estimated registration with the common variables; None where it was never registered.
         covariance: (D, D) there.
     """
 
@@ -98,19 +98,20 @@ class Epoch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """All that the incremental estimate is.
+    """The whole incremental estimate.
 
     Attributes:
         epochs: the last one is the current one.
-        aims, aim_inlier: calibration shots, and which of them count.
+        aims, aim_inlier: calibration shots, and which of them are inliers.
         shots: pairs, in the session's order.
         layout: None until a first registration.
         active_window: None where the current epoch has no registration (yet).
-        carried: prior on the current epoch's shared variables from the aims, the earlier epochs and what is known
-            beforehand; older: from the epoch's own pairs that have left the window. Their sum is the window's prior.
+        carried: prior on the current epoch's shared variables from the aims, the earlier epochs and the priors of the
+            configuration; older: from the epoch's own pairs that have left the active window. Their sum is the marginal
+            prior of the active window.
         marginalised: labels of the PMs in ``older``.
         why_none: why there is no registration, where there is none.
-        is_open: two minima cannot be told apart.
+        is_open: whether the registration is ambiguous: two minima fit equally well.
         nis, used: of the last event, where it was a pair.
     """
 
@@ -154,12 +155,12 @@ class State:
         return len({shot.label for shot in self.current})
 
     def measurements(self) -> Measurements:
-        """Everything that was taken in, as the batch solve takes it."""
+        """All measurements, as the batch solve takes them."""
         pairs = tuple(shot.pair for shot in self.shots)
         return Measurements(self.aims, pairs, tuple(epoch.start for epoch in self.epochs))
 
     def counts(self) -> tuple[int, int]:
-        """PMs that are inliers, and all PMs, over the epochs that have a registration."""
+        """Numbers of inlier PMs, and of all PMs, over the epochs that have a registration."""
         known = {k for k, epoch in enumerate(self.epochs) if epoch.state is not None}
         pms = {shot.key: shot.inlier for shot in self.shots if shot.pair.epoch in known}
         return sum(pms.values()), len(pms)
@@ -186,7 +187,7 @@ def pairs_of_epoch(shots: Sequence[Shot]) -> tuple[Pair, ...]:
 
 
 def own_prior(state: State, labels: frozenset[int], at: SharedState, setting: Setting) -> Quadratic | None:
-    """What inlier PMs of the current epoch say about its shared variables, at a state near their optimum.
+    """The quadratic of some inlier PMs on the current epoch's shared variables, at a state near their optimum.
 
     Raises:
         ArithmeticError: a number is not finite.
@@ -200,7 +201,7 @@ def own_prior(state: State, labels: frozenset[int], at: SharedState, setting: Se
 
 
 def carried_prior(state: State, at: SharedState, setting: Setting) -> tuple[State, Quadratic]:
-    """What the aims, the earlier epochs and prior knowledge say about the current epoch's shared variables.
+    """The prior on the current epoch's shared variables from the aims, the earlier epochs and the configuration.
 
     Args:
         state: ``layout`` has to be that of ``at``.
@@ -228,7 +229,7 @@ def carried_prior(state: State, at: SharedState, setting: Setting) -> tuple[Stat
 
 
 def total_prior(state: State, at: SharedState, setting: Setting) -> Quadratic:
-    """The window's marginal prior about a state near its linearisation points."""
+    """The marginal prior of the active window, about a state near its linearisation points."""
     if state.carried is None:
         raise ValueError("there is no registration")
     prior = state.carried.at(at, setting.columns)

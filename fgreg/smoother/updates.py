@@ -1,4 +1,4 @@
-"""What each kind of event makes of a state: one pair more, one aim more, a camera that moved."""
+"""Updates of a state: by one more pair, by one more aim, by a camera move."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from fgreg.smoother.shared_variables import Layout
 from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, own_prior, total_prior
 
 MOST, LEAVE = 32, 16
-"""Most PMs in the active window, and how many of the oldest leave it at once when one more comes."""
+"""Largest number of PMs in the active window, and how many of the oldest leave it together when it is full."""
 FIRST_PAIRS = 10
-"""Up to so many pairs of an epoch the full solve runs at each, and an update may lead anywhere."""
+"""Up to this number of pairs of an epoch the full solve runs at each pair, and an update may diverge."""
 MOST_UPDATES = 8
 SETTLED_SIGMA = 0.05
 """Updates are repeated until the estimate moves by less, in its own standard deviations."""
 
 
 def with_pair(state: State, pair: Pair, setting: Setting) -> State:
-    """The state with one pair more, which is an inlier where its innovation is within the limit.
+    """The state with one more pair, which is an inlier where its innovation is within the limit.
 
-    Where there is no registration yet it only joins the others. Where it contradicts them so much that no registration
-    is left, the epoch has none until it is registered again.
+    Where there is no registration yet the pair is only added. Where it contradicts the others so much that no
+    registration is left, the epoch has none until it is registered again.
 
     Raises:
         ArithmeticError: a result that is not finite, or a system that is undetermined, though there are many pairs.
@@ -37,18 +37,18 @@ def with_pair(state: State, pair: Pair, setting: Setting) -> State:
         return joined
     try:
         return _one_more(joined, state.active_window, state.layout, setting)
-    except ArithmeticError as error:  # full steps may lead anywhere among few pairs that contradict each other
+    except ArithmeticError as error:  # full steps may diverge among few pairs that contradict each other
         if sum(other.inlier for other in state.current) > FIRST_PAIRS:
             raise
         return replace(joined, active_window=None, why_none=f"the pairs contradict each other ({error})")
 
 
 def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setting) -> State:
-    """:func:`with_pair` where there is a registration; the pair is the state's last shot, an outlier so far."""
+    """:func:`with_pair` where there is a registration; the pair is the state's last shot, an outlier up to now."""
     place, shot = len(state.shots) - 1, state.shots[-1]
     label = shot.label
     places = [state.now.first + i for i, other in enumerate(state.current) if other.label == label]
-    if label in state.marginalised:  # an older PM is looked at again: all its looks come back into the window
+    if label in state.marginalised:  # a new look at a marginalised PM: all its looks return to the active window
         state = replace(state, marginalised=state.marginalised - {label})
         state = replace(state, older=own_prior(state, state.marginalised, active.state, setting))
         change = Change(prior=total_prior(state, active.state, setting))
@@ -64,7 +64,7 @@ def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setti
     fits = nis <= limit_of(len(prepared.rows), inliers + (same is None), count)
     state = replace(state, nis=nis, used=fits)
     if not fits:
-        # Which of several looks at a PM is the outlier is for the full solve to say; until then it is the last one.
+        # The full solve decides which of several looks at a PM is the outlier; until then it is the last one.
         return _split_off(state, place) if same is not None else state
     shots = list(state.shots)
     for p in places:
@@ -90,7 +90,7 @@ def _active_window(state: State) -> ActiveWindow:
 
 
 def _marginalised(state: State, active: ActiveWindow, change: Change, setting: Setting) -> tuple[State, Change]:
-    """The oldest PMs become part of the marginal prior, where the window is full, in the update that is due."""
+    """Move the oldest PMs to the marginal prior where the active window is full, as part of the given change."""
     stay = [group for group in active.groups if group.label not in change.remove]
     if len(stay) < MOST:
         return state, change
@@ -107,7 +107,7 @@ def _marginalised(state: State, active: ActiveWindow, change: Change, setting: S
 def settled(
     state: State, active: ActiveWindow, layout: Layout, change: Change, setting: Setting, limit: float = SETTLED_SIGMA
 ) -> State:
-    """Update the window until the estimate stands still, with the marginal prior linearised again on the way.
+    """Update the active window until the estimate converges; the marginal prior is linearised again where needed.
 
     Raises:
         ArithmeticError: an indeterminate system, or a result that is not finite.
@@ -125,7 +125,7 @@ def settled(
 
 
 def _relinearised(state: State, at: SharedState, setting: Setting) -> tuple[State, bool]:
-    """The state with those parts of its marginal prior linearised again that the estimate has moved away from."""
+    """The state with those parts of its marginal prior linearised again whose linearisation point is too far away."""
     again = False
     if state.carried is not None and has_moved(state.carried, at, setting.empty):
         state, carried = carried_prior(state, at, setting)
@@ -136,7 +136,7 @@ def _relinearised(state: State, at: SharedState, setting: Setting) -> tuple[Stat
 
 
 def with_aim(state: State, aim: Aim, setting: Setting) -> State:
-    """The state with one calibration shot more, which counts where it agrees with the estimate."""
+    """The state with one more calibration shot, which is an inlier where it fits the estimate."""
     active, layout = state.active_window, state.layout
     fits = active is None or aim_fits(aim, active, setting)
     aims, inlier = (*state.aims, aim), (*state.aim_inlier, fits)
@@ -150,10 +150,10 @@ def with_aim(state: State, aim: Aim, setting: Setting) -> State:
 
 
 def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) -> State:
-    """The state with a new epoch, to which the last so many pairs belong already.
+    """The state with a new epoch, to which the ``last`` pairs belong already.
 
-    A measured motion ties the new registration to the old one, so that it is known at once. Otherwise, and where pairs
-    change their epoch, the epoch has none until it is registered.
+    With a measured motion the new epoch has a registration at once, from the motion prior between the epochs. Without
+    one, and where pairs change their epoch, the epoch has none until it is registered.
 
     Raises:
         ValueError: they are not all of the current epoch.
@@ -182,9 +182,9 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
 
 
 def tied(state: State, setting: Setting) -> State:
-    """The state whose current epoch, which has no pairs yet, is registered by the measured motion that it began with.
+    """The state whose current epoch, which has no pairs yet, is registered by the measured motion at its start.
 
-    As it is where there is no such motion, or no registration that it is counted from.
+    It is unchanged where there is no such motion, or where the epoch before the motion has no registration.
     """
     start, layout = state.now.start, state.layout
     before = state.epochs[start.old(state.epoch)].state if start.motion_known and state.epoch else None
@@ -200,9 +200,9 @@ def tied(state: State, setting: Setting) -> State:
 
 
 def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
-    """The state whose current epoch began with a motion that is known only now, from the epoch before or another one.
+    """The state with a motion prior between the current epoch and an earlier one, known only after the epoch's start.
 
-    Where the epoch that the motion is counted from has no registration, it says nothing.
+    The motion is not used where the epoch that it is counted from has no registration.
     """
     now = replace(state.now, start=start)
     state = replace(state, epochs=(*state.epochs[:-1], now), nis=None, used=False)
