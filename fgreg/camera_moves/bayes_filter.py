@@ -1,8 +1,8 @@
 """The full test: Bayes factors of camera moves at given split points, with outliers, windows and large moves.
 
-Given the Gaussian of the shared variables from PMs that are known first, the marginal likelihood of the PMs that follow
-(as whitened equations, fgreg.camera_moves.whitened) under a hypothesis is a product of predictive densities, as a
-Kalman filter runs through them. Hypotheses:
+The filter starts from the Gaussian of the shared variables given the first PMs. Under a hypothesis the marginal
+likelihood of the following PMs (as whitened equations, fgreg.camera_moves.whitened) is the product of the predictive
+densities of a Kalman filter. Hypotheses:
 
 - none: the camera did not move.
 - moved at a split point: the registration is ``trus_T_camera * Exp(xi)`` from that PM on, xi about the camera with a
@@ -33,24 +33,24 @@ from fgreg.model.sensitivity import interval_moments, log_interval
 from fgreg.registration.outliers import OUTLIER_DENSITY
 
 BRANCHES = 4
-"""Sequences of labels carried along per hypothesis."""
+"""Sequences of labels per hypothesis."""
 REACH_RAD, REACH_MM = math.radians(4.0), 10.0
-"""Moves up to this are linear enough."""
+"""Largest moves that are linear enough."""
 ROUNDS, SETTLED = 6, 5.0
-"""Times that moved hypotheses are linearised again, at most, until they move by no more than reach over this."""
+"""Largest number of linearisations of moved hypotheses; they stop when a move changes by less than reach over this."""
 CLOSER = 6
-"""Split points that are linearised again."""
+"""Number of split points that are linearised again."""
 SUSPICION = 2.0
-"""Log of the score by the first linearisation from which large moves are linearised again."""
+"""Log score of the first linearisation above which large moves are linearised again."""
 
 OUTLIER_PRIOR, OUTLIER_PRIOR_PMS, OUTLIER_MEMORY = 0.04, 10.0, 50
-"""Share of outliers expected at first, how many PMs that is worth, and from how many PMs it is learned."""
+"""Prior share of outliers, its weight in PMs, and the number of PMs from which it is learned."""
 LEAST_OUTLIERS, MOST_OUTLIERS = 0.01, 0.5
-"""However clean the stream: a single odd PM must never pass for a move."""
+"""Bounds of that share: even in a clean stream a single outlier must not look like a move."""
 
 
 Relinearise = Callable[[FloatArray], WhitenedPms]
-"""From steps (S, D) off the base to the same PMs linearised there, steps counted from the base."""
+"""Linearises the same PMs at steps (S, D) from the base; their steps are counted from the base."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ class MoveSettings:
 
     Attributes:
         scales: prior of a move.
-        outlier_probability: of each PM; :meth:`learned` from those known first.
+        outlier_probability: of each PM; :meth:`learned` from the first PMs.
         threshold: log score from which a camera move is reported.
     """
 
@@ -72,7 +72,7 @@ class MoveSettings:
             raise ValueError(f"outlier_probability is {self.outlier_probability}, expected a number between 0 and 1")
 
     def learned(self, inlier: BoolArray) -> MoveSettings:
-        """With outliers as probable as the PMs before (n,) say: two in a row are a move where outliers are rare."""
+        """Settings with the outlier probability of the PMs before (n,): where it is small, two in a row are a move."""
         recent = inlier[-OUTLIER_MEMORY:]
         outliers = OUTLIER_PRIOR_PMS * self.outlier_probability + float(np.sum(~recent))
         share = outliers / (OUTLIER_PRIOR_PMS + len(recent))
@@ -81,7 +81,7 @@ class MoveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MoveEvidence:
-    """What the PMs of the filter say.
+    """Result of the filter.
 
     Attributes:
         log_bayes: (C,) log Bayes factor of a move at each split point against none.
@@ -103,7 +103,7 @@ class _Groups:
 
     @staticmethod
     def one(gaussian: Gaussian) -> _Groups:
-        """A single hypothesis of a single sequence; the others do not weigh anything."""
+        """A single hypothesis of a single sequence; the other sequences have weight zero."""
         log_weight = np.full((1, BRANCHES), -np.inf)
         log_weight[0, 0] = 0.0
         return _Groups(
@@ -113,7 +113,7 @@ class _Groups:
         )
 
     def moved(self, move: FloatArray) -> _Groups:
-        """What a single hypothesis becomes when the registration moves by each of K priors (K, 6, 6)."""
+        """A single hypothesis after a move of the registration, for each of K priors of it (K, 6, 6)."""
         count = len(move)
         covariance = np.repeat(self.covariance, count, axis=0)
         covariance[:, :, POSE, POSE] += move[:, None]
@@ -138,7 +138,7 @@ def _spread(innovation: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """One PM as G (or 1) hypotheses have it: residual (G, q), jacobian (G, q, D), rest (G,); its window, if any."""
+    """One PM under G (or 1) hypotheses: residual (G, q), jacobian (G, q, D), rest (G,); its window, if any."""
 
     residual: FloatArray
     jacobian: FloatArray
@@ -147,7 +147,7 @@ class _Rows:
 
 
 def _rows(terms: WhitenedPms, j: int, hypotheses: slice, times: int) -> _Rows:
-    """PM ``j`` of some hypotheses of the terms, each several times over."""
+    """PM ``j`` of some hypotheses of the terms, each repeated ``times`` times."""
 
     def of(values: FloatArray) -> FloatArray:
         return np.repeat(values[hypotheses, j], times, axis=0) if times > 1 else values[hypotheses, j]
@@ -162,9 +162,9 @@ def _rows(terms: WhitenedPms, j: int, hypotheses: slice, times: int) -> _Rows:
 def _in_window(
     mean: FloatArray, covariance: FloatArray, window: WindowRows
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Step given that the rotation is in its window, by moments (exact ones of its first two), and the log density.
+    """Step given that the rotation is in its window, by the exact first two moments, and the log density.
 
-    Means (G, B, D), covariances (G, B, D, D). Density: of the interval's, in units of the site that stands for it.
+    Means (G, B, D), covariances (G, B, D, D). The density is that of the interval, in units of the window's site.
     """
     gain = window.gain[:, None]
     along = (covariance @ gain[..., None])[..., 0]
@@ -178,7 +178,7 @@ def _in_window(
 
 
 def _advance(groups: _Groups, rows: _Rows, log_outlier: float, log_inlier: float) -> _Groups:
-    """One PM more: as an inlier, and as an outlier, of which nothing is learned; the heaviest sequences go on.
+    """One more PM: as an inlier, and as an outlier, which changes no estimate; the heaviest sequences are continued.
 
     ``log_outlier``: log of an outlier's probability and density; ``log_inlier``: of an inlier's probability.
     """
@@ -206,7 +206,7 @@ def _advance(groups: _Groups, rows: _Rows, log_outlier: float, log_inlier: float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Run:
-    """The filters' ends: no move (G = 1), and moves in order of split point and scale."""
+    """Final states of the filters: no move (G = 1), and moves in order of split point and scale."""
 
     none: _Groups
     moved: _Groups
@@ -255,14 +255,14 @@ def move_evidence(
     """Test PMs for a move of the camera.
 
     Args:
-        before: the shared variables' step given the PMs that are known first, and all else.
-        terms: the other PMs, in the order in which they are taken in, linearised once, at the base of the steps.
+        before: the shared variables' step given the first PMs, and all else.
+        terms: the other PMs in filter order, linearised once, at the base of the steps.
         splits: (C,) increasing, indices of the first PM after a move.
         settings: priors.
-        relinearise: for large moves; without, they are judged by ``terms`` alone.
+        relinearise: for large moves; without it they are tested with ``terms`` only.
 
     Raises:
-        ValueError: no split point, or one that is not there.
+        ValueError: no split point, or one that does not exist.
     """
     if not len(splits) or splits[0] < 0 or splits[-1] >= terms.count or (np.diff(splits) <= 0).any():
         raise ValueError(f"splits are {splits.tolist()}, expected increasing indices of {terms.count} PMs")
@@ -291,7 +291,7 @@ def _look_closer(
     log_bayes: FloatArray,
     best: list[Gaussian],
 ) -> None:
-    """Judge the likeliest split points of large moves again, linearised about where they lead; in place."""
+    """Test the likeliest split points of large moves again, linearised about the moved registration; in place."""
     share = settings.scales.share
     likeliest = np.sort(np.argsort(-log_bayes)[:CLOSER])
     far = np.array([c for c in likeliest if _far(best[c].mean[POSE])], dtype=np.int64)

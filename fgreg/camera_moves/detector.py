@@ -1,17 +1,17 @@
 """The test for unreported camera moves: over all split points of the current epoch, and for a loop closure.
 
-A split point is the first PM after a move. Three steps, of which nearly always only the first is taken:
+A split point is the first PM after a move. There are three steps; usually only the first is needed:
 
-1. Screening, in closed form, over all split points (fgreg.graph.split_points). Outliers take part, since what has
-   happened since a move looks like them. Where the sum of the Bayes factors stays below its gate the epoch is steady.
+1. Screening, in closed form, over all split points (fgreg.graph.split_points). Outliers take part, since PMs after a
+   move look like outliers. Where the sum of the Bayes factors is below its gate there is no move.
 2. The full test, by a Gaussian sum filter (fgreg.camera_moves.bayes_filter), over the split points that screening
-   picks. Of each the side with more PMs is known first, and the PMs of the other side follow one by one: forward in
-   time for late moves, backward for early ones. A move is as likely either way round, and its prior has zero mean.
+   selects. For each of them the filter starts from the side with more PMs and adds the PMs of the other side one by
+   one: forward in time for late moves, backward for early ones. The prior of a move is symmetric, with zero mean.
 3. Loop closure: the same filter about an earlier epoch's registration (fgreg.camera_moves.loop_closure).
 
-The score is the log of the sum of the Bayes factors over all split points (Shiryaev, 1963; Roberts, 1966). While
-nothing happens that sum, less the number of PMs, is a martingale: if the model holds, a threshold A on it is passed at
-most once in A PMs on average.
+The score is the log of the sum of the Bayes factors over all split points (Shiryaev, 1963; Roberts, 1966). Without a
+move that sum, less the number of PMs, is a martingale. So if the model holds, a threshold A on it is exceeded at most
+once in A PMs on average.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from fgreg.registration.register import SoundSpeedPrior, pack_session
 from fgreg.smoother.shared_variables import Quadratic
 
 MIN_KNOWN = 6
-"""PMs that a registration takes: with fewer on either side of a split point there is nothing that could have moved."""
+"""PMs needed for a registration: with fewer on one side of a split point a move cannot be tested."""
 MARGIN, MOST_SPLITS = 6.0, 24
-"""The full test takes split points within so much of the best one's log Bayes factor, at most so many."""
+"""The full test uses split points whose log Bayes factor is this close to the best one's; largest number of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,15 +54,14 @@ class MoveCase:
 
     Attributes:
         epoch: the current epoch.
-        pms: looks at each PM of the epoch, in the order of first looks; one that was split off as an outlier is a PM of
-            its own.
+        pms: looks at each PM of the epoch, in the order of first looks; a look split off as an outlier is a PM of its
+            own.
         places: of each PM's first look in the session's order of pairs.
-        inlier: (n,) which PMs count in the estimate.
-        known: what everything but this epoch's pairs says of the shared variables, priors included, about the epoch's
-            optimum (one hypothesis); None where it has none, or two that cannot be told apart: only a loop is closed
-            then.
-        earlier: of the epochs that a loop may be closed to, what was known of the shared variables when each ended,
-            about its optimum. Empty where the motion since is known.
+        inlier: (n,) which PMs are inliers.
+        known: prior of the shared variables from everything but this epoch's pairs, about the epoch's optimum (one
+            hypothesis). None where there is no optimum, or an ambiguous one; then only a loop may be closed.
+        earlier: for each epoch that a loop may be closed to, the prior of the shared variables when it ended, about its
+            optimum. Empty where the motion since is known.
     """
 
     epoch: int
@@ -75,12 +74,12 @@ class MoveCase:
 
 @dataclass(frozen=True, slots=True)
 class CameraMove:
-    """The camera has moved.
+    """An unreported camera move.
 
     Attributes:
-        epoch: in which it did.
+        epoch: in which the camera moved.
         first: place of the first pair after the move, in the session's order of pairs.
-        log_bayes: of a move there, against none. score: of a move at any split point.
+        log_bayes: of a move there against none. score: of a move at any split point.
     """
 
     epoch: int
@@ -91,7 +90,8 @@ class CameraMove:
 
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
-    """The camera is back: in ``epoch`` it is where ``to`` had it. log_bayes: of that, against elsewhere."""
+    """A loop closure: in ``epoch`` the camera is back where ``to`` had it. log_bayes: of the same place, against
+    elsewhere."""
 
     epoch: int
     to: int
@@ -102,7 +102,7 @@ Pms = Sequence[tuple[Pair, ...]]
 
 
 class Pack(Protocol):
-    """PMs as an epoch of their own, numbered in their order; ``shapes``: with their windows as they are."""
+    """Packs PMs as an epoch of their own, numbered in order; ``shapes``: with the windows' own shapes."""
 
     def __call__(self, pms: Pms, *, shapes: bool) -> PackedProblem: ...
 
@@ -135,7 +135,7 @@ def find_camera_move(
 
 
 def _camera_move(case: MoveCase, packed: Pack, settings: MoveSettings) -> CameraMove | None:
-    """Screening, and the full test where that asks for it."""
+    """Screening, and the full test where the screening exceeds its gate."""
     count, known = len(case.pms), case.known
     if known is None or count <= MIN_KNOWN:
         return None
@@ -147,7 +147,7 @@ def _camera_move(case: MoveCase, packed: Pack, settings: MoveSettings) -> Camera
     before = np.arange(1, count)
     testable = np.maximum(before, count - before) >= MIN_KNOWN
     if not testable[np.argmax(screened)]:
-        return None  # what speaks for that split point would be taken for another one
+        return None  # evidence for that split point would be attributed to another one
     likeliest = np.argsort(-screened)[:MOST_SPLITS]
     splits = np.sort(before[likeliest[testable[likeliest] & (screened[likeliest] > screened.max() - MARGIN)]])
     late = 2 * splits >= count
@@ -163,12 +163,12 @@ def _camera_move(case: MoveCase, packed: Pack, settings: MoveSettings) -> Camera
 def screening(parts: Contributions, inlier: BoolArray, known: Quadratic, limit: FloatArray) -> FloatArray:
     """(n - 1,) log Bayes factor of a move before each PM but the first, in closed form.
 
-    Outliers take part with the weight that leaves them at their limit (Huber's).
+    Outliers take part with the weight that reduces them to their limit (Huber's).
 
     Args:
-        parts: what the n PMs add, one hypothesis, at the estimate.
-        inlier: (n,) which count in it.
-        known: what all else says, about it.
+        parts: contributions of the n PMs, one hypothesis, at the estimate.
+        inlier: (n,) which PMs are inliers of it.
+        known: prior from all else, about the estimate.
         limit: (n,) chi square beyond which a PM is an outlier.
     """
     weight = np.where(inlier, 1.0, np.minimum(limit / np.maximum(parts.cost[0], 1e-12), 1.0))
@@ -192,8 +192,8 @@ def _full_test(
 ) -> FloatArray:
     """(C,) log Bayes factors of moves at split points (C,), increasing, by the filter.
 
-    The PMs before all of them are known first, or (``backward``) those after. They are linearised about the estimate of
-    all PMs. Where they leave the registration open nothing speaks for a move.
+    The filter starts from the PMs before all split points, or (``backward``) from those after. They are linearised
+    about the estimate of all PMs. Where they do not determine the registration there is no evidence for a move.
     """
     if not len(splits):
         return np.zeros(0)
@@ -218,7 +218,7 @@ def _full_test(
 
 
 def _without_pose(known: Quadratic) -> Quadratic:
-    """With the registration eliminated: what was known of it holds for the first PMs only."""
+    """The prior without the registration, which is eliminated: that prior is valid before the move only."""
     size = len(known.gradient)
     rest = np.r_[0 : POSE.start, POSE.stop : size]
     hessian, gradient = np.zeros((size, size)), np.zeros(size)

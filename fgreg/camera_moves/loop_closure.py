@@ -1,8 +1,9 @@
 """Loop closure: whether the camera is back where an earlier epoch had it.
 
-The current epoch's PMs are judged under the earlier epoch's registration (with its uncertainty, and what a camera put
-back may be off) against one that is elsewhere: the one split point before the first PM. Elsewhere begins where using
-the earlier registration would do harm; a nudge below that is no reason to begin again, and the test for moves goes on.
+The hypothesis that the current epoch's PMs have the earlier epoch's registration (with its uncertainty and a tolerance)
+is tested against a registration elsewhere. This is the camera-move test with one split point, before the first PM.
+Elsewhere begins where using the earlier registration would do harm. A smaller difference is accepted, and the test for
+moves goes on.
 """
 
 from __future__ import annotations
@@ -19,17 +20,19 @@ from fgreg.graph.split_points import MoveScales
 from fgreg.model.measurements import EpochStart
 
 MIN_LOOKS, MOST_LOOKS = 8, 30
-"""Looks of the current epoch between which a loop is closed: then it knows its registration as well by itself."""
+"""Range of the current epoch's number of looks in which a loop is closed; with more it determines its registration well
+by itself."""
 MIN_EARLIER = 8
-"""PMs that an earlier epoch has to have for a loop to be closed to it."""
+"""Smallest number of PMs of an earlier epoch that a loop may be closed to."""
 CANDIDATES = 4
-"""Only so many of the last epochs are asked about."""
+"""Number of last epochs that are tested."""
 
 
 def elsewhere_scales() -> MoveScales:
-    """Where the camera is if it is not back: from just far enough to matter to anywhere.
+    """Prior of the camera's place if it is not back: from just far enough to matter to anywhere.
 
-    Near by, turned only and shifted only have shares of their own: else no turn would speak against a shift.
+    Near by, pure rotations and pure shifts have shares of their own; otherwise a shift without a rotation would count
+    as evidence for the same place.
     """
     degrees, mm = [1.0, 1.2, 0.1, 2.0, 10.0, 40.0], [2.0, 0.3, 2.4, 4.0, 30.0, 120.0]
     return MoveScales(np.radians(degrees), np.array(mm), np.array([0.2, 0.15, 0.15, 0.2, 0.2, 0.1]))
@@ -37,13 +40,13 @@ def elsewhere_scales() -> MoveScales:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopClosureSettings:
-    """How to decide.
+    """Settings of the loop closure.
 
     Attributes:
         elsewhere: prior of the registration's difference where the camera is not back, and of outliers.
-        accept: log Bayes factor of the same place from which it is; by the share of cameras 2 mm or 1 deg off that are
-            taken for back (tools/study_returns.py).
-        tolerance: turn (rad) and shift (mm), sigmas, that a camera that is back may be off.
+        accept: log Bayes factor of the same place from which a loop is closed; chosen by the share of cameras 2 mm or 1
+            deg off for which a loop is closed wrongly (tools/study_returns.py).
+        tolerance: sigmas of the rotation (rad) and shift (mm) of a camera that is back.
     """
 
     elsewhere: MoveSettings = field(default_factory=lambda: MoveSettings(elsewhere_scales()))

@@ -1,4 +1,4 @@
-"""Static tags (board, markers fixed to the patient or table): whether, and how, the camera moved against them.
+"""Static tags (board, markers fixed to the patient or table): whether the camera moved against them, and how.
 
 All static tags move by one and the same rigid motion when the camera does: ``camera_new_T_tag =
 camera_new_T_camera_old * camera_old_T_tag``. A tag that goes its own way was bumped or misread. The motion is tested
@@ -70,7 +70,7 @@ class TagMotion:
 
 @dataclass(frozen=True, slots=True)
 class TagSettings:
-    """How to watch.
+    """Settings of the tag monitor.
 
     Attributes:
         windows: numbers of last frames that are averaged, each tested.
@@ -196,7 +196,11 @@ def tag_motion(old: Mapping[int, TagPose], new: Mapping[int, TagPose]) -> TagMot
 
 
 def _majority(both: _Both, limit: float) -> tuple[FloatArray, FloatArray, BoolArray] | None:
-    """Motion, information and who shares it: of no motion and each tag's own the one that most tags agree on."""
+    """Motion, its information, and the tags that share it.
+
+    Each candidate (no motion, and each tag's own motion) is fitted to the tags near it; the one that most tags agree
+    with is used. None without a majority.
+    """
     best: tuple[int, float, FloatArray] | None = None
     for start in (np.eye(4), *(both.new @ inverse(both.old))):
         inside = both.misfits(start)[1] <= 2.0 * limit
@@ -225,7 +229,7 @@ class TagMoveDetector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagCheck:
-    """What one more frame says: whether the camera moved, by what, and how many of the last frames came after."""
+    """Result of one more frame: whether the camera moved, its motion, and how many of the last frames came after it."""
 
     alarm: bool
     motion: TagMotion | None
@@ -259,7 +263,7 @@ def detect_tag_move(
 
 
 def _on_its_way(means: Mapping[int, TagPose], recent: Sequence[TagFrame], settings: TagSettings) -> TagCheck | None:
-    """An alarm where the last few frames do not agree with each other, and each of them alone is off its place."""
+    """An alarm where the last few frames do not agree with each other, and each of them shows a motion."""
     few = recent[-min(settings.windows) :]
     if len(few) < 2 or average_tags(few, settings.constant_share):
         return None
@@ -278,14 +282,14 @@ def detector_from(frames: Sequence[TagFrame], settings: TagSettings) -> TagMoveD
 
 @dataclass(frozen=True, slots=True)
 class TagsMoved:
-    """The camera has left its place: at ``since_t`` or a frame before."""
+    """The camera has moved: at ``since_t`` or a frame before."""
 
     since_t: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagsAtRest:
-    """The camera stands again: its motion (4, 4) since the alarm's epoch began, and its covariance (6, 6)."""
+    """The camera is at rest again: its motion (4, 4) against the epoch before the alarm, and its covariance (6, 6)."""
 
     camera_new_T_camera_old: FloatArray
     covariance: FloatArray
@@ -293,13 +297,13 @@ class TagsAtRest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagMonitor:
-    """What is carried from frame to frame, a value.
+    """State of the monitor between frames; it is never changed in place.
 
     Attributes:
         detector: of the current epoch.
         times: of its recent frames.
-        before: mean poses of the epoch before, while the camera has not come to rest since an alarm.
-        moving: frames since then.
+        before: mean poses of the epoch before, from an alarm until the camera is at rest.
+        moving: frames since the alarm.
     """
 
     detector: TagMoveDetector = field(default_factory=TagMoveDetector)
@@ -309,14 +313,14 @@ class TagMonitor:
 
     @property
     def is_moving(self) -> bool:
-        """Whether an alarm's motion is still to be measured."""
+        """Whether there was an alarm whose motion is not measured yet."""
         return bool(self.before)
 
 
 def monitored(
     monitor: TagMonitor, t: float, frame: TagFrame, settings: TagSettings
 ) -> tuple[TagMonitor, TagsMoved | TagsAtRest | None]:
-    """Take in one frame, and what it says: an alarm at once, the motion as soon as the camera stands still again."""
+    """Take in one frame: an alarm comes at once, the motion as soon as the camera is at rest again."""
     if monitor.is_moving:
         return _until_rest(monitor, frame, settings)
     detector, check = detect_tag_move(monitor.detector, frame, settings)

@@ -1,8 +1,8 @@
 """PMs as whitened linear equations on the shared variables, and the Gaussian of those variables.
 
-With everything private eliminated (fgreg.graph.reduced_graph) a PM adds ``cost + 2 g' d + d' H d`` at a step d from the
-linearisation point, and H has the rank of the equations it leaves over (two for one look). So that is
-``|residual + jacobian d|^2 + rest`` with few rows, which is what a Kalman filter takes one by one.
+With the private variables eliminated (fgreg.graph.reduced_graph) a PM adds ``cost + 2 g' d + d' H d`` at a step d from
+the linearisation point. The rank of H is the PM's degrees of freedom (two for one look). So the sum equals
+``|residual + jacobian d|^2 + rest`` with few rows, which a Kalman filter takes one by one.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from fgreg.registration.outliers import pm_degrees_of_freedom
 POSE = slice(0, 6)
 """Columns of the registration: problems here are of one epoch."""
 TYPICAL_RAD, TYPICAL_MM = 1e-2, 1.0
-"""Steps at which rotations and lengths matter alike: scale of the pivots."""
+"""Rotations and lengths of equal importance: scale of the pivots."""
 LEAST_PIVOT = 1e-14
 PRIVATE_ROUNDS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gaussian:
-    """Of the shared variables' step (D,) from the linearisation point: mean (D,), covariance (D, D)."""
+    """Gaussian of the shared variables' step from the linearisation point: mean (D,), covariance (D, D)."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -38,15 +38,15 @@ class Gaussian:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowRows:
-    """Rotations of PMs without what their windows say: Gaussian given a step, and the intervals they are in.
+    """Rotations of PMs without their sensitivity windows: a Gaussian given a step; and the windows' intervals.
 
-    The rotation is ``mean + gain step``, with ``variance``; the window has it in (low, high), softened by ``soft``.
+    The rotation is ``mean + gain step``, with ``variance``; its window is (low, high), softened by ``soft``.
 
     Attributes:
-        there: (n,) which PMs this is for: one look that knows only the window.
+        there: (n,) which PMs have an interval: those with one look that is no first hit.
         mean, variance: (S, n) rad and rad^2. gain: (S, n, D).
         low, high, soft: (n,) rad.
-        site: (n,) the sigma that stands for the window elsewhere: densities are in its units.
+        site: (n,) sigma of the window's Gaussian site: densities are in its units.
     """
 
     there: BoolArray
@@ -74,14 +74,14 @@ class WindowRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WhitenedPms:
-    """n PMs, linearised at S places; steps are all counted from one base point.
+    """n PMs, linearised at S states; all steps are counted from one base state.
 
     Attributes:
         residual: (S, n, q), zero in rows that a PM does not have.
         jacobian: (S, n, q, D).
-        rest: (S, n) chi square that no step takes away (looks that contradict each other).
-        equations: (n,) that a PM leaves over.
-        windows: where some PMs' rotations are held by an interval instead of by a row; None: all by rows.
+        rest: (S, n) chi square that no step reduces (looks that contradict each other).
+        equations: (n,) degrees of freedom of each PM.
+        windows: where the rotations of some PMs have an interval instead of a row; None: all have rows.
     """
 
     residual: FloatArray
@@ -108,13 +108,13 @@ def pivot_scale(columns: Columns) -> FloatArray:
 
 
 def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: FloatArray | None = None) -> WhitenedPms:
-    """Whitened equations of PMs by Cholesky with pivots, as many rows as there are equations.
+    """Whitened equations of PMs by pivoted Cholesky, with one row per equation.
 
     Args:
         part: cost (S, n), gradient (S, n, D), hessian (S, n, D, D).
         equations: (n,).
         scale: (D,) typical steps.
-        at: (S, D) steps from the base to where ``part`` was linearised; None: there.
+        at: (S, D) steps from the base to the linearisation point of ``part``; None: it is the base.
     """
     hessian, gradient = part.hessian.copy(), part.gradient.copy()
     count, n, size = gradient.shape
@@ -143,7 +143,7 @@ def whiten(part: Contributions, equations: IntArray, scale: FloatArray, at: Floa
 def linearise(problem: PackedProblem, state: SharedState, base: SharedState | None = None) -> WhitenedPms:
     """The problem's PMs, whitened at S states; steps are counted from ``base`` (one hypothesis; ``state`` where None).
 
-    PMs with one look that knows only the window are held by it as the interval it is, where the problem has shapes.
+    PMs with one look that is no first hit have their window as an interval, where the problem has shapes.
     """
     private = settled_private(problem, state)
     at = None if base is None else step_between(_repeated(base, state.count), state, problem.columns)
@@ -160,7 +160,7 @@ def linearise(problem: PackedProblem, state: SharedState, base: SharedState | No
 
 
 def settled_private(problem: PackedProblem, state: SharedState) -> PrivateState:
-    """The private variables of S states, found afresh from the arcs."""
+    """The private variables of S states, optimised from the arcs."""
     private = initial_private(problem, state)
     for _ in range(PRIVATE_ROUNDS):
         _, private = refine(problem, state, private)
@@ -212,7 +212,7 @@ def _window_rows(
         gain=gain,
         low=windows.low_rad[look],
         high=windows.high_rad[look],
-        # The edge's own error moves both ends: as much softness, since what it does to one pair is little.
+        # The edge's error moves both ends. Its effect on one pair is small, so it is added to the softness.
         soft=np.hypot(windows.soft_rad[look], edge),
         site=problem.looks.weight[look, 2, 2] ** -0.5,
     )
@@ -223,7 +223,7 @@ def _repeated(state: SharedState, count: int) -> SharedState:
 
 
 def gaussian_of(hessian: FloatArray, gradient: FloatArray, columns: Columns) -> Gaussian | None:
-    """The Gaussian ``exp(-(d' H d) / 2 - g' d)``; None where H leaves a direction open."""
+    """The Gaussian ``exp(-(d' H d) / 2 - g' d)``; None where H does not determine a direction."""
     scale = pivot_scale(columns)
     scaled = hessian * scale * scale[:, None]
     root = np.sqrt(np.maximum(np.diag(scaled), 1e-300))
