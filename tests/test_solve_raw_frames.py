@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 
 from fgreg.errors import InputError
 from fgreg.model.estimate import Verdict
-from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.pipeline.solve import SolveReport, SolveRequest, solve_session
 
 
 def _events(folder: Path) -> list[dict[str, object]]:
@@ -26,9 +27,26 @@ def _frames_of(folder: Path, kind: str) -> list[dict[str, object]]:
     return [event for event in _events(folder) if event["type"] == kind]
 
 
-def test_raw_frames_give_a_registration_near_the_truth(raw_session: Path) -> None:
+@dataclass
+class Solved:
+    """A session as it was simulated, solved once; ``seen``: items done and in all, as they were reported."""
+
+    report: SolveReport
+    seen: list[tuple[int, int]]
+    rrd: Path
+
+
+@pytest.fixture(scope="module")
+def solved(_raw_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Solved:
+    folder = tmp_path_factory.mktemp("solved")
     seen: list[tuple[int, int]] = []
-    report = solve_session(SolveRequest(raw_session), progress=lambda _, done, total: seen.append((done, total)))
+    request = SolveRequest(_raw_session, out=folder / "result.yaml", rrd=folder / "session.rrd")
+    report = solve_session(request, progress=lambda _, done, total: seen.append((done, total)))
+    return Solved(report, seen, folder / "session.rrd")
+
+
+def test_raw_frames_give_a_registration_near_the_truth(solved: Solved) -> None:
+    report, seen = solved.report, solved.seen
     assert report.errors is not None
     tre = report.errors.tre_mm[0]
     assert tre is not None
@@ -77,8 +95,7 @@ def test_a_marker_in_one_view_is_told_or_used_never_guessed(raw_session: Path) -
         assert pair.used or "ambiguous" in pair.reason or "not found" in pair.reason
 
 
-def test_a_recorded_pose_wins_unless_detection_is_asked_for(raw_session: Path) -> None:
-    plain = solve_session(SolveRequest(raw_session))
+def test_a_recorded_pose_wins_unless_detection_is_asked_for(raw_session: Path, solved: Solved) -> None:
     events = _events(raw_session)
     pair = next(event for event in events if event["type"] == "pair")
     marker = pair["marker"]
@@ -90,7 +107,7 @@ def test_a_recorded_pose_wins_unless_detection_is_asked_for(raw_session: Path) -
     again = solve_session(SolveRequest(raw_session, redetect=True))
     posed_marker = posed.recognised.measurements.pairs[0].marker.camera_T_marker
     np.testing.assert_allclose(posed_marker[:3, 3], [0, 0, 100])
-    first, redone = plain.estimate.epochs[0].trus_T_camera, again.estimate.epochs[0].trus_T_camera
+    first, redone = solved.report.estimate.epochs[0].trus_T_camera, again.estimate.epochs[0].trus_T_camera
     assert first is not None
     assert redone is not None
     np.testing.assert_allclose(redone, first)
@@ -127,8 +144,6 @@ def test_a_wrong_sound_speed_is_told(raw_session: Path) -> None:
     assert any("probe.sound_speed_m_s" in reason for reason in report.estimate.reasons)
 
 
-def test_a_recording_is_written_with_the_result(raw_session: Path, tmp_path: Path) -> None:
-    rrd = tmp_path / "session.rrd"
-    report = solve_session(SolveRequest(raw_session, rrd=rrd))
-    assert report.rrd_path == rrd
-    assert rrd.stat().st_size > 100_000
+def test_a_recording_is_written_with_the_result(solved: Solved) -> None:
+    assert solved.report.rrd_path == solved.rrd
+    assert solved.rrd.stat().st_size > 100_000
