@@ -40,7 +40,7 @@ from fgreg.simulation.room import Room
 from fgreg.stage.limits import MotionKind
 
 SIGMA_RAD, SIGMA_MM = 0.003, np.array([0.05, 0.05, 0.2])
-FRAME_S, PULSE_S = 1.0 / 30.0, 0.1
+PULSE_S = 0.1
 TRACK_SIGMA_RAD = math.radians(2.0)
 
 
@@ -50,6 +50,7 @@ class Rehearsal:
 
     Attributes:
         obliging: the operator says what he is asked to say.
+        frame_s: from one picture to the next.
         deaf_from_s: from then on the probe hears nothing. blind_from_s: nor does the camera see the marker.
         latched: why the stage may not move, as the gate would say it; a release ends it.
         told: all that the operator was told, with the time. asked: all actions but words.
@@ -60,6 +61,7 @@ class Rehearsal:
     room: Room
     threshold: float = 0.45
     obliging: bool = True
+    frame_s: float = 1.0 / 30.0
     deaf_from_s: float = math.inf
     blind_from_s: float = math.inf
     latched: str = ""
@@ -93,14 +95,14 @@ class Rehearsal:
             self._frame()
 
     def _frame(self) -> None:
-        self.now_s += FRAME_S
+        self.now_s += self.frame_s
         room, now = self.room, self.now_s
         room.pass_to(now)
         if now < self.blind_from_s:
             self.poses.add(self._observed(now))
         status = self.stage.status()
         heard = []
-        while self._next_pulse <= now - FRAME_S:  # the poses about it are there
+        while self._next_pulse <= now - self.frame_s:  # the poses about it are there
             heard.append(self._pulse(self._next_pulse, status.moving))
             self._next_pulse += PULSE_S
         estimate = self.engine.estimate
