@@ -21,7 +21,7 @@ from fgreg.cli.main import main
 from fgreg.drivers import endoscope, thorlabs_identify, thorlabs_stage
 from fgreg.drivers.thorlabs_identify import identify
 from fgreg.live.config import read_config
-from fgreg.live.device_check import Answer, configured, cubes, extras, video
+from fgreg.live.device_check import DeviceReport, configured, cubes, extras, video
 from fgreg.stage.interface import StageError, StageLost
 from tests import live_configs, session_files
 from tests.cube_emulator import CubeEmulator
@@ -118,7 +118,7 @@ def test_each_device_says_what_comes_from_it_and_the_stage_is_not_touched(
     assert float(rate) == pytest.approx(20.0, abs=0.1)  # by the sender's clock, which is exact
     assert rest == "128 x 16 int16, its own clock"
     assert answers["stage"]["says"] == f"KDC101 no. 27000001 at {stage.port}, 0.0 deg, has to find its zero position"
-    assert answers["sinks 1"]["says"].startswith("nobody connected within 2 s")
+    assert answers["sinks 1"]["says"].startswith("no one connected within 2 s")
     assert answers["operator"]["says"] == "standard input, not a terminal"
 
 
@@ -139,7 +139,7 @@ def test_silent_devices_are_named_and_the_status_is_1(
     assert f"stage at {gone} cannot be opened" in text["stage"]
 
 
-def answers_of(config: Path, listen_s: float = 0.8) -> dict[str, Answer]:
+def answers_of(config: Path, listen_s: float = 0.8) -> dict[str, DeviceReport]:
     return {answer.what: answer for answer in configured(read_config(config), listen_s)}
 
 

@@ -17,7 +17,7 @@ import pytest
 from fgreg.errors import FgregError
 from fgreg.live import recorder as recorder_module
 from fgreg.live.launch import NewestSnapshots
-from fgreg.live.recorder import UNWATCHED, Recorder
+from fgreg.live.recorder import ENGINE_ENDED, Recorder
 from fgreg.model.estimate import Verdict
 from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent
 from fgreg.model.session_model import SessionModel
@@ -256,7 +256,7 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
                 if state.pairs and state.estimate is not None:
                     assert snapshots.read().snapshot.epochs
                 longest = max(longest, time.perf_counter() - start)
-                if UNWATCHED in state.known.reasons:
+                if ENGINE_ENDED in state.known.reasons:
                     told.append(state.known.verdict)
                 taken_in = not state.waiting and state.aims + state.pairs >= done
                 if taken_in and not state.trouble and len(engines.made) >= made:

@@ -321,7 +321,7 @@ def test_the_simulated_room_brings_its_own_set_up(tmp_path: Path) -> None:
     assert "it, and the simulated room" in error_of(live_configs.write(tmp_path, data))
     data = live_configs.room()
     del data["operator"]
-    assert "nobody tells the room's surgeon" in read_config(live_configs.write(tmp_path, data)).warnings[0]
+    assert "no one tells the room's surgeon" in read_config(live_configs.write(tmp_path, data)).warnings[0]
     data = live_configs.room()
     data["stage"] = {"driver": "stand-in"}
     assert "stand-in, and camera of the simulated room" in error_of(live_configs.write(tmp_path, data))

@@ -7,7 +7,7 @@ import pytest
 
 from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.live.actions import LocatedPulse
-from fgreg.live.merge_looks import LEAST_WANDER_MM, one_spot
+from fgreg.live.merge_looks import LEAST_SCATTER_MM, one_spot
 from fgreg.model.time_sync import TimedPose
 
 
@@ -43,7 +43,7 @@ def test_a_rest_without_a_tremor_is_not_believed() -> None:
     spot = one_spot([look(float(t), (0.0, 0.0, 0.0), (0.0, 0.0, 90.0)) for t in range(1, 4)])
     for one in spot.looks:
         assert one.covariance is not None
-        assert one.covariance[0, 0] == pytest.approx(0.01 + LEAST_WANDER_MM**2)
+        assert one.covariance[0, 0] == pytest.approx(0.01 + LEAST_SCATTER_MM**2)
 
 
 def test_looks_without_a_marker_are_refused() -> None:

@@ -105,4 +105,4 @@ def test_a_frame_that_cannot_be_looked_into_is_no_silence(pulse_locator: PulseLo
     pulse(pulse_locator, np.zeros((3, 5, 7), dtype=np.int16))
     (heard,) = turn(pulse_locator, lambda: not pulse_locator.waiting)
     assert heard.scan_rad is None  # as a pulse of which nobody knows anything
-    assert "could not be looked into" in pulse_locator.trouble
+    assert "could not be processed" in pulse_locator.trouble

@@ -125,8 +125,8 @@ def test_where_it_ends_or_hangs_frames_are_looked_into_here_and_another_takes_ov
             see()
 
     try:
-        until(lambda: (worker := marker_tracker._second._worker) is not None and worker.ready)
-        worker = marker_tracker._second._worker
+        until(lambda: (worker := marker_tracker._right_worker._worker) is not None and worker.ready)
+        worker = marker_tracker._right_worker._worker
         assert worker is not None
         pid = worker.pid
         assert pid is not None

@@ -26,7 +26,7 @@ sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 
 import numpy as np
 
-from fgreg.live.launch import OneProcess
+from fgreg.live.launch import EngineProcesses
 from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.live_session import LiveSession
@@ -53,7 +53,7 @@ def spoil(path: Path, share: float, seed: int) -> None:
     path.write_text("".join(lines))
 
 
-def bench(folder: Path, pairs: int, outliers: float, seed: int, make_engine: OneProcess | None) -> bool:
+def bench(folder: Path, pairs: int, outliers: float, seed: int, make_engine: EngineProcesses | None) -> bool:
     """One session; whether the limits are met. ``make_engine``: of processes."""
     config = replace(PRESETS["first-hit"], pairs=pairs, tracks_heard=0, tracks_silent=0)
     write_session(simulate(config, seed), folder)
@@ -108,7 +108,7 @@ def main() -> int:
     parser.add_argument("--process", action="store_true", help="the registration in a process of its own")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as stack:
-        engines = OneProcess() if options.process else None
+        engines = EngineProcesses() if options.process else None
         if engines is not None:
             stack.callback(engines.close)
         met = [

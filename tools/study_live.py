@@ -29,7 +29,7 @@ import numpy as np
 
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, log_so3
-from fgreg.live.launch import NewestSnapshots, OneProcess, make_folder, running, setup_text
+from fgreg.live.launch import EngineProcesses, NewestSnapshots, make_folder, running, setup_text
 from fgreg.live.recorder import Recorded
 from fgreg.live.room_truth import write_room_truth
 from fgreg.live.simulated_room import simulated_room
@@ -131,7 +131,7 @@ def rehearse(folder: Path, seed: int, aims: int, bump_every_s: float, seconds: f
     rehearsal = Rehearsal(room)
     make_folder(folder, setup_text(session_document(room.config.scene)))
     with ExitStack() as stack:
-        make_engine = OneProcess()
+        make_engine = EngineProcesses()
         stack.callback(make_engine.close)
         session = stack.enter_context(LiveSession.open(folder, SolveConfig(), make_engine, late=True))
         rehearsal.engine = Recording(session, told)  # type: ignore[assignment]

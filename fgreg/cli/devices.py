@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from fgreg.live.device_check import Answer
+    from fgreg.live.device_check import DeviceReport
 
 EXIT_SILENT = 1
 
@@ -58,7 +58,7 @@ class _Shown:
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
-        self.sections: dict[str, list[Answer]] = {}
+        self.sections: dict[str, list[DeviceReport]] = {}
 
     def section(self, title: str, answers: Any, key: str = "") -> None:
         """A heading and its answers."""
@@ -79,7 +79,7 @@ class _Shown:
             typer.echo(json.dumps(document, indent=2))
 
 
-def _line(answer: "Answer") -> str:
+def _line(answer: "DeviceReport") -> str:
     mark = "+" if answer.answers else "-"
     if not answer.driver:
         return f"  {mark} {answer.name:<16} {answer.says}"

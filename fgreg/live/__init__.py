@@ -1,1 +1,1 @@
-"""A session as it is conducted: devices to events, estimates to prompts and to where the stage turns."""
+"""A live session: turns devices' data into events, and estimates into prompts and stage orders."""

@@ -1,4 +1,4 @@
-"""What the workflow sees of the world at one moment, and what it can ask for. Plain data."""
+"""The workflow's inputs at one moment, and the actions it can ask for. Plain data."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from fgreg.stage.limits import MotionKind
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocatedPulse:
-    """One laser pulse as the probe took it.
+    """One laser pulse as the probe received it.
 
     Attributes:
         pulse_s: host time of the pulse.
-        scan_rad: where the plane stood; None where it turned, or is not known.
-        marker: ``camera_T_marker`` at the pulse; None where that cannot be told, and then ``unpaired`` says why.
-        x_mm, range_mm, covariance, amplitude: of the source that was located; None where none was.
+        scan_rad: angle of the image plane; None if the plane was turning or its angle is unknown.
+        marker: ``camera_T_marker`` at the pulse; None if it is unknown, and then ``unpaired`` gives the reason.
+        x_mm, range_mm, covariance, amplitude: of the located source; None if no source was located.
     """
 
     pulse_s: float
@@ -34,7 +34,14 @@ class LocatedPulse:
 
 @dataclass(frozen=True, slots=True)
 class RegistrationState:
-    """Of the estimate: verdict, reasons, camera epoch, looks that count in it, whether it has a registration at all."""
+    """Summary of the estimate.
+
+    Attributes:
+        verdict, reasons: of the registration.
+        epoch: current camera epoch.
+        pairs: inlier looks in this epoch.
+        registered: whether the estimate has a registration.
+    """
 
     verdict: Verdict = Verdict.REFUSED
     reasons: tuple[str, ...] = ()
@@ -45,8 +52,14 @@ class RegistrationState:
 
 @dataclass(frozen=True, slots=True)
 class StageView:
-    """Of the stage: where its plane stands, whether it knows its zero, what motion the operator has asked for, and why
-    nothing may move until a reset (``latched``; empty: it may)."""
+    """Status of the stage.
+
+    Attributes:
+        scan_rad: angle of the image plane. at_s: host time of this angle. moving: whether the stage turns.
+        homed: whether the stage has found its zero position.
+        requested: the motion that the operator has asked for.
+        latched: why nothing may move until a reset; empty if the stage may move.
+    """
 
     scan_rad: float
     moving: bool
@@ -58,19 +71,19 @@ class StageView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """One moment.
+    """Inputs of one step of the workflow.
 
     Attributes:
         now_s: host time.
         poses: recent camera_T_marker.
-        stage: None where there is none, or it is lost.
-        heard: pulses since the last moment, oldest first.
-        commands: of the operator since the last moment.
-        known: of the estimate.
-        answer: where the plane should turn for the newest pose; None where nothing can be told.
-        aims: calibration shots recorded.
-        camera_moving_s: the camera has been on the move since this host time, or its move is not in the estimate yet:
-            what is known of the registration holds no more. None where it holds.
+        stage: None if there is no stage or it is lost.
+        heard: pulses since the last step, oldest first.
+        commands: the operator's commands since the last step.
+        known: state of the registration.
+        answer: tracking result for the newest pose: the angle that the plane should turn to; None if there is none.
+        aims: number of recorded calibration shots.
+        camera_moving_s: host time since which the camera has been moving, or since which a move has been missing in
+            the estimate: the registration is invalid. None while it is valid.
     """
 
     now_s: float
@@ -89,14 +102,14 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """The operator's request for a kind of motion, to be handed on; homing begins with it."""
+    """Pass the operator's request for a kind of motion on to the stage; a request for homing also starts it."""
 
     kind: MotionKind
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """The stage turns to a position of a search."""
+    """Turn the stage to a position of a PM search."""
 
     scan_rad: float
     reason: str
@@ -104,7 +117,7 @@ class Sweep:
 
 @dataclass(frozen=True, slots=True)
 class Follow:
-    """The stage turns to where the beam will be heard; ``marker_s``: host time of the pose behind it."""
+    """Turn the stage to where the beam's PM is expected; ``marker_s``: host time of the marker pose it rests on."""
 
     scan_rad: float
     sigma_rad: float
@@ -114,26 +127,26 @@ class Follow:
 
 @dataclass(frozen=True, slots=True)
 class Halt:
-    """The stage stops."""
+    """Stop the stage."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """The operator has looked at the latched stage: it may be asked to move again."""
+    """Reset the latched stage, which the operator has inspected: motions may be requested again."""
 
 
 @dataclass(frozen=True, slots=True)
 class TakeAim:
-    """Record a calibration shot at this corner, from the newest frames."""
+    """Record a calibration shot at this board corner (column, row) from the newest frames."""
 
     corner: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TakePairs:
-    """Record these looks as looks at one PM."""
+    """Record these pulses as looks at one PM."""
 
     pm: int
     looks: tuple[LocatedPulse, ...]
@@ -141,14 +154,17 @@ class TakePairs:
 
 @dataclass(frozen=True, slots=True)
 class TakeMove:
-    """Record that the camera has moved."""
+    """Record a reported camera move."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tell:
-    """Something the operator should know.
+    """A message to the operator.
 
-    ``done``: the present spot needs the fibre no longer. ``wants``: what the operator is asked to say.
+    Attributes:
+        text: the message.
+        done: whether the current spot is finished, so that the fibre may move on.
+        wants: the command that the operator is asked for.
     """
 
     text: str

@@ -1,6 +1,6 @@
 """CONFIG.yaml of ``fgreg live``: a driver for each role, read and checked before any device is opened.
 
-``example_config`` has all of its keys. Paths are relative to the file's folder.
+``example_config`` shows all of its keys. Paths are relative to the file's folder.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _MAX_BYTES = 1_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
-    """A driver with its options, both checked; ``where`` names the place in the file."""
+    """A checked driver with its checked options; ``where`` names the place in the file."""
 
     entry: DriverEntry
     options: Any
     where: str
 
     def open(self, context: DriverContext) -> Any:
-        """The device. Raises what its driver raises."""
+        """Open the device. Raises what its driver raises."""
         return self.entry.open(context, self.options)
 
 
@@ -55,13 +55,13 @@ class LiveConfig:
     """A CONFIG.yaml, read and checked.
 
     Attributes:
-        setup: content of the new session's ``session.yaml``; ``model`` is what it says.
-        devices: by role; several of ``sinks`` and ``operator``.
-        stage_limits: as MotionLimits.of_session takes them.
-        room: options of the simulated room, where its devices are used.
-        rectified: fgreg.drivers.rectification.Rectification of the pictures, where they are to be rectified.
+        setup: text of the new session's ``session.yaml``. model: its content.
+        devices: by role; ``sinks`` and ``operator`` may have several.
+        stage_limits: arguments of MotionLimits.of_session.
+        room: options of the simulated room, if its devices are used.
+        rectified: fgreg.drivers.rectification.Rectification, if the pictures are to be rectified.
         settings, holder, latencies, solve: of the workflow, the endoscope's holder, the devices, the estimate.
-        warnings: plain sentences on what is allowed but hardly meant.
+        warnings: sentences about settings that are allowed but probably a mistake.
     """
 
     path: Path
@@ -78,7 +78,7 @@ class LiveConfig:
     warnings: tuple[str, ...]
 
     def context(self, stack: ExitStack, say: Callable[[str], None]) -> DriverContext:
-        """What the drivers need; starts the simulated room where one is used, until the stack is left."""
+        """What the drivers need; if the simulated room is used, it is started and runs until the stack is left."""
         room = None
         if self.room is not None:
             from fgreg.drivers.simulated import RoomProcess
@@ -89,12 +89,12 @@ class LiveConfig:
         return DriverContext(say, None if board is None else (board.columns, board.rows), self.rectified, room)
 
     def live_setup(self, stack: ExitStack, say: Callable[[str], None], *, seen: bool = True) -> LiveSetup:
-        """What to conduct. Opens no device, but starts the simulated room where one is used.
+        """Set-up of the live session. Opens no device, but starts the simulated room if it is used.
 
         Args:
             stack: ends the room.
             say: shows one line to an operator at the terminal; called from several threads.
-            seen: whether anybody sees pictures that are only to be shown; where not, their device is not opened.
+            seen: whether pictures that are only displayed are wanted; if not, their device is not opened.
         """
         context = self.context(stack, say)
 
@@ -126,7 +126,7 @@ class LiveConfig:
         )
 
     def stage_setup(self, context: DriverContext) -> StageSetup | None:
-        """The stage for the watchdog; None where there is none."""
+        """The stage's driver, options and limits for the watchdog; None if there is no stage."""
         chosen = self.devices.get(Role.STAGE)
         if chosen is None:
             return None
@@ -134,7 +134,7 @@ class LiveConfig:
         options = {"path": os.fspath(context.room)} if chosen[0].entry.room and context.room else own
         limits = dict(self.stage_limits)
         if (acceleration := own.get("acceleration_deg_s2")) is not None:
-            limits["deceleration"] = math.radians(acceleration)  # what a driver is told to use is what it brakes with
+            limits["deceleration"] = math.radians(acceleration)  # the driver brakes with this acceleration
         return StageSetup(f"fgreg.drivers.{chosen[0].entry.factory}", options, limits)
 
 
@@ -150,7 +150,7 @@ def _together(operators: list[Operator]) -> Operator:
 
 
 def read_config(path: Path) -> LiveConfig:
-    """Reads a CONFIG.yaml. No device is opened.
+    """Read a CONFIG.yaml. No device is opened.
 
     Raises:
         InputError: the first problem, with file, key and line.
@@ -165,7 +165,7 @@ def read_config(path: Path) -> LiveConfig:
 
 @dataclass(slots=True, eq=False)
 class _Reader:
-    """Puts together what one file says; its methods raise FieldError, InputError."""
+    """Reads one file; its methods raise FieldError, InputError."""
 
     path: Path
     data: Mapping[str, object]
@@ -203,7 +203,7 @@ class _Reader:
         )
 
     def _devices(self, document: LiveDocument) -> dict[Role, tuple[Chosen, ...]]:
-        """What is chosen for each role; the operator is at the keyboard where none is."""
+        """The drivers of each role; the default operator is the keyboard."""
         found: dict[Role, tuple[Chosen, ...]] = {}
         for role in Role:
             chosen = getattr(document, role)
@@ -222,7 +222,7 @@ class _Reader:
         return found
 
     def _room(self, document: LiveDocument, devices: Mapping[Role, tuple[Chosen, ...]]) -> RoomOptions | None:
-        """The room's options; its camera, probe and stage go together, since they see and hear the same things."""
+        """The room's options; its camera, probe and stage are used together, since they measure the same scene."""
         simulated = [role for role, chosen in devices.items() if any(one.entry.room for one in chosen)]
         world = [role for role in (Role.CAMERA, Role.PHOTOACOUSTIC, Role.STAGE) if role in devices]
         for role in world:
@@ -239,7 +239,7 @@ class _Reader:
                 raise FieldError.of("it, and the simulated room", expected, key)
         if Role.OPERATOR not in simulated:
             self.warnings.append(
-                f"{self.path.name}: without a simulated operator nobody tells the room's surgeon to go on"
+                f"{self.path.name}: without a simulated operator no one tells the room's surgeon to go on"
             )
         return document.room or RoomOptions()
 
@@ -258,7 +258,7 @@ class _Reader:
         room: RoomOptions | None,
         aims: int,
     ) -> tuple[str, str, Any]:
-        """Text of the ``session.yaml``, what messages call it, the rectification of the pictures."""
+        """Text of the ``session.yaml``, its name in messages, the rectification of the pictures."""
         if room is not None:
             from fgreg.simulation.documents import session_document
             from fgreg.simulation.room import room_config
@@ -281,7 +281,7 @@ class _Reader:
         return text.rstrip("\n") + "\n" + camera_yaml(rig), label, rectified
 
     def _calibration(self, options: CalibrationOptions, camera: Chosen) -> tuple[StereoRig, Any]:
-        """The rig of the pictures as the loop sees them."""
+        """The calibration of the pictures that the loop gets, and their rectification."""
         from fgreg.drivers.calibration_files import read_calibration
         from fgreg.drivers.interlacing import Fields as Interlaced
         from fgreg.drivers.interlacing import field_rig
@@ -310,12 +310,12 @@ def _raw_choices(data: Mapping[str, object]) -> Iterator[object]:
 
 
 def _uses_room(data: Mapping[str, object]) -> bool:
-    """Whether any device is one of the simulated room."""
+    """Whether any device belongs to the simulated room."""
     return any(isinstance(one, Mapping) and one.get("driver") == "simulated" for one in _raw_choices(data))
 
 
 def _with_room(data: Mapping[str, object]) -> Mapping[str, object]:
-    """A configuration in which what the room brings has its default."""
+    """The configuration with the room's defaults."""
     settings = data.get("settings", {})
     misspelt = "settings" not in data and any(nearest(key, ["settings"]) for key in data)
     if misspelt or not isinstance(settings, Mapping):
@@ -334,7 +334,7 @@ def _check_limits(model: SessionModel, limits: Mapping[str, Any]) -> None:
 
 
 def _check_model(model: SessionModel, devices: Mapping[Role, tuple[Chosen, ...]], aims: int) -> None:
-    """Whether the session.yaml has what a live session needs."""
+    """Check that the session.yaml has what a live session needs. Raises FieldError."""
     needs = {"camera": model.camera, "marker": model.marker}
     for name, part in needs.items():
         if part is None:
@@ -354,14 +354,14 @@ def _check_model(model: SessionModel, devices: Mapping[Role, tuple[Chosen, ...]]
 
 
 def _connections(devices: Mapping[Role, tuple[Chosen, ...]]) -> Iterator[tuple[str, Connection]]:
-    """Devices that wait for the other side to connect, with their places."""
+    """Devices that wait for a connection, with their places in the file."""
     for chosen in (one for several in devices.values() for one in several):
         if isinstance(chosen.options, Connection) and chosen.options.listen:
             yield chosen.where, chosen.options
 
 
 def _check_ports(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
-    """Two devices cannot listen at one port."""
+    """Check that no two devices listen at one port. Raises InputError."""
     taken: dict[int, str] = {}
     for where, options in _connections(devices):
         if options.port in taken:
@@ -370,6 +370,7 @@ def _check_ports(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
 
 
 def _open_to_all(devices: Mapping[Role, tuple[Chosen, ...]]) -> list[str]:
+    """Warnings about devices that listen beyond this machine."""
     out = []
     for where, options in _connections(devices):
         if not (options.host.startswith("127.") or options.host in ("localhost", "::1")):

@@ -1,4 +1,4 @@
-"""What a CONFIG.yaml of a live session may say, and a commented example of all of it."""
+"""The keys of a live session's CONFIG.yaml, and a commented example with all of them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -45,21 +45,26 @@ class CalibrationOptions:
     ] = None
     unit: Annotated[
         str | None,
-        Key("of its lengths; m for ROS and Kalibr, mm for OpenCV", Text(allowed=("m", "mm")), null=True, example="m"),
+        Key(
+            "of the files' lengths; m for ROS and Kalibr, mm for OpenCV",
+            Text(allowed=("m", "mm")),
+            null=True,
+            example="m",
+        ),
     ] = None
     pictures: Annotated[
         str,
         Key(
-            "rectified: they come rectified with it; rectify: do that here",
+            "rectified: the pictures arrive rectified; rectify: rectify them here",
             Text(allowed=("raw", "rectified", "rectify")),
         ),
     ] = "raw"
-    of_fields: Annotated[bool, Key("it is that of the single fields of interlaced frames")] = False
+    of_fields: Annotated[bool, Key("the calibration is that of single fields of interlaced frames")] = False
 
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
-    """``settings``: of the workflow, the endoscope's holder, the devices, the estimate."""
+    """``settings`` of the workflow, the endoscope's holder, the devices and the estimate."""
 
     workflow: Annotated[WorkflowSettings, Inline()]
     holder: Annotated[HolderSettings, Inline()] = field(default_factory=HolderSettings)
@@ -69,7 +74,7 @@ class LiveSettings:
 
 @dataclass(frozen=True, slots=True)
 class OneOrMore(Kind):
-    """One value, or a list of them; a tuple inside."""
+    """One value or a list of them; read as a tuple."""
 
     each: Kind
 
@@ -102,7 +107,7 @@ class LiveDocument:
 
     session: Annotated[
         Path | None,
-        Key("how things are set up; copied into the new session's folder", ExistingPath(), example="session.yaml"),
+        Key("the set-up; copied into the new session's folder", ExistingPath(), example="session.yaml"),
     ] = None
     calibration: Annotated[CalibrationOptions | None, Key("of the endoscope, where session.yaml has no camera")] = None
     room: Annotated[
@@ -111,23 +116,21 @@ class LiveDocument:
     ] = None
     camera: Annotated[Choice, Key("The endoscope.", DriverChoice(Role.CAMERA))]
     photoacoustic: Annotated[
-        Choice, Key("What the probe hears, once for each laser pulse.", DriverChoice(Role.PHOTOACOUSTIC))
+        Choice, Key("The probe's photoacoustic data, one frame for each laser pulse.", DriverChoice(Role.PHOTOACOUSTIC))
     ]
-    stage: Annotated[
-        Choice | None, Key("The stage that turns the probe; without it nothing turns.", DriverChoice(Role.STAGE))
-    ] = None
-    motion: Annotated[
-        Choice | None, Key("What the endoscope's holder knows of its motion.", DriverChoice(Role.MOTION))
-    ] = None
-    bmode: Annotated[Choice | None, Key("Pictures of a scanner, to show with the rest.", DriverChoice(Role.BMODE))] = (
+    stage: Annotated[Choice | None, Key("The stage that turns the probe; may be absent.", DriverChoice(Role.STAGE))] = (
         None
     )
+    motion: Annotated[Choice | None, Key("The motion of the endoscope's holder.", DriverChoice(Role.MOTION))] = None
+    bmode: Annotated[
+        Choice | None, Key("B-mode pictures of a scanner, for display only.", DriverChoice(Role.BMODE))
+    ] = None
     sinks: Annotated[
-        tuple[Choice, ...], Key("Who is told the registration; any number.", ListOf(DriverChoice(Role.SINKS)))
+        tuple[Choice, ...], Key("Receivers of the registration; any number.", ListOf(DriverChoice(Role.SINKS)))
     ] = ()
     operator: Annotated[
         tuple[Choice, ...],
-        Key("Who says what is to be done; a list where there are several.", OneOrMore(DriverChoice(Role.OPERATOR))),
+        Key("Sources of the operator's commands; a list if there are several.", OneOrMore(DriverChoice(Role.OPERATOR))),
     ] = ()
     settings: Annotated[LiveSettings | None, Key("Of the session.")] = None
 
@@ -136,18 +139,18 @@ LIVE = record(LiveDocument, ("format", LIVE_FORMAT))
 """``CONFIG.yaml``."""
 
 _ABSENT = (Role.MOTION, Role.BMODE)
-"""Not in the example but as comments."""
+"""Roles that the example has as comments only."""
 
 
 def example_config() -> str:
-    """A CONFIG.yaml with every key of every driver; what has a default, or is an alternative, is commented out."""
+    """A CONFIG.yaml with every key of every driver; keys with a default and alternatives are commented out."""
     return "\n".join(_lines()) + "\n"
 
 
 def _lines() -> Iterator[str]:
     top = {entry.name: entry for entry in LIVE.fields}
     yield "# Devices of a live session: fgreg live CONFIG.yaml; fgreg devices CONFIG.yaml asks each of them."
-    yield "# Paths are relative to this file's folder. What is commented out is the default, or an alternative."
+    yield "# Paths are relative to this file's folder. Lines that are commented out are defaults or alternatives."
     yield f"format: {LIVE_FORMAT}"
     yield example_line(top["session"]).removesuffix("; may be absent")
     for name, cls in (("calibration", CalibrationOptions), ("room", RoomOptions)):
@@ -168,7 +171,7 @@ def _lines() -> Iterator[str]:
 
 
 def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
-    """A driver's keys."""
+    """Lines of a driver's keys."""
     extra = f"; pip install 'fgreg[{entry.extra}]'" if entry.extra else ""
     dash, indent = ("- ", "    ") if role is Role.SINKS else ("", "  ")
     lines = [f"{role}:", f"  {dash}driver: {entry.name}  # {entry.help}{extra}"]
@@ -187,7 +190,7 @@ def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
 
 
 def example_line(entry: Field) -> str:
-    """As in an example: ``name: value  # help; default``."""
+    """A key's line in the example: ``name: value  # help; default``."""
     key, kind = entry.key, entry.kind
     if key.example:
         value = key.example

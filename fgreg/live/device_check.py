@@ -1,4 +1,4 @@
-"""What devices are there, and whether they answer: each is listened to for two seconds at most, and no stage moves."""
+"""Lists the devices and checks whether they answer. Each is polled for two seconds at most, and no stage moves."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from fgreg.model.session_model import SessionModel
 
 LISTEN_S = 2.0
 ENOUGH, ENOUGH_S = 20, 1.0
-"""After so many frames in so long the rate is known."""
+"""Polling ends early after this many items and this many seconds."""
 _POLL_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """One device, or one library.
+class DeviceReport:
+    """State of one device or library.
 
     Attributes:
-        what: its role, or what kind of thing it is.
-        driver: of a configuration; else empty.
-        name: what the user calls it.
-        answers: whether it is there and does what it should.
-        says: what came, or why nothing did; one line.
+        what: its role, or its kind.
+        driver: the driver's name in a configuration; else empty.
+        name: name shown to the user.
+        answers: whether it is present and works.
+        says: one line on its data, or on why there are none.
     """
 
     what: str
@@ -41,37 +41,39 @@ class Answer:
     says: str
 
 
-def extras() -> Iterator[Answer]:
+def extras() -> Iterator[DeviceReport]:
     """The libraries that drivers need."""
     for extra, (_, purpose) in EXTRAS.items():
         package = distribution(extra)
         if not installed(extra):
-            yield Answer("extra", "", extra, False, f"{package} is missing ({purpose}): pip install 'fgreg[{extra}]'")
+            yield DeviceReport(
+                "extra", "", extra, False, f"{package} is missing ({purpose}): pip install 'fgreg[{extra}]'"
+            )
             continue
         try:
             version = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             version = "of unknown version"
-        yield Answer("extra", "", extra, True, f"{package} {version} ({purpose})")
+        yield DeviceReport("extra", "", extra, True, f"{package} {version} ({purpose})")
 
 
-def video(listen_s: float = LISTEN_S) -> Iterator[Answer]:
+def video(listen_s: float = LISTEN_S) -> Iterator[DeviceReport]:
     """The video devices of this machine; each is opened unless ``listen_s`` is 0."""
     from fgreg.drivers.endoscope import open_endoscope, video_devices
 
     for path, label in video_devices():
         if listen_s == 0:
-            yield Answer("video", "", path, True, label)
+            yield DeviceReport("video", "", path, True, label)
             continue
         with ExitStack() as stack:
             device = open_endoscope(_alone(), EndoscopeOptions(left=path))
             stack.callback(device.close)
             found = _listened(device, None, listen_s)
-        yield Answer("video", "", path, found.answers, f"{label}: {found.says}" if label else found.says)
+        yield DeviceReport("video", "", path, found.answers, f"{label}: {found.says}" if label else found.says)
 
 
-def cubes() -> Iterator[Answer]:
-    """The Thorlabs cubes that are plugged in, as USB tells; none is moved."""
+def cubes() -> Iterator[DeviceReport]:
+    """The Thorlabs cubes found on USB; none is moved."""
     from fgreg.drivers.thorlabs_identify import identify
     from fgreg.drivers.thorlabs_stage import find_ports
 
@@ -81,16 +83,16 @@ def cubes() -> Iterator[Answer]:
         return
     for port in ports:
         try:
-            yield Answer("cube", "", port, True, str(identify(port)))
+            yield DeviceReport("cube", "", port, True, str(identify(port)))
         except FgregError as error:
-            yield Answer("cube", "", port, False, str(error))
+            yield DeviceReport("cube", "", port, False, str(error))
 
 
-def configured(config: LiveConfig, listen_s: float = LISTEN_S) -> Iterator[Answer]:
-    """Each device of a configuration, one after the other.
+def configured(config: LiveConfig, listen_s: float = LISTEN_S) -> Iterator[DeviceReport]:
+    """Check each device of a configuration, one after the other.
 
     Raises:
-        FgregError: the simulated room, where it is used, does not start.
+        FgregError: the simulated room is used and does not start.
     """
     with ExitStack() as stack:
         context = config.context(stack, lambda _: None)
@@ -98,22 +100,22 @@ def configured(config: LiveConfig, listen_s: float = LISTEN_S) -> Iterator[Answe
             for number, chosen in enumerate(several, 1):
                 what = str(role) if len(several) == 1 and role is not Role.SINKS else f"{role} {number}"
                 name, found = _asked(role, chosen, context, config.model, listen_s)
-                yield Answer(what, chosen.entry.name, name, found.answers, one_line(found.says, 300))
+                yield DeviceReport(what, chosen.entry.name, name, found.answers, one_line(found.says, 300))
 
 
 @dataclass(frozen=True, slots=True)
-class _Heard:
+class _Reply:
     answers: bool
     says: str
 
 
 def _asked(
     role: Role, chosen: Chosen, context: DriverContext, model: SessionModel, listen_s: float
-) -> tuple[str, _Heard]:
+) -> tuple[str, _Reply]:
     name = _name(chosen)
     try:
         if chosen.entry.ask is not None:
-            return name, _Heard(True, load(chosen.entry.ask)(context, chosen.options))
+            return name, _Reply(True, load(chosen.entry.ask)(context, chosen.options))
         device = chosen.open(context)
         try:
             name = device.name
@@ -125,29 +127,29 @@ def _asked(
         finally:
             device.close()
     except FgregError as error:
-        return name, _Heard(False, str(error))
+        return name, _Reply(False, str(error))
 
 
 def _name(chosen: Chosen) -> str:
-    """What a device is called before it is opened."""
+    """Name of a device before it is opened."""
     known = (getattr(chosen.options, name, None) for name in ("port", "left", "path"))
     return str(next((value for value in known if value), chosen.entry.help))
 
 
-def _connected(device: Any, listens: bool, listen_s: float) -> _Heard:
-    """A device that sends nothing by itself."""
+def _connected(device: Any, listens: bool, listen_s: float) -> _Reply:
+    """State of a device that sends nothing by itself."""
     end = time.monotonic() + listen_s
     while not device.connected and time.monotonic() < end:
         time.sleep(_POLL_S)
     if device.connected:
-        return _Heard(True, "connected")
+        return _Reply(True, "connected")
     if listens:
-        return _Heard(True, f"nobody connected within {listen_s:g} s; it goes on waiting")
-    return _Heard(False, f"no connection within {listen_s:g} s")
+        return _Reply(True, f"no one connected within {listen_s:g} s; it goes on waiting")
+    return _Reply(False, f"no connection within {listen_s:g} s")
 
 
-def _listened(device: Any, model: SessionModel | None, listen_s: float) -> _Heard:
-    """A device that sends by itself."""
+def _listened(device: Any, model: SessionModel | None, listen_s: float) -> _Reply:
+    """State of a device that sends by itself."""
     begin = time.monotonic()
     items: list[Any] = []
     loss = ""
@@ -158,16 +160,16 @@ def _listened(device: Any, model: SessionModel | None, listen_s: float) -> _Hear
             loss = str(error)
         time.sleep(_POLL_S)
     if not items:
-        told = f": {loss}" if loss else ", but it is connected" if device.connected else ""
-        return _Heard(False, f"nothing came within {listen_s:g} s{told}")
+        why = f": {loss}" if loss else ", but it is connected" if device.connected else ""
+        return _Reply(False, f"nothing came within {listen_s:g} s{why}")
     wrong = "" if model is None else _misfit(items[-1], model)
     says = ", ".join(part for part in (_rate(items), _shape(items[-1]), _clock(items)) if part)
-    told = "; ".join(part for part in (says, wrong, loss) if part)
-    return _Heard(not wrong and (device.connected or "played to its end" in loss), told)
+    line = "; ".join(part for part in (says, wrong, loss) if part)
+    return _Reply(not wrong and (device.connected or "played to its end" in loss), line)
 
 
 def _rate(items: Sequence[Any]) -> str:
-    """Per second by the device's own times; what was dropped counts where items are numbered."""
+    """Items per second by the device's clock; dropped items count if items are numbered."""
     first, last = items[0], items[-1]
     span_s = last.stamp.device_s - first.stamp.device_s
     count = last.index - first.index if hasattr(last, "index") else len(items) - 1
@@ -189,7 +191,7 @@ def _shape(item: Any) -> str:
 
 
 def _misfit(item: Any, model: SessionModel) -> str:
-    """What session.yaml says otherwise; empty where it agrees."""
+    """How session.yaml differs from the item; empty if they agree."""
     match item:
         case StereoFrame(left=left) if model.camera is not None:
             width, height = model.camera.left.image_size

@@ -1,7 +1,7 @@
-"""Devices that come and go: which are lost and why, which are back, and what is told of it.
+"""Monitors the devices: which are lost and why, which are back, and the messages about it.
 
-A device is lost where its driver says so, where it does not answer, and where it answers with nothing worth having: a
-camera whose picture does not change or shows nothing. Everything is noticed well within a second.
+A device is lost if its driver says so, if it does not answer, or if its data are useless: a camera whose picture is
+frozen or blank. Every loss is detected well within a second.
 """
 
 from __future__ import annotations
@@ -16,54 +16,54 @@ import numpy.typing as npt
 from fgreg.drivers.base import DeviceLost, StereoFrame
 
 START_S = 5.0
-"""So long devices may take to send for the first time."""
+"""Longest time until a device's first data."""
 SILENT_S = 0.7
-"""A video without pictures for so long has stopped, whatever its driver says."""
+"""A video without pictures for this long has stopped, whatever its driver says."""
 VIDEO_S = 0.15
-"""Longer between pictures is no video: then there is nothing to expect."""
+"""A source with a longer interval between pictures is no video, and no interval is expected of it."""
 NOTHING_NEW_S = 0.4
-"""Pictures that repeat or show nothing for so long mean trouble."""
+"""A camera whose pictures repeat or are blank for this long is lost."""
 FLAT = 4.0
-"""Standard deviation, in grey levels, below which a picture shows nothing but its sensor's noise."""
+"""A picture is blank if its standard deviation in grey levels is smaller: that is the sensor's noise."""
 ROWS, COLUMNS = 16, 4
-"""Every so many of a picture's are looked at: noise makes any of them change from exposure to exposure."""
+"""Steps between the rows and columns that are compared; sensor noise changes every pixel from exposure to exposure."""
 
 
 class Health:
-    """What is lost.
+    """The lost devices.
 
     Attributes:
-        lost: reasons by role.
+        lost: reason of each loss, by role.
     """
 
     def __init__(self) -> None:
         self.lost: dict[str, str] = {}
-        self._told: list[str] = []
+        self._news: list[str] = []
 
     def found(self, role: str, trouble: str) -> None:
-        """How a role is now: what is wrong with it, or nothing."""
+        """Take in a role's state: ``trouble`` says what is wrong; empty if nothing is."""
         before = self.lost.get(role)
         if trouble:
             self.lost[role] = trouble
             if before is None:
-                self._told.append(f"{role} lost: {trouble}")
+                self._news.append(f"{role} lost: {trouble}")
         elif before is not None:
             del self.lost[role]
-            self._told.append(f"{role} is back")
+            self._news.append(f"{role} is back")
 
     def news(self) -> list[str]:
-        """What has changed since the last call, to be told."""
-        told, self._told = self._told, []
-        return told
+        """Messages about the changes since the last call."""
+        news, self._news = self._news, []
+        return news
 
 
 class Source:
-    """A device that is polled or sent to, with what is wrong with it.
+    """A device that is polled or sent to, with its state.
 
     Args:
         device: fits fgreg.drivers.base.Device.
-        began_s: host time from which on it is waited for.
-        sends: by itself, as long as it is there: then it is lost, too, where it never came.
+        began_s: host time at which waiting for it began.
+        sends: whether it sends without being asked; then it is lost also if it never connects.
     """
 
     def __init__(self, device: Any, began_s: float, *, sends: bool) -> None:
@@ -71,7 +71,7 @@ class Source:
         self._seen, self._lost = False, ""
 
     def poll(self) -> Sequence[Any]:
-        """What came; nothing where the device is gone."""
+        """New data; empty if the device is lost."""
         try:
             return self._device.poll()  # type: ignore[no-any-return]
         except DeviceLost as error:
@@ -79,11 +79,11 @@ class Source:
             return ()
 
     def failed(self, reason: str) -> None:
-        """The driver has said that the device is gone."""
+        """Take in that the driver has reported a loss."""
         self._lost = reason
 
     def trouble(self, now_s: float) -> str:
-        """What is wrong; empty where nothing is. A loss is told even if the device is back at once."""
+        """What is wrong; empty if nothing is. A loss is reported even if the device is back at once."""
         lost, connected = self._lost, bool(self._device.connected)
         if connected:
             self._seen, self._lost = True, ""
@@ -95,7 +95,7 @@ class Source:
 
 
 class Pictures:
-    """Whether a camera's pictures are new ones, and show something."""
+    """Detects frozen and blank pictures of a camera."""
 
     def __init__(self) -> None:
         self._before: tuple[npt.NDArray[np.uint8], ...] = ()
@@ -104,13 +104,13 @@ class Pictures:
         self._side = ""
 
     def is_new(self, frame: StereoFrame, now_s: float) -> bool:
-        """Take in a frame; whether both its pictures differ from those before.
+        """Take in a frame; whether all its pictures differ from those before.
 
-        The same picture again is no new look at anything, whatever time it is stamped with.
+        A repeated picture carries no new measurement, whatever its time stamp.
         """
         sides = [frame.left] if frame.right is None else [frame.left, frame.right]
         samples = tuple(side[::ROWS, ::COLUMNS].copy() for side in sides)
-        repeated = self._changed_not(samples)
+        repeated = self._repeated_side(samples)
         flat = next((side for side, sample in zip(("left", "right"), samples, strict=False) if sample.std() < FLAT), "")
         if math.isnan(self._came_s):
             self._new_s = self._showed_s = now_s
@@ -125,14 +125,14 @@ class Pictures:
         self._side = repeated or flat
         return not repeated
 
-    def _changed_not(self, samples: tuple[npt.NDArray[np.uint8], ...]) -> str:
+    def _repeated_side(self, samples: tuple[npt.NDArray[np.uint8], ...]) -> str:
         if len(samples) != len(self._before):
             return ""
         both = zip(("left", "right"), samples, self._before, strict=False)
         return next((side for side, new, old in both if np.array_equal(new, old)), "")
 
     def trouble(self, now_s: float) -> str:
-        """What is wrong; empty where nothing is."""
+        """What is wrong; empty if nothing is."""
         if self._interval_s <= VIDEO_S and now_s - self._came_s > SILENT_S:
             return "it sends no pictures"
         if self._came_s - self._new_s > NOTHING_NEW_S:

@@ -1,4 +1,4 @@
-"""Whether the fibre is held still: a hand trembles, a detection is noisy, and neither is a motion."""
+"""Whether the fibre is held still. The hand's tremor and the detection's noise do not count as motion."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from fgreg.geometry.transforms import FloatArray, log_so3
 from fgreg.model.time_sync import PoseHistory
 
 STILL_S = 0.35
-"""Held still means for so long."""
+"""The fibre is held still once it has been within the limits for this long."""
 STILL_MM, STILL_RAD = 0.8, 0.02
-"""And by no more than this from the middle."""
+"""Largest distance and rotation from the median pose."""
 FEWEST = 4
+"""Least number of poses."""
 
 
 def held_pose(poses: PoseHistory, now_s: float, over_s: float = STILL_S) -> FloatArray | None:
-    """Where the marker is held, ``camera_T_marker`` (4, 4): the pose nearest to the middle; None where it moves.
+    """Pose at which the marker is held, ``camera_T_marker`` (4, 4): the one nearest to the median; None if it moves.
 
-    Of the last ``over_s`` before ``now_s``, in which there have to be poses from near its beginning to near its end.
+    Uses the poses of the last ``over_s`` before ``now_s``; they have to span most of that time.
     """
     recent = poses.since(now_s - over_s)
     if len(recent) < FEWEST or now_s - recent[-1].t_s > 0.5 * over_s or recent[0].t_s > now_s - 0.5 * over_s:
@@ -32,7 +33,7 @@ def held_pose(poses: PoseHistory, now_s: float, over_s: float = STILL_S) -> Floa
 
 
 def turned_rad(first: FloatArray, second: FloatArray) -> float:
-    """Angle between two poses (4, 4)."""
+    """Rotation angle between two poses (4, 4)."""
     return float(np.linalg.norm(log_so3(first[:3, :3].T @ second[:3, :3])))
 
 

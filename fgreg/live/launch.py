@@ -1,4 +1,4 @@
-"""Everything that a live session needs, put together and taken apart again: folder, engine, devices, stage, loop."""
+"""Start and end of a live session: folder, engine, devices, stage, loop."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ WATCHDOG_LOG = "stage-orders.log"
 
 
 OpenDevices = Callable[[ExitStack, SessionModel], Devices]
-"""Opens the devices but the stage; what it opens is closed with the stack."""
+"""Opens all devices except the stage; they are closed with the stack."""
 
 
-TellTruth = Callable[[Path, float, float], None]
+WriteTruth = Callable[[Path, float, float], None]
 """Writes a session's ground truth, from its folder, the host time of session time 0, and the session time after which
 its events are this run's."""
 
@@ -55,16 +55,16 @@ class StageSetup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveSetup:
-    """A session to be conducted.
+    """Set-up of a live session.
 
     Attributes:
-        setup: the content of its ``session.yaml``, as text.
-        open_devices: all but the stage.
-        stage: None where there is none: then nothing turns.
+        setup: the text of its ``session.yaml``.
+        open_devices: opens all devices except the stage.
+        stage: None if there is no stage.
         settings: of the workflow.
-        holder: how far the endoscope's holder is to be believed, where there is one.
+        holder: accuracy of the endoscope's holder, if there is one.
         latencies: of the devices.
-        tell_truth: called when all is recorded, where somebody knows the truth.
+        write_truth: called after the last event is recorded, if the ground truth is known.
     """
 
     setup: str
@@ -73,12 +73,12 @@ class LiveSetup:
     settings: WorkflowSettings
     holder: HolderSettings = field(default_factory=HolderSettings)
     latencies: Latencies = field(default_factory=Latencies)
-    tell_truth: TellTruth | None = None
+    write_truth: WriteTruth | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Running:
-    """A session under way."""
+    """A running session."""
 
     folder: Path
     model: SessionModel
@@ -87,8 +87,8 @@ class Running:
     session: LiveSession
 
 
-class OneProcess:
-    """Makes engines, each a process; the one before is ended."""
+class EngineProcesses:
+    """Starts engine processes, one at a time: starting one ends the one before."""
 
     def __init__(self) -> None:
         self._engine: EngineProcess | None = None
@@ -99,15 +99,15 @@ class OneProcess:
         return self._engine
 
     def close(self) -> None:
-        """End the last one."""
+        """End the last process."""
         if self._engine is not None:
             self._engine.close()
 
 
 class NewestSnapshots:
-    """The snapshots of a session's engine, whichever process that is by now; for one thread.
+    """Snapshots of a session's current engine process; for one thread.
 
-    While a new process takes in what is recorded, those of the one before stand.
+    While a new process takes in the recorded events, the last snapshot of the process before stays valid.
     """
 
     def __init__(self, session: LiveSession) -> None:
@@ -116,10 +116,10 @@ class NewestSnapshots:
         self._reader: SnapshotReader | None = None
 
     def read(self) -> Received:
-        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.read`; closed also where the process was killed."""
+        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.read`; also ``closed`` if the process was killed."""
         engine = self._session.engine
         if engine is not self._engine and isinstance(engine, EngineProcess):
-            with suppress(FileNotFoundError):  # that one has ended as well
+            with suppress(FileNotFoundError):  # the new process has ended as well
                 self._reader = engine.reader()
             self._engine = engine
         if self._reader is None:
@@ -130,7 +130,7 @@ class NewestSnapshots:
 
 
 def make_folder(folder: Path, setup: str) -> None:
-    """A new session's folder with its ``session.yaml``; an existing session goes on if that is the same.
+    """Make a new session's folder with its ``session.yaml``; an existing session is resumed if its file is the same.
 
     Raises:
         InputError: the folder holds something else, or cannot be made.
@@ -151,7 +151,7 @@ def make_folder(folder: Path, setup: str) -> None:
 
 
 def setup_text(document: Mapping[str, Any]) -> str:
-    """A ``session.yaml`` of a mapping."""
+    """The mapping as text of a ``session.yaml``."""
     return str(yaml.safe_dump(dict(document), sort_keys=False, width=200, default_flow_style=None))
 
 
@@ -163,29 +163,29 @@ def running(
     on_taken: OnTaken | None = None,
     say: Callable[[str], None] = lambda _text: None,
 ) -> Iterator[Running]:
-    """A session with everything started; all is ended when the block is left, the stage first.
+    """Start a session; leaving the block ends everything, the stage first.
 
     Args:
-        live: what to conduct.
-        folder: of the session; made where it is not there.
+        live: set-up of the session.
+        folder: of the session; made if it does not exist.
         config: of the estimate.
-        on_taken: called after each event that was taken in, on the recorder's thread.
-        say: told what is being started.
+        on_taken: called on the recorder's thread after each event that was taken in.
+        say: gets a line for each part that is started.
 
     Raises:
         InputError: bad input.
-        FgregError: something did not start.
+        FgregError: a part did not start.
     """
     make_folder(folder, live.setup)
     with ExitStack() as stack:
         say("starting the registration")
-        make_engine = OneProcess()
-        stack.callback(make_engine.close)  # after the recorder, whichever process is there then
+        make_engine = EngineProcesses()
+        stack.callback(make_engine.close)  # runs after the recorder has closed
         session = stack.enter_context(LiveSession.open(folder, config, make_engine, late=True))
         model = session.journal.model
         last_t = session.journal.last_t
         start_s = host_now() - (0.0 if last_t is None else max(last_t, 0.0) + 1.0)
-        stack.callback(_tell_truth, live.tell_truth, folder, start_s, -1.0 if last_t is None else last_t, say)
+        stack.callback(_write_truth, live.write_truth, folder, start_s, -1.0 if last_t is None else last_t, say)
         say("opening the devices")
         devices = live.open_devices(stack, model)
         if live.stage is not None:
@@ -206,7 +206,7 @@ def running(
             raise
         finally:
             if devices.stage is not None:
-                devices.stage.close()  # first of all; the rest follows in the stack's order
+                devices.stage.close()  # first; the rest follows in the stack's order
 
 
 def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:
@@ -215,13 +215,13 @@ def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:
         say(f"the last {recorder.state.waiting} events could not be recorded: {recorder.state.blocked}")
 
 
-def _tell_truth(
-    tell: TellTruth | None, folder: Path, start_s: float, begin_t: float, say: Callable[[str], None]
+def _write_truth(
+    write: WriteTruth | None, folder: Path, start_s: float, begin_t: float, say: Callable[[str], None]
 ) -> None:
-    """The session is what it is without."""
-    if tell is not None:
+    """Write the ground truth; a failure is reported and leaves the session as it is."""
+    if write is not None:
         try:
-            tell(folder, start_s, begin_t)
+            write(folder, start_s, begin_t)
         except FgregError as error:
             say(f"no ground truth: {error}")
 

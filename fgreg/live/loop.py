@@ -1,7 +1,7 @@
-"""The live loop: frames and pulses in, events and orders out, once per frame.
+"""The live loop: frames and pulses in, events and stage orders out, once per frame.
 
-One turn: the newest frame -> the marker's pose -> where to turn (from the shared snapshot, which never waits) -> what
-the workflow asks for -> the stage's watchdog, the recorder, the operator. All devices are polled; none can hold it up.
+One step: newest frame -> marker pose -> angle to turn to (from the shared snapshot, which is read without waiting) ->
+actions of the workflow -> stage watchdog, recorder, operator. The loop polls all devices; none of them can block it.
 """
 
 from __future__ import annotations
@@ -51,36 +51,36 @@ from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
 IDLE_S = 0.002
-"""Between looks for a frame."""
+"""Time between two polls for a frame."""
 STEP_S = 0.02
-"""Without frames the rest goes on at this pace."""
+"""Time between two steps of the loop while no frames come."""
 SEND_S = 0.2
-"""Between sendings of the registration where nothing has changed."""
+"""Time between two messages with the registration."""
 STALE_S = 3.0
-"""An engine that has not stirred for so long hangs: nobody would notice that the camera moves. The first pairs of an
-epoch may take it a second on a busy machine."""
+"""An engine that has been silent for this long hangs, and camera moves would go undetected. The first pairs of an epoch
+may take a second on a busy machine."""
 SENDERS = ("camera", "probe", "motion", "bmode")
-"""They send by themselves."""
+"""Roles of devices that send without being asked."""
 
 
 class Snapshots(Protocol):
-    """Where the estimate's snapshots come from."""
+    """Source of the estimate's snapshots."""
 
     def read(self) -> Received:
-        """The latest; ``closed`` where there will be no more. Raises NoSnapshotError where there is none yet."""
+        """The latest snapshot; ``closed`` if no more will come. Raises NoSnapshotError if there is none yet."""
 
 
 class LiveLoop:
-    """Conducts a session with devices.
+    """Runs a session with devices.
 
     Args:
-        model: of the session.
-        devices: connected; closed by whoever made them.
+        model: session model.
+        devices: connected devices; their owner closes them.
         recorder: of the session.
         reader: of the estimate's snapshots.
-        workflow: what happens next.
+        workflow: decides what happens next.
         start_s: host time of session time 0.
-        holder: how far the endoscope's holder is to be believed, where there is one (``devices.motion``).
+        holder: accuracy of the endoscope's holder, if there is one (``devices.motion``).
         latencies: of the devices.
     """
 
@@ -103,7 +103,7 @@ class LiveLoop:
             PulseLocator(model, latencies.pulse_s),
         )
         self._holder = Holder(holder or HolderSettings(), latencies.holder_s)
-        self._unsettled_s: float | None = None
+        self._camera_moving_s: float | None = None
         self.figures = Figures()
         self._began_s = host_now()
         self._health, self._pictures = Health(), Pictures()
@@ -121,7 +121,7 @@ class LiveLoop:
         self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
 
     def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
-        """While ``going``."""
+        """Step while ``going`` returns True."""
         while going():
             if not self.turn():
                 time.sleep(IDLE_S)
@@ -129,7 +129,7 @@ class LiveLoop:
                 on_status(self.status())
 
     def turn(self) -> bool:
-        """One turn; whether there was anything to do."""
+        """One step; whether there was anything to do."""
         frames = self._sources["camera"].poll()
         now = host_now()
         if not frames and now - self._stepped_s < STEP_S:
@@ -148,7 +148,7 @@ class LiveLoop:
         for action in self._workflow.step(self._view(now)):
             self._do(action)
         self._take_aim()
-        if self.marker_tracker.newest is not before:  # it was looked into
+        if self.marker_tracker.newest is not before:  # the frame was processed
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
         self._look_after(host_now())
@@ -156,11 +156,11 @@ class LiveLoop:
 
     @property
     def lost(self) -> Mapping[str, str]:
-        """Why devices are lost, by role."""
+        """Why each lost device is lost, by role."""
         return self._health.lost
 
     def status(self) -> Status:
-        """The session now."""
+        """Current status of the session."""
         return Status(
             now := host_now(),
             self._t(now),
@@ -179,7 +179,7 @@ class LiveLoop:
         )
 
     def close(self) -> None:
-        """End what the loop has started itself."""
+        """End the worker processes that the loop has started."""
         self.marker_tracker.close()
         self.pulse_locator.close()
 
@@ -205,7 +205,7 @@ class LiveLoop:
         self._commands += self._sources["operator"].poll()
 
     def _show(self) -> None:
-        """The newest B-mode picture; nothing is measured in it."""
+        """Take the newest B-mode picture, which is only displayed."""
         device = self._devices.bmode
         if device is None:
             return
@@ -219,23 +219,23 @@ class LiveLoop:
         self.figures.unshown = self._unshown + device.dropped
 
     def _follow_camera(self) -> None:
-        """Whether the camera is where the registration has it, by its holder's account and by what is recorded."""
+        """Update since when the camera has been moving, from its holder and from the recorded moves."""
         if self._devices.motion is not None:
             move = self._holder.take(self._sources["motion"].poll(), host_now())
             if move is not None:
                 self._recorder.hand_over(
                     CameraMovedEvent(self._t(host_now()), 0, move.camera_new_T_camera_old, move.covariance)
                 )
-                self.marker_tracker.poses.clear()  # those of before are another frame's
+                self.marker_tracker.poses.clear()  # earlier poses are in another camera frame
         since_s = self._holder.moving_since_s
         if since_s is None and self._recorder.state.camera_moving:
-            since_s = host_now() if self._unsettled_s is None else self._unsettled_s
-        if since_s is not None and self._unsettled_s is None:
-            self._tell(Tell("the camera moves: nothing holds until it rests and is registered again"))
-        self._unsettled_s = since_s
+            since_s = host_now() if self._camera_moving_s is None else self._camera_moving_s
+        if since_s is not None and self._camera_moving_s is None:
+            self._tell(Tell("the camera moves: the registration is invalid until it rests and is registered again"))
+        self._camera_moving_s = since_s
 
     def _where_to(self, pose: TimedPose | None) -> TrackEstimate | None:
-        """Where to turn for a new pose, else for the last one as long as that is new enough to matter."""
+        """Tracking result for the new pose; without one the last result, as long as its pose is recent."""
         try:
             received = self._reader.read()
         except NoSnapshotError:
@@ -243,7 +243,7 @@ class LiveLoop:
         self._snapshot = received.snapshot
         stale = received.silent_s > STALE_S or received.closed
         self._health.found("registration", "its process has ended or hangs" if stale else "")
-        if stale or self._unsettled_s is not None:
+        if stale or self._camera_moving_s is not None:
             return None
         if pose is None:
             newest = self.marker_tracker.poses.newest()
@@ -273,7 +273,7 @@ class LiveLoop:
             state.known,
             self._answer,
             state.aims,
-            self._unsettled_s,
+            self._camera_moving_s,
         )
 
     # --- out --------------------------------------------------------------------------------------------------------
@@ -283,15 +283,15 @@ class LiveLoop:
         return max(0.0, host_s - self._start_s)
 
     def _verdict(self) -> Verdict | None:
-        """Of the registration that holds now; None where there is none."""
+        """Verdict of the registration; None if there is no valid one."""
         known = self._recorder.state.known
         return known.verdict if known.registered and not self._invalid() else None
 
     def _invalid(self) -> str:
-        """Why what is known of the registration holds no more; empty where it does."""
+        """Why the registration is invalid; empty if it is valid."""
         if (lost := self._health.lost.get("registration")) is not None:
             return f"the registration is lost: {lost}"
-        return "" if self._unsettled_s is None else "the camera is moving, or its move is not in the estimate yet"
+        return "" if self._camera_moving_s is None else "the camera is moving, or its move is not in the estimate yet"
 
     def _do(self, action: Action) -> None:
         match action:
@@ -313,7 +313,7 @@ class LiveLoop:
         self._news(tell)
 
     def _news(self, tell: Tell) -> None:
-        """What asks nothing of the operator, so that what was asked before still holds."""
+        """A message that asks nothing of the operator; the last task stays in force."""
         self._text = tell.text
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
 
@@ -331,19 +331,19 @@ class LiveLoop:
         if rig is None or board is None:
             self._tell(Tell("no aim: session.yaml has no board"))
             return
-        if self._aiming is None:  # else one is being looked at
+        if self._aiming is None:  # else a detection is under way
             found = self.pulse_locator.locator.run(detect_board, frame.left, frame.right, rig, board)
             self._aiming = (corner, pose, found)
 
     def _take_aim(self) -> None:
-        """The calibration shot whose board was being looked for, once it is found."""
+        """Record the pending calibration shot once its board has been detected."""
         if self._aiming is None or not self._aiming[2].done():
             return
         (corner, pose, found), self._aiming = self._aiming, None
         board = self._model.board
         try:
             fit = found.result()
-        except Exception as error:  # of one picture: the next one may be as it should
+        except Exception as error:  # a fault of one picture; the next may be good
             self._tell(Tell(f"no aim: {error}"))
             return
         if board is None or not (0 <= corner[0] < board.columns and 0 <= corner[1] < board.rows):
@@ -361,14 +361,14 @@ class LiveLoop:
 
     def _pair(self, pm: int, pose: TimedPose, look: LocatedPulse) -> None:
         if look.scan_rad is None:
-            raise AssertionError("a look that cannot be paired")
+            raise AssertionError("a look without a plane angle")
         device = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
         trus = TrusRecord(device, look.x_mm, look.range_mm, covariance=look.covariance, amplitude=look.amplitude)
         marker = MarkerRecord(pose.parent_T_child, pose.covariance)
         self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))
 
     def _send(self, now: float) -> None:
-        """The registration, to whoever wants it."""
+        """Send the registration to the sinks."""
         if not self._devices.sinks or now - self._sent_s < SEND_S:
             return
         self._sent_s = now
@@ -397,14 +397,14 @@ class LiveLoop:
                 self._sources[f"sink {number + 1}"].failed(str(error))
 
     def _look_after(self, now: float) -> None:
-        """What was lost and what is back, told and noted."""
+        """Update which devices are lost; report and note each change."""
         health, state, steering = self._health, self._recorder.state, self._steering
         for role, source in self._sources.items():
             trouble = source.trouble(now)
             health.found(role, trouble or (self._pictures.trouble(now) if role == "camera" else ""))
         health.found("locator", self.pulse_locator.trouble)
         if "recording" in health.lost and not (state.blocked or state.waiting):
-            steering.unwritten = ""  # the note of it has been written
+            steering.unwritten = ""  # the note about it has been written
         health.found("recording", state.blocked or steering.unwritten)
         for text in health.news():
             self._note(text)

@@ -1,6 +1,6 @@
 """Marker poses from the camera's frames, on the host's clock.
 
-The marker is looked for in the newest frame only; older ones are dropped and counted.
+The marker is detected in the newest frame only; older frames are dropped and counted.
 """
 
 from __future__ import annotations
@@ -19,11 +19,17 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import DeviceClock, PoseHistory, TimedPose
 
 POOL_EVERY, POOL_OVER = 15, 60
-"""The corner noise is pooled anew after so many markers found, over so many."""
+"""The corner noise is pooled again after every ``POOL_EVERY`` detections, over the last ``POOL_OVER``."""
 
 
 class MarkerTracker:
-    """Marker poses from frames."""
+    """Detects the marker in each frame.
+
+    Attributes:
+        poses: recent ``camera_T_marker`` at host times.
+        missing: why the marker was not found in the newest frame; empty if it was.
+        newest: the newest frame.
+    """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
         if model.camera is None or model.marker is None:
@@ -32,7 +38,7 @@ class MarkerTracker:
         rig = self._rig
         self._left = MarkerRoi(rig.left, 0, np.eye(4), self._marker)
         self._right = None if rig.right is None else right_roi(rig, self._marker)
-        self._second = RightViewWorker(rig, self._marker)
+        self._right_worker = RightViewWorker(rig, self._marker)
         self._clock = DeviceClock(latency_s)
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
@@ -42,7 +48,7 @@ class MarkerTracker:
         self.newest: StereoFrame | None = None
 
     def see(self, frame: StereoFrame) -> TimedPose | None:
-        """The marker's pose at the frame's exposure; None, and ``missing`` says why, where it is not found."""
+        """The marker's pose at the frame's exposure; None if it is not found, and ``missing`` gives the reason."""
         t_s = self._clock.host_time(frame.stamp)
         fit = self._detect(frame)
         self.newest = frame
@@ -58,14 +64,14 @@ class MarkerTracker:
         return pose if self.poses.add(pose) else None
 
     def _detect(self, frame: StereoFrame) -> MarkerFit | NotFound:
-        """As :func:`fgreg.detection.marker.detect_marker`, both views at once where that is possible."""
+        """As :func:`fgreg.detection.marker.detect_marker`, with both views in parallel if the worker is ready."""
         right: ViewCorners | None = None
-        helped = frame.right is not None and self._right is not None and self._second.look(frame.right)
+        in_worker = frame.right is not None and self._right is not None and self._right_worker.look(frame.right)
         left = self._left.see(frame.left)
         if frame.right is not None and self._right is not None:
-            right = (self._second.seen() if helped else None) or self._right.see(frame.right)
+            right = (self._right_worker.seen() if in_worker else None) or self._right.see(frame.right)
         return marker_from_views(left, right, self._marker)
 
     def close(self) -> None:
-        """End the right view's process."""
-        self._second.close()
+        """End the right view's worker process."""
+        self._right_worker.close()

@@ -1,7 +1,7 @@
-"""Looks at one spot as one PM: a hand trembles, so that the beam's end wanders while the stage turns.
+"""Merges the looks at one spot into one PM. The hand trembles, so the beam's end moves while the stage turns.
 
-The graph has one point per PM, and a beam through it. So the looks get one marker observation, the mean over their
-pulses, and what the beam's end wanders about the mean is noise of each look.
+The graph has one point per PM and one beam through it. So all looks share one marker observation, the mean over their
+pulses, and the scatter of the beam's end about the mean is added to each look's noise.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from fgreg.live.actions import LocatedPulse
 from fgreg.model.time_sync import TimedPose
 
 REACH_MM = 50.0
-"""Distance along the beam at which a turn of the marker moves its end; spots are 20 to 80 mm off."""
-LEAST_WANDER_MM = 0.05
+"""Lever arm along the beam that turns a rotation of the marker into a shift of the beam's end; spots are 20 to 80 mm
+away."""
+LEAST_SCATTER_MM = 0.05
+"""Lower limit of the standard deviation of the beam's end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,10 +31,10 @@ class Spot:
 
 
 def one_spot(looks: Sequence[LocatedPulse]) -> Spot:
-    """The looks (each with its marker and what was located) as looks at one PM.
+    """Looks at one PM with a common marker observation.
 
-    The mean pose has the mean covariance of the poses, since their errors have much in common. A look's covariance
-    grows by the variance, per axis, of the beam's end about the mean.
+    The mean pose gets the mean covariance of the poses, since their errors are strongly correlated. Each look's
+    covariance (2, 2), mm^2, grows by the variance per axis of the beam's end about the mean.
 
     Raises:
         ValueError: no look, or one without a marker.
@@ -49,7 +51,7 @@ def one_spot(looks: Sequence[LocatedPulse]) -> Spot:
     freedom = len(poses) - 1
     shift = float(np.square(origins - origins.mean(axis=0)).sum()) / (3.0 * freedom)
     turn = float(np.square(turns - turns.mean(axis=0)).sum()) / (3.0 * freedom)
-    variance = max(shift + REACH_MM**2 * turn, LEAST_WANDER_MM**2)
+    variance = max(shift + REACH_MM**2 * turn, LEAST_SCATTER_MM**2)
     covariance: FloatArray = np.mean([pose.covariance for pose in poses], axis=0)
     marker = TimedPose(float(np.mean([pose.t_s for pose in poses])), mean, covariance)
     return Spot(marker, tuple(_wider(look, variance) for look in looks))

@@ -1,4 +1,4 @@
-"""Sources are located in a worker process: the camera's loop goes on, and one that ends or hangs is replaced."""
+"""Locates photoacoustic sources in a worker process, so that the live loop is not blocked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fgreg.model.session_model import ProbeModel
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S, START_S = 10.0, 30.0
-"""A process that takes longer to answer, or to start, is killed."""
+"""A process that takes longer to answer or to start is killed and replaced."""
 
 Result = TypeVar("Result")
 
@@ -30,9 +30,9 @@ class _Job:
 
 
 class Locator:
-    """One job after another, in their order. For one thread, which calls :meth:`check` often.
+    """Runs jobs one after the other in a worker process. For one thread, which calls :meth:`check` often.
 
-    A job whose process ended is done again by the next one, but once only: it may be to blame.
+    A job whose process ended is repeated once by the next process, and not again: the job may be the cause.
     """
 
     def __init__(self, probe: ProbeModel) -> None:
@@ -45,12 +45,12 @@ class Locator:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with the process; empty where it answers."""
+        """What is wrong with the process; empty if it answers."""
         return self._worker.trouble
 
     @property
     def pid(self) -> int | None:
-        """Of the process; None where there is none."""
+        """Id of the process; None if there is none."""
         return self._worker.pid
 
     @property
@@ -60,22 +60,22 @@ class Locator:
 
     @property
     def busy(self) -> bool:
-        """Whether a job is under way, or waits."""
+        """Whether a job is running or waiting."""
         return self._under_way is not None or bool(self._waiting)
 
     def submit(self, data: npt.NDArray[Any]) -> Future[PaFind | NoSignal]:
-        """Have a source located. The future raises FgregError where that failed."""
+        """Locate a source in one frame's data. The future raises FgregError if that fails."""
         return self.run(locate_in_frame, data, self._probe)
 
     def run(self, work: Callable[..., Result], *arguments: Any) -> Future[Result]:
-        """Have something else done there; as :meth:`submit`."""
+        """Run another function in the process; the future is as that of :meth:`submit`."""
         job = _Job(Future(), (work, arguments))
         self._waiting.append(job)
         self._begin_next()
         return job.found
 
     def check(self) -> None:
-        """Take in what was found, and see that the process is there."""
+        """Take in results, and restart the process if it has ended or hangs."""
         self._worker.check()
         job, reply = self._under_way, self._worker.fetch()
         if job is not None and reply is not None:

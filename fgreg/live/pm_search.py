@@ -1,4 +1,4 @@
-"""The search for one PM while its fibre is held: positions of the planner, pulses at each, and what came of it."""
+"""The search for one PM while the fibre is held still: the planner's positions, and a pulse at each."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from fgreg.model.session_model import SessionModel
 from fgreg.search.planner import Found, NotFound, SearchPlanner, Turn
 
 ARRIVED_RAD = 0.004
-"""So near to its goal the stage has arrived."""
+"""The stage has arrived when it is this close to its goal."""
 QUIET_S = 0.03
-"""A pulse counts once the stage has stood for so long."""
+"""A pulse counts once the stage has stood still for this long."""
 PATIENCE_S = 3.0
-"""A stage that stands elsewhere for so long, or a laser that has not pulsed, ends the search."""
+"""The search ends if the stage does not arrive, or no laser pulse comes, within this time."""
 MOST_LOOKS = 4
+"""Largest number of looks recorded for one PM."""
 
 
 @dataclass(slots=True, eq=False)
 class PmSearch:
-    """One search.
+    """One PM search.
 
     Attributes:
-        planner: what is known.
-        held: the marker's pose at the beginning.
-        cold: whether the whole field is searched.
-        looks: pulses at which something was heard.
-        listens: whether the next pulse counts: the stage stands where it was to go.
+        planner: plans the positions; holds the belief about the PM's angle.
+        held: ``camera_T_marker`` (4, 4) at the beginning.
+        cold: whether the search covers the whole field, without a prediction.
+        threshold: least amplitude of a detection.
+        started_s: host time of the beginning.
+        looks: pulses with a detection.
+        listens: whether the next pulse counts, because the stage stands at its goal.
     """
 
     planner: SearchPlanner
@@ -44,7 +47,7 @@ class PmSearch:
     _stood_s: float | None = None
 
     def step(self, now_s: float, stage: StageView, heard: tuple[LocatedPulse, ...]) -> Turn | Found | NotFound | None:
-        """A new position to turn to, or how it ended; None: wait."""
+        """The next position to turn to, or how the search has ended; None to wait."""
         if self._goal is not None:
             there = not stage.moving and abs(stage.scan_rad - self._goal.scan_rad) < ARRIVED_RAD
             if stage.moving or (there and self._stood_s is None):
@@ -67,8 +70,8 @@ class PmSearch:
             self._goal, self._waits_s, self._stood_s, self.listens = step, now_s, None, False
         return step
 
-    def kept(self, found: Found, model: SessionModel) -> tuple[LocatedPulse, ...]:
-        """The looks that are certainly within the sensitivity window, those that say most about the angle."""
+    def best_looks(self, found: Found, model: SessionModel) -> tuple[LocatedPulse, ...]:
+        """At most ``MOST_LOOKS`` looks, all surely inside the sensitivity window and most informative on the angle."""
         table = model.probe.sensitivity
         inside = []
         for look in self.looks:
@@ -79,7 +82,7 @@ class PmSearch:
                 inside.append(look)
         if len(inside) <= MOST_LOOKS:
             return tuple(inside)
-        # Of many the outermost to either side, then the loudest: flanks tell the angle, peaks the rest.
+        # The outermost look on either side determines the angle; the loudest ones determine position and range.
         by_side = sorted(inside, key=lambda look: look.scan_rad or 0.0)
         chosen = [by_side[0], by_side[-1]]
         rest = sorted(by_side[1:-1], key=lambda look: -(look.amplitude or 0.0))

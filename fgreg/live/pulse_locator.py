@@ -1,8 +1,8 @@
-"""Laser pulses from the probe's frames: on the host's clock, with where the plane stood and where the marker was.
+"""Laser pulses from the probe's frames: on the host's clock, with the plane's angle and the marker's pose.
 
-Pulses are never dropped: the source is located in a process of its own, and a pulse is handed on once the marker's
-poses about it are known. Where that process cannot keep up, pulses are handed on as if the plane had turned, and
-counted: then no one takes them for silent.
+Pulses are never dropped. A worker process locates the source, and a pulse is handed on once the marker poses around it
+are known. If the worker cannot keep up, pulses are handed on without a plane angle, as if the plane had been turning,
+and are counted: so they do not count as pulses without a signal.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import DeviceClock, PairRefused, PoseHistory
 
 GIVE_UP_S = 0.5
-"""A pulse waits for the poses about it no longer than this."""
+"""Longest time that a pulse waits for the marker poses around it."""
 LOCATE_S = 2.0
-"""A pulse waits for the locating process no longer than this."""
+"""Longest time that a pulse waits for the worker process."""
 UNREAD_S = 2.0
-"""So long it is told that a frame could not be looked into."""
+"""A frame that could not be processed is reported for this long."""
 STOOD_RAD = 0.002
-"""The plane stands if it has turned by no more than this about the pulse."""
+"""The plane stands still if it turns by no more than this around the pulse."""
 
 
 @dataclass(slots=True, eq=False)
 class _Waiting:
-    """A pulse under way: its frame until that was looked into, where the plane stood, what is located."""
+    """A pending pulse: its frame until it has been processed, the plane's angle, the located source."""
 
     pulse_s: float
     data: npt.NDArray[Any] | None
@@ -44,17 +44,17 @@ class _Waiting:
 
     @property
     def under_way(self) -> bool:
-        """Whether it is still to be looked into."""
+        """Whether the frame still has to be processed."""
         return self.data is not None and (self.located is None or not self.located.done())
 
 
 class PulseLocator:
-    """Pulses with what was heard, where the plane stood, and where the marker was.
+    """Turns the probe's frames into pulses with source, plane angle and marker pose.
 
     Attributes:
-        listening: whether anybody wants to know what is heard: locating a source takes time.
-        passed_over: pulses that would have been located, had there been time.
-        locator: the process that locates sources; it has time for other things while nobody listens.
+        listening: whether sources should be located, which takes processor time.
+        passed_over: number of pulses that were not located for want of time.
+        locator: the worker that locates sources; it is free for other jobs while ``listening`` is False.
     """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
@@ -67,33 +67,33 @@ class PulseLocator:
 
     @property
     def trouble(self) -> str:
-        """Why nothing is located now; empty where it is."""
+        """Why sources cannot be located now; empty if they can."""
         if host_now() - self._unread_s > UNREAD_S:
             self._unread = ""
         return self.locator.trouble or self._unread
 
     @property
     def waiting(self) -> int:
-        """Pulses that have not been handed on yet."""
+        """Number of pulses that have not been handed on yet."""
         return len(self._waiting)
 
     def plane(self, at_s: float, scan_rad: float, moving: bool) -> None:
-        """Where the plane stands, as the stage reports it."""
+        """Take in the plane's angle as the stage reports it."""
         if not self._planes or at_s > self._planes[-1][0]:
             self._planes.append((at_s, scan_rad, moving))
 
     def hear(self, frames: Sequence[PaFrame]) -> None:
-        """Take in pulses. One at a time is looked into: the next is of use once it is known what came of that."""
+        """Take in pulses. One is processed at a time: the next is of use only once its result is known."""
         for frame in frames:
             wanted = self.listening and not any(pulse.under_way for pulse in self._waiting)
             self._waiting.append(_Waiting(self._clock.host_time(frame.stamp), frame.data if wanted else None))
 
     def heard(self, now_s: float, poses: PoseHistory) -> tuple[LocatedPulse, ...]:
-        """The pulses that are complete, in their order."""
+        """The pulses that are complete, oldest first."""
         out = []
         self.locator.check()
         for pulse in self._waiting:
-            self._look_into(pulse, now_s)
+            self._locate(pulse, now_s)
             if pulse.located is not None and not pulse.located.done() and now_s - pulse.pulse_s > LOCATE_S:
                 self._pass_over(pulse)
         while self._waiting:
@@ -105,8 +105,8 @@ class PulseLocator:
             out.append(self._complete(first, poses))
         return tuple(out)
 
-    def _look_into(self, pulse: _Waiting, now_s: float) -> None:
-        """Have the source located, once it is known that the plane stood at the pulse; a turning one is of no use."""
+    def _locate(self, pulse: _Waiting, now_s: float) -> None:
+        """Have the source located once it is known that the plane stood still at the pulse."""
         if pulse.data is None:
             return
         if pulse.located is None:
@@ -116,7 +116,7 @@ class PulseLocator:
             if pulse.scan_rad is None:
                 pulse.data = None
                 return
-            if self.locator.busy:  # with a pulse that was passed over
+            if self.locator.busy:  # still at work on a pulse that was passed over
                 self._pass_over(pulse)
                 return
             pulse.located = self.locator.submit(pulse.data)
@@ -124,7 +124,7 @@ class PulseLocator:
             pulse.data = None
 
     def _pass_over(self, pulse: _Waiting) -> None:
-        """Nobody knows whether anything was heard: then the pulse says nothing of any angle."""
+        """Give up on locating: without a result the pulse says nothing about any plane angle."""
         if pulse.located is not None:
             pulse.located.cancel()
         pulse.data = pulse.scan_rad = pulse.located = None
@@ -140,10 +140,10 @@ class PulseLocator:
             return heard
         try:
             found = pulse.located.result()
-        except Exception as error:  # of one frame: the next one may be as it should
+        except Exception as error:  # a fault of one frame; the next may be good
             self._unread_s = host_now()
-            self._unread = f"a frame of the probe could not be looked into: {error}"
-            return replace(heard, scan_rad=None)  # nobody knows whether anything was heard there
+            self._unread = f"a frame of the probe could not be processed: {error}"
+            return replace(heard, scan_rad=None)  # unknown whether there was a signal
         if isinstance(found, NoSignal):
             return heard
         return replace(
@@ -151,7 +151,7 @@ class PulseLocator:
         )
 
     def _stood(self, t_s: float) -> float | None:
-        """The plane's angle at a time; None where it turned then, or nobody knows."""
+        """The plane's angle at a time; None if the plane was turning or its angle is unknown."""
         before = [plane for plane in self._planes if plane[0] <= t_s]
         after = [plane for plane in self._planes if plane[0] > t_s]
         if not before or not after:
@@ -162,5 +162,5 @@ class PulseLocator:
         return float(np.interp(t_s, (t0, t1), (first, second)))
 
     def close(self) -> None:
-        """End the process."""
+        """End the worker process."""
         self.locator.close()

@@ -1,8 +1,8 @@
-"""Records events and has them estimated, on a thread of its own: the loop hands over and goes on.
+"""Records events and passes them to the engine, on a thread of its own: the loop hands an event over and goes on.
 
-Nothing that was handed over is dropped: what waits is counted, and what the disk refuses is said. Each event is on disk
-before it is counted as recorded (fgreg.session.journal). Where the registration's process ends, a new one goes on from
-what is on disk; the last estimate stands until then, as a warning at most, since nobody notices if the camera moves.
+No event that was handed over is dropped: waiting ones are counted, and a disk error is reported. Each event is on disk
+before it counts as recorded (fgreg.session.journal). If the engine's process ends, a new one is started from the
+recorded events. Until then the last estimate stays valid with a warning, since camera moves go undetected.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import LiveSession
 
 REFRESH_S = 0.2
-"""Between looks at what was found out meanwhile."""
+"""Time between two fetches of the engine's newest estimate."""
 AGAIN_S = 5.0
-"""Between attempts to go on with a new process."""
-REVIVED = "the registration's process had ended; another one has taken in what is recorded"
-UNWATCHED = "the registration's process has ended, and another one is being started: what came since is not in here"
+"""Time between two attempts to start a new process."""
+RESTARTED = "the registration's process had ended; a new one has taken in the recorded events"
+ENGINE_ENDED = "the registration's process has ended and is being restarted: later events are not in the estimate"
 
 Recorded = AimEvent | PairEvent | CameraMovedEvent | NoteEvent
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderState:
-    """What has become of the events.
+    """State of recording and estimate.
 
     Attributes:
-        known: of the estimate. estimate: itself.
-        aims, pairs: on disk and taken in. refused: on disk, and not taken in. waiting: handed over, not on disk yet.
-        trouble: the last thing that went wrong; empty where nothing is.
-        camera_moving: a move of the camera was handed over and is not in the estimate: its registration holds no more.
-        blocked: why nothing can be recorded now; what waits is recorded when it can be. Empty where it can.
+        known: summary of the estimate. estimate: the estimate itself.
+        aims, pairs: counts on disk and taken in. refused: on disk, not taken in. waiting: handed over, not on disk yet.
+        trouble: the last error; empty if there is none.
+        camera_moving: a reported camera move is not in the estimate yet, so the registration is invalid.
+        blocked: why nothing can be recorded now; waiting events are recorded later. Empty if recording works.
     """
 
     known: RegistrationState
@@ -57,16 +57,16 @@ class RecorderState:
 
 
 OnTaken = Callable[[Recorded, OnlineEstimate | None, FloatArray | None], None]
-"""Gets the event, the estimate after it, and the beam (``marker_T_laser``) as that has it."""
+"""Gets the event, the estimate after it, and the estimated beam (``marker_T_laser``)."""
 
 
 class Recorder:
     """One session's recorder.
 
     Args:
-        session: opened; the recorder is the only one that adds to it from now on.
-        on_taken: called on the recorder's thread after each event that was taken in, but for those that a new process
-            of the registration took in when it began.
+        session: opened; only the recorder may add to it from now on.
+        on_taken: called on the recorder's thread after each event that was taken in; not for the recorded events that
+            a new engine process takes in when it starts.
     """
 
     def __init__(self, session: LiveSession, on_taken: OnTaken | None = None) -> None:
@@ -74,20 +74,20 @@ class Recorder:
         self._waiting: queue.Queue[Recorded | None] = queue.Queue()
         self._lock = threading.Lock()
         self._state = self._recorded()
-        self._moves, self._move_lost = 0, False  # of the camera: handed over and waiting; one that was not taken in
+        self._moves, self._move_lost = 0, False  # camera moves that wait; whether one was refused
         self._ended, self._left, self._revived_s = False, 0, -math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
 
     @property
     def state(self) -> RecorderState:
-        """As it is now."""
+        """Current state."""
         with self._lock:
             waits = self._left or self._waiting.qsize() + bool(self._state.blocked)
             return replace(self._state, waiting=waits)
 
     def hand_over(self, event: Recorded) -> None:
-        """Have an event recorded, and return at once.
+        """Queue an event for recording, and return at once.
 
         Raises:
             RuntimeError: after :meth:`close`.
@@ -101,7 +101,7 @@ class Recorder:
         self._waiting.put(event)
 
     def close(self) -> None:
-        """Record what still waits, then end; what the disk still refuses then is lost, and counted as waiting."""
+        """Record the waiting events, then end. Events that the disk still refuses are lost, and counted as waiting."""
         if not self._ended:
             self._ended = True
             self._waiting.put(None)
@@ -118,42 +118,44 @@ class Recorder:
                 return
             while not self._take(event):
                 if self._ended:
-                    self._left = self._waiting.qsize()  # the mark of the end stands for this event
+                    self._left = self._waiting.qsize()  # the queue's end mark counts in place of this event
                     return
                 self._refresh(holding=True)
                 time.sleep(REFRESH_S)
 
     def _recorded(self) -> RecorderState:
-        """What the session has."""
+        """State of the session as opened."""
         taken, estimate = self._session.measurements(), self._session.estimate
         return RecorderState(registration_state(estimate), estimate, aims=len(taken.aims), pairs=len(taken.pairs))
 
     def _revive(self) -> None:
-        """Go on with a new engine, unless that has just been tried."""
+        """Start a new engine, unless that was tried within ``AGAIN_S``."""
         with self._lock:
-            standing = _unwatched(self._state.estimate)
-            self._state = replace(self._state, known=registration_state(standing), estimate=standing, trouble=UNWATCHED)
+            standing = _without_engine(self._state.estimate)
+            self._state = replace(
+                self._state, known=registration_state(standing), estimate=standing, trouble=ENGINE_ENDED
+            )
         if time.monotonic() < self._revived_s + AGAIN_S:
             return
         self._revived_s = time.monotonic()
         try:
             self._session.revive()
             t = self._session.journal.last_t
-            self._session.record(NoteEvent(0.0 if t is None else t, 0, REVIVED))
+            self._session.record(NoteEvent(0.0 if t is None else t, 0, RESTARTED))
             state = self._recorded()
         except FgregError as error:
             with self._lock:
-                self._state = replace(self._state, trouble=f"{UNWATCHED}: {error}")
+                self._state = replace(self._state, trouble=f"{ENGINE_ENDED}: {error}")
             return
         with self._lock:
             self._state = replace(state, refused=self._state.refused, camera_moving=self._moves > 0 or self._move_lost)
 
     def _take(self, event: Recorded) -> bool:
-        """Record one; whether that was possible."""
+        """Record one event; whether the disk took it."""
         aims = pairs = refused = 0
         trouble, estimate = "", self._session.estimate
         moved = isinstance(event, CameraMovedEvent)
-        if isinstance(event, CameraMovedEvent) and self._move_lost:  # it begins where a move nobody knows of has ended
+        if isinstance(event, CameraMovedEvent) and self._move_lost:  # it follows a move that is not in the estimate
             event = replace(event, camera_new_T_camera_old=None, covariance=None)
         try:
             if isinstance(event, NoteEvent):
@@ -197,7 +199,7 @@ class Recorder:
         return True
 
     def _refresh(self, *, holding: bool = False) -> None:
-        """``holding``: an event waits for the disk."""
+        """Fetch the newest estimate. ``holding``: an event waits for the disk."""
         try:
             estimate = self._session.refresh()
         except EngineGone:
@@ -213,16 +215,16 @@ class Recorder:
             self._state = replace(self._state, known=registration_state(estimate), estimate=estimate, blocked=blocked)
 
 
-def _unwatched(estimate: OnlineEstimate | None) -> OnlineEstimate | None:
-    """An estimate that nothing is added to, and that nobody looks after."""
-    if estimate is None or UNWATCHED in estimate.reasons:
+def _without_engine(estimate: OnlineEstimate | None) -> OnlineEstimate | None:
+    """The estimate with at least a warning, since its engine has ended."""
+    if estimate is None or ENGINE_ENDED in estimate.reasons:
         return estimate
     verdict = max(estimate.verdict, Verdict.WARNING, key=lambda v: v.severity)
-    return replace(estimate, verdict=verdict, reasons=(UNWATCHED, *estimate.reasons))
+    return replace(estimate, verdict=verdict, reasons=(ENGINE_ENDED, *estimate.reasons))
 
 
 def registration_state(estimate: OnlineEstimate | None) -> RegistrationState:
-    """What the workflow wants to know of an estimate."""
+    """Summary of an estimate for the workflow."""
     if estimate is None:
         return RegistrationState(Verdict.REFUSED)
     return RegistrationState(

@@ -1,8 +1,8 @@
-"""The right view is looked into by a worker process, while the left one is looked into here.
+"""Detects the marker in the right view in a worker process, while the caller processes the left view.
 
-A stereo frame takes a processor most of the time until the next one comes: two of them are done in half of that. Where
-the process is not there (yet, or any more), the caller looks into both views itself; another one is started meanwhile.
-Pictures go there through shared memory: one of 1920 x 1080 pixels in colour takes 0.1 ms that way, 20 ms by a pipe.
+Detection in both views takes one processor for most of a frame's interval, and in parallel half of that. If the process
+has not started or has ended, the caller processes both views itself while a new process starts. Pictures are passed in
+shared memory: a colour picture of 1920 x 1080 px takes 0.1 ms that way, and 20 ms through a pipe.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from fgreg.model.session_model import MarkerModel, StereoRig
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S = 0.3
-"""An answer that takes longer does not come: a busy machine takes a third of that."""
+"""A process that takes longer counts as hung; on a busy machine detection takes a third of this."""
 
 Shape = tuple[tuple[int, ...], str]
-"""Of a picture, and its kind of numbers."""
+"""Shape and data type of a picture."""
 
 
 class RightViewWorker:
-    """One process at a time; for one thread.
+    """One worker process for the right view; for one thread.
 
     Args:
         rig, marker: of the session.
@@ -39,11 +39,11 @@ class RightViewWorker:
         self._picture: Any = None
 
     def look(self, image: npt.NDArray[np.generic]) -> bool:
-        """Hand over a right picture; False where no process is there to look at it."""
+        """Hand over a right picture; False if no process is ready for it."""
         if self._worker is None or len(self._picture) != image.nbytes:
             self._start(image.nbytes)
             return False
-        self._worker.fetch()  # a late answer, to another picture
+        self._worker.fetch()  # discard a late result of an earlier picture
         if self._worker.busy or not self._worker.ready:
             return False
         np.frombuffer(self._picture, image.dtype).reshape(image.shape)[...] = image
@@ -51,7 +51,7 @@ class RightViewWorker:
         return True
 
     def seen(self) -> ViewCorners | None:
-        """What is in the picture that was handed over; None where no answer comes, or the picture is none."""
+        """Corners in the picture that was handed over; None if there is no result in time or the process failed."""
         reply = None if self._worker is None else self._worker.fetch(ANSWER_S)
         return None if reply is None else reply[0]
 
@@ -71,27 +71,27 @@ class RightViewWorker:
         )
 
     def close(self) -> None:
-        """End the process."""
+        """End the worker process."""
         if self._worker is not None:
             self._worker.close()
             self._worker = None
 
 
 def right_roi(rig: StereoRig, marker: MarkerModel) -> MarkerRoi:
-    """For the right view. Raises ValueError where the rig has none."""
+    """Marker detector of the right view. Raises ValueError if the rig has no right camera."""
     if rig.right is None or rig.right_T_left is None:
         raise ValueError("a right frame, but the rig has no right camera")
     return MarkerRoi(rig.right, 1, rig.right_T_left, marker)
 
 
 def _looking(picture: Any, rig: StereoRig, marker: MarkerModel) -> Work[Shape, ViewCorners]:
-    """The process's work. What it raises at a picture the caller meets as well, and says so."""
+    """The process's work. If it raises, the caller meets the same error when it processes the picture itself."""
     return partial(_look, picture, right_roi(rig, marker))
 
 
-def _look(picture: Any, watch: MarkerRoi, shape: Shape) -> ViewCorners:
+def _look(picture: Any, roi: MarkerRoi, shape: Shape) -> ViewCorners:
     size, kind = shape
-    return watch.see(np.frombuffer(picture, np.dtype(kind)).reshape(size))
+    return roi.see(np.frombuffer(picture, np.dtype(kind)).reshape(size))
 
 
 __all__ = ["RightViewWorker", "right_roi"]

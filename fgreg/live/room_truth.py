@@ -1,4 +1,4 @@
-"""What the simulated room knows and no estimator may: a session's ``ground_truth.yaml``, written at its end."""
+"""Writes the ``ground_truth.yaml`` of a session in the simulated room, at the session's end."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from fgreg.session.session_reader import TRUTH_FILE, read_ground_truth, read_ses
 from fgreg.simulation.documents import rows
 from fgreg.simulation.write import yaml_text
 
-Ask = Callable[[Sequence[float], Sequence[float]], dict[str, Any]]
+TruthAt = Callable[[Sequence[float], Sequence[float]], dict[str, Any]]
 """As :meth:`fgreg.simulation.room.Room.truth_at`."""
 
 
-def write_room_truth(ask: Ask, folder: Path, start_s: float, begin_t: float) -> None:
-    """Write the truth about a session that was recorded in a room that still runs.
+def write_room_truth(truth_at: TruthAt, folder: Path, start_s: float, begin_t: float) -> None:
+    """Write the ground truth of a session that was recorded in a room that is still running.
 
-    Epochs are the session's own. Each gets the pose in which the camera stood at the epoch's last pair: if it was moved
-    within an epoch and nobody noticed, the registration that was told at the epoch's end is wrong, and is found to be.
-    ``x_moved_s`` are the times at which the camera truly began to move in this room, ``x_stood`` where it stood at the
-    start and after each.
+    The epochs are those of the session. Each gets the camera's true pose at the epoch's last pair: after an undetected
+    camera move within an epoch, the registration at the epoch's end is wrong, and is evaluated as wrong. ``x_moved_s``
+    are the times at which the camera truly began to move in this room; ``x_stood`` are its poses at the start and after
+    each of these moves.
 
     Args:
-        ask: tells the truth.
-        folder: of the session, complete.
-        start_s: of session time 0, on the clock of who tells it.
-        begin_t: session time after which this room's events are; those before are another room's, and what the file
-            says of them stays.
+        truth_at: asks the room for the truth.
+        folder: of the complete session.
+        start_s: session time 0 on the room's clock.
+        begin_t: session time after which the events come from this room. Earlier events come from another room, and
+            their entries in the file stay.
 
     Raises:
-        FgregError: the room does not answer, or nobody knows the truth about the epochs before.
+        FgregError: the room does not answer, or the truth of the earlier epochs is unknown.
     """
     session = read_session(folder)
     measured = recognise(session.events, session.model).measurements
@@ -47,8 +47,8 @@ def write_room_truth(ask: Ask, folder: Path, start_s: float, begin_t: float) -> 
     old = sum(t <= begin_t for t in at_t)
     first = {pair.pm: pair.t for pair in reversed(measured.pairs)}
     fresh = {pm: t for pm, t in sorted(first.items()) if t > begin_t}
-    told = ask([start_s + t for t in at_t[old:]], [start_s + t for t in fresh.values()])
-    text = yaml_text(_document(told, earlier, old, list(fresh), start_s))
+    truth = truth_at([start_s + t for t in at_t[old:]], [start_s + t for t in fresh.values()])
+    text = yaml_text(_document(truth, earlier, old, list(fresh), start_s))
     path = folder / TRUTH_FILE
     part = path.with_name(f".{TRUTH_FILE}.tmp")
     try:
@@ -61,7 +61,7 @@ def write_room_truth(ask: Ask, folder: Path, start_s: float, begin_t: float) -> 
 
 
 def _epoch_ends(measured: Measurements, last_t: float) -> list[float]:
-    """Session times of each epoch's last pair; of its end where it has none."""
+    """Session time of each epoch's last pair; the epoch's end if it has none."""
     ends = [start.t for start in measured.epochs[1:]] + [last_t]
     for pair in measured.pairs:  # in the order of time
         ends[pair.epoch] = pair.t
@@ -69,19 +69,19 @@ def _epoch_ends(measured: Measurements, last_t: float) -> list[float]:
 
 
 def _document(
-    told: dict[str, Any], earlier: GroundTruth | None, old: int, fresh: list[int], start_s: float
+    truth: dict[str, Any], earlier: GroundTruth | None, old: int, fresh: list[int], start_s: float
 ) -> dict[str, Any]:
     known = () if earlier is None else earlier.trus_T_camera[:old]
     if len(known) < old:
-        raise FgregError(f"nobody knows the truth about the session's first {old} camera epochs")
+        raise FgregError(f"the ground truth of the session's first {old} camera epochs is unknown")
     spots = {} if earlier is None else {pm: rows(spot) for pm, spot in earlier.trus_p_pm_mm.items()}
-    spots |= {pm: rows(np.array(spot)) for pm, spot in zip(fresh, told["spots_mm"], strict=True)}
+    spots |= {pm: rows(np.array(spot)) for pm, spot in zip(fresh, truth["spots_mm"], strict=True)}
     return {
-        "trus_T_camera": [rows(np.array(pose)) for pose in [*known, *told["trus_T_camera"]]],
-        "marker_T_laser": rows(np.array(told["marker_T_laser"])),
+        "trus_T_camera": [rows(np.array(pose)) for pose in [*known, *truth["trus_T_camera"]]],
+        "marker_T_laser": rows(np.array(truth["marker_T_laser"])),
         "pms": spots,
         "tracks": [],
-        "x_seed": told["seed"],
-        "x_moved_s": [round(t - start_s, 3) for t in told["moved_s"]],
-        "x_stood": [rows(np.array(pose)) for pose in told["stood"]],
+        "x_seed": truth["seed"],
+        "x_moved_s": [round(t - start_s, 3) for t in truth["moved_s"]],
+        "x_stood": [rows(np.array(pose)) for pose in truth["stood"]],
     }

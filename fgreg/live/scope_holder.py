@@ -1,7 +1,7 @@
-"""What the endoscope's holder says of the camera's moves: that one goes on, and how far it went once it is over.
+"""Camera moves as the endoscope's holder measures them: whether one is under way, and the motion once it has ended.
 
-While the camera moves no registration holds. A move is measured between two rests, each the mean of its samples, so
-that the noise of single samples and the way in between do not count. Pure state: samples in, moves out.
+While the camera moves, the registration is invalid. A move is measured between two rests. Each rest is the mean of its
+samples, so neither the noise of single samples nor the path in between matters. Pure state: samples in, moves out.
 """
 
 import math
@@ -18,22 +18,27 @@ from fgreg.schema.kinds import Number
 from fgreg.schema.record import Key
 
 REST_S = 0.4
-"""At rest means for so long."""
+"""The camera is at rest once it has stood still for this long."""
 FEWEST = 4
-"""And in so many samples."""
+"""Least number of samples of a rest."""
 SILENT_S = 2.0
-"""A holder that was silent for so long may have been switched off and on, and then counts from elsewhere."""
+"""A holder that was silent for longer may have been switched off and on, and may have a new origin."""
 SEEN_MM = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0], [40.0, 0.0, 100.0], [0.0, 40.0, 100.0]])
-"""Camera points, (4, 3), by whose displacement a move is judged: about where tissue is."""
+"""Points in the camera frame, (4, 3), mm, about where tissue is; a move's size is their largest displacement."""
 
 
 @dataclass(frozen=True, slots=True)
 class HolderSettings:
-    """How far the holder is to be believed; sigmas of each axis."""
+    """Accuracy of the holder; sigmas per axis.
+
+    Attributes:
+        sigma_mm, sigma_rad: of a measured move.
+        least_mm: smallest displacement of the view that counts as a move.
+    """
 
     sigma_mm: Annotated[
         float,
-        Key("of a move, by motion's account", Number(0.0, 100.0, above=True, unit="mm"), name="holder_sigma_mm"),
+        Key("of a move as motion reports it", Number(0.0, 100.0, above=True, unit="mm"), name="holder_sigma_mm"),
     ] = 2.0
     sigma_rad: Annotated[
         float,
@@ -45,7 +50,7 @@ class HolderSettings:
     ] = math.radians(1.0)
     least_mm: Annotated[
         float,
-        Key("a smaller shift of the view is none", Number(0.0, 10.0, above=True, unit="mm"), name="holder_least_mm"),
+        Key("a smaller shift of the view is no move", Number(0.0, 10.0, above=True, unit="mm"), name="holder_least_mm"),
     ] = 1.0
 
     def __post_init__(self) -> None:
@@ -57,10 +62,10 @@ class HolderSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HolderMove:
-    """A move that is over: began at ``since_s`` or just before, host time.
+    """A move that has ended; it began at host time ``since_s`` or just before.
 
-    ``camera_new_T_camera_old`` (4, 4) with its covariance (6, 6), right tangent; None where the holder was silent
-    meanwhile, and so cannot tell.
+    ``camera_new_T_camera_old`` (4, 4) with its covariance (6, 6), right tangent (rad, mm); both None if the holder was
+    silent meanwhile, so that the motion is unknown.
     """
 
     since_s: float
@@ -76,11 +81,12 @@ class _Rest:
 
 @dataclass(slots=True, eq=False)
 class Holder:
-    """See the module.
+    """Detects and measures moves in the holder's samples.
 
     Attributes:
+        settings: accuracy of the holder.
         latency_s: of its messages (fgreg.model.time_sync.Latencies).
-        moving_since_s: host time at which the move under way was noticed; None at rest.
+        moving_since_s: host time at which the current move was detected; None at rest.
     """
 
     settings: HolderSettings
@@ -96,7 +102,7 @@ class Holder:
         self._clock = DeviceClock(self.latency_s)
 
     def take(self, samples: Sequence[MotionSample], now_s: float) -> HolderMove | None:
-        """Take in what came; the move that has just ended, if one has."""
+        """Take in new samples; returns the move that has just ended, or None."""
         for sample in samples:
             t_s = self._clock.host_time(sample.stamp)
             if t_s <= self._newest_s:
@@ -105,27 +111,27 @@ class Holder:
                 self._recent.clear()
                 self._silent = self._rest is not None
             self._newest_s = t_s
-            self._recent = [(t, kept) for t, kept in self._recent if t > t_s - REST_S]
+            self._recent = [(t, recent) for t, recent in self._recent if t > t_s - REST_S]
             self._recent.append((t_s, sample))
             if self._rest is not None and self.moving_since_s is None and self._away(sample.base_T_camera) > 1.0:
                 self.moving_since_s = t_s
         if samples:
             return self._settle()
         if self.moving_since_s is not None and now_s - self._newest_s > SILENT_S:
-            return self._end(None)  # it fell silent on the way: the camera is somewhere else, nobody knows where
+            return self._end(None)  # it fell silent during the move: the new pose is unknown
         return None
 
     def _away(self, base_T_camera: FloatArray) -> float:
-        """How far from the rest, as a share of what counts as a move."""
+        """Displacement from the rest, in units of ``settings.least_mm``."""
         return 0.0 if self._rest is None else self._shift_mm(self._rest.base_T_camera, base_T_camera)
 
     def _shift_mm(self, before: FloatArray, after: FloatArray) -> float:
-        """Largest displacement of what is seen, as a share of the least that counts."""
+        """Largest displacement of ``SEEN_MM``, in units of ``settings.least_mm``."""
         shift = transform_points(inverse(after) @ before, SEEN_MM) - SEEN_MM
         return float(np.linalg.norm(shift, axis=1).max()) / self.settings.least_mm
 
     def _settle(self) -> HolderMove | None:
-        """Whether the camera rests; what that ends."""
+        """Detect a rest; returns the move that it ends, or None."""
         times = [t for t, _ in self._recent]
         if len(times) < FEWEST or times[-1] - times[0] < 0.75 * REST_S:
             return None
@@ -138,7 +144,7 @@ class Holder:
         if self.moving_since_s is None:
             self._silent = False
             return None
-        if self._away(rest.base_T_camera) <= 1.0:  # there and back, or a sample that was wrong
+        if self._away(rest.base_T_camera) <= 1.0:  # there and back, or a wrong sample
             self.moving_since_s, self._silent = None, False
             return None
         return self._end(None if self._silent else rest)
@@ -154,7 +160,7 @@ class Holder:
 
 
 def _mean_rest(samples: Sequence[MotionSample]) -> _Rest:
-    """The mean of samples at rest; one covariance: what a holder does not know is much the same in all."""
+    """Mean of the samples at rest, with the covariance of one sample: the holder's errors are strongly correlated."""
     first = samples[0].base_T_camera[:3, :3]
     turns = np.array([log_so3(first.T @ sample.base_T_camera[:3, :3]) for sample in samples])
     middle = np.mean([sample.base_T_camera[:3, 3] for sample in samples], axis=0)
@@ -166,12 +172,12 @@ def _mean_rest(samples: Sequence[MotionSample]) -> _Rest:
 
 
 def _move(before: _Rest, after: _Rest, settings: HolderSettings) -> tuple[FloatArray, FloatArray]:
-    """``inv(base_T_new) base_T_old`` and its covariance: of either rest, and what is stated of the move.
+    """``inv(base_T_new) base_T_old`` and its covariance, the sum of both rests' and that of the settings.
 
-    A right perturbation of the new pose is one by ``-Ad(inv(new_T_old))`` of the product.
+    A right perturbation ``d`` of the new pose perturbs the product on the right by ``-Ad(inv(new_T_old)) d``.
     """
     new_T_old = np.asarray(inverse(after.base_T_camera) @ before.base_T_camera)
-    carried = adjoint(np.asarray(inverse(new_T_old)))
-    stated = np.diag(np.repeat([settings.sigma_rad**2, settings.sigma_mm**2], 3))
-    covariance = before.covariance + carried @ after.covariance @ carried.T + stated
+    transport = adjoint(np.asarray(inverse(new_T_old)))
+    of_move = np.diag(np.repeat([settings.sigma_rad**2, settings.sigma_mm**2], 3))
+    covariance = before.covariance + transport @ after.covariance @ transport.T + of_move
     return new_T_old, np.asarray(0.5 * (covariance + covariance.T))

@@ -1,4 +1,4 @@
-"""The simulated operating room as something to conduct a session with: what ``fgreg live`` runs without a CONFIG."""
+"""Set-up of a live session in the simulated operating room, which ``fgreg live`` runs without a CONFIG."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fgreg.drivers.simulated import (
     SimulatedScanner,
     ask_truth,
 )
-from fgreg.live.launch import LiveSetup, StageSetup, TellTruth, setup_text
+from fgreg.live.launch import LiveSetup, StageSetup, WriteTruth, setup_text
 from fgreg.live.room_truth import write_room_truth
 from fgreg.live.status import Devices
 from fgreg.live.workflow import WorkflowSettings
@@ -25,7 +25,7 @@ from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import BUMP_EVERY_S, RoomConfig, room_config
 
 HEARING_THRESHOLD = 20.0
-"""Amplitude in the room's units: well above what its noise makes, half of what is heard at the window's edge."""
+"""Amplitude in the room's units: well above the noise, and half the amplitude at the sensitivity window's edge."""
 SPEED_RAD_S = math.radians(20.0)
 
 
@@ -46,17 +46,17 @@ def simulated_room(
         aims: calibration shots before the surgeon turns to the tissue.
         bump_every_s: mean time between moves of the camera.
         width_px: of its images.
-        seen: whether anybody sees pictures that are only to be shown.
+        seen: whether pictures that are only displayed are wanted.
 
     Raises:
-        FgregError: it did not start.
+        FgregError: the room did not start.
     """
     room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
     return room_setup(room.path, room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s), seen=seen)
 
 
 def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSetup:
-    """How to conduct a session with the room whose socket is at ``path``; ``seen`` as of :func:`simulated_room`."""
+    """Set-up of a session in the room whose socket is at ``path``; ``seen`` as in :func:`simulated_room`."""
 
     def open_devices(devices: ExitStack, _model: SessionModel) -> Devices:
         found = Devices(
@@ -80,10 +80,10 @@ def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSet
         open_devices,
         stage,
         WorkflowSettings(aims=config.aims, hearing_threshold=HEARING_THRESHOLD),
-        tell_truth=room_truth(path),
+        write_truth=room_truth(path),
     )
 
 
-def room_truth(path: Path) -> TellTruth:
-    """What writes the truth about a session in the room whose socket is at ``path``."""
+def room_truth(path: Path) -> WriteTruth:
+    """Writer of the ground truth of a session in the room whose socket is at ``path``."""
     return partial(write_room_truth, partial(ask_truth, path))

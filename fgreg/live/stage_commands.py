@@ -1,4 +1,4 @@
-"""The loop's end of the stage: orders out, reports in, and what is told where the stage is not there."""
+"""Stage orders out and reports in, for the live loop; tells the operator if the stage is missing."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from fgreg.stage.limits import MotionKind
 from fgreg.stage.reconnect import ReconnectingStage
 
 AGAIN_RAD, AGAIN_S = math.radians(0.1), 0.5
-"""An order to follow is repeated once the goal has moved by so much, or after so long."""
-NOT_THERE = "the stage is not there"
+"""A track order is repeated once its goal has moved by ``AGAIN_RAD``, or after ``AGAIN_S``."""
+NOT_THERE = "the stage is not connected"
 
 Order = Ask | Sweep | Follow | Halt | Release
 
 
 class Steering:
-    """One stage, or none.
+    """Sends orders to the stage, if there is one.
 
     Args:
-        stage: None where there is none: then nothing is ordered and nothing lost.
-        health: told whether it is there.
-        say: to the operator.
-        began_s: host time from which on it is waited for.
+        stage: None if the session has no stage; then orders are ignored.
+        health: gets whether the stage is lost.
+        say: shows a line to the operator.
+        began_s: host time at which waiting for the stage began.
 
     Attributes:
-        unwritten: why the last order or stop could not be written down; empty where it could.
+        unwritten: why the last order or stop could not be recorded; empty if it was.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Steering:
 
     @property
     def view(self) -> StageView | None:
-        """The newest; None where there is no stage, or it is not there."""
+        """Newest status; None if there is no stage or it is not connected."""
         view = None if self._stage is None else self._stage.view
         if view is None or view.status is None or not view.connected:
             return None
@@ -52,12 +52,12 @@ class Steering:
 
     @property
     def latched(self) -> str:
-        """Why nothing may move until a reset, whether the stage is there or not; empty: it may."""
+        """Why nothing may move until a reset, whether the stage is connected or not; empty if it may move."""
         view = None if self._stage is None else self._stage.view
         return "" if view is None else view.latched or ""
 
     def listen(self) -> StageView | None:
-        """Take in what has happened; the newest status."""
+        """Take in the stage's reports; returns the newest status."""
         if self._stage is None:
             return None
         try:
@@ -66,7 +66,7 @@ class Steering:
         except StageError as error:
             self._health.found("stage", str(error))
             return None
-        except FgregError as error:  # a stop that cannot be written down now: it is when that is possible
+        except FgregError as error:  # a stop that cannot be recorded now is recorded later
             self.unwritten = str(error)
         view = self.view
         if view is not None:
@@ -80,7 +80,7 @@ class Steering:
             self._say(f"stage {report.what}: {report.reason}")
 
     def beat(self, marker_s: float | None, verdict: str | None) -> None:
-        """The loop lives; what tracking rests on is as :meth:`fgreg.stage.client.StageLink.beat` takes it."""
+        """Send the heartbeat; arguments as those of :meth:`fgreg.stage.client.StageLink.beat`."""
         if self._stage is None or self._stage.link is None:
             return
         try:
@@ -89,7 +89,7 @@ class Steering:
             self._health.found("stage", str(error))
 
     def order(self, order: Order) -> bool:
-        """Have an order carried out; whether it was sent."""
+        """Send an order to the stage; whether it was sent."""
         if self._stage is None:
             return False
         link = self._stage.link
@@ -119,7 +119,7 @@ class Steering:
         except StageError as error:
             self._health.found("stage", str(error))
             return False
-        except FgregError as error:  # a stop was sent all the same, anything else was not
+        except FgregError as error:  # a stop was sent all the same, other orders were not
             self.unwritten = str(error)
             return False
         return True

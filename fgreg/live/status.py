@@ -1,4 +1,4 @@
-"""What a live session consists of, what it measures of itself, and how it stands at a moment. Plain data."""
+"""Devices, timing figures and momentary status of a live session. Plain data."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ from fgreg.model.time_sync import TimedPose
 from fgreg.stage.reconnect import ReconnectingStage
 
 LATENCIES = 100_000
+"""Largest number of latencies kept."""
 
 
 @dataclass(slots=True, eq=False)
 class Devices:
-    """What is connected: one device a role, any number of sinks; ``bmode`` only where somebody looks at it."""
+    """The connected devices: one per role, any number of sinks; ``bmode`` only if its pictures are displayed."""
 
     camera: StereoCamera
     probe: PhotoacousticSource
@@ -39,7 +40,7 @@ class Devices:
     sinks: Sequence[TransformSink] = ()
 
     def roles(self) -> dict[str, Any]:
-        """Those that can be lost, by role."""
+        """Devices that can be lost, by role; the stage reports its loss itself."""
         found: dict[str, Any] = {"camera": self.camera, "probe": self.probe, "operator": self.operator}
         if self.motion is not None:
             found["motion"] = self.motion
@@ -50,7 +51,7 @@ class Devices:
         return found
 
     def close(self) -> None:
-        """Let go of all, the stage first."""
+        """Close all devices, the stage first."""
         if self.stage is not None:
             self.stage.close()
         for device in self.roles().values():
@@ -59,13 +60,13 @@ class Devices:
 
 @dataclass(slots=True, eq=False)
 class Figures:
-    """What the loop measures of itself.
+    """Counts and latencies of the live loop.
 
     Attributes:
-        latency_ms: from a frame's arrival to its order, or to the knowledge that there is none.
-        frames, skipped: frames looked into, and left out here: for newer ones, or the same as before.
+        latency_ms: from a frame's arrival to its stage order, or to the decision that there is none.
+        frames, skipped: frames processed, and frames left out for a newer one or as repeated.
         found: frames in which the marker was found. pulses: taken in. orders: sent to the stage.
-        pictures, unshown: B-mode pictures taken in, and dropped for newer ones by the driver or here.
+        pictures, unshown: B-mode pictures taken in, and dropped for newer ones by the driver or the loop.
     """
 
     latency_ms: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES))
@@ -80,14 +81,15 @@ class Figures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Status:
-    """The session at one moment, for whoever shows it.
+    """The session at one moment, for display.
 
     Attributes:
-        now_s: host time. t: session time. stage: how far it has come.
-        text: last told to the operator. task: the last of that which was no news of devices, so what comes next.
-        answer: where to turn for the newest pose. plane: the stage. lost: devices that are gone, by role.
-        pose, frame: newest. bmode: newest, None where its scanner is gone.
-        invalid: why what is known of the registration holds no more, whatever its verdict was; empty where it does.
+        now_s: host time. t: session time. stage: current stage of the workflow.
+        text: last message to the operator. task: last message that was not about devices: what to do next.
+        answer: tracking result for the newest pose. plane: status of the stage. lost: roles of the lost devices.
+        latched: why the stage may not move until a reset; empty if it may.
+        pose, frame: newest. bmode: newest, None if its scanner is lost.
+        invalid: why the registration is invalid, whatever its verdict was; empty if it is valid.
     """
 
     now_s: float
@@ -107,10 +109,10 @@ class Status:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the registration as it counts now."""
+        """Current verdict; REFUSED if the registration is invalid."""
         return Verdict.REFUSED if self.invalid else self.recorder.known.verdict
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why."""
+        """Reasons for the verdict."""
         return tuple(filter(None, (self.invalid, *self.recorder.known.reasons)))

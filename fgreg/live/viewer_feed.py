@@ -1,4 +1,4 @@
-"""Shows a live session in Rerun: each event with what is known after it, and between them where the stage follows."""
+"""Shows a live session in Rerun: each event with the estimate after it, and between events the state of tracking."""
 
 from __future__ import annotations
 
@@ -29,26 +29,27 @@ from fgreg.viewer.spawn import spawn_viewer
 from fgreg.viewer.status_line import Now
 
 LOOK_S = 0.5
-"""Between pictures of the following stage: drawing takes time that the loop wants."""
+"""Time between two drawings of the tracking state; drawing takes processor time from the loop."""
 FRESH_S = 0.5
-"""A marker seen longer ago is not where it was."""
+"""An older marker pose is not drawn."""
 WAITING = 64
+"""Largest number of drawings that wait."""
 INSTEAD = (
     "with --no-viewer the session is shown in the terminal only; --no-viewer --rrd FILE records what it would show"
 )
 
 
 class ViewerFeed(Protocol):
-    """What a live session tells whoever shows it."""
+    """Interface of a session's display."""
 
     def session(self, model: SessionModel) -> None:
         """The session begins."""
 
     def taken(self, event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
-        """An event was taken in (told on the recorder's thread)."""
+        """An event was taken in (called on the recorder's thread)."""
 
     def status(self, status: Status) -> None:
-        """A turn of the loop has ended."""
+        """A step of the loop has ended."""
 
 
 class NullFeed:
@@ -65,8 +66,8 @@ class NullFeed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """Something to be drawn: an event, or a look at the following stage."""
+class _Drawing:
+    """One drawing: an event, or the state of tracking."""
 
     t: float
     shot: Aim | Pair | Track | None
@@ -78,12 +79,16 @@ class _Seen:
 
 
 class RerunFeed:
-    """Draws on a thread of its own; where that cannot keep up, what is oldest is left out: it is only a view."""
+    """Draws on a thread of its own; if it cannot keep up, the oldest drawings are left out.
+
+    Attributes:
+        left_out: number of drawings left out.
+    """
 
     def __init__(self, viewer: Viewer | NullViewer) -> None:
         self._viewer = viewer
         self._model: SessionModel | None = None
-        self._waiting: queue.Queue[_Seen | None] = queue.Queue(WAITING)
+        self._waiting: queue.Queue[_Drawing | None] = queue.Queue(WAITING)
         self._status: Status | None = None
         self._beam: FloatArray | None = None
         self._looked_s, self._number, self._marker = -math.inf, 0, 0
@@ -111,25 +116,25 @@ class RerunFeed:
         if isinstance(event, NoteEvent):
             note = event.text
         status = self._status
-        self._put(_Seen(event.t, shot, note, estimate, _frame(status), status))
+        self._put(_Drawing(event.t, shot, note, estimate, _frame(status), status))
 
     def status(self, status: Status) -> None:
-        """Remember the newest pictures; now and then draw how things stand."""
+        """Store the newest status; draw it every ``LOOK_S``."""
         self._status = status
         if status.now_s - self._looked_s < LOOK_S:
             return
         self._looked_s = status.now_s
         self._put(self._look(status))
 
-    def _look(self, status: Status, *, ended: bool = False) -> _Seen:
+    def _look(self, status: Status, *, ended: bool = False) -> _Drawing:
         track, pose = None, status.pose
         if pose is not None and status.now_s - pose.t_s < FRESH_S:
             marker = self._observation(pose.parent_T_child, pose.covariance)
             track = Track(status.t, status.recorder.known.epoch, marker, ())
-        return _Seen(status.t, track, "", status.recorder.estimate, _frame(status), status, ended)
+        return _Drawing(status.t, track, "", status.recorder.estimate, _frame(status), status, ended)
 
     def close(self) -> None:
-        """Draw what waits and that it is over, then end."""
+        """Draw what waits and the end of the session, then end the thread."""
         if self._thread.is_alive():
             if self._status is not None:
                 self._put(self._look(self._status, ended=True))
@@ -150,10 +155,10 @@ class RerunFeed:
         look = Look(scan, model.noise.scan_rad, trus.x_mm, trus.range_mm, spread, trus.sweep, trus.amplitude)
         return Pair(event.t, event.pm, epoch, marker, look)
 
-    def _put(self, seen: _Seen) -> None:
+    def _put(self, drawing: _Drawing) -> None:
         while True:
             try:
-                self._waiting.put_nowait(seen)
+                self._waiting.put_nowait(drawing)
                 return
             except queue.Full:
                 try:
@@ -163,31 +168,31 @@ class RerunFeed:
                 self.left_out += 1
 
     def _run(self) -> None:
-        while (seen := self._waiting.get()) is not None:
+        while (drawing := self._waiting.get()) is not None:
             try:
-                self._draw(seen)
-            except Exception:  # one picture that cannot be drawn must not freeze the view
+                self._draw(drawing)
+            except Exception:  # one failed drawing must not stop the display
                 self.left_out += 1
 
-    def _draw(self, seen: _Seen) -> None:
-        known, number, status, model = seen.estimate, self._number, seen.status, self._model
+    def _draw(self, drawing: _Drawing) -> None:
+        known, number, status, model = drawing.estimate, self._number, drawing.status, self._model
         invalid = "" if status is None else status.invalid
         if model is None:
             raise AssertionError("the session comes first")
         self._number += 1
-        if seen.frame is not None:
+        if drawing.frame is not None:
             kind: ShotKind = "track"
-            if isinstance(seen.shot, Aim | Pair):
-                kind = "aim" if isinstance(seen.shot, Aim) else "pair"
-            right = None if kind == "track" else seen.frame.right  # of all the looks between, one view is enough
-            self._viewer.shot_images(seen.t, kind, number, seen.frame.left, right)
-        self._viewer.bmode(seen.t, number, None if status is None else status.bmode)
+            if isinstance(drawing.shot, Aim | Pair):
+                kind = "aim" if isinstance(drawing.shot, Aim) else "pair"
+            right = None if kind == "track" else drawing.frame.right  # one view is enough between events
+            self._viewer.shot_images(drawing.t, kind, number, drawing.frame.left, right)
+        self._viewer.bmode(drawing.t, number, None if status is None else status.bmode)
         self._viewer.moment(
             Moment(
-                t=seen.t,
+                t=drawing.t,
                 number=number,
-                shot=seen.shot,
-                note=seen.note,
+                shot=drawing.shot,
+                note=drawing.note,
                 trus_T_camera=None if known is None else known.trus_T_camera,
                 covariance=None if known is None else known.covariance,
                 marker_T_laser=self._beam,
@@ -195,19 +200,19 @@ class RerunFeed:
                 verdict=Verdict.REFUSED if known is None or invalid else known.verdict,
                 reasons=() if known is None else tuple(filter(None, (invalid, *known.reasons))),
                 pairs=0 if known is None else known.pairs,
-                nis=known.nis if known is not None and isinstance(seen.shot, Pair) else None,
+                nis=known.nis if known is not None and isinstance(drawing.shot, Pair) else None,
                 used=known is not None and known.used,
-                answer=None if status is None or not isinstance(seen.shot, Track) else status.answer,
-                now=None if status is None else now_of(status, model.stage, ended=seen.ended),
+                answer=None if status is None or not isinstance(drawing.shot, Track) else status.answer,
+                now=None if status is None else now_of(status, model.stage, ended=drawing.ended),
                 epoch=0 if known is None else known.epoch,
             )
         )
 
 
 def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
-    """What has to be seen at a glance of a moment."""
+    """Content of the viewer's status line."""
     plane, answer = status.plane, status.answer
-    told = None if answer is None else answer.stage_rad
+    goal = None if answer is None else answer.stage_rad
     return Now(
         status.stage,
         status.task,
@@ -217,7 +222,7 @@ def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
         plane is not None and plane.homed,
         plane is not None and plane.moving,
         status.latched,
-        None if told is None else stage.scan_from_device(told),
+        None if goal is None else stage.scan_from_device(goal),
         None if answer is None else answer.sigma_rad,
         "" if answer is None or status.verdict is Verdict.REFUSED else answer.reason,
         ended,
@@ -225,13 +230,13 @@ def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
 
 
 def _frame(status: Status | None) -> StereoFrame | None:
-    """The newest picture; none where its camera is gone."""
+    """The newest frame; None if the camera is lost."""
     return None if status is None or "camera" in status.lost else status.frame
 
 
 @contextmanager
 def viewer_feed(rrd: Path | None, name: str, *, live: bool, say: Callable[[str], None]) -> Iterator[ViewerFeed]:
-    """A feed that records to ``rrd`` and, where ``live``, shows in a viewer; the null one where neither.
+    """A feed that records to ``rrd`` if given and shows in a viewer if ``live``; the null feed if neither.
 
     Raises:
         ViewerError: there is no viewer, or no screen for it.

@@ -1,7 +1,7 @@
-"""What happens next, and what the stage is asked for: calibration shots, searches for PMs, following the beam.
+"""The workflow of a session: calibration shots, PM searches, following the beam.
 
-No devices, no clock of its own, no estimate: :meth:`Workflow.step` gets a view of the moment and returns what it asks
-for. Whether the stage may really turn is decided elsewhere (fgreg.stage): here is only what would be useful.
+It has no devices, no clock and no estimate: :meth:`Workflow.step` gets the inputs of one moment and returns actions.
+The safety gate (fgreg.stage) decides whether the stage may turn; the workflow only says what would be useful.
 """
 
 import math
@@ -39,29 +39,29 @@ from fgreg.search.planner import Found, NotFound, Prediction, SearchPlanner, Tur
 from fgreg.stage.limits import MotionKind
 
 SLIP_MM, SLIP_RAD = 1.2, 0.03
-"""A fibre that leaves its pose by more than this during a search has moved: what was heard belongs to no one spot."""
+"""A fibre that leaves its pose by more than this during a search has moved: its pulses belong to no single spot."""
 ANOTHER_MM, ANOTHER_RAD = 3.0, 0.06
-"""A new PM wants the fibre to be held so far from where the last one was taken."""
+"""A new PM needs the fibre to be at least this far from the pose of the last PM."""
 WORTH_PREDICTING_RAD = math.radians(8.0)
 """A prediction less certain than this is no better than a sweep."""
 CHECK_RAD = math.radians(2.0)
-"""While the stage follows, a PM heard with the plane so near to the answer becomes a pair."""
+"""While the stage follows, a PM detected with the plane this close to the tracking result becomes a pair."""
 CHECK_S = 0.3
-"""And so often it is listened for."""
+"""Time between two such detections."""
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
-"""A spot at which nothing happens for so long is not worth waiting at."""
-DEAF = 8
-"""Pulses in a row that are not heard where they should be before the operator is told."""
+"""The operator is told what is missing after a wait of this long."""
+UNHEARD = 8
+"""The operator is told after this many pulses in a row without a PM where the registration expects one."""
 
 
 def _why(known: RegistrationState) -> str:
-    """The first reason for a refusal."""
+    """The first reason for refusing the registration."""
     return known.reasons[0] if known.reasons else "no registration"
 
 
 class Stage(StrEnum):
-    """How far the session has come."""
+    """Stages of a session."""
 
     AIMING = "calibrating"
     COLLECTING = "registering"
@@ -70,7 +70,7 @@ class Stage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class WorkflowSettings:
-    """What is wanted. The operator can end the calibration earlier."""
+    """How many shots and PMs to take, and what counts as a detection. The operator can end the calibration earlier."""
 
     aims: Annotated[int, Key("calibration shots", Integer(0, 1000))] = 8
     pms: Annotated[int, Key("PMs of an epoch after which the stage may follow", Integer(1, 1000))] = 8
@@ -95,15 +95,15 @@ class WorkflowSettings:
 
 
 class Workflow:
-    """Conducts one session.
+    """The workflow of one session.
 
     Args:
-        model: its set-up.
-        settings: what is wanted.
-        next_pm: number of the next PM: beyond those of a session that goes on.
+        model: session model.
+        settings: how many shots and PMs to take.
+        next_pm: number of the next PM; in a resumed session it follows the recorded ones.
 
     Attributes:
-        stage: how far the session has come.
+        stage: current stage of the session.
     """
 
     def __init__(self, model: SessionModel, settings: WorkflowSettings, next_pm: int = 0) -> None:
@@ -117,40 +117,40 @@ class Workflow:
         self._search: PmSearch | None = None
         self._done_at: FloatArray | None = None
         self._pms, self._epoch = 0, 0
-        self._told_refused = 0
-        self._deaf = 0
+        self._refused_pms = 0
+        self._unheard = 0
         self._wanted: CommandKind | None = None
         self._latched = ""
         self._wanted_s = -math.inf
         self._waits_s = -math.inf
         self._checks, self._checked_s = False, -math.inf
-        self._not_before_s = -math.inf  # pulses of before are another epoch's
+        self._not_before_s = -math.inf  # earlier pulses belong to another epoch
 
     @property
     def listens(self) -> bool:
-        """Whether it is of any use now to know what is heard: locating a source takes a processor's time."""
+        """Whether pulses should be located now; locating a source takes processor time."""
         return self._checks if self._search is None else self._search.listens
 
     def step(self, view: Inputs) -> tuple[Action, ...]:
-        """What to do now."""
+        """The actions for these inputs."""
         out: list[Action] = []
         self._checks = False
         for command in view.commands:
             out += self._obey(command, view)
         latched = view.stage is not None and self._is_latched(view.stage, view.now_s, out)
         if view.camera_moving_s is not None:
-            # What is known holds no more. The stage's request stays: the gate holds the motion, as long as this lasts.
+            # The registration is invalid. The motion request stays; the safety gate blocks the motion meanwhile.
             self._search, self._not_before_s = None, max(self._not_before_s, view.now_s)
             return tuple(out)
         if view.known.epoch != self._epoch:
-            self._epoch, self._pms, self._done_at, self._deaf = view.known.epoch, 0, None, 0
-            self._told_refused = 0
+            self._epoch, self._pms, self._done_at, self._unheard = view.known.epoch, 0, None, 0
+            self._refused_pms = 0
             self._search = None
-            out.append(Tell("the camera has moved: the registration begins anew"))
+            out.append(Tell("the camera has moved: the registration starts again"))
         self._advance(view, out)
         if any(isinstance(action, Ask | Halt | Release) for action in out):
             self._search = None
-            return tuple(out)  # what the stage is asked for next depends on how it takes that
+            return tuple(out)  # the next stage order depends on how the stage reacts
         if view.stage is not None and not latched and self._may_turn(view, view.stage, out):
             searches = view.stage.requested is MotionKind.SEARCH
             if self.stage is Stage.COLLECTING or (self.stage is Stage.FOLLOWING and searches):
@@ -162,9 +162,9 @@ class Workflow:
         return tuple(out)
 
     def _is_latched(self, stage: StageView, now_s: float, out: list[Action]) -> bool:
-        """Whether nothing may move until the operator's reset; asks for it."""
+        """Whether the stage is latched; then ask the operator for a reset."""
         if stage.latched != self._latched:
-            self._latched, self._wanted = stage.latched, None  # told at once, and what it needs after it, too
+            self._latched, self._wanted = stage.latched, None  # ask at once
             if not stage.latched:
                 out.append(Tell("the stage is free again, and moves once it is asked to"))
         if stage.latched:
@@ -173,7 +173,7 @@ class Workflow:
         return bool(stage.latched)
 
     def _may_turn(self, view: Inputs, stage: StageView, out: list[Action]) -> bool:
-        """Whether the stage knows its zero and has the operator's request for what comes next; asks where not."""
+        """Whether the stage is homed and the operator has requested the next kind of motion; if not, ask for it."""
         if not stage.homed:
             self._want(CommandKind.HOME, "the stage has to find its zero position", view.now_s, out)
             return False
@@ -188,12 +188,12 @@ class Workflow:
                 self._want(CommandKind.SEARCH, f"{view.answer.reason}: hold it still and search here", view.now_s, out)
         return True
 
-    def _want(self, said: CommandKind, text: str, now_s: float, out: list[Action]) -> None:
-        """Ask the operator, and again after a while."""
-        if self._wanted == said and now_s - self._wanted_s < ASK_AGAIN_S:
+    def _want(self, wanted: CommandKind, text: str, now_s: float, out: list[Action]) -> None:
+        """Ask the operator for a command, and again after a while."""
+        if self._wanted == wanted and now_s - self._wanted_s < ASK_AGAIN_S:
             return
-        self._wanted, self._wanted_s = said, now_s
-        out.append(Tell(text, wants=said))
+        self._wanted, self._wanted_s = wanted, now_s
+        out.append(Tell(text, wants=wanted))
 
     # --- the session's course ---------------------------------------------------------------------------------------
 
@@ -234,11 +234,11 @@ class Workflow:
             if self._pms >= enough and self._search is None:
                 self.stage = Stage.FOLLOWING
                 out.append(Tell("registered", done=True))
-        elif self.stage is Stage.COLLECTING and self._pms >= self._told_refused + self._settings.most_pms:
-            self._told_refused = self._pms
+        elif self.stage is Stage.COLLECTING and self._pms >= self._refused_pms + self._settings.most_pms:
+            self._refused_pms = self._pms
             out.append(Tell(f"{self._pms} PMs, and refused: {_why(known)}; if the camera was moved, say so (moved)"))
         elif self.stage is Stage.FOLLOWING and not usable:
-            self.stage, self._pms, self._told_refused = Stage.COLLECTING, 0, 0
+            self.stage, self._pms, self._refused_pms = Stage.COLLECTING, 0, 0
             why = _why(known)
             out += [Halt(f"the registration is refused: {why}"), Tell("hold the fibre at the tissue: registering")]
 
@@ -266,7 +266,7 @@ class Workflow:
             self._not_found(view, stage, self._search, step, out)
 
     def _wait(self, view: Inputs, held: FloatArray | None, out: list[Action]) -> None:
-        """Say what is waited for, once it lasts."""
+        """Tell the operator what is missing, once the wait is long."""
         if view.now_s - self._waits_s < PATIENCE_S:
             return
         self._waits_s = view.now_s
@@ -291,9 +291,10 @@ class Workflow:
 
     def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
         self._search, self._done_at, self._waits_s = None, search.held, now_s
-        looks = tuple(look for look in search.kept(found, self._model) if look.marker is not None)
+        looks = tuple(look for look in search.best_looks(found, self._model) if look.marker is not None)
         if not looks:
-            why = next((look.unpaired for look in search.looks if look.unpaired), "the looks were off the window")
+            off_window = "the looks were outside the sensitivity window"
+            why = next((look.unpaired for look in search.looks if look.unpaired), off_window)
             out.append(Tell(f"the PM was heard, but cannot be paired ({why}): go on to the next spot", done=True))
             return
         out.append(TakePairs(self._next_pm, looks))
@@ -312,7 +313,7 @@ class Workflow:
         out.append(Tell(f"{why.reason}: go on to the next spot", done=True))
 
     def _slipped(self, view: Inputs, search: PmSearch) -> str | None:
-        """Why a search is over; None where it goes on."""
+        """Why a search has to end; None if it goes on."""
         newest = view.poses.newest()
         if newest is None or view.now_s - newest.t_s > 1.0:
             return "the marker is not seen"
@@ -322,7 +323,7 @@ class Workflow:
         return None
 
     def _is_another(self, held: FloatArray) -> bool:
-        """Whether the fibre is held elsewhere than where the last PM was taken."""
+        """Whether the fibre is far enough from where the last PM was taken."""
         if self._done_at is None:
             return True
         return moved_mm(held, self._done_at) > ANOTHER_MM or turned_rad(held, self._done_at) > ANOTHER_RAD
@@ -339,7 +340,7 @@ class Workflow:
             out.append(Follow(plane, answer.sigma_rad, newest.t_s, reason))
         held = held_pose(view.poses, view.now_s)
         if held is None or abs(stage.scan_rad - plane) > CHECK_RAD:
-            self._deaf = 0
+            self._unheard = 0
             return
         self._checks = view.now_s - self._checked_s > CHECK_S
         for pulse in view.heard:
@@ -347,13 +348,13 @@ class Workflow:
                 continue
             self._checked_s = view.now_s
             loud = pulse.amplitude is not None and pulse.amplitude >= self._settings.hearing_threshold
-            self._deaf = 0 if loud else self._deaf + 1
+            self._unheard = 0 if loud else self._unheard + 1
             if loud and pulse.marker is not None and self._is_another(held):
                 self._done_at = held
                 out.append(TakePairs(self._next_pm, (pulse,)))
                 self._next_pm += 1
                 self._pms += 1
-        if self._deaf == DEAF:
+        if self._unheard == UNHEARD:
             out.append(Tell("the PM is not heard where the registration expects it: has the camera moved?"))
 
 
