@@ -5,10 +5,11 @@ from __future__ import annotations
 import ast
 import importlib.util
 import inspect
+import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import assert_type
+from typing import Any, assert_type
 
 import pytest
 
@@ -84,3 +85,25 @@ def test_measurements_are_solved_as_in_their_session(pose_session: Path) -> None
     assert theirs is not None
     assert ours.worst_mm == pytest.approx(theirs.worst_mm, rel=1e-6)
     assert [track.stage_rad for track in estimate.tracks] == [track.stage_rad for track in report.estimate.tracks]
+
+
+def test_the_readme_s_python_runs_with_public_names_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    program = "\n".join(part.split("```")[0] for part in text.split("```python\n")[1:])
+    tree = ast.parse(program)
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    assert [ast.unparse(node) for node in imports] == ["import fgreg"]
+    used = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
+    assert {node.attr for node in used if ast.unparse(node.value) == "fgreg"} <= {*fgreg.__all__}
+
+    shutil.copytree(CHECKOUT / "sessions" / "paper", tmp_path / "sessions" / "paper")
+    (tmp_path / "my-session").mkdir()
+    shutil.copy(CHECKOUT / "sessions" / "paper" / "session.yaml", tmp_path / "my-session")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(compile(tree, "README.md", "exec"), names)
+    solved, online = names["report"].estimate, names["now"]
+    assert solved.verdict is not fgreg.Verdict.REFUSED
+    assert online.trus_T_camera == pytest.approx(solved.epochs[0].trus_T_camera, abs=0.5)
+    assert names["answer"].stage_rad is None
+    assert len((tmp_path / "my-session" / "events.jsonl").read_text(encoding="utf-8").splitlines()) == 2

@@ -21,6 +21,7 @@ import fgreg
 assert pathlib.Path(fgreg.__file__).is_relative_to(sys.prefix), fgreg.__file__
 for name in ("factors", "drivers", "tests", "tools", "sessions"):
     assert importlib.util.find_spec(name) is None, f"top-level package {name}"
+fgreg.solve, fgreg.LiveSession
 import fgreg.factors.point_on_line, fgreg.detection.frame_files
 import fgreg.drivers.base, fgreg.drivers.thorlabs_stage, fgreg.stage.client, fgreg.search.planner
 """
