@@ -2,7 +2,7 @@
 
 Native calls of the estimate's updates hold their interpreter's lock, so a thread beside them waits. A client of this
 server waits for one round trip over a local socket. A camera loop that is a process of its own needs no server: it
-holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.track` itself.
+holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.query.track` itself.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class QueryClient:
         return self._age_s
 
     def track(self, query: Track) -> TrackEstimate:
-        """The answer to a query, as of :func:`fgreg.tracking.track`.
+        """The answer to a query, as of :func:`fgreg.tracking.query.track`.
 
         Raises:
             QueryError: the server could not work on it. EOFError, OSError: the server is gone.

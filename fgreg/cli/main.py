@@ -1,4 +1,4 @@
-"""The command line: ``fgreg solve``, ``check``, ``simulate``; others are in fgreg.cli_*.
+"""The command line: ``fgreg solve``, ``check``, ``simulate``; the other commands have modules of their own.
 
 Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
 starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command

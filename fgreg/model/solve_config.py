@@ -13,6 +13,7 @@ class SolveConfig:
     """Settings of the estimate and of its verdict, which is refused beyond twice ``limit_mm``.
 
     Attributes:
+        limit_mm: predicted 95 % error at the worst target up to which the verdict is ``ok``.
         second_minimum_chi2: two minima whose costs differ by less cannot be told apart (99 % of chi square, 2 dof).
         min_pairs: below, the registration counts as open unless the session gives an initial one.
         refuse_beam_spread_rad, warn_beam_spread_rad: root mean square angle of the beams about their mean direction.
