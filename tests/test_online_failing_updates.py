@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import fgreg.online.engine as engine_module
+import fgreg.online.reported_estimate as report_module
 import fgreg.smoother.isam_window as window_module
 import fgreg.smoother.marginal_prior as prior_module
 import fgreg.smoother.updates as updates_module
@@ -90,7 +91,7 @@ FAILURES: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "ISAM2 throws": lambda patch: patch.setattr(gtsam.ISAM2, "update", _raise(RuntimeError("an invalid key"))),
     "the joint covariance is not finite": lambda patch: patch.setattr(window_module, "finite", lambda _: False),
     "the predicted error is not finite": lambda patch: patch.setattr(
-        engine_module, "gaussian_tre", _raise(FloatingPointError("overflow"))
+        report_module, "gaussian_tre", _raise(FloatingPointError("overflow"))
     ),
     "the innovation raises": lambda patch: patch.setattr(
         updates_module, "innovation", _raise(np.linalg.LinAlgError("not positive definite"))
@@ -190,7 +191,7 @@ def test_a_failing_full_solve_leaves_the_incremental_estimate_and_says_so(
             case "its registration raises":
                 patch.setattr(engine_module, "initialised", _raise(RuntimeError("a defect")))
             case _:
-                patch.setattr(engine_module, "gaussian_tre", second_call)
+                patch.setattr(report_module, "gaussian_tre", second_call)
         estimate = engine.add(measurements.pairs[8])
     assert estimate.trus_T_camera is not None
     assert estimate.pairs == len(engine.state.shots) == 9

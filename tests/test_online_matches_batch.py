@@ -12,10 +12,11 @@ from fgreg.geometry.transforms import as_float_array
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online.engine import NOT_SOLVED, OnlineRegistration, is_due
+from fgreg.online.engine import OnlineRegistration, is_due
 from fgreg.online.estimate import gaussian_quantile_mm, gaussian_tre
 from fgreg.online.events import CameraMoved
 from fgreg.online.full_solve import FullSolveCase, result_of
+from fgreg.online.reported_estimate import NOT_SOLVED
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
 from fgreg.smoother.isam_window import free_number

@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
 
-import gtsam
 import numpy as np
 
 from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase, find_camera_move
@@ -30,25 +29,23 @@ from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
-from fgreg.online.estimate import OnlineEstimate, gaussian_tre
+from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.event_checks import check
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
+from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.register import EpochSearch, Minimum, SoundSpeedPrior
 from fgreg.registration.solve import Solution, solve
-from fgreg.registration.verdict import accuracy
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
-from fgreg.smoother.shared_variables import POSE, Quadratic
+from fgreg.smoother.shared_variables import Quadratic
 from fgreg.smoother.state import Epoch, State, looks_by_pm, make_setting
 from fgreg.smoother.updates import FIRST_PAIRS, with_aim, with_motion, with_move, with_pair
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
-NOT_SOLVED = "this camera epoch has not been through the full solve yet: take the estimate as preliminary"
-NO_REGISTRATION = "no registration of this camera epoch"
 LEAST_PMS = 3
 """Smallest number of PMs with which an epoch is registered."""
 FIRST_PMS = 8
@@ -515,7 +512,9 @@ class OnlineRegistration:
 
     def _estimated(self, state: State, t: float) -> OnlineEstimate:
         """The estimate of a state, with the full solve's report of its epoch, and detected camera moves."""
-        estimate = self._reported(state, t)
+        report = self._report if self._report is not None and self._report.epoch == state.epoch else None
+        settled = report is not None and report.serial == self._serial and state is self._state
+        estimate = reported(state, t, report, self._model, self._config, settled=settled)
         known = [self._noticed.get(state.epoch, "")]
         if self._solver.failure:
             known.append(f"the full solve failed: {self._solver.failure}: its earlier result may be out of date")
@@ -526,45 +525,3 @@ class OnlineRegistration:
             return estimate
         verdict = max(estimate.verdict, Verdict.WARNING, key=lambda v: v.severity)
         return replace(estimate, verdict=verdict, reasons=(*texts, *estimate.reasons))
-
-    def _reported(self, state: State, t: float) -> OnlineEstimate:
-        report = self._report
-        if report is not None and report.epoch != state.epoch:
-            report = None
-        active = state.active_window
-        optimum = None if active is None else active.state.trus_T_camera()[0]
-        count = state.epoch_pairs if active is None else sum(shot.inlier for shot in state.current)
-        if report is not None and report.serial == self._serial and state is self._state:
-            return OnlineEstimate(
-                t, state.epoch, report.trus_T_camera, report.covariance, report.predicted_tre, state.nis, state.used,
-                report.verdict, report.reasons, report.pairs, optimum, True,
-            )  # fmt: skip
-        if active is None or optimum is None:
-            reason = f"{NO_REGISTRATION}: {state.why_none}"
-            return OnlineEstimate(
-                t, state.epoch, None, None, None, state.nis, state.used, Verdict.REFUSED, (reason,), count, None, False
-            )
-        covariance = active.covariance[POSE, POSE]
-        pose = optimum
-        verdict: Verdict = Verdict.WARNING
-        reasons: tuple[str, ...] = (NOT_SOLVED,)
-        if state.is_open:
-            verdict, reasons = (
-                Verdict.REFUSED,
-                ("two registrations explain these pairs equally well: take more", *reasons),
-            )
-        if report is not None:
-            covariance, shift = report.applied(covariance)
-            if np.any(shift):
-                pose = optimum @ gtsam.Pose3.Expmap(shift).matrix()
-            verdict, reasons = report.verdict, report.reasons
-        tre = gaussian_tre(covariance, pose, self._model.targets_mm)
-        if not (math.isfinite(tre.worst_mm) and np.isfinite(pose).all()):
-            raise ArithmeticError("the reported registration is not finite")
-        for condition in accuracy(tre, self._config):
-            if condition.verdict.severity > verdict.severity or report is None:
-                verdict = max(verdict, condition.verdict, key=lambda v: v.severity)
-                reasons = (*reasons, condition.text)
-        return OnlineEstimate(
-            t, state.epoch, pose, covariance, tre, state.nis, state.used, verdict, reasons, count, optimum, False
-        )
