@@ -1,1 +1,1 @@
-"""The one graph, twice: explicit over GTSAM (the reference), and reduced to the shared variables (the fast path)."""
+"""The graph in two forms: explicit in GTSAM (the reference), and reduced to the shared variables (the fast path)."""

@@ -1,4 +1,4 @@
-"""Where each shared variable sits in a vector of all of them."""
+"""Places of the shared variables in a vector of all of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Where each shared variable sits in the vector of shared perturbations; an absent one is None.
+    """Places of the shared variables in the vector of their perturbations; None for an absent one.
 
     Order: 6 per epoch (rotation rad, translation mm; right tangent), beam chart 4, window edge 1, then the optional
     marker bias 3, sound speed ratio 1, probe radius 1.
@@ -29,7 +29,7 @@ class Columns:
 
 
 def make_columns(epochs: int, *, bias: bool, sound_speed: bool, radius: bool) -> Columns:
-    """Lay out the shared variables."""
+    """The columns for a number of epochs, with the optional variables that are asked for."""
     size = 6 * epochs + 5
     bias_at = size if bias else None
     size += 3 * bias

@@ -1,9 +1,9 @@
-"""Gaussian sites that stand for the windows' shapes: expectation propagation (Minka, 2001) on the reduced problem.
+"""Gaussian sites for the sensitivity windows: expectation propagation (Minka, 2001) on the reduced problem.
 
-A Gaussian as wide as the window treats a PM at its edge like one at its middle. Here each look's stand-in is chosen so
-that, together with all the rest of the session (its *cavity*), it has the mean and variance that the interval itself
-would give. The optimum with such sites is close to the posterior's mean, and its inverse Hessian to the posterior's
-covariance, where the optimum of the intervals themselves would be anywhere on a plateau.
+A Gaussian as wide as the window is a poor approximation for a PM near the window's edge. Here each look has a Gaussian
+site. Together with all the rest of the session (its *cavity*) it has the mean and variance that the interval itself
+would give. The optimum with such sites is close to the posterior mean, and its inverse Hessian to the posterior's
+covariance. The optimum of the intervals themselves would be undetermined, anywhere on a plateau.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from fgreg.graph.window_likelihood import LEAST_PRECISION
 from fgreg.model.sensitivity import interval_moments, log_interval
 
 ROUNDS, FEW_ROUNDS = 30, 12
-"""Sites that are not settled after so many rounds are given up; those of a session that settle do so in six or so."""
+"""Rounds after which sites that have not converged are dropped; usually they converge in about six."""
 SETTLED = 0.02
-"""Sites have settled when no rotation, nor its standard deviation, moves by more than this share of the latter."""
+"""Sites have converged when no rotation, nor its standard deviation, changes by more than this share of the latter."""
 DAMPING = 0.8
-"""Share of a site's change that is made at once."""
+"""Share of a site's change that is applied in one round."""
 FARTHEST_SIGMA = 100.0
-"""Sites that ask for an optimum farther away than this are fitted to nothing: where they settle it is a few."""
+"""Longest Gauss-Newton step, in sigmas, after which sites are fitted; where they converge it is a few."""
 UPHILL = 1.0
-"""A step may raise the cost (half a chi square) by so much: what it obeys is the last round's sites, and linear points.
-Shortened for less, it would seem to have settled where it only crept."""
+"""Largest rise of the cost (half a chi square) by a step: the step follows the last round's sites and linearisation.
+If it were shortened for less, the sites would seem to have converged while the steps are only short."""
 HALVINGS = 6
-"""So often a step is halved before the sites are given up."""
+"""Number of times that a step is halved before the sites are dropped."""
 LEAST_SITE = 1e-3
-"""Precision of a site that says nothing, rad^-2."""
+"""Precision of a site without information, rad^-2."""
 
 
 def with_sites(problem: PackedProblem, centre_rad: FloatArray, precision: FloatArray) -> PackedProblem:
-    """The problem with other Gaussian stand-ins of its looks' rotations, (L,) and (L,) rad^-2."""
+    """The problem with other Gaussian sites of its looks' rotations: centres (L,) rad, precisions (L,) rad^-2."""
     weight = problem.looks.weight.copy()
     weight[:, 2, 2] = precision
     return replace(problem, looks=replace(problem.looks, weight=weight, centre_rad=centre_rad))
 
 
 def propagate(problem: PackedProblem, optimum: Optimum) -> tuple[PackedProblem, Optimum] | None:
-    """Sites for the windows' shapes, and the optimum with them; None where they do not settle.
+    """Sites for the windows' shapes, and the optimum with them; None where they do not converge.
 
     Args:
         problem: with shapes, and the Gaussian priors as first sites.
@@ -70,11 +70,11 @@ def settle(
     damping: float = DAMPING,
     rounds: int = ROUNDS,
 ) -> tuple[PackedProblem, SharedState, Evaluation] | None:
-    """Sites for the windows' shapes, and where they settled: near their optimum; None where they do not settle.
+    """Sites for the windows' shapes, and the state where they converged, near their optimum; None where they do not.
 
     Args:
         problem: with the Gaussian priors as first sites, which stay where it has no shapes.
-        state: to start from, one hypothesis. at: the problem there.
+        state: start, one hypothesis. at: the problem evaluated there.
         settled, damping, rounds: in place of ``SETTLED``, ``DAMPING`` and ``ROUNDS``.
     """
     if not len(problem.look_pm):
@@ -98,7 +98,7 @@ def settle(
             centre = pull / precision
             problem = with_sites(problem, centre, precision)
             at = evaluate(problem, state, at.private)
-        # One Gauss-Newton step with the sites as they are now; they are refitted before the next.
+        # One Gauss-Newton step with the current sites; they are fitted again before the next step.
         stepped = _step(problem, state, at)
         if stepped is None:
             return None
@@ -107,9 +107,9 @@ def settle(
 
 
 def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[SharedState, Evaluation] | None:
-    """One Gauss-Newton step, shortened until it leads up no more; None where it does, or leads anywhere.
+    """One Gauss-Newton step, halved until the cost does not rise; None where it always rises or is not finite.
 
-    Among few pairs the whole step can end far off; sites that are fitted there lead on, to numbers without meaning.
+    Among few pairs the full step can end far off, and sites that are fitted there diverge.
     """
     step = -np.linalg.solve(at.hessian[0], at.gradient[0])
     if not -(step @ at.gradient[0]) <= FARTHEST_SIGMA**2:
@@ -138,7 +138,7 @@ def inverse_hessian(hessian: FloatArray) -> FloatArray | None:
 def _look_marginals(
     problem: PackedProblem, state: SharedState, at: Evaluation, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and variance (L,) of ``rotation - edge_gain * window_edge``, all else integrated out."""
+    """Mean and variance (L,) of ``rotation - edge_gain * window_edge``, all other variables marginalised."""
     look = look_block(problem, state, at.private.trus_p_pm[:, problem.look_pm])
     by_point = look.by_point[0, :, 2]
     by_shared = look.by_shared[0, :, 2] + np.einsum("lp,lpd->ld", by_point, at.point_gain[0][problem.look_pm])
@@ -155,12 +155,12 @@ def _new_sites(
     centre: FloatArray,
     precision: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Sites (centre, precision) that give each look the moments that its interval gives."""
+    """Sites (centre, precision) with which each look has the moments of its interval."""
     q = np.maximum(1.0 / variance - precision, LEAST_PRECISION)
     cavity = (mean / variance - precision * centre) / q
     windows = shapes.windows
-    # The half width's error moves a first hit's interval as a whole, which the site follows by its gain; of a window
-    # known as a whole it moves the ends apart, which counts as softness here.
+    # The half width's error shifts a first hit's interval, which the site follows by its gain. In the window-only case
+    # it moves the two ends apart, which is added to the softness here.
     edge = problem.columns.edge
     held = problem.prior_information[edge] + (0.0 if problem.anchor is None else problem.anchor.information[edge, edge])
     edge_variance = 1.0 / held
@@ -177,7 +177,7 @@ def _new_sites(
             first = float(weight @ d)
             second = float(weight @ (d - first) ** 2)
             slope[look], curvature[look] = q[look] * first, q[look] - q[look] ** 2 * second
-    left = np.maximum(1.0 - curvature / q, 1e-6)  # what share of the cavity's variance is left
+    left = np.maximum(1.0 - curvature / q, 1e-6)  # share of the cavity's variance that remains
     site = np.maximum(curvature / left, LEAST_SITE)
     # site * centre = (slope + cavity * curvature) / left
     return np.where(site > LEAST_SITE, (slope + cavity * curvature) / left / site, cavity + slope / site), site

@@ -1,13 +1,13 @@
 """The explicit graph of a session: the variables and factors of docs/model.md, sections 3 and 4.
 
-This is the reference. The reduced problem, with everything private eliminated in closed form, has to reach the same
-optimum and is what bulk work uses. Solving is in
-gtsam_solver.py, starting values and reading back in gtsam_values.py.
+This is the reference. The reduced problem, with the private variables eliminated in closed form, has to reach the same
+optimum; it is used where speed matters. Solving is in gtsam_solver.py, starting values and reading back in
+gtsam_values.py.
 
 Shots: a *shot* is one marker observation of one spot. Aims come first, one shot each; then the pairs' shots, one per PM
-and marker observation: looks at a PM that share an observation share the shot (its pose counts once), looks with
-observations of their own have shots of their own. All shots and looks of a PM share its point. A pair not to be used
-is left out of the measurements by the caller.
+and marker observation. Looks at a PM that share an observation share the shot (its pose counts once); looks with
+observations of their own have shots of their own. All shots and looks of a PM share its point. The caller leaves
+outliers out of the measurements.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class AimKeys:
 
 @dataclass(frozen=True, slots=True)
 class ShotKeys:
-    """The private variables of one shot at a PM, and the first of the pairs that it serves."""
+    """The private variables of one shot at a PM, and the first of the pairs that share it."""
 
     camera_T_marker: int
     lam: int
@@ -78,7 +78,7 @@ class ShotKeys:
 
 @dataclass(frozen=True, slots=True)
 class GraphKeys:
-    """Where each variable of a session is found.
+    """Keys of a session's variables.
 
     Attributes:
         trus_T_camera: one per epoch.
@@ -104,7 +104,7 @@ class GraphKeys:
 
     @property
     def shared(self) -> tuple[int, ...]:
-        """The shared variables: ``trus_T_camera`` per epoch, ``marker_laser``, then those there are of the others."""
+        """The shared variables: ``trus_T_camera`` per epoch, ``marker_laser``, then the others that exist."""
         others = (self.window_edge, self.marker_bias, self.sound_speed_ratio)
         return (*self.trus_T_camera, self.marker_laser, *(key for key in others if key is not None))
 
@@ -120,22 +120,22 @@ class GraphKeys:
 
     @property
     def private(self) -> tuple[int, ...]:
-        """All others, in the order in which they are eliminated: points, distances and angles, marker poses."""
+        """All private variables in elimination order: points, distances and angles, marker poses."""
         points = (*(aim.camera_p_spot for aim in self.aims), *self.trus_p_pm.values())
         return (*points, *self.lam, *self.theta, *self.camera_T_marker)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphOptions:
-    """What the graph is to hold beside the measurements.
+    """Options of the graph, in addition to the measurements.
 
     Attributes:
         marker_T_nominal: (4, 4) fixed frame of the beam's chart; None: the session's initial ``marker_T_laser``, else
             the marker's own frame. The beam has to be within some 60 deg of its z axis.
         sound_speed_sigma: prior sigma of ``sound_speed_ratio``, None where it is not a variable.
         sound_speed_mean: its prior mean.
-        unknown_motion_sigma: sigmas (rad, mm) of a camera motion of which nothing is known, about no motion: too wide
-            to matter where there are pairs, and keeps an epoch without any from being singular. None: no factor.
+        unknown_motion_sigma: sigmas (rad, mm) of an unknown camera motion, about no motion. They are too wide to matter
+            where there are pairs, and keep an epoch without pairs from being singular. None: no factor.
     """
 
     marker_T_nominal: FloatArray | None = None
@@ -148,7 +148,7 @@ class GraphOptions:
 class ExplicitGraph:
     """The graph of a session, its keys, and an elimination order: private variables first, shared ones last.
 
-    ``shared`` and ``private`` are the keys that some factor touches, in that order.
+    ``shared`` and ``private`` are the keys that some factor uses, in that order.
     """
 
     graph: gtsam.NonlinearFactorGraph
@@ -185,7 +185,7 @@ def _make_keys(measurements: Measurements, *, edge: bool, bias: bool, sound_spee
     for index, pair in enumerate(measurements.pairs):
         if not 0 <= pair.epoch < len(measurements.epochs):
             raise EstimationError(f"pair {index} is in epoch {pair.epoch}, of {len(measurements.epochs)}")
-        # A PM's number may be anything; its variable's index counts the PMs as they come.
+        # A PM may have any number; the index of its variable counts the PMs in order of their first looks.
         point = points.setdefault(pair.pm, Variable.trus_p_pm.key(len(points)))
         place = places.setdefault((pair.pm, pair.marker.id), len(shots))
         if place == len(shots):
@@ -216,12 +216,12 @@ def build_graph(
     first hit depends on it.
 
     Args:
-        measurements: what to use; unused pairs left out.
+        measurements: inliers only.
         session: probe, stage step and noise.
-        options: the defaults of :class:`GraphOptions` where absent.
+        options: the defaults of :class:`GraphOptions` where None.
 
     Raises:
-        EstimationError: a pair in an epoch that is not there.
+        EstimationError: a pair in an epoch that does not exist.
     """
     options = options or GraphOptions()
     nominal = options.marker_T_nominal

@@ -3,8 +3,8 @@
 The loop is our own, over ``graph.linearize(values)`` with values that Python holds: inside GTSAM's optimizers each
 callback of a Python factor copies all values, which makes one linearisation quadratic in the number of pairs.
 
-Elimination is by QR: GTSAM's Cholesky calls a variable undetermined as soon as the last two diagonal entries of its
-factor differ by 2^12, which coincidences at 1e-3 mm beside noise of some tenths do in sound problems. QR takes some 1.6
+Elimination is by QR. GTSAM's Cholesky calls a variable undetermined when the last two diagonal entries of its factor
+differ by 2^12; constraints of 1e-3 mm next to noise of some tenths do that in well-posed problems. QR takes about 1.6
 times as long.
 
 Costs are GTSAM's, half the chi square.
@@ -30,11 +30,11 @@ _SCALE: dict[Variable, tuple[float, ...]] = {
     Variable.lam: (10.0,),
     Variable.theta: (0.1,),
 }
-"""What counts as a step of one, where the damping is one: rad and mm. The others are held by their own priors."""
+"""Scale of a step under a damping of one, in rad and mm. The other variables have priors of their own."""
 
 
 class GraphOptimum(NamedTuple):
-    """Result of :func:`optimize`: values, cost (half the chi square), linearisations made, and whether it converged."""
+    """Result of :func:`optimize`: values, cost (half the chi square), linearisations, whether it converged."""
 
     values: gtsam.Values
     cost: float
@@ -89,14 +89,14 @@ def optimize(
 ) -> GraphOptimum:
     """Levenberg-Marquardt from starting values.
 
-    A step is tried as it is, and where that does not pay as its linear model says, with points and angles made
-    consistent again (:func:`fgreg.graph.gtsam_values.made_consistent`); the better of the two counts.
+    A step is tried as it is. Where the cost falls by less than its linear model predicts, it is also tried with points
+    and angles made consistent again (:func:`fgreg.graph.gtsam_values.made_consistent`); the better one is taken.
 
     Args:
         explicit: the graph.
-        values: where to start; not changed.
-        max_iterations: linearisations.
-        tolerance: converged when a step promises less than this share of 1 + cost.
+        values: start; not changed.
+        max_iterations: largest number of linearisations.
+        tolerance: converged when the predicted decrease of a step is less than this share of 1 + cost.
 
     Raises:
         FactorError: the start itself has a factor that cannot be computed.
@@ -136,7 +136,7 @@ def optimize(
 
 
 def newton_step(explicit: ExplicitGraph, values: gtsam.Values) -> gtsam.VectorValues | None:
-    """The Gauss-Newton step of all variables from some values: zero at an optimum. None where it is undetermined.
+    """The Gauss-Newton step of all variables at some values: zero at an optimum; None where it is undetermined.
 
     Raises:
         FactorError: a factor cannot be computed there.

@@ -1,4 +1,4 @@
-"""Values of the explicit graph: where to start from, how to make them consistent, how to read them back.
+"""Values of the explicit graph: starting values, making them consistent, reading them back.
 
 Millimetres, radians. The distance ``lam`` is counted from where the beam crosses the nominal frame's xy plane (the
 chart's origin), along the unit direction.
@@ -22,7 +22,8 @@ from fgreg.model.session_model import SessionModel
 
 _START_SIGMA_MM = 1.0
 _START_SPAN, _START_STEPS = 3.0, 61
-"""A start weighs misses of the beam by the first, and tries arc angles up to so many sigmas off what is expected."""
+"""A start weights the distance of beam and arc by the first, and tries arc angles up to the second (in sigmas) from
+their expected value; number of tried angles."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +47,7 @@ class SharedValues:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphEstimate:
-    """What the graph's variables are; tuples of aims and pairs are in the order of the measurements.
+    """Values of the graph's variables; tuples of aims and pairs are in the order of the measurements.
 
     Attributes:
         shared: the shared variables.
@@ -74,7 +75,7 @@ def laser_chart(marker_T_laser: FloatArray, marker_T_nominal: FloatArray) -> tup
         marker_T_nominal: (4, 4), its z axis within 90 deg of the beam.
 
     Returns:
-        (x, y, a, b) (4,), and what to add to distances from the laser frame's origin to have them from the chart's.
+        (x, y, a, b) (4,), and what to add to a distance from the laser frame's origin to get it from the chart's.
 
     Raises:
         ValueError: the beam does not point along the nominal z axis.
@@ -117,7 +118,7 @@ def _meeting_point(
     session: SessionModel,
     shared: SharedValues,
 ) -> FloatArray:
-    """Midway between a line and a look's arc where they pass, at an arc angle that the look's prior can live with."""
+    """The point midway between a line and a look's arc, at the arc angle where distance and prior together fit best."""
     z = np.linspace(-_START_SPAN, _START_SPAN, _START_STEPS)
     rotation = prior.centre_rad + prior.edge_gain * shared.window_edge_rad + z * prior.sigma_rad
     reach = shared.sound_speed_ratio * look.range_mm
@@ -135,7 +136,7 @@ class PrivateValues:
     Attributes:
         aim_camera_T_marker: (A, 4, 4). camera_p_spot_mm: (A, 3).
         camera_T_marker: (B, 4, 4) of the shots of pairs, in the order of the graph's keys.
-        trus_p_pm_mm: (J, 3), in the order in which the PMs first come.
+        trus_p_pm_mm: (J, 3), in the order of the PMs' first looks.
     """
 
     aim_camera_T_marker: FloatArray
@@ -193,8 +194,8 @@ def values_at(explicit: ExplicitGraph, shared: SharedValues, private: PrivateVal
 def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Values:
     """Starting values from a state of the shared variables.
 
-    Marker poses are at their observations (less the bias), spots at theirs, each PM midway between its beams and arcs
-    (the mean over its looks); distances and arc angles follow from the points.
+    Marker poses (less the bias) and spots are at their observations. Each PM is midway between its beams and arcs (mean
+    over its looks). Distances and arc angles follow from the points.
 
     Raises:
         ValueError: another number of registrations than epochs.
@@ -226,7 +227,7 @@ def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Value
 def bearing_from_element(trus_p: FloatArray, look: Look, radius_mm: float) -> float:
     """Arc angle theta' (rad) of a point (3,), seen from the element at a look's stage angle.
 
-    On the branch within half a turn of the stage angle.
+    The branch is that within half a turn of the stage angle.
     """
     dy = float(trus_p[1]) - radius_mm * math.sin(look.scan_rad)
     dz = float(trus_p[2]) - radius_mm * math.cos(look.scan_rad)
@@ -234,12 +235,12 @@ def bearing_from_element(trus_p: FloatArray, look: Look, radius_mm: float) -> fl
 
 
 def made_consistent(explicit: ExplicitGraph, values: gtsam.Values) -> gtsam.Values:
-    """The values with what coincides by definition made to coincide exactly.
+    """The values with points that coincide by definition made to coincide exactly.
 
-    Points go onto the beam of their (first) shot at its distance, arc angles to where the points are seen, and the
-    markers of a PM's further shots shift to where their beams meet it. A straight step from a consistent state is off
-    by the curvature of all this, a few tenths of a millimetre that sigmas of 1e-3 mm take for hundreds of sigmas; with
-    it put right, the solver can take steps of a sensible size.
+    Points are moved onto the beam of their (first) shot at its distance, and arc angles to the points' bearings. The
+    markers of a PM's further shots are shifted so that their beams meet it. After a straight step the curvature leaves
+    a few tenths of a millimetre, which is hundreds of sigmas of 1e-3 mm. With this correction the solver can take steps
+    of a useful size.
     """
     keys, nominal = explicit.keys, explicit.marker_T_nominal.tolist()
     out = gtsam.Values(values)
@@ -289,7 +290,7 @@ def _beam_miss(
 
 
 def read_shared(explicit: ExplicitGraph, values: gtsam.Values, default: SharedValues) -> SharedValues:
-    """The shared variables; what no factor touches, or is no variable, is taken from ``default``."""
+    """The shared variables; those that no factor uses, or that are not variables, are taken from ``default``."""
     keys = explicit.keys
     return SharedValues(
         trus_T_camera=tuple(

@@ -1,7 +1,7 @@
-"""Measurements as flat arrays: what the reduced problem works on.
+"""Measurements as flat arrays, for the reduced problem.
 
-A *beam* is one marker observation of one PM (looks of one PM that share an observation share the beam), a *look* one
-hearing of a PM. Marker covariances are turned to the camera's axes about the marker's origin, where the reduced
+A *beam* is one marker observation of one PM (looks of one PM that share an observation share the beam). A *look* is one
+hearing of a PM. Marker covariances are rotated to the camera's axes about the marker's origin, where the reduced
 problem perturbs the pose by a twist (w, n): the right tangent of GTSAM's Pose3, in other axes.
 """
 
@@ -28,7 +28,7 @@ from fgreg.model.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_tab
 from fgreg.model.session_model import SensitivityModel, SessionModel
 
 LINE_SIGMA_MM = 1e-3
-"""Width of the beam itself: point on line is an equality; this keeps its covariance invertible (as in the factors)."""
+"""Sigma of point on line, which is an equality: it keeps the covariance invertible (as in the factors)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,13 +57,13 @@ class LookArrays:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationShapes:
-    """What looks say about the rotation, not made Gaussian: the density that the posterior is sampled from.
+    """Likelihoods of the looks' rotations in their own shape, not as Gaussians, for sampling the posterior.
 
     Attributes:
         windows: interval of each look.
         plane_rad: (J, G) plane angles at which each PM's amplitudes were compared with the sensitivity curve, or None.
         amplitude_log: (J, G) log likelihood of the amplitudes there, 0 at its best; zero for PMs without.
-        amplitude_look: (J,) the look that stands for the amplitudes of its PM, -1 for PMs without.
+        amplitude_look: (J,) the look to which the amplitudes of its PM are assigned, -1 for PMs without.
     """
 
     windows: WindowShapes
@@ -150,7 +150,7 @@ def pack(
     shapes: bool = False,
     amplitude_sigma: float = AMPLITUDE_SIGMA,
 ) -> PackedProblem:
-    """Lay measurements out as arrays.
+    """Pack measurements as arrays.
 
     Args:
         measurements: aims, pairs and epochs.
@@ -158,7 +158,7 @@ def pack(
         sound_speed_sigma: prior sigma of the sound speed ratio; None: not estimated.
         sound_speed_mean: its prior mean.
         radius_sigma_mm: prior sigma of the probe's radius; None: not estimated.
-        shapes: keep the windows' own shape, and the amplitudes, for the posterior beside the Gaussian priors.
+        shapes: keep the windows' own shapes, and the amplitudes, for the posterior, in addition to the Gaussian priors.
         amplitude_sigma: relative noise of amplitudes.
     """
     probe = model.probe
@@ -268,7 +268,7 @@ def _rotation_shapes(
         table = amplitude_table([looks[i] for i in mine], sensitivity, amplitude_sigma)
         plane.append(table.plane_rad)
         log.append(table.log_likelihood)
-        # Best a look that knows only the window: its interval does not hang on the window's edge.
+        # A look that is no first hit is preferred: its interval does not depend on the window's edge.
         free = [i for i in mine if looks[i].sweep == 0] or mine
         look_of.append(free[0] if table.used else -1)
     return RotationShapes(

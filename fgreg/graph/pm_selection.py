@@ -1,4 +1,4 @@
-"""Some of a packed problem's PMs, with what belongs to them."""
+"""Subsets of a packed problem's PMs."""
 
 from __future__ import annotations
 

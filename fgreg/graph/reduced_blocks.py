@@ -1,10 +1,11 @@
-"""Residuals of the reduced problem in blocks, and the private variables they are linearised at.
+"""Residuals of the reduced problem in blocks, and the private variables at which they are linearised.
 
-From outside shapes lead with S, the hypotheses side by side; in here it is the last dimension, (n, ..., S): arithmetic
-runs along it, and a marker's own matrices meet all hypotheses in one product.
+In public shapes S, the number of hypotheses, is the first dimension. In this module it is the last one, (n, ..., S), so
+that arithmetic runs along it, and a marker's matrix multiplies all hypotheses in one product.
 
-A beam is the line ``(x + z a, y + z b, z)`` of the chart's nominal frame. A point ``laser_p`` of that frame is off it
-by ``laser_p_xy - (x, y) - laser_p_z (a, b)``: two residuals, linear in the chart, their covariance from the marker's.
+A beam is the line ``(x + z a, y + z b, z)`` of the chart's nominal frame. The deviation of a point ``laser_p`` of that
+frame is ``laser_p_xy - (x, y) - laser_p_z (a, b)``: two residuals, linear in the chart. Their covariance follows from
+the marker's.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from fgreg.model.sensitivity import arc_of_rotation
 class PrivateState:
     """Estimates of the eliminated variables.
 
-    PMs (S, J, 3) in TRUS mm; marker errors (w, n) of beams (S, B, 6) and of aims (S, A, 6); what the aimed-at spots are
-    off their measured places, (S, A, 3) camera axes.
+    PMs (S, J, 3) in TRUS mm; marker errors (w, n) of beams (S, B, 6) and of aims (S, A, 6); errors of the aimed-at
+    spots' measured places, (S, A, 3) mm, camera axes.
     """
 
     trus_p_pm: FloatArray
@@ -50,7 +51,7 @@ def outer(values: FloatArray) -> FloatArray:
 
 
 def perpendicular_basis(direction: FloatArray) -> FloatArray:
-    """Two unit columns across each unit direction: (..., 3) -> (..., 3, 2) (Duff et al., 2017)."""
+    """Two unit columns perpendicular to each unit direction: (..., 3) -> (..., 3, 2) (Duff et al., 2017)."""
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)
@@ -159,12 +160,12 @@ class Chart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineBlock:
-    """Points against beams, with the markers' errors as they are estimated.
+    """Points against beams, at the estimated errors of the markers.
 
     Attributes:
         rows: (n, 4, 2, S) the residual (mm, the marker's error linearised at zero) and its derivative by the point,
             camera axes.
-        covariance: (n, 3, S): the entries 00, 01 and 11 of what the marker's pose leaves open, mm^2.
+        covariance: (n, 3, S): entries 00, 01 and 11 of the covariance from the marker's pose, mm^2.
         spread: (n, 6, 2, S) the marker's covariance times the derivative by its error.
         laser_p: (n, 3, S) the point in the chart's nominal frame, mm.
     """
@@ -259,7 +260,7 @@ class Whitening:
         return out
 
     def back(self, values: FloatArray) -> FloatArray:
-        """Whitened values (n, 2, S) as the inverse covariance would have made them of the plain ones."""
+        """From whitened values (n, 2, S) to the inverse covariance times the plain values."""
         second = values[:, 1] / self.second
         out = np.empty_like(values)
         out[:, 0], out[:, 1] = (values[:, 0] - self.below * second) / self.first, second
@@ -285,7 +286,7 @@ def look_block(problem: PackedProblem, state: SharedState, points: FloatArray) -
 
 
 def look_columns(problem: PackedProblem) -> list[int]:
-    """The shared variables that looks depend on beside their point: window edge, sound speed, radius."""
+    """The shared variables that looks depend on besides their point: window edge, sound speed, radius."""
     columns = problem.columns
     return [at for at in (columns.edge, columns.sound_speed, columns.radius) if at is not None]
 

@@ -1,18 +1,18 @@
-"""The graph with everything private eliminated in closed form, for many hypotheses at once.
+"""The graph with the private variables eliminated in closed form, for many hypotheses at once.
 
 Private to a PM are its point, lambda and theta' of each look, and the marker pose of each beam. Given the shared
 variables (registration, beam, window edge, ...) they enter through small blocks:
 
 - point on line, lambda free: two residuals across the beam, ``N' (trus_p_pm - beam)``. The marker pose's error
-  (w, n) has a Gaussian prior and enters linearly around its current estimate, so eliminating it leaves the same
-  residual, shifted, with covariance ``J Sigma J'`` (the update of an iterated Kalman filter). The estimate is
-  refreshed at every evaluation, so the fixed point is the optimum of the explicit graph, not of a linearised one.
+  (w, n) has a Gaussian prior and enters linearly around its current estimate. Eliminating it leaves the same residual,
+  shifted, with covariance ``J Sigma J'`` (the update of an iterated Kalman filter). The estimate is updated at every
+  evaluation, so the fixed point is the optimum of the explicit graph, not of a linearised one.
 - point on arc, theta' free, and the sensitivity prior: three residuals (x, range, rotation offset) in the point.
 - the point itself: a 3 x 3 Schur complement.
 
-What is left is a normal system on the shared variables, dense and small, built by vectorised numpy: linear in the
-number of pairs, and with a leading dimension S so that all starts (or posterior samples) go in one call. Costs are
-chi squares (twice the negative log of the density). Same optimum as fgreg.graph, which is the reference.
+The result is a small dense normal system on the shared variables, built by vectorised numpy. Its time is linear in the
+number of pairs, and a leading dimension S lets all starts (or posterior samples) be evaluated in one call. Costs are
+chi squares (twice the negative log of the density). The optimum is that of the reference, fgreg.graph.gtsam_graph.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class Evaluation:
         cost: (S,) chi square, private variables at their (linearised) optimum.
         gradient: (S, D), hessian: (S, D, D): of half the cost.
         private: private variables after this evaluation's refinement, at the *same* shared variables.
-        point_gain: (S, J, 3, D): how the PMs move with the shared variables.
+        point_gain: (S, J, 3, D): derivative of the PMs by the shared variables.
         point_covariance: (S, J, 3, 3): of the PMs given the shared variables.
-        pm_weight: (S, J), aim_weight: (S, A): with which they count. aim_cost: (S, A) chi square of each.
+        pm_weight: (S, J), aim_weight: (S, A): weights of the loss. aim_cost: (S, A) chi square of each aim.
         lambda_mm: (S, B). aim_lambda_mm: (S, A). look_residual: (S, L, 3) over (x mm, range mm, rotation rad).
         aim_residual: (S, A, 2) mm, along x and y of the beam chart's nominal frame.
     """
@@ -130,7 +130,7 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
         camera_p = np.concatenate([camera_p, problem.aim_spot_mm[..., None] + shift])
         markers, error = _joined(markers, problem.aims), np.concatenate([error, inner(private.aim_error)])
     block = line_block(markers, error, chart, camera_p)
-    # What the spot of an aim is off its measured place is eliminated like the marker's error.
+    # The error of an aim's measured spot is eliminated like the marker's error.
     by_spot = block.rows[count:, 1:]
     spot_spread = _times_each(problem.aim_spot_covariance, by_spot)
     if len(shift):
@@ -155,7 +155,7 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
     pm_cost = beams.sum(line_cost[:count]) + looks.sum(np.einsum("nks,nks->ns", look_residual, look_residual))
     pm_cost = pm_cost + np.einsum("nis,nis->ns", b_p, point_step)
 
-    # The private variables' optimum at these shared ones, as linearised here.
+    # Optimum of the private variables at these shared ones, as linearised here.
     updated = line[:, 0].copy()
     updated[:count] += np.einsum("niks,nis->nks", by_point, beams.spread(point_step))
     back = whitening.back(updated)
@@ -191,7 +191,7 @@ def _joined(first: BeamArrays, second: BeamArrays) -> BeamArrays:
 
 
 def _times_each(matrix: FloatArray, values: FloatArray) -> FloatArray:
-    """Products (n, i, ..., S) of matrices (n, i, j) with values (n, j, ..., S): the same one for all hypotheses."""
+    """Products (n, i, ..., S) of matrices (n, i, j), the same for all hypotheses, with values (n, j, ..., S)."""
     flat = values.reshape(*values.shape[:2], math.prod(values.shape[2:]))
     return np.asarray((matrix @ flat).reshape(len(matrix), matrix.shape[1], *values.shape[2:]))
 
@@ -215,7 +215,7 @@ def refine(problem: PackedProblem, state: SharedState, private: PrivateState) ->
 def private_at(problem: PackedProblem, state: SharedState) -> PrivateState:
     """The private variables at shared ones, from the arcs.
 
-    On the way from a far start a PM may end up on the far side of its arc, where it seems to fit.
+    From a far start a PM may converge to the far side of its arc, where it seems to fit; hence the start on the arcs.
     """
     private = initial_private(problem, state)
     for _ in range(3):
@@ -226,13 +226,13 @@ def private_at(problem: PackedProblem, state: SharedState) -> PrivateState:
 def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateState) -> FloatArray:
     """Log density (S,) of the shared variables, up to a constant.
 
-    Private variables: at their optimum, ``-cost / 2``. Not integrated out with flat priors, which would multiply the
-    density by the volume they are free in, and so by how steeply beams happen to cross arcs: as in straight line fits
-    with errors in both coordinates that estimate is inconsistent (Neyman and Scott, 1948; Kendall and Stuart, vol. 2,
-    ch. 29), the one with the private variables at their optimum is not. Where the problem keeps the windows' own
-    shapes, the PMs' rotations are integrated over them (fgreg.graph.window_likelihood). Where it doubts PMs, each is
-    either good,
-    or junk of the density given: the sum of both.
+    The private variables are at their optimum: ``-cost / 2``. They are not integrated out with flat priors. That would
+    multiply the density by the volume of the private variables, which depends on the angle between beams and arcs. As
+    in straight line fits with errors in both coordinates such an estimate is inconsistent (Neyman and Scott, 1948;
+    Kendall and Stuart, vol. 2, ch. 29); the one with the private variables at their optimum is not.
+
+    Where the problem keeps the windows' own shapes, the PMs' rotations are integrated over them
+    (fgreg.graph.window_likelihood). Where it has outlier densities, each PM is a mixture of inlier and outlier.
     """
     system = _system(problem, state, private)
     pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost.T
@@ -242,7 +242,7 @@ def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateSt
 
 
 def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> FloatArray:
-    """(S, J) log of what the windows' own shapes make of the Gaussian stand-ins' density of each PM."""
+    """(S, J) log ratio of each PM's density with the windows' own shapes to that with the Gaussian sites."""
     if problem.shapes is None:
         return np.zeros((state.count, len(problem.pms)))
     by_point = system.look_raw[:, 2, 1:4]
@@ -296,7 +296,7 @@ def _summed(groups: Groups, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contributions:
-    """What n parts add to the reduced problem: cost (S, n), gradient (S, n, D), hessian (S, n, D, D)."""
+    """Contributions of n parts to the reduced problem: cost (S, n), gradient (S, n, D), hessian (S, n, D, D)."""
 
     cost: FloatArray
     gradient: FloatArray
@@ -305,7 +305,7 @@ class Contributions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """The reduced problem at S hypotheses, taken apart: what each PM, each aim and the priors (n = 1) add.
+    """The reduced problem at S hypotheses in parts: contributions of each PM, each aim and the priors (n = 1).
 
     ``private`` and ``point_gain`` are as in :class:`Evaluation`.
     """
@@ -318,7 +318,7 @@ class Parts:
 
 
 def contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Parts:
-    """:func:`evaluate`, but not summed: the terms of the sum."""
+    """The terms whose sum is :func:`evaluate`."""
     size, pms = problem.columns.size, len(problem.beam_pm)
     system = _system(problem, state, private)
     by = _shared_derivatives(problem, state, system)
@@ -343,7 +343,7 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
 
 
 def pm_contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Contributions:
-    """What each PM adds, for a state of one hypothesis: cost (J,), gradient (J, D), hessian (J, D, D)."""
+    """Contributions of each PM, for a state of one hypothesis: cost (J,), gradient (J, D), hessian (J, D, D)."""
     parts = contributions(problem, state, private).pm
     return Contributions(parts.cost[0], parts.gradient[0], parts.hessian[0])
 
@@ -363,7 +363,7 @@ class Costs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weights:
-    """How a loss counts: weights of the PMs (S, J) and aims (S, A), and the cost (S,) as it is by that loss."""
+    """Result of a loss: weights of the PMs (S, J) and aims (S, A), and the cost (S,) under it."""
 
     pm: FloatArray
     aim: FloatArray
@@ -374,7 +374,7 @@ Loss = Callable[[Costs], Weights]
 
 
 def least_squares(costs: Costs) -> Weights:
-    """The loss under which everything counts in full."""
+    """The least squares loss: all weights are one."""
     total = costs.pm.sum(axis=1) + costs.aim.sum(axis=1) + costs.prior
     return Weights(np.ones_like(costs.pm), np.ones_like(costs.aim), total)
 
@@ -387,7 +387,7 @@ def evaluate(
     Args:
         problem: the packed measurements.
         state: S hypotheses.
-        private: where the private variables are linearised; refined once here (returned in ``private``).
+        private: linearisation point of the private variables; refined once here (returned in ``private``).
         loss: of each PM's and aim's chi square.
     """
     system = _system(problem, state, private)

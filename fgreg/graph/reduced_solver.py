@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on the reduced problem, many starts side by side."""
+"""Levenberg-Marquardt on the reduced problem, from many starts in parallel."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from fgreg.graph.reduced_graph import Evaluation, Loss, evaluate, least_squares,
 from fgreg.graph.shared_state import SharedState, step_between
 
 WEIGHT_FLOOR = 1e-12
-"""Curvature lent to shared variables that nothing observes (a registration without pairs): they stay where they are."""
+"""Curvature added to shared variables that no measurement observes (a registration without pairs): they do not move."""
 
 
 LONG_STEP = 0.1
-"""Newton decrement (chi square) above which the private variables are refined before a step is judged."""
+"""Newton decrement (chi square) above which the private variables are refined before a step is accepted or rejected."""
 STALLED = 1e-6
-"""Newton decrement (chi square) at which a step that gains nothing is the last: private variables lag by as much."""
+"""Newton decrement (chi square) at which a step without gain is the last: the private variables lag by as much."""
 CREEPING = 30.0
-"""At most so many times what one step promised is what all the steps after it may still gain."""
+"""Bound on the gain of all following steps, as a multiple of the gain that one step predicts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,19 +47,19 @@ def optimize(
     loss: Loss = least_squares,
     start: Evaluation | None = None,
 ) -> Optimum:
-    """Levenberg-Marquardt on the shared variables, all hypotheses side by side.
+    """Levenberg-Marquardt on the shared variables, all hypotheses in parallel.
 
     Args:
         problem: the packed measurements.
         state: S starts.
-        private: where to linearise the private variables first; from the arcs where None.
+        private: first linearisation point of the private variables; from the arcs where None.
         max_iterations: of the outer loop.
         tolerance: a hypothesis has converged when the Newton decrement (in chi square) falls below this; the default is
             a thousandth of a standard deviation.
-        keep_within: stop early on hypotheses whose cost exceeds the best converged one by more than this.
-        wanted: hypotheses whose cost will not come below this are left where they are.
-        loss: of each PM's and aim's chi square: iteratively reweighted least squares.
-        start: the evaluation at the starts, where that is known.
+        keep_within: hypotheses whose cost exceeds the best converged one by more than this are stopped.
+        wanted: hypotheses whose cost cannot fall below this are stopped.
+        loss: of each PM's and aim's chi square (iteratively reweighted least squares).
+        start: the evaluation at the starts, if there is one.
     """
     current = start
     if current is None:
@@ -102,7 +102,7 @@ def optimize(
 
 
 def distinct(problem: PackedProblem, state: SharedState, at: Evaluation) -> IntArray:
-    """Which hypotheses to go on with, best first: none that is within a standard deviation of a better one."""
+    """Indices of distinct hypotheses, best first: none is within a standard deviation of a better one."""
     left, chosen = np.argsort(at.cost), []
     while len(left):
         best = int(left[0])

@@ -1,13 +1,13 @@
-"""Odds that the PMs of one camera epoch are of two registrations, by split point and in closed form: screening.
+"""Screening for camera moves: odds that the PMs of one epoch have two registrations, by split point, in closed form.
 
-A split point is the first PM after an unreported camera move. Everything is Gaussian here, and each move small enough
-to be linear. Given all PMs, a move of prior covariance S at a split point has the Bayes factor, against none,
+A split point is the first PM after an unreported camera move. Here all densities are Gaussian, and moves are small
+enough to be linear. Given all PMs, a move of prior covariance S at a split point has the Bayes factor, against none,
 
     |1 + S F|^(-1/2) exp(h' (1 + S F)^(-1) S h / 2),
 
-F the information that the PMs from there on have on the move with the shared variables free, and h their pull. Neither
-side of the move has to know a registration by itself. The sum over all split points grows by one per PM on average
-while nothing happens, so it seldom passes a threshold (Shiryaev, 1963; Roberts, 1966).
+with F the information of the PMs from there on about the move, shared variables free, and h their gradient. Neither
+side of the move has to determine a registration by itself. Without a move the sum over all split points grows by one
+per PM on average, so it seldom exceeds a threshold (Shiryaev, 1963; Roberts, 1966).
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from fgreg.graph.reduced_graph import pm_contributions
 from fgreg.graph.reduced_solver import Optimum
 
 GATE = 2.5
-"""Log of that sum from which a move is possible and the full test (fgreg.camera_moves) is worth its time."""
+"""Log of that sum from which the full test (fgreg.camera_moves) runs."""
 ALARM = 5.4
-"""Log of that sum from which a move is certain: reached once in several thousand steady pairs (tools/study_moves.py),
-and never by one outlier."""
+"""Log of that sum from which a move is certain: reached once in several thousand pairs without a move
+(tools/study_moves.py), and never by one outlier."""
 
 _SIX = np.arange(6)
 
 
 def logsumexp(values: FloatArray, axis: int | None = None) -> FloatArray:
-    """Log of the sum of exponentials; as scipy's, without what that does for arrays of other kinds."""
+    """Log of the sum of exponentials, as scipy's, which is slower since it handles other kinds of arrays."""
     top = np.max(values, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
@@ -64,7 +64,7 @@ class MoveScales:
 
 
 def default_scales() -> MoveScales:
-    """A nudge, a shift, a large move, and the camera put back anywhere."""
+    """Scales of a nudge, a shift, a large move, and a camera put back anywhere."""
     degrees, mm = [0.5, 1.2, 4.0, 10.0, 40.0], [1.0, 2.5, 10.0, 30.0, 120.0]
     return MoveScales(np.radians(degrees), np.array(mm), np.array([0.25, 0.45, 0.15, 0.1, 0.05]))
 
@@ -91,7 +91,7 @@ def log_move_odds(
 def move_odds_in_epoch(
     problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
 ) -> tuple[tuple[int, ...], FloatArray]:
-    """The n PMs of one epoch of a registration, in the order of time, and :func:`log_move_odds` (n - 1,) of them.
+    """Move odds within an epoch: its n PMs in the order of time, and their :func:`log_move_odds` (n - 1,).
 
     Args:
         problem: of the inliers. optimum: one hypothesis. covariance: (D, D) there.
@@ -114,7 +114,7 @@ def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -
     bordered[..., _SIX, _SIX] += 1.0
     bordered[..., 6, :6] = bordered[..., :6, 6] = pulled
     bordered[..., 6, 6] = bound
-    try:  # a third of the time that solving takes; the last pivot is what the form leaves of its bound
+    try:  # a third of the time of solving; the last pivot gives the quadratic form
         pivot = np.linalg.cholesky(bordered).diagonal(axis1=-2, axis2=-1)
     except np.linalg.LinAlgError:  # where hardly anything is known, F is a small difference of large numbers
         spread = np.eye(6) + prior @ information[:, None]

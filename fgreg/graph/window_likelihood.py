@@ -1,9 +1,9 @@
-"""The windows' own shape in the reduced problem: what the rotations' likelihoods are worth beside Gaussian stand-ins.
+"""The windows' own shapes in the reduced problem: ratio of the rotations' likelihoods to their Gaussian sites.
 
-The reduced problem is Gaussian in each PM's point: every look holds its rotation ``rho`` by a Gaussian *site* of
-precision ``l`` about ``centre + gain * window_edge``. Take the sites of a PM out again and its rotation is left with
-the *cavity*, a Gaussian of precision ``q = 1 / v - sum l`` (v the variance with them). The likelihood proper is an
-interval with soft ends (and the amplitudes' table), so what a state's density has to be multiplied by is
+The reduced problem is Gaussian in each PM's point: every look has a Gaussian *site* on its rotation ``rho``, of
+precision ``l`` about ``centre + gain * window_edge``. Without the sites of its PM the rotation has the *cavity*, a
+Gaussian of precision ``q = 1 / v - sum l`` (v the variance with them). The actual likelihood is an interval with soft
+ends (and the amplitudes' table), so a state's density is multiplied by
 
     integral of cavity(d) * product of intervals(rho + d) dd  /  integral of cavity(d) * product of sites(rho + d) dd
 
@@ -21,15 +21,15 @@ from fgreg.graph.packing import PackedProblem, RotationShapes
 from fgreg.model.sensitivity import log_interval
 
 LEAST_PRECISION = 0.1
-"""Of a cavity, rad^-2: a PM of which nothing is known is still within some three radians."""
+"""Least precision of a cavity, rad^-2: even without information a PM is within about three radians."""
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 REACH = 6.0
-"""Sigmas to which quadratures go."""
+"""Range of the quadratures, in sigmas."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LookGroups:
-    """PMs by kind: ``single`` looks (n,) alone at their PM; the others' PMs (m,), looks (m, K) and which are there."""
+    """PMs by kind: ``single`` looks (n,) alone at their PM; of the others the PMs (m,), looks (m, K), and a mask."""
 
     single: IntArray
     pm: IntArray
@@ -38,7 +38,7 @@ class LookGroups:
 
 
 def group_looks(problem: PackedProblem, shapes: RotationShapes) -> LookGroups:
-    """Which PMs the closed form serves and which need a quadrature."""
+    """Split PMs into those with the closed form and those that need a quadrature."""
     pms = len(problem.pms)
     count = np.bincount(problem.look_pm, minlength=pms)
     plain = (count == 1) & (shapes.amplitude_look < 0)
@@ -63,13 +63,13 @@ def interval_at(shapes: RotationShapes, edge_rad: FloatArray) -> tuple[FloatArra
 def log_shape_ratios(
     problem: PackedProblem, edge_rad: FloatArray, offset: FloatArray, variance: FloatArray
 ) -> FloatArray:
-    """(S, J) log of what the intervals make of each PM's density with Gaussian sites.
+    """(S, J) log ratio of each PM's density with intervals to that with Gaussian sites.
 
     Args:
         problem: with shapes; its sites are ``looks.weight[:, 2, 2]``, ``looks.centre_rad`` and ``looks.edge_gain``.
         edge_rad: (S,) errors of the half width.
-        offset: (S, L) rotations with the sites in, less the sites' expectation.
-        variance: (S, L) of the rotations given the shared variables, sites in.
+        offset: (S, L) rotations with the sites included, less the sites' expectation.
+        variance: (S, L) of the rotations given the shared variables, sites included.
     """
     shapes = problem.shapes
     if shapes is None or not len(problem.look_pm):
@@ -83,7 +83,7 @@ def log_shape_ratios(
     if len(groups.single):
         i = groups.single
         q = np.maximum(1.0 / variance[:, i] - site[i], LEAST_PRECISION)
-        shift = site[i] * offset[:, i] / q  # from the mean with the site in to the cavity's
+        shift = site[i] * offset[:, i] / q  # from the mean with the site to the cavity's mean
         mean = rotation[:, i] + shift
         log = log_interval(low[:, i] - mean, high[:, i] - mean, np.sqrt(1.0 / q + soft[i] ** 2))
         log = log - np.log(high[:, i] - low[:, i])
@@ -117,7 +117,7 @@ def _group_ratio(
     margin, sigma = REACH * soft.max(axis=1), 1.0 / np.sqrt(q)
     begin = np.maximum(centre - REACH * sigma, inside_low - margin)
     end = np.minimum(centre + REACH * sigma, inside_high + margin)
-    apart = end <= begin  # the looks contradict each other or the rest: judge by the nearest place
+    apart = end <= begin  # the looks contradict each other or the rest: use the nearest place
     near = np.clip(centre, np.minimum(inside_low, inside_high) - margin, np.maximum(inside_low, inside_high) + margin)
     begin, end = np.where(apart, near - margin, begin), np.where(apart, near + margin, end)
     half = 0.5 * (end - begin)
@@ -131,7 +131,7 @@ def _group_ratio(
     log = log + _amplitude_log(shapes, groups, rotation + problem.looks.scan_rad, d)
     peak = log.max(axis=2)
     value = peak + np.log(np.sum(np.exp(log - peak[..., None]) * WEIGHTS, axis=2) * half)
-    # Where the stage went after the first look was chosen: only that one's place in its window is chance.
+    # Later stage angles were chosen from the first look: only the place of the first look in its window is random.
     value = value - np.log(high[:, looks[:, 0]] - low[:, looks[:, 0]])
     spread = np.sum(site * offset[:, looks] ** 2, axis=2)
     at_site = -pull / np.maximum(total, 1e-300)
