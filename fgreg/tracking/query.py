@@ -1,9 +1,9 @@
 """Where to turn the stage for a beam: absolute angle with its sigma, from a snapshot of the estimate.
 
-With the PM heard now (the paper's Eq. 11): lambda and theta' given the registration. Here the registration and the
-beam enter with their covariance, the marker and the look with theirs: the answer is the posterior of the PM's angle
-given the session and the query, by the reduced graph of this one PM with the estimate as its prior. The session's
-estimate itself is not touched. With nothing heard, lambda comes from the tissue surface that the PMs trace.
+With a PM heard now (Eq. 11 of the publication): lambda and theta' given the registration. Here registration, beam,
+marker and look enter with their covariances. The result is the posterior of the PM's angle given the session and the
+query, from the reduced graph of this one PM with the estimate as its prior. The session's estimate does not change.
+With no PM heard, lambda comes from the tissue surface that the PMs trace.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from fgreg.model.tissue_surface import GRAZING
 from fgreg.tracking.snapshot import SHARED, EpochSnapshot, Snapshot
 
 SAMPLES = 1000
-"""Draws of the shared variables, the marker's error and the surface's height: they spread the beam's end."""
+"""Draws of the shared variables, the marker's error and the surface's height, for the spread of the beam's end."""
 
 
 def _standard(size: int) -> FloatArray:
     """(SAMPLES, size) standard normal draws whose own mean and covariance are exactly zero and the identity.
 
-    What is linear in them has its exact variance.
+    So a linear function of them has its exact variance.
     """
     draws = np.random.default_rng(0).standard_normal((SAMPLES, size))
     draws = draws - draws.mean(axis=0)
@@ -42,8 +42,8 @@ def _standard(size: int) -> FloatArray:
 
 STANDARD = _standard(SHARED + 6 + 1)
 SETTLED = 0.005
-"""The windows' sites have settled when the PM's rotation moves by no more than this share of its standard deviation.
-The looks of one PM settle without damping."""
+"""The windows' sites have converged when the PM's rotation changes by at most this share of its standard deviation.
+The sites of one PM's looks converge without damping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class _Placed:
 
 
 def track(query: Track, snapshot: Snapshot) -> TrackEstimate:
-    """Answer one query; ``stage_rad`` None with a reason where it cannot be answered."""
+    """Answer one query; ``stage_rad`` is None, with a reason, where there is no answer."""
     epoch = snapshot.epoch(query.epoch)
     if epoch is None:
         if query.epoch < snapshot.oldest:
@@ -85,7 +85,7 @@ def _refused(query: Track, snapshot: Snapshot, reason: str) -> TrackEstimate:
 
 
 def _from_looks(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Placed | str:
-    """The PM that the query's looks heard, or why it has no place."""
+    """The PM that the query's looks heard, or why its place cannot be computed."""
     problem, state = _one_pm(query, snapshot, epoch)
     _, private = refine(problem, state, initial_private(problem, state))
     start = evaluate(problem, state, private)
@@ -94,7 +94,7 @@ def _from_looks(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Plac
         settled = settle(replace(problem, shapes=None), state, start, settled=SETTLED)
     shared = None if settled is None else inverse_hessian(settled[2].hessian[0])
     if settled is None or shared is None:
-        return "the beam and what is heard do not settle on a place of the PM"
+        return "beam and looks do not converge to one place of the PM"
     at = settled[2]
     gain = at.point_gain[0, 0]
     covariance = at.point_covariance[0, 0] + gain @ shared @ gain.T

@@ -1,7 +1,7 @@
-"""All that a tracking query needs, as plain arrays: what queries are answered from while the estimate moves on.
+"""Everything that a tracking query needs, as plain arrays, so that queries do not depend on the running estimation.
 
-A query concerns one camera epoch and one PM, so of the joint covariance of the shared variables it needs the block of
-its epoch with what all epochs share: 16 variables in a fixed order, with zero variance where one is not estimated.
+A query concerns one camera epoch and one PM. So from the joint covariance of the shared variables it needs the block of
+its registration and the common variables: 16 variables in a fixed order, with zero variance where one is not estimated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 
 EDGE, BIAS, SPEED, RADIUS, SHARED = 10, 11, 14, 15, 16
-"""Where window edge (rad), marker bias (3, mm), sound speed ratio and probe radius (mm) sit in the covariance of one
+"""Places of window edge (rad), marker bias (3, mm), sound speed ratio and probe radius (mm) in the covariance of one
 epoch, and its size; the order is that of fgreg.graph.columns, with a place for each optional variable."""
 
 
@@ -28,7 +28,7 @@ epoch, and its size; the order is that of fgreg.graph.columns, with a place for 
 class EpochSnapshot:
     """One camera epoch: ``trus_T_camera`` as rotation (3, 3) and translation (3,) mm, covariance (SHARED, SHARED).
 
-    ``verdict`` and ``reason``: of a refused epoch no query is answered.
+    ``verdict`` and ``reason``: queries of a refused epoch are not answered.
     """
 
     number: int
@@ -44,13 +44,13 @@ class Snapshot:
     """The estimate at one moment.
 
     Attributes:
-        t: session time of the last event that entered. pairs: how many did. causal: whether only what was known then.
+        t: session time of the last event taken in. pairs: number of pairs. causal: whether no later events are used.
         epochs: those with a registration, and those refused.
         marker_T_nominal: (4, 4) of the beam chart. beam: (4,). origin_shift_mm: lambda of the laser frame's origin.
         edge_rad, bias_mm (3,), sound_speed_ratio, radius_mm: as in :class:`fgreg.graph.shared_state.SharedState`.
         sensitivity, stage: of the session. amplitude_sigma, window_shape: of its configuration.
         surface: where the PMs trace one.
-        oldest: epochs of lower numbers are not kept any more.
+        oldest: lowest number of the epochs that it may have.
     """
 
     t: float
@@ -98,7 +98,7 @@ class Snapshot:
 
     @classmethod
     def without_registration(cls, model: SessionModel, config: SolveConfig, refused: Mapping[int, str]) -> Snapshot:
-        """A snapshot that answers nothing: epochs refused, with the reason (which may be empty)."""
+        """A snapshot without a registration: all epochs are refused, with the reason (which may be empty)."""
         return cls(
             t=0.0,
             pairs=0,
@@ -125,7 +125,7 @@ def _refused_epoch(number: int, reason: str) -> EpochSnapshot:
 
 
 def _epoch_columns(columns: Columns, place: int) -> tuple[IntArray, IntArray]:
-    """Columns of the whole covariance that concern an epoch, and where they go among the ``SHARED``."""
+    """Columns of the whole covariance that concern an epoch, and their places among the ``SHARED``."""
     whole = [*range(6 * place, 6 * place + 6), *range(columns.beam, columns.beam + 4), columns.edge]
     mine = [*range(EDGE + 1)]
     for at, to, size in ((columns.bias, BIAS, 3), (columns.sound_speed, SPEED, 1), (columns.radius, RADIUS, 1)):
@@ -158,7 +158,7 @@ def make_snapshot(
         covariance: (D, D) of the shared variables, laid out by ``columns``.
         epochs: the session's numbers of the epochs with a registration.
         origin_shift_mm, surface, causal, t, pairs: as in :class:`Snapshot`.
-        refused: further epochs, or some of ``epochs``, of which no query may be answered, and why (may be empty).
+        refused: further epochs, or some of ``epochs``, whose queries are not answered, and why (may be empty).
     """
     refused = {} if refused is None else refused
     found = []
