@@ -1,1 +1,1 @@
-"""What all else speaks of: the session's model, events, measurements, and the estimate."""
+"""The types that all packages use: the session's model, events, measurements, and the estimate."""

@@ -1,7 +1,7 @@
-"""What comes out: registration, beam, PMs, tracks and a verdict. Millimetres, radians.
+"""The estimate: registration, beam, PMs, tracks and a verdict. Millimetres, radians.
 
-The classes are the description of ``result.yaml``, too. Transforms are written to 1e-9 in rotation and 1e-6 mm in
-translation, so that rotations stay rigid to 1e-8; angles and lengths to 1e-6; covariances to ten digits; times whole.
+The classes also describe ``result.yaml``. Transforms are written to 1e-9 in rotation and 1e-6 mm in translation, so
+that rotations stay rigid to 1e-8; angles and lengths to 1e-6; covariances to ten digits; times in full.
 """
 
 import math
@@ -29,7 +29,7 @@ def _covariance(size: int) -> Covariance:
 
 
 class Verdict(StrEnum):
-    """``ok``: usable; ``warning``: usable, a condition missed; ``refused``: no transform may be used."""
+    """``ok``: usable; ``warning``: usable, but a condition is missed; ``refused``: no transform may be used."""
 
     OK = "ok"
     WARNING = "warning"
@@ -44,7 +44,7 @@ VERDICT = Text.of(Verdict, "a verdict")
 
 
 def worst_verdict(*verdicts: Verdict) -> Verdict:
-    """The most severe of the verdicts, ``ok`` of none."""
+    """The most severe of the verdicts; ``ok`` where there are none."""
     return max(verdicts, key=lambda verdict: verdict.severity, default=Verdict.OK)
 
 
@@ -94,7 +94,7 @@ class PairEstimate:
     t: Annotated[float, NotStored(math.nan)]
     pm: Annotated[int, Key("of the look", _COUNT)]
     epoch: Annotated[int, Key("index of its camera epoch", _COUNT)]
-    used: Annotated[bool, Key("whether the estimate rests on it")]
+    used: Annotated[bool, Key("whether it is an inlier of the estimate")]
     lambda_mm: Annotated[
         float | None,
         Key("distance along the beam from the laser frame's origin", _SIZE, null=True, required_if=_USED),
@@ -160,7 +160,7 @@ class AimEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """Of how long something took, ms."""
+    """Quantiles of durations, ms."""
 
     p50: Annotated[float, Key("median", _NOT_NEGATIVE)]
     p99: Annotated[float, Key("99 % quantile", _NOT_NEGATIVE)]
@@ -169,19 +169,19 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How long things took; None where there was none of them."""
+    """Durations of each kind of step; None where there was no such step."""
 
     add: Annotated[
-        Quantiles | None, Key("taking in an aim, a pair or a move, and judging all of it where that is due", null=True)
+        Quantiles | None, Key("taking in an aim, a pair or a move, with the full solve where it is due", null=True)
     ]
     track: Annotated[Quantiles | None, Key("answering a query", null=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionEstimate:
-    """The whole answer for a session; what ``result.yaml`` holds, and the calibration shots besides.
+    """The whole estimate of a session: the contents of ``result.yaml``, and the calibration shots.
 
-    ``timing``: where events were taken in one by one.
+    ``timing``: only where events were taken in one by one.
     """
 
     version: Annotated[str, Key("version of fgreg that made it", name="fgreg", required=True)] = field(

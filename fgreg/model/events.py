@@ -1,7 +1,7 @@
-"""What happened in a session, as recorded: one dataclass per event type of ``events.jsonl``, which it describes.
+"""Recorded events of a session: one dataclass per event type of ``events.jsonl``, which it describes.
 
 ``line`` is the 1-based line in the file. Frame names are resolved paths inside the session's folder. Angles here are
-still the *device's*, in degrees, as the file has them: measurements.py holds what the estimator sees.
+those of the *device*, in degrees, as in the file; measurements.py has the numbers that the estimator uses.
 """
 
 from collections.abc import Iterable, Mapping
@@ -160,7 +160,7 @@ class TrackEvent:
 
     @property
     def looks(self) -> tuple[TrusRecord, ...]:
-        """Of the PM, where it is heard now."""
+        """The query's looks at the PM; empty where it is not heard now."""
         return self.several if self.trus is None else (self.trus,)
 
 
@@ -182,7 +182,7 @@ class CameraMovedEvent:
     covariance: Annotated[FloatArray | None, Key("of the move", Covariance(6), requires="camera_new_T_camera_old")] = (
         None
     )
-    detected: Annotated[bool, Key("a program noticed, nobody reported it", brief=True)] = False
+    detected: Annotated[bool, Key("detected by a program, not reported", brief=True)] = False
     since_t: Annotated[float | None, Key("with `detected`: from when on the new epoch counts, s", SECONDS)] = None
 
     def __post_init__(self) -> None:
@@ -205,7 +205,7 @@ class RefusedEvent:
     event: Annotated[
         object,
         Key(
-            "the event as it was told; where it was recorded first, on a line of its own, its `line` (a number)",
+            "the event as it was reported; where it was recorded first, on a line of its own, its `line` (a number)",
             Anything("the event that was not taken in"),
         ),
     ]
@@ -220,7 +220,7 @@ class RefusedEvent:
 
 @dataclass(frozen=True, slots=True)
 class StageEvent:
-    """What the stage was told: of no effect on an estimate."""
+    """A command to the stage; it has no effect on the estimate."""
 
     t: Seconds
     line: int
@@ -231,7 +231,7 @@ class StageEvent:
 
 @dataclass(frozen=True, slots=True)
 class NoteEvent:
-    """Somebody's words: of no effect on an estimate."""
+    """A note by the operator; it has no effect on the estimate."""
 
     t: Seconds
     line: int
@@ -260,7 +260,7 @@ Shot = AimEvent | PairEvent | TrackEvent
 
 
 def looks_of(event: Event) -> tuple[TrusRecord, ...]:
-    """The looks that an event brings."""
+    """The looks of an event."""
     if isinstance(event, PairEvent):
         return (event.trus,)
     return event.looks if isinstance(event, TrackEvent) else ()

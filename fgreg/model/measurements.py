@@ -1,4 +1,4 @@
-"""What the estimator sees: numbers with covariances. Millimetres, radians, TRUS and camera frames."""
+"""Measurements for the estimator: numbers with covariances. Millimetres, radians, TRUS and camera frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from fgreg.model.session_model import NoiseModel
 
 FLOOR_RAD = 1e-5
 FLOOR_MM = 1e-3
-"""What a noise of zero (a session may say so) counts as; a covariance with a direction below these gets them added."""
+"""Floor of the noise: it replaces a noise of zero, and its squares are added to covariances that are smaller in some
+direction."""
 POSE_FLOOR = (FLOOR_RAD,) * 3 + (FLOOR_MM,) * 3
 
 
@@ -24,7 +25,7 @@ class MarkerObservation:
     Attributes:
         camera_T_marker: (4, 4).
         covariance: (6, 6) over the right tangent (rotation rad, translation mm).
-        id: equal for observations that are one and the same (same frames, or same matrix), unique otherwise.
+        id: the same for identical observations (same frames, or same matrix), unique otherwise.
     """
 
     camera_T_marker: FloatArray
@@ -67,7 +68,7 @@ class Aim:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A registration shot: one look at PM ``pm`` with the beam that made it, in camera epoch ``epoch``."""
+    """A registration shot: one look at PM ``pm`` with the marker pose of its beam, in camera epoch ``epoch``."""
 
     t: float
     pm: int
@@ -80,7 +81,7 @@ class Pair:
 class Track:
     """A query in camera epoch ``epoch``; ``looks`` where the PM is heard now.
 
-    ``look_markers``: one per look, where the marker was detected anew at each; else ``marker`` serves them all.
+    ``look_markers``: one per look, where the marker was detected at each look; else ``marker`` is used for all.
     """
 
     t: float
@@ -93,9 +94,10 @@ class Track:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpochStart:
-    """Start of a camera epoch; the motion (and its 6x6 covariance, right tangent) where kinematics gave it.
+    """Start of a camera epoch, with the motion (and its 6x6 covariance, right tangent) where kinematics measured it.
 
-    ``after``: the epoch that the motion is counted from, an earlier one than the last where the camera came back to it.
+    ``after``: the epoch from which the motion is counted; None: the one before. It is an earlier one after a loop
+    closure.
     """
 
     t: float
@@ -104,12 +106,12 @@ class EpochStart:
     after: int | None = None
 
     def old(self, index: int) -> int:
-        """The epoch that the motion is counted from, of an epoch with this index."""
+        """The epoch from which the motion is counted, for the epoch with this index."""
         return index - 1 if self.after is None else self.after
 
     @property
     def motion_known(self) -> bool:
-        """Whether the epoch is tied to the one before: a motion without a covariance says nothing to rely on."""
+        """Whether there is a motion prior between the epochs: a motion without a covariance is not used."""
         return self.camera_new_T_camera_old is not None and self.covariance is not None
 
 
@@ -132,7 +134,7 @@ def usable_covariance(covariance: FloatArray, floor: Sequence[float]) -> FloatAr
     """Covariances (..., n, n), with the floor's squares (n,) added to those with a direction below the floor."""
     least = _squares(tuple(floor))
     try:
-        # Less the floor it has a Cholesky factor: a fraction of the time that its eigenvalues take.
+        # It is large enough if it has a Cholesky factor without the floor: a fraction of the time of eigenvalues.
         np.linalg.cholesky(covariance - least)
     except np.linalg.LinAlgError:
         below = np.linalg.eigvalsh(covariance - least)[..., :1, None] <= 0.0

@@ -1,13 +1,13 @@
-"""What the probe's sensitivity window says about a look, in terms of stage rotation (docs/model.md, section 2).
+"""The information of the probe's sensitivity window on a look, as stage rotation (docs/model.md, section 2).
 
 A PM at range r from the element, delta off the plane on its arc, comes into the plane when the stage turns by
 
     rotation = atan2(r sin delta, R + r cos delta),        R the probe's radius,
 
 since the arc is centred on the element but the stage turns about the axis, R behind it. The window was measured by
-turning the stage: it bounds the rotation. At R = 10 mm, r = 30 mm, 6 deg of rotation is 8.0 deg of arc.
+turning the stage, so it bounds the rotation. At R = 10 mm, r = 30 mm, 6 deg of rotation is 8.0 deg of arc.
 
-Everything here is pure and works on arrays as well as on numbers; millimetres and radians.
+All functions are pure and work on arrays and on numbers; millimetres and radians.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from fgreg.model.session_model import SensitivityModel
 _Angles = npt.ArrayLike
 
 MIN_SOFTNESS_RAD = 1e-3
-"""Least softness of a window's edge (0.06 deg): no probe's window ends like a step."""
+"""Least softness of a window's edge (0.06 deg): no probe's window has a step as its edge."""
 
 
 def wrap_angle(angle_rad: _Angles) -> FloatArray:
@@ -45,8 +45,8 @@ def arc_of_rotation(rotation_rad: _Angles, range_mm: _Angles, radius_mm: float) 
     """Arc angle off the plane (rad) for a stage rotation: the inverse of :func:`rotation_of_arc`.
 
     By the law of sines in the triangle axis, element, PM: R / sin(delta - rotation) = r / sin(rotation), so
-    delta = rotation + asin(R sin(rotation) / r), on the branch that contains 0. A PM nearer to the element than R
-    can be at most asin(r / R) off, seen from the axis; for rotations beyond, the arc angle that comes nearest.
+    delta = rotation + asin(R sin(rotation) / r), on the branch that contains 0. Seen from the axis, a PM nearer to the
+    element than R is at most asin(r / R) off the plane; larger rotations give the nearest arc angle.
     """
     rotation, r = np.asarray(rotation_rad, dtype=np.float64), np.asarray(range_mm, dtype=np.float64)
     widest = np.where(r < radius_mm, np.arcsin(np.minimum(r / radius_mm, 1.0)), np.pi)
@@ -57,17 +57,17 @@ def arc_of_rotation(rotation_rad: _Angles, range_mm: _Angles, radius_mm: float) 
 AMPLITUDE_SIGMA = 0.05
 """Relative noise of amplitudes."""
 TABLE_SIZE, TABLE_MARGIN_RAD = 241, math.radians(3.0)
-"""Plane angles at which amplitudes are compared with the curve, and how far beyond the window they reach."""
+"""Number of plane angles at which amplitudes are compared with the curve, and their margin beyond the window."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensitivityPrior:
-    """What one look says: its stage rotation is ``centre + edge_gain * window_edge``, give or take ``sigma``.
+    """Gaussian prior of one look's stage rotation: ``centre + edge_gain * window_edge``, with sigma ``sigma_rad``.
 
     Attributes:
         centre_rad: expected stage rotation.
         edge_gain: +1 or -1 where the window's edge was met sweeping that way, else 0.
-        sigma_rad: standard deviation about it, stage reading included.
+        sigma_rad: standard deviation about it, including the stage reading's.
     """
 
     centre_rad: float
@@ -90,9 +90,9 @@ def window_priors(
     """The priors of n looks from plain arrays.
 
     Window only (sweep 0): uniform over +-w, as a Gaussian of sigma w / sqrt(3).
-    First hit (sweep s = +-1): nothing was heard a step earlier, so the rotation is uniform over (w - step, w] ahead in
-    the sweep's direction: centre s (w - step / 2), sigma step / sqrt(12), and an error of the known half width moves
-    it by s. A step of 2 w or more tells nothing beyond the window, and the case above is what it comes to.
+    First hit (sweep s = +-1): one step earlier was silent, so the rotation is uniform over (w - step, w] ahead in the
+    sweep's direction: centre s (w - step / 2), sigma step / sqrt(12). An error of the half width moves the centre by s.
+    A step of 2 w or more adds no information to the window, so the prior is that of the first case.
 
     Args:
         range_mm: (n,) observed ranges, the depths at which the window's half width w is taken.
@@ -103,7 +103,7 @@ def window_priors(
     """
     s = np.asarray(sweep, dtype=np.float64)
     w = sensitivity.half_width_at(np.asarray(range_mm, dtype=np.float64))
-    span = np.where((s != 0.0) & (step_rad < 2.0 * w), step_rad, 2.0 * w)  # of rotations that fit what was heard
+    span = np.where((s != 0.0) & (step_rad < 2.0 * w), step_rad, 2.0 * w)  # width of the interval of possible rotations
     informed = span < 2.0 * w
     return SensitivityPriors(
         centre_rad=np.asarray(np.where(informed, s * (w - span / 2.0), 0.0)),
@@ -131,15 +131,15 @@ def sensitivity_prior(look: Look, sensitivity: SensitivityModel, step_rad: float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowShapes:
-    """In which interval of stage rotation n looks put their PM, arrays (n,): the window as it is, not as a Gaussian.
+    """Intervals of stage rotation of n looks, arrays (n,): the window in its own shape, not as a Gaussian.
 
     The likelihood of a rotation is one inside ``(low + low_gain * window_edge, high + high_gain * window_edge)`` and
     zero outside, softened by the stage reading's noise.
 
     Attributes:
         low_rad, high_rad: the interval's ends.
-        low_gain, high_gain: how the error of the known half width moves them: -1, +1 for the window itself, both the
-            sweep's sign for a first hit.
+        low_gain, high_gain: their derivative by the error of the half width: -1, +1 for the window itself, the sweep's
+            sign for both ends of a first hit.
         soft_rad: standard deviation of the ends' softness.
     """
 
@@ -168,7 +168,7 @@ def window_shapes(looks: Sequence[Look], sensitivity: SensitivityModel, step_rad
 def log_interval(low: _Angles, high: _Angles, sigma: _Angles) -> FloatArray:
     """Log of the probability that a Gaussian of mean 0 and ``sigma`` lies between ``low`` and ``high``; any shapes.
 
-    Exact far out in either tail, where the difference of the two distribution functions would be 0.
+    Exact in both tails, where the difference of the two distribution functions would be 0.
     """
     per_sigma = 1.0 / np.asarray(sigma, dtype=np.float64)
     a, b = np.asarray(low, dtype=np.float64) * per_sigma, np.asarray(high, dtype=np.float64) * per_sigma
@@ -194,7 +194,7 @@ def interval_moments(low: _Angles, high: _Angles, sigma: _Angles) -> tuple[Float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AmplitudeTable:
-    """Log likelihood (G,) of a PM's amplitudes at plane angles (G,), 0 at its best; ``used``: whether it says anything.
+    """Log likelihood (G,) of a PM's amplitudes at plane angles (G,), 0 at its best; ``used``: False without amplitudes.
 
     The plane angle is that at which the image plane passes through the PM: scan angle plus rotation.
     """
@@ -223,11 +223,11 @@ def amplitude_curve(sensitivity: SensitivityModel) -> AmplitudeCurve | None:
 
 
 def amplitude_table(looks: Sequence[Look], sensitivity: SensitivityModel, amplitude_sigma: float) -> AmplitudeTable:
-    """What the amplitudes of the looks at one PM say about its plane angle, its unknown peak eliminated.
+    """Likelihood of a PM's plane angle from the amplitudes of its looks, with the unknown peak eliminated.
 
     ``log amplitude = log peak + log curve(rotation) + noise``: at a plane angle each look gives one estimate of the
-    peak, and with a flat prior on its logarithm what counts is how far they scatter about their weighted mean. The
-    stage reading's noise adds by the curve's slope. Needs two looks with amplitudes and a curve.
+    peak. With a flat prior on the logarithm of the peak the likelihood is that of their scatter about the weighted
+    mean. The stage reading's noise enters by the curve's slope. Needs two looks with amplitudes, and a curve.
     """
     scan = np.array([look.scan_rad for look in looks])
     heard = [(look.scan_rad, look.scan_sigma_rad, look.amplitude) for look in looks if look.amplitude]

@@ -1,8 +1,8 @@
-"""What a session is made of: probe, stage, cameras, marker, board, noise. Frozen; lengths mm, angles rad.
+"""The set-up of a session: probe, stage, cameras, marker, board, noise. Frozen; lengths mm, angles rad.
 
-The classes are the description of ``session.yaml``, too: keys, bounds and units of the file stand in their types
-(fgreg.schema.record). Each raises ValueError on values that do not fit together; the session reader turns that into a
-line that names the key.
+The classes also describe ``session.yaml``: their types have the keys, bounds and units of the file
+(fgreg.schema.record). Each raises ValueError on values that do not fit together; the session reader makes that a line
+that names the key.
 """
 
 import math
@@ -114,8 +114,8 @@ class SensitivityModel:
 
 
 def _check_table(over: str, abscissa: FloatArray, ordinate: FloatArray, *path: str) -> None:
-    """Raises FieldError where a table's first column ``over`` does not increase, or its second, at ``path``, has not
-    as many entries."""
+    """Raises FieldError where a table's first column ``over`` does not increase, or where its second, at ``path``, has
+    another number of entries."""
     if (np.diff(abscissa) <= 0).any():
         raise FieldError.of("numbers that do not increase", "each number larger than the one before", *path[:-1], over)
     if abscissa.shape != ordinate.shape:
@@ -172,7 +172,7 @@ class ProbeModel:
         _positive(sound_speed_m_s=self.sound_speed_m_s)
 
     def is_channel_data(self, frame: npt.NDArray[np.generic]) -> bool:
-        """Whether a frame is channel data; of a probe with ``image``, too, all others are images."""
+        """Whether a frame is channel data; all other frames of a probe with ``image`` are images."""
         return self.holds_channels(frame.shape, frame.dtype)
 
     def holds_channels(self, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> bool:
@@ -305,7 +305,7 @@ STEREO_RIG = Converted(record(_CameraSection), _CameraSection.rig, _CameraSectio
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagModel:
-    """One square tag: id, outer edge of its black border (mm), and where it sits on the marker body."""
+    """One square tag: id, outer edge of its black border (mm), and its pose on the marker body."""
 
     id: Annotated[int, Key("in the dictionary", Integer(0, max(DICTIONARY_SIZES.values()) - 1))]
     size_mm: Annotated[float, Key("outer edge of the black border", POSITIVE_MM)]
@@ -362,12 +362,12 @@ class BoardModel:
     def __post_init__(self) -> None:
         _positive(square_mm=self.square_mm)
         if self.charuco is None:
-            # OpenCV finds plain chessboards from 3 x 3 inner corners on.
+            # OpenCV detects plain chessboards of at least 3 x 3 inner corners.
             for key, count in (("columns", self.columns), ("rows", self.rows)):
                 if count < 3:
                     raise FieldError.of(str(count), "an integer from 3 to 200", key)
             if (self.columns + self.rows) % 2 == 0:
-                # The square at the far end from a black corner square is columns + rows squares away: black, too.
+                # The square at the opposite end of a black corner square is columns + rows squares away: also black.
                 found = f"{self.columns} x {self.rows} inner corners, the same when turned by half a turn"
                 raise FieldError.of(found, "columns + rows odd, or a charuco board")
         else:
@@ -439,7 +439,7 @@ NAME = Text(check=_check_name)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionModel:
-    """How a session was set up: everything ``session.yaml`` says; ``targets_mm`` (n, 3)."""
+    """The set-up of a session: the contents of ``session.yaml``; ``targets_mm`` (n, 3)."""
 
     name: Annotated[str, Key("of the session", NAME, default="the folder's")]
     probe: Annotated[ProbeModel, Key("the TRUS probe")]

@@ -1,4 +1,4 @@
-"""What a user may set for a solve; raises on a value that cannot be, never repairs."""
+"""Settings of a solve; invalid values raise, they are never repaired."""
 
 import math
 from dataclasses import dataclass
@@ -14,20 +14,20 @@ class SolveConfig:
 
     Attributes:
         limit_mm: predicted 95 % error at the worst target up to which the verdict is ``ok``.
-        second_minimum_chi2: two minima whose costs differ by less cannot be told apart (99 % of chi square, 2 dof).
-        min_pairs: below, the registration counts as open unless the session gives an initial one.
+        second_minimum_chi2: two minima whose costs differ by less are ambiguous (99 % of chi square, 2 dof).
+        min_pairs: with fewer pairs the registration counts as undetermined unless the session gives an initial one.
         refuse_beam_spread_rad, warn_beam_spread_rad: root mean square angle of the beams about their mean direction.
         refuse_spot_spread_mm, warn_spot_spread_mm: root mean square distance of the PMs from their best line.
-        min_sweeps_per_side: below, a session that relies on first hits counts as one-way.
-        window_shape: the sensitivity window as the interval it is, and amplitudes by the sensitivity curve; False: a
-            Gaussian of the same mean and variance, and no amplitudes.
+        min_sweeps_per_side: with fewer sweeps from one side a session with first hits counts as one-way.
+        window_shape: use the sensitivity window's own shape, an interval, and amplitudes by the sensitivity curve;
+            False: a Gaussian of the same mean and variance, and no amplitudes.
         amplitude_sigma: relative noise of amplitudes.
         estimate_sound_speed, estimate_radius: make these variables, with the priors that follow.
         sound_speed_sigma: prior of the ratio of true to assumed sound speed, about 1.
         radius_sigma_mm: prior of the probe's radius, about the session's.
-        posterior_effective: independent samples that the draws from the posterior should be worth.
-        posterior_samples: draws after which fewer have to do.
-        posterior_looks: with more looks than this the posterior counts as the Gaussian that it then is.
+        posterior_effective: effective number of independent posterior samples to reach.
+        posterior_samples: largest number of draws; sampling then stops with fewer effective samples.
+        posterior_looks: with more looks than this the posterior is taken as the Gaussian at the optimum.
         seed: of those draws.
     """
 

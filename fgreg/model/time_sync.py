@@ -1,10 +1,10 @@
-"""Pairs by time: where the marker was at the moment of the laser pulse, on one clock for all devices.
+"""Pairs by time: the marker pose at the moment of the laser pulse, on one clock for all devices.
 
-Marker poses come from a camera, laser pulses from the ultrasound side; each device stamps with its own clock, and what
-arrives gets the host's time as well. :class:`DeviceClock` brings a device's time onto the host's clock;
-:func:`pose_at` interpolates marker poses to a pulse and refuses where the poses around it are too far apart.
+Marker poses come from a camera, laser pulses from the ultrasound side. Each device stamps with its own clock, and the
+host adds the time of arrival. :class:`DeviceClock` converts a device's time to the host's clock. :func:`pose_at`
+interpolates marker poses to a pulse and refuses where the poses around it are too far apart.
 
-Host times are seconds of ``time.monotonic()``: one clock for all processes of a machine, which nobody sets.
+Host times are seconds of ``time.monotonic()``: one clock for all processes of a machine, which no one sets.
 """
 
 import itertools
@@ -21,17 +21,17 @@ from fgreg.schema.kinds import Number
 from fgreg.schema.record import Key
 
 MAX_GAP_S = 0.1
-"""Poses farther apart than this do not say where the marker was between them (three frames at 30 frames/s)."""
+"""Longest time between two poses that are interpolated (three frames at 30 frames/s)."""
 UNSTEADY_MM_S2, UNSTEADY_RAD_S2 = 300.0, 3.0
-"""Accelerations (sigma) of a hand-held fibre between two poses: a tremor of 0.1 mm and 1 mrad at 9 Hz."""
+"""Sigmas of the acceleration of a hand-held fibre between two poses: a tremor of 0.1 mm and 1 mrad at 9 Hz."""
 _LATENCY = Number(0.0, 1.0, unit="s")
 CLOCK_MEMORY = 256
-"""Stamps over which a device's clock is compared with the host's."""
+"""Number of stamps over which a device's clock is compared with the host's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """When something happened: ``device_s`` by the device's clock, ``host_s`` when it reached the host.
+    """Times of an event: ``device_s`` by the device's clock, ``host_s`` of its arrival at the host.
 
     A device without a clock stamps both with the host's.
     """
@@ -48,9 +48,9 @@ class Stamp:
 class DeviceClock:
     """A device's time on the host's clock, from the stamps it sends.
 
-    The way to the host only ever delays, so the smallest of the recent ``host - device`` differences is the nearest to
-    the clocks' offset: what jitters is left out, a drift is followed. ``latency_s`` is what even the quickest message
-    takes from the event to the host, where it is known.
+    Transmission only delays, so the smallest of the recent ``host - device`` differences is nearest to the offset of
+    the clocks. Jitter has no effect, and a drift is followed. ``latency_s`` is the shortest time from event to arrival,
+    where it is known.
     """
 
     latency_s: float = 0.0
@@ -60,8 +60,8 @@ class DeviceClock:
     def host_time(self, stamp: Stamp) -> float:
         """Host time (s) of the event itself; takes the stamp into account.
 
-        A device time that goes back starts anew: the device was switched off and on. One that leaps ahead is the
-        smallest difference at once; a single message held up on its way is just that.
+        A device time that goes back starts again: the device was switched off and on. One that jumps ahead is the
+        smallest difference at once. A single delayed message has no effect.
         """
         if stamp.device_s < self._last_device_s:
             self._offsets.clear()
@@ -72,9 +72,8 @@ class DeviceClock:
 
 @dataclass(frozen=True, slots=True)
 class Latencies:
-    """What even the quickest message of a device takes from the event to the host (s), where that was measured: a
-    grabber holds a picture for some frames, a scanner's packet comes after its pulse. Together they decide where the
-    marker was at a pulse."""
+    """Shortest times from event to arrival at the host (s), where they were measured: a grabber delays a picture by
+    some frames, a scanner's packet comes after its pulse. Their difference shifts the marker pose at a pulse."""
 
     camera_s: Annotated[float, Key("from exposure to arrival, at best", _LATENCY, name="camera_latency_s")] = 0.0
     pulse_s: Annotated[float, Key("from laser pulse to arrival, at best", _LATENCY, name="pulse_latency_s")] = 0.0
@@ -95,16 +94,16 @@ class TimedPose:
 
 
 class PairRefused(Exception):  # noqa: N818
-    """No pose can be told for this moment; the text says why, with the figures."""
+    """There is no pose for this moment; the text says why, with the figures."""
 
 
 def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S) -> TimedPose:
     """The pose at a time, between the pose before and the pose after.
 
-    Along the geodesic of rotation and, apart from it, the straight line of the origin: what a body does that turns
-    evenly while its origin moves evenly. The covariance is propagated from both ends, taken as independent: half way
-    between two equal ones it is half of either, which is what averaging two detections is worth. What the body may have
-    done in between is added: an acceleration a leaves the straight line by ``a gap^2 s (1 - s) / 2`` at share s.
+    The rotation is interpolated along its geodesic, the origin along a straight line: a body of constant angular
+    velocity whose origin has constant velocity. The covariance is propagated from both ends, taken as independent: half
+    way between two equal ones it is half of either, as for the mean of two detections. An acceleration a between the
+    poses is added: it moves the body off the straight line by ``a gap^2 s (1 - s) / 2`` at share s.
 
     Args:
         poses: in time order.
@@ -144,7 +143,7 @@ def scan_at(readings: Sequence[tuple[float, float]], t_s: float, max_gap_s: floa
 
 
 def _bracket(times: Sequence[float], t_s: float, max_gap_s: float, what: str) -> tuple[int, int, float]:
-    """Indices before and after a moment, and its share of the way; twice the same where it is met exactly."""
+    """Indices before and after a moment, and its share of the interval; the same index twice for an exact match."""
     if any(later < earlier for earlier, later in itertools.pairwise(times)):
         raise ValueError(f"{what}s are not in time order")
     if not math.isfinite(t_s):
@@ -201,13 +200,13 @@ def _right_jacobian(w: FloatArray) -> FloatArray:
 
 @dataclass(slots=True)
 class PoseHistory:
-    """The recent poses of one body, oldest first: what :func:`pose_at` looks into. Bounded by ``keep_s``."""
+    """The recent poses of one body, oldest first, for :func:`pose_at`; ``keep_s`` bounds their age."""
 
     keep_s: float = 2.0
     _poses: deque[TimedPose] = field(default_factory=deque)
 
     def add(self, pose: TimedPose) -> bool:
-        """Take in a pose; False, and nothing taken, where it is not later than the last one (a clock went back)."""
+        """Add a pose; False, and nothing added, where it is not later than the last one (a clock went back)."""
         if self._poses and pose.t_s <= self._poses[-1].t_s:
             return False
         self._poses.append(pose)
@@ -216,7 +215,7 @@ class PoseHistory:
         return True
 
     def clear(self) -> None:
-        """Forget all: the poses' frame has changed, or their clock."""
+        """Remove all poses: their frame or their clock has changed."""
         self._poses.clear()
 
     def newest_s(self) -> float | None:

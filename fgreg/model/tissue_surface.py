@@ -1,7 +1,7 @@
-"""The tissue surface that the PMs trace: where a beam with no PM heard will end.
+"""The tissue surface that the PMs trace, for the end of a beam whose PM is not heard.
 
-Heights over the PMs' best plane: a plane plus a Gaussian process (kriging with a
-linear trend), its amplitude from the data, its predictive sigma widened where leaving out a PM shows it too small.
+Heights over the PMs' best plane are a plane plus a Gaussian process (kriging with a linear trend). Its amplitude comes
+from the data. Its predictive sigma is widened where leave-one-out errors of the PMs show that it is too small.
 """
 
 from __future__ import annotations
@@ -13,29 +13,29 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray, rotation_to_direction
 
 LENGTH_MM = 15.0
-"""Distance over which the surface's deviations from its plane stay alike."""
+"""Correlation length of the surface's deviations from its plane."""
 MIN_RELIEF_MM = 0.5
-"""Least sigma of those deviations: no tissue is flatter."""
+"""Least sigma of these deviations: no tissue is flatter."""
 MIN_POINTS = 5
 MOST_POINTS = 150
-"""As many PMs trace a field of some 40 mm every 3 mm; more cost their number cubed and tell nothing new."""
+"""Largest number of PMs used. It covers a field of 40 mm every 3 mm; the time grows with the cube of the number."""
 MIN_SPREAD_MM = 1.0
 """Least root mean square distance of the PMs from their best line."""
 GRAZING = 0.2
-"""Least cosine of beam against normal: at less, the distance is not to be had."""
+"""Least cosine between beam and normal: below it the distance cannot be determined."""
 REACH_MM = 12.0
-"""Farthest from a PM that the surface is taken to be known."""
+"""Largest distance from a PM at which the surface is used."""
 LONGEST_MM = 30.0
-"""Longest stretch (four sigmas) of a beam on which it may end."""
+"""Longest interval (four sigmas) of a beam in which its end may lie."""
 ALONG_MM = np.arange(1.0, 201.0)
 """Distances along a ray at which it is compared with the surface; linear in between."""
 SLOPE_STEP_MM = 0.1
-"""Either way of a place: for the surface's slope there."""
+"""Step to either side of a place for the surface's slope."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """Where a ray ends: distance along it (mm), point (3,) in TRUS, unit normal (3,), sigma of ``normal @ point``."""
+    """End of a ray: distance along it (mm), point (3,) in TRUS, unit normal (3,), sigma of ``normal @ point``."""
 
     distance_mm: float
     trus_p: FloatArray
@@ -77,16 +77,16 @@ class TissueSurface:
         return mean, self.inflation * np.sqrt(variance)
 
     def meet(self, trus_p: FloatArray, trus_d: FloatArray) -> Meeting | None:
-        """Where a ray from (3,) along the unit vector (3,) first meets the surface; None where that is not known.
+        """Where a ray from (3,) along the unit vector (3,) first meets the surface.
 
-        It may miss the surface, graze it, or meet it farther than ``REACH_MM`` from all PMs.
+        None where it misses the surface, grazes it, or meets it farther than ``REACH_MM`` from all PMs.
         """
         points = (trus_p + ALONG_MM[:, None] * trus_d - self.centre) @ self.axes
         height, sigma = self.height(points[:, :2])
         gap = points[:, 2] - height
         crossing, end = _first_rise(gap), _first_rise(gap - 2.0 * sigma)
-        # From where the ray may have met the surface to where it must have: long where it grazes it or comes near it
-        # twice.
+        # From where the ray may have met the surface to where it must have: a long interval where it grazes the
+        # surface or comes near it twice.
         begin = float(ALONG_MM[0]) if gap[0] + 2.0 * sigma[0] > 0.0 else _first_rise(gap + 2.0 * sigma)
         if crossing is None or end is None or begin is None or end < crossing or gap[0] > 2.0 * sigma[0]:
             return None
@@ -135,7 +135,7 @@ def fit_surface(trus_p_pm: FloatArray, covariance: FloatArray, trus_d_beam: Floa
     centre = trus_p_pm.mean(axis=0)
     _, spread, directions = np.linalg.svd(trus_p_pm - centre)
     if spread[1] < MIN_SPREAD_MM * np.sqrt(len(trus_p_pm)):
-        return None  # PMs in a row: the slope across is anybody's guess
+        return None  # PMs in a row do not determine the slope across it
     normal = directions[2] * (1.0 if directions[2] @ trus_d_beam.mean(axis=0) >= 0 else -1.0)
     axes = rotation_to_direction(normal)
     local = (trus_p_pm - centre) @ axes
