@@ -1,1 +1,1 @@
-"""The factors of the graph: one file each, a pure ``residual`` and a builder; ``adapter`` makes them GTSAM's."""
+"""The factors of the graph: one file each, with a pure ``residual`` and a builder; ``adapter`` makes GTSAM factors."""

@@ -1,12 +1,12 @@
-"""Makes a ``gtsam.CustomFactor`` of a pure residual function, and refuses what GTSAM would take silently.
+"""Makes a ``gtsam.CustomFactor`` from a pure residual function, with checks that GTSAM does not make.
 
-GTSAM accepts a Jacobian of the wrong shape without a word, dies obscurely of one that is missing, and answers a NaN
-by returning the start. So every number passes here first: wrong shapes and numbers that are not finite raise
-:class:`FactorError`, which reaches the caller intact.
+GTSAM accepts a Jacobian of the wrong shape without an error, fails with an obscure one where a Jacobian is missing, and
+returns the start where a number is NaN. So every number is checked here: wrong shapes and numbers that are not finite
+raise :class:`FactorError`, which reaches the caller unchanged.
 
-Speed, since this runs once per factor and iteration: residual functions work on plain floats (for 3 x 6 blocks that
-beats numpy), the Jacobians go into one preallocated buffer in one copy, keys are read once by the builder. The factor
-is never referred to from its own callback: that cycle would never be freed.
+This runs once per factor and iteration, so it has to be fast. Residual functions work on plain floats (faster than
+numpy for 3 x 6 blocks), the Jacobians go into one preallocated buffer in one copy, and the builder reads the keys once.
+The callback does not refer to its own factor: that cycle would never be freed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Rows = Sequence[Row]
 """A small matrix as rows of floats, e.g. ``pose.matrix().tolist()``."""
 
 Residual = tuple[Row, Sequence[Rows]]
-"""What a residual function returns: error (m,), and one (m, n) Jacobian per variable (none where not asked for)."""
+"""Result of a residual function: error (m,), and one (m, n) Jacobian per variable (none where not wanted)."""
 
 Evaluate = Callable[[gtsam.Values, bool], Residual]
-"""Reads the variables, calls the residual function; the flag says whether Jacobians are wanted."""
+"""Reads the variables and calls the residual function; the flag: whether Jacobians are wanted."""
 
 
 class FactorError(ValueError):
-    """A residual function gave something that GTSAM must not see: a wrong shape, or a number that is not finite."""
+    """A residual function returned a wrong shape, or a number that is not finite."""
 
 
 def custom_factor(
@@ -77,7 +77,7 @@ def custom_factor(
             raise FactorError(f"{name}: the residual cannot be computed here: {failure}") from failure
         if len(error) != error_dim:
             raise FactorError(f"{name}: error of length {len(error)}, expected {error_dim}")
-        # A sum is finite only if its terms are: one test for all of them.
+        # A sum is finite only if its terms are, so one test covers all of them.
         if not finite(sum(error)):
             raise FactorError(f"{name}: error {list(error)} is not finite")
         error_out[:] = error
@@ -99,7 +99,7 @@ def custom_factor(
 
 
 def _misshapen(jacobians: Sequence[Rows], error_dim: int, dims: Sequence[int]) -> str:
-    """What is wrong with the first Jacobian that has not the shape it should have."""
+    """Description of the first Jacobian of a wrong shape."""
     for index, rows in enumerate(jacobians):
         if len(rows) != error_dim:
             return f"Jacobian {index} has {len(rows)} rows, expected {error_dim}"

@@ -1,6 +1,6 @@
 """Marker pose: one detection of the marker, as a prior with the *detection's own* 6x6 covariance.
 
-Equation. The detection says ``observed = [R_o, t_o]`` with ``t_o = t + bias + noise``; taking the bias off,
+Equation. The detection is ``observed = [R_o, t_o]`` with ``t_o = t + bias + noise``. With the bias subtracted,
 
     e = Log([R_o, t_o - bias]^-1 * camera_T_marker)
 

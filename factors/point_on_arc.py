@@ -1,4 +1,4 @@
-"""Point on arc: a PM lies on the arc that a look at it left open.
+"""Point on arc: a PM lies on the arc of each look at it.
 
 Equation (Song et al.'s arc; docs/model.md, section 2), t the look's stage angle, R the probe's radius, r the range:
 
@@ -12,10 +12,10 @@ assumed sound speed, is 1 unless it is a variable.
 Residual: (3,) mm. Jacobians, in the order of the keys: (3, 3) trus_p_pm, (3, 1) theta, (3, 1) sound_speed_ratio.
 
 Noise: the look's 2x2 covariance of (x, range) on the first two, so that range noise acts along the radius only (where c
-is a variable it scales the range, not its sigma); the third is a definition, and gets the sigma of what coincides.
+is a variable it scales the range, not its sigma). The third is a definition and has the coincidence sigma.
 
-The stage reading's noise enters by the sensitivity prior only: here a wrong t moves the arc's centre along its tangent
-by R dt, 0.02 mm for 0.1 deg at R = 10 mm, which theta takes up; what is left across the arc is negligible.
+The stage reading's noise enters by the sensitivity prior only. Here a wrong t moves the arc's centre along its tangent
+by R dt, 0.02 mm for 0.1 deg at R = 10 mm, which theta compensates; the rest across the arc is negligible.
 """
 
 from __future__ import annotations

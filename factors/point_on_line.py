@@ -25,7 +25,7 @@ from fgreg.factors.adapter import Residual, Row, Rows, custom_factor
 from fgreg.geometry.transforms import FloatArray, as_float_array
 
 COINCIDENCE_SIGMA_MM = 1e-3
-"""Of what coincides by definition (PM and beam, PM and arc): far below any noise, far above rounding."""
+"""Sigma of points that coincide by definition (PM and beam, PM and arc): far below any noise, far above rounding."""
 
 _MINUS_IDENTITY = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 

@@ -1,4 +1,4 @@
-"""Sensitivity prior: what having heard the PM at stage angle t says about where off the plane it lies.
+"""Sensitivity prior: a PM heard at stage angle t lies within the sensitivity window about the plane.
 
 Equation (docs/model.md, section 2). With delta = theta - t, R the probe's radius and r the observed range:
 
@@ -36,7 +36,7 @@ def residual(
     edge_gain: float,
     want_jacobians: bool = True,
 ) -> Residual:
-    """The rotation offset of an arc angle against what the look says of it.
+    """The rotation offset of an arc angle against its expected value.
 
     Args:
         theta_rad: arc angle theta' (TRUS convention).
@@ -76,7 +76,7 @@ def sensitivity_prior_factor(
     window_edge_key: int | None = None,
     sound_speed_ratio_key: int | None = None,
 ) -> gtsam.CustomFactor:
-    """The factor of a look: theta, and where given window_edge and sound_speed_ratio; doubles all.
+    """The factor of a look: theta, and where given window_edge and sound_speed_ratio; all are doubles.
 
     ``sigma_rad`` is of the rotation offset about its centre. Without ``window_edge_key`` the edge counts as exact,
     without ``sound_speed_ratio_key`` the ratio is 1.
