@@ -224,7 +224,7 @@ class StageEvent:
 
     t: Seconds
     line: int
-    command: Annotated[str, Key("what it was told")]
+    command: Annotated[str, Key("the command")]
     scan_deg: Annotated[float | None, Key("where to, device angle", SCAN_DEG)] = None
     reason: Annotated[str, Key("why", brief=True)] = ""
 

@@ -39,9 +39,9 @@ def find_epochs(
     config: SolveConfig,
     sound_speed_prior: SoundSpeedPrior | None = None,
 ) -> EpochsFound:
-    """Unreported moves and loop closures in the order of time: what the online engine finds in the same events.
+    """Unreported moves and loop closures in the order of time, as the online engine detects them in the same events.
 
-    None are found in sessions that there is no online form of (``config.estimate_radius``).
+    The online engine has no radius variable: ``config.estimate_radius`` is ignored here.
     """
     if config.estimate_radius:
         config = replace(config, estimate_radius=False)
@@ -81,7 +81,7 @@ def split_epochs(
 ) -> Measurements:
     """The measurements with an epoch more for every move found; reported motions stay between their sides.
 
-    Epochs in which the camera is back are tied to those that it is back to.
+    A loop closure links its epoch to the earlier one by a motion prior.
 
     All looks at a PM are of the epoch of its first.
     """

@@ -178,10 +178,10 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
         nis=None,
         used=False,
     )
-    return moved if last else tied(moved, setting)
+    return moved if last else with_motion_prior(moved, setting)
 
 
-def tied(state: State, setting: Setting) -> State:
+def with_motion_prior(state: State, setting: Setting) -> State:
     """The state whose current epoch, which has no pairs yet, is registered by the measured motion at its start.
 
     It is unchanged where there is no such motion, or where the epoch before the motion has no registration.
@@ -208,7 +208,7 @@ def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
     state = replace(state, epochs=(*state.epochs[:-1], now), nis=None, used=False)
     active, layout = state.active_window, state.layout
     if active is None or layout is None:
-        return state if state.epoch_pairs else tied(state, setting)
+        return state if state.epoch_pairs else with_motion_prior(state, setting)
     state, carried = carried_prior(state, active.state, setting)
     state = replace(state, carried=carried)
     return settled(state, active, layout, Change(prior=total_prior(state, active.state, setting)), setting)
