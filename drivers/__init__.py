@@ -1,1 +1,1 @@
-"""Devices: one file each, imported when used."""
+"""Device drivers: one file each, imported when used."""

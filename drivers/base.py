@@ -2,19 +2,19 @@
 
 Conventions for all of them:
 
-- **Time.** Everything that comes in carries a :class:`Stamp`: the device's time and the host's, seconds. Host times are
-  ``time.monotonic()`` (:func:`host_now`). ``fgreg.model.time_sync.DeviceClock`` brings device times onto the host's
-  clock, ``fgreg.model.time_sync.PoseHistory`` and ``scan_at`` interpolate marker poses and stage angles to a laser
-  pulse. Devices without a clock stamp both alike.
-- **Never wait.** ``poll`` returns what is there, oldest first, or nothing, at once. What was not fetched in time is
-  dropped by the driver, oldest first, and counted in ``dropped``: queues do not grow.
-- **Loss.** A device that is gone raises :class:`DeviceLost` from ``poll`` or ``send``, once; after that the driver
-  looks for it by itself, ``poll`` returns nothing, and ``connected`` says how things are.
-- **Close.** ``close`` lets go of the device, may be called twice, and never raises.
+- **Time.** All incoming data carry a :class:`Stamp`: the device's time and the host's, seconds. Host times are
+  ``time.monotonic()`` (:func:`host_now`). ``fgreg.model.time_sync.DeviceClock`` maps device times to the host's clock,
+  ``fgreg.model.time_sync.PoseHistory`` and ``scan_at`` interpolate marker poses and stage angles to a laser pulse. A
+  device without a clock stamps both with the host's time.
+- **Never wait.** ``poll`` returns at once with the waiting items, oldest first. The driver drops items that are not
+  fetched in time, oldest first, and counts them in ``dropped``: queues do not grow.
+- **Loss.** A lost device raises :class:`DeviceLost` from ``poll`` or ``send``, once. After that the driver reconnects
+  by itself; meanwhile ``poll`` returns nothing and ``connected`` is False.
+- **Close.** ``close`` releases the device, may be called twice, and never raises.
 - Frames: ``camera`` is the left camera, millimetres and radians (fgreg.geometry.transforms). Arrays are the receiver's
   own.
 
-The stage is different in one point: only the watchdog process of ``fgreg.stage`` may hold a :class:`RotationStage`;
+The stage differs in one point: only the watchdog process of ``fgreg.stage`` may hold a :class:`RotationStage`;
 programs turn it through ``fgreg.stage.client.StageLink``.
 """
 
@@ -61,11 +61,11 @@ __all__ = [
 
 
 class DeviceLost(FgregError):  # noqa: N818
-    """A device is gone: names the role, the device and what was seen; the driver tries to get it back."""
+    """A device is lost; the text names role, device and symptom. The driver tries to reconnect."""
 
 
 def host_now() -> float:
-    """Now, on the host's clock (s): the same for all processes of the machine, set by nobody."""
+    """Now on the host's monotonic clock (s), which is the same for all processes of the machine."""
     return time.monotonic()
 
 
@@ -74,9 +74,9 @@ class StereoFrame:
     """One exposure of the endoscope.
 
     Attributes:
-        stamp: the middle of the exposure, as well as the device knows it.
+        stamp: the middle of the exposure, as precisely as the device knows it.
         left, right: 8 bit, (h, w) grey or (h, w, 3) BGR; ``right`` None for one camera.
-        index: counts the device's frames, so that what was dropped shows.
+        index: counts the device's frames, so that gaps show dropped ones.
     """
 
     stamp: Stamp
@@ -87,7 +87,7 @@ class StereoFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaFrame:
-    """What the probe heard after one laser pulse.
+    """The probe's data after one laser pulse.
 
     Attributes:
         stamp: the laser pulse.
@@ -102,14 +102,14 @@ class PaFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BmodeFrame:
-    """One B-mode picture, to show with the rest; nothing is measured in it.
+    """One B-mode picture, for display only.
 
     Attributes:
-        stamp: when it was taken, as well as the device knows it.
+        stamp: when it was taken, as precisely as the device knows it.
         image: 8 bit, (depth, lateral) grey or (depth, lateral, 3) BGR; columns along TRUS x.
-        index: counts the device's pictures, so that what was dropped shows.
-        pixel_mm: size of a pixel along depth and laterally, where the device tells it.
-        origin_mm: depth below the array's face and TRUS x of the centre of pixel [0, 0], where that is known.
+        index: counts the device's pictures, so that gaps show dropped ones.
+        pixel_mm: size of a pixel along depth and laterally; None if unknown.
+        origin_mm: depth below the array's face and TRUS x of the centre of pixel [0, 0]; None if unknown.
     """
 
     stamp: Stamp
@@ -121,8 +121,8 @@ class BmodeFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionSample:
-    """Where the endoscope is by its holder's own account: ``base_T_camera`` (4, 4), mm, with its (6, 6) covariance
-    (right tangent) where the holder knows one."""
+    """The endoscope's pose as its holder measures it: ``base_T_camera`` (4, 4), mm, with its (6, 6) covariance (right
+    tangent; rad, mm) or None."""
 
     stamp: Stamp
     base_T_camera: FloatArray
@@ -131,15 +131,15 @@ class MotionSample:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registration:
-    """What goes out to other programs.
+    """The registration as it is sent to other programs.
 
     Attributes:
-        stamp: of the data it rests on.
-        verdict: ``ok``, ``warning`` or ``refused``; where refused, ``trus_T_camera`` is None.
-        trus_T_camera, covariance: (4, 4), (6, 6) right tangent.
-        scan_rad, sigma_rad: where the plane should be for the present beam, where that can be told.
-        stage_rad: what the stage itself reads there, by its own zero and direction.
-        reasons: the verdict's, plain sentences.
+        stamp: of the newest data behind it.
+        verdict: ``ok``, ``warning`` or ``refused``; if refused, ``trus_T_camera`` is None.
+        trus_T_camera, covariance: (4, 4), mm; (6, 6), right tangent (rad, mm).
+        scan_rad, sigma_rad: plane angle for the current beam and its sigma; None if unknown.
+        stage_rad: the same angle as the stage reads it, with its own zero and direction.
+        reasons: of the verdict, plain sentences.
     """
 
     stamp: Stamp
@@ -153,26 +153,26 @@ class Registration:
 
 
 class Device(Protocol):
-    """What all roles but the stage have in common."""
+    """Interface that all roles except the stage share."""
 
     @property
     def name(self) -> str:
-        """What the user calls it: port, path, address."""
+        """Name shown to the user: port, path or address."""
 
     @property
     def connected(self) -> bool:
-        """Whether the device is there and answers."""
+        """Whether the device is connected and answers."""
 
     @property
     def dropped(self) -> int:
-        """Frames, samples or messages dropped so far because nobody fetched or took them in time."""
+        """Number of frames, samples or messages dropped because they were not fetched or taken in time."""
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
 
 
 class CommandKind(StrEnum):
-    """What an operator can say."""
+    """Commands of an operator."""
 
     HOME = "home"
     AIM = "aim"
@@ -187,12 +187,12 @@ class CommandKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OperatorCommand:
-    """Words of the operator.
+    """One command of the operator.
 
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
-    ``search``, ``follow``: the stage may turn in search of PMs, after the beam; ``next``: leave this spot; ``moved``:
-    the camera has moved; ``stop`` the stage at once; ``reset``: the latched stage was looked at, and may be asked to
-    move again.
+    ``search``, ``follow``: the stage may turn to search for PMs, or to follow the beam; ``next``: leave this spot;
+    ``moved``: the camera has moved; ``stop`` the stage at once; ``reset``: the latched stage has been inspected, and
+    motions may be requested again.
     """
 
     kind: CommandKind
@@ -200,14 +200,13 @@ class OperatorCommand:
 
 
 class Operator(Device, Protocol):
-    """Whoever holds the fibre, and whoever speaks for them: a keyboard, a foot switch, a simulated surgeon."""
+    """Source of the operator's commands: a keyboard, a foot switch, a simulated surgeon."""
 
     def poll(self) -> Sequence[OperatorCommand]:
-        """What was said since the last call. Raises DeviceLost."""
+        """Commands since the last call. Raises DeviceLost."""
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
-        """Something they should know. ``done``: the present spot needs the fibre no longer; ``wants``: what they are
-        asked to say."""
+        """Show a message. ``done``: the current spot is finished; ``wants``: the command that is asked for."""
 
 
 class StereoCamera(Device, Protocol):
@@ -232,29 +231,29 @@ class BmodeSource(Device, Protocol):
 
 
 class MotionSource(Device, Protocol):
-    """Something that knows how the endoscope moves: a robot's kinematics."""
+    """Source of the endoscope's motion: a robot's kinematics."""
 
     def poll(self) -> Sequence[MotionSample]:
         """Samples since the last call. Raises DeviceLost."""
 
 
 class TransformSink(Device, Protocol):
-    """Somebody who wants to know the registration: a navigation program."""
+    """Receiver of the registration: a navigation program."""
 
     def send(self, registration: Registration) -> None:
-        """Hand it on; where the receiver is slow only the newest is kept. Raises DeviceLost."""
+        """Send the registration; for a slow receiver only the newest is kept. Raises DeviceLost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriverContext:
-    """What drivers are given besides their options.
+    """What drivers get besides their options.
 
     Attributes:
         say: shows one line to the operator.
         corners: columns and rows of the board's inner corners.
-        rectified: fgreg.drivers.rectification.Rectification of the endoscope's pictures, where that is wanted.
-        room: socket of the simulated room, where there is one.
-        paces: of recordings that play together; filled by the drivers.
+        rectified: fgreg.drivers.rectification.Rectification of the endoscope's pictures, or None.
+        room: socket of the simulated room, or None.
+        paces: shared by devices that play one recording together; filled by the drivers.
     """
 
     say: Callable[[str], None]

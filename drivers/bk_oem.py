@@ -5,8 +5,9 @@ inverse. Payloads are text that ends in ``;``, but for grabbed frames: ``DATA:GR
 digits follow; those: how many bytes follow), four bytes of a time stamp of no documented unit, the pixels row by row,
 ``;``.
 
-What is asked: the window's size and geometry (and to hear of changes), then frames at a given rate. Queries and replies
-are those that PLUS (vtkPlusBkProFocusOemVideoSource) uses with ProFocus and bk5000; tested against an emulator only.
+The driver asks for the window's size and geometry, subscribes to their changes, and asks for frames at a given rate.
+Queries and replies are those that PLUS (vtkPlusBkProFocusOemVideoSource) uses with ProFocus and bk5000; tested against
+an emulator only.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def encode(payload: str) -> bytes:
 
 
 def unescape(body: bytes) -> bytes:
-    """A payload from what was between 01 and 04. Raises ValueError: an escape that is none."""
+    """The payload of the bytes between 01 and 04. Raises ValueError on an invalid escape."""
     raw = np.frombuffer(body, dtype=np.uint8)
     at = np.flatnonzero(raw == ESCAPE[0])
     if not at.size:
@@ -82,11 +83,11 @@ class OemMessage:
 
 
 class OemDecoder:
-    """One connection's bytes to payloads. What is outside of a message, or cut off by the next one, is left out.
+    """Turns one connection's bytes into payloads. Bytes outside a message and cut-off messages are left out.
 
     Args:
-        rejections: counts that.
-        counter: numbers the grabbed frames; goes on from one connection to the next.
+        rejections: counts what is left out.
+        counter: numbers the grabbed frames across connections.
     """
 
     def __init__(self, rejections: Rejections, counter: Iterator[int]) -> None:
@@ -99,7 +100,7 @@ class OemDecoder:
         return bool(self._buffer)
 
     def feed(self, data: bytes, host_s: float) -> list[OemMessage]:
-        """Messages completed by these bytes. Raises StreamBroken: one that is too long."""
+        """Messages completed by these bytes. Raises StreamBroken if a message is too long."""
         messages = []
         *complete, rest = data.split(END)
         for piece in complete:
@@ -127,7 +128,7 @@ class OemDecoder:
 
 @dataclass(frozen=True, slots=True)
 class _Geometry:
-    """What the scanner tells of its window: pixels of the screen, and metres of tissue."""
+    """Geometry of the scanner's window: in screen pixels, and in metres of tissue."""
 
     window: tuple[int, int] | None = None  # columns, rows
     screen: tuple[float, ...] | None = None  # left, top, right, bottom of the tissue rectangle
@@ -136,13 +137,13 @@ class _Geometry:
 
     @property
     def falls(self) -> bool:
-        """Whether the lateral position falls from column to column."""
+        """Whether the lateral position decreases from column to column."""
         if self.screen is None or self.tissue_m is None:
             return False
         return (self.tissue_m[2] < self.tissue_m[0]) != (self.screen[2] < self.screen[0])
 
     def pixel_mm(self) -> tuple[float, float] | None:
-        """Along depth, laterally; None where it was not told, or cannot be."""
+        """Pixel size along depth and laterally; None if it is unknown or impossible."""
         if self.screen is None or self.tissue_m is None:
             return None
         columns, rows = self.screen[2] - self.screen[0], self.screen[3] - self.screen[1]
@@ -157,7 +158,7 @@ class _Geometry:
     def origin_mm(self) -> tuple[float, float] | None:
         """Depth and lateral position of the first grabbed pixel's centre, if all rectangles count the same pixels.
 
-        None where that was not told, or where depth is upwards in the picture.
+        None if it is unknown, or if depth points upwards in the picture.
         """
         size = self.pixel_mm()
         if size is None or self.screen is None or self.tissue_m is None or self.grabbed is None:
@@ -170,15 +171,15 @@ class _Geometry:
 
 
 class BkOemScanner(LinkedDevice[OemMessage]):
-    """BmodeSource: a scanner that is asked for its pictures.
+    """BmodeSource: a BK scanner.
 
-    The time stamps on the wire have no documented unit: both times are the host's.
+    The time stamps on the wire have no documented unit, so both times are the host's.
 
     Args:
         endpoint: the scanner's address; its OEM port is 7915 as a rule.
         rate_hz: pictures per second to ask for.
         silent_s: a scanner that says nothing for this long counts as lost; a frozen picture is silent.
-        flip: where the columns run against TRUS x.
+        flip: whether the columns run against TRUS x.
     """
 
     _role = "BK scanner"
@@ -247,7 +248,7 @@ class BkOemScanner(LinkedDevice[OemMessage]):
         return BmodeFrame(stamp, (image[:, ::-1] if falls else image).copy(), message.index, pixel_mm, origin_mm)
 
     def _ask_again(self) -> None:
-        """The window has changed and the scanner did not say so."""
+        """Ask for the geometry again after an unannounced change of the window."""
         now = time.monotonic()
         if now - self._asked_s > ASK_AGAIN_S:
             self._asked_s = now

@@ -1,6 +1,6 @@
-"""Calibrations that users have: ROS ``camera_info``, OpenCV FileStorage, Kalibr camchains; read as a StereoRig.
+"""Reads calibration files as a StereoRig: ROS ``camera_info``, OpenCV FileStorage, Kalibr camchains.
 
-What each says, and what becomes of it (``right_T_left`` maps left coordinates to right ones, mm):
+Content of each kind, and how it is converted (``right_T_left`` maps left coordinates to right ones, mm):
 
 - ROS: ``K``, ``D``, ``R``, ``P`` of each camera, metres. The rectified cameras are parallel, apart by
   ``b = P_right[:, 3] / f - P_left[:, 3] / f``; so ``right_T_left = [R_right' R_left, R_right' b]``.
@@ -9,9 +9,9 @@ What each says, and what becomes of it (``right_T_left`` maps left coordinates t
 - Kalibr: ``cam0`` is left, ``cam1`` right, ``T_cn_cnm1`` of cam1 is ``right_T_left``, metres.
 
 A session's camera has five distortion parameters (plumb_bob, radtan). Files of other models are refused unless their
-further parameters are zero. ``rectified`` reads the model of images that were rectified already: the matrix out of
-``P``, no distortion, cameras parallel. The ``camera`` frame is then the *rectified* left camera, turned by ``R_left``
-against the real one, and so is everything that is registered with it.
+further parameters are zero. ``rectified`` reads the model of images that were rectified already: the matrix from ``P``,
+no distortion, cameras parallel. The ``camera`` frame is then the *rectified* left camera, rotated by ``R_left`` against
+the real one, and the registration refers to it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """An endoscope's calibration, and what of it is allowed but hardly meant."""
+    """An endoscope's calibration, and warnings about values that are allowed but probably a mistake."""
 
     rig: StereoRig
     warnings: tuple[str, ...] = ()
@@ -76,10 +76,10 @@ def read_calibration(
             and extrinsics in any order.
         unit: of the file's lengths, ``m`` or ``mm``. Default: metres for ROS and Kalibr, millimetres for OpenCV.
         rectified: the images were rectified with this calibration.
-        image_size: (width, height) px, for OpenCV files that do not say.
+        image_size: (width, height) px, for OpenCV files without it.
 
     Raises:
-        InputError: what is wrong, with file and key.
+        InputError: bad input, with file and key.
     """
     if not 1 <= len(files) <= 2:
         raise InputError("calibration", f"{len(files)} files", "one file, or two: left and right")
@@ -153,7 +153,7 @@ def five_parameters(values: FloatArray, model: str, where: str) -> FloatArray:
     """OpenCV's (k1, k2, p1, p2, k3) of a file's distortion parameters.
 
     Raises:
-        InputError: a model, or parameters, that these five cannot say.
+        InputError: a model or parameters that these five cannot express.
     """
     values = np.asarray(values, dtype=np.float64).ravel()
     expected = "plumb_bob or radtan with up to 5 parameters k1, k2, p1, p2, k3; calibrate with these"
@@ -182,7 +182,7 @@ def _camera(size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, w
 
 
 def _checked(rig: StereoRig, name: str, unit: str) -> Calibration:
-    """The rig, where its baseline can be an endoscope's: metres taken for millimetres end here."""
+    """Check that the baseline can be an endoscope's, which catches metres read as millimetres."""
     if rig.right_T_left is None:
         return Calibration(rig)
     shift = rig.right_T_left[:3, 3]
@@ -370,7 +370,7 @@ def _kalibr_camera(file: _Values, key: str) -> CameraModel:
     return _camera(size, matrix, parameters, f"{file.name}: {key}.intrinsics")
 
 
-# Values of other programs' YAML files: keys that are not asked for do not matter.
+# Values of other programs' YAML files; unknown keys are ignored.
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 Sources, as the user writes them:
 
 - ``0`` or ``/dev/video0``: a V4L2 device. Times are the driver's (Linux' monotonic clock).
-- ``scheme://...``: a stream, by FFMPEG. Times are those of arrival.
+- ``scheme://...``: a stream, by FFMPEG. Times are arrival times.
 - a file: a video, by FFMPEG, played at its own pace.
 - a folder, or a pattern such as ``left/*.png``: pictures, played at ``fps`` (fgreg.drivers.image_folder).
 """
@@ -58,9 +58,9 @@ class InputConfig:
     Attributes:
         source: see the module.
         width, height, fps, fourcc: asked of a device; ``fps`` of a folder is its pace.
-        loop: files and folders begin again at their end.
+        loop: whether files and folders start again at their end.
         delay_s: from the middle of the exposure to the device's stamp; subtracted from its time.
-        silence_s: without a frame for so long the input counts as lost.
+        silence_s: an input without a frame for this long counts as lost.
     """
 
     source: str | int
@@ -87,12 +87,12 @@ class EndoscopeConfig:
         left: the left input, or the only one.
         right: the right input, where there are two.
         layout: where left and right are.
-        swap: left and right are the other way round in each frame.
-        fields: what to make of interlaced frames; the session's camera is then that of the fields
+        swap: whether left and right are exchanged in each frame.
+        fields: how interlaced frames are split; the session's camera is then that of the fields
             (fgreg.drivers.interlacing.field_rig).
-        max_gap_s: most time between left and right of two inputs. Default: half a frame period at 30 frames/s.
-        by_arrival: match two inputs by their times of arrival even where both have device times on one clock.
-        queue: frames that may wait.
+        max_gap_s: longest time between left and right of two inputs. Default: half a frame period at 30 frames/s.
+        by_arrival: match two inputs by arrival time even if both have device times on one clock.
+        queue: largest number of waiting frames.
     """
 
     left: InputConfig
@@ -113,7 +113,7 @@ class EndoscopeConfig:
 
 @dataclass(slots=True)
 class _Cadence:
-    """The time between two frames, as the last ones had it: for the second field's stamp."""
+    """Time between the last two frames, for the second field's stamp."""
 
     last_s: float | None = None
     period_s: float = field(default=1.0 / 30.0)
@@ -128,14 +128,14 @@ class _Cadence:
 class Endoscope:
     """A StereoCamera (fgreg.drivers.base) of one or two video inputs.
 
-    Where the right one of two inputs is lost, left frames go on alone (``right`` None); both come again by themselves.
+    If the right one of two inputs is lost, left frames continue alone (``right`` None) until it is back.
 
     Args:
-        config: which inputs, and what to make of them.
-        rectified: rectify the pictures with this; the session's camera is then ``rectified.rig``.
+        config: inputs and their layout.
+        rectified: rectification of the pictures, or None; the session's camera is then ``rectified.rig``.
 
     Raises:
-        InputError: a source that cannot be one. Devices that are absent are no error: they are lost, and looked for.
+        InputError: an invalid source. An absent device is no error: it counts as lost, and the driver tries again.
     """
 
     def __init__(self, config: EndoscopeConfig, rectified: Rectification | None = None) -> None:
@@ -171,14 +171,14 @@ class Endoscope:
 
     @property
     def dropped(self) -> int:
-        """Frames that nobody fetched in time or that found no partner."""
+        """Number of frames that were not fetched in time or had no partner."""
         return sum(entry.dropped for entry in self._inputs) + self._matcher.dropped
 
     def poll(self) -> list[StereoFrame]:
         """Frames since the last call, oldest first.
 
         Raises:
-            DeviceLost: an input is gone; once for each loss, names it, and what goes on without.
+            DeviceLost: an input is lost; once for each loss, with what continues without it.
             InputError: frames that do not fit the layout or the rectification.
         """
         grabbed: list[list[Grabbed]] = []
@@ -198,7 +198,7 @@ class Endoscope:
             pairs = [(entry, None) for entry in grabbed[0]]
         self._held += [frame for left, right in pairs for frame in self._frames(left, right)]
         if self._losses:
-            raise self._losses.pop(0)  # what came meanwhile comes with the next call
+            raise self._losses.pop(0)  # the frames are returned by the next call
         frames, self._held = self._held, []
         return frames
 
@@ -208,7 +208,7 @@ class Endoscope:
         return "; the left camera goes on alone" if lost == 1 else "; no frames until it is back"
 
     def close(self) -> None:
-        """Let go of all inputs."""
+        """Release all inputs."""
         for entry in self._inputs:
             entry.close()
 
@@ -245,7 +245,7 @@ class Endoscope:
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """A source by its kind: how it is opened, and whose clock its frames have."""
+    """A source of one kind: how it is opened, and which clock stamps its frames."""
 
     name: str
     open: Callable[[], Capture | None]
@@ -266,7 +266,7 @@ class _Source:
         played = replace(timing, paced=True, loop=config.loop)
         path = Path(text)
         if path.is_dir() or "*" in path.name:
-            folder = FolderCapture.of(path, config.fps or 30.0)  # what is wrong with it is told here, not later
+            folder = FolderCapture.of(path, config.fps or 30.0)  # so that errors are raised here, not later
             return cls(text, folder.again, played, "file")
         if not path.is_file():
             raise InputError(text, "nothing", "a video device, a stream, a video file, or a folder of pictures")
@@ -284,7 +284,7 @@ def _open_device(path: str, config: InputConfig) -> Capture | None:
         return None
     backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
     capture = _quietly(lambda: cv2.VideoCapture(int(path.removeprefix("/dev/video")), backend))
-    # The kind of pixels first: it decides which sizes and rates the device has.
+    # The pixel format first: available sizes and rates depend on it.
     if config.fourcc is not None:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
     for key, value in (
@@ -302,7 +302,7 @@ def _open_device(path: str, config: InputConfig) -> Capture | None:
 
 
 def _open_stream(url: str, silence_s: float) -> Capture | None:
-    # FFMPEG has a log of its own, which would fill standard error while a stream is looked for.
+    # FFMPEG's own log would fill standard error during repeated attempts.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     patience_ms = max(1, round(1000.0 * silence_s))
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, patience_ms]
@@ -310,7 +310,7 @@ def _open_stream(url: str, silence_s: float) -> Capture | None:
 
 
 class _Quiet:
-    """Holds back OpenCV's own warnings while anything is being opened: absent devices are looked for all the time."""
+    """Suppresses OpenCV's own warnings while a source is opened, since absent devices are tried repeatedly."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -338,7 +338,7 @@ def _quietly(make: Callable[[], cv2.VideoCapture]) -> cv2.VideoCapture:
 
 
 def video_devices(known: Path = Path("/sys/class/video4linux")) -> list[tuple[str, str]]:
-    """The V4L2 devices of this machine: path, and what the driver calls it."""
+    """The V4L2 devices of this machine: path, and the driver's name for it."""
     out = []
     for entry in sorted(known.glob("video*"), key=lambda p: (len(p.name), p.name)):
         try:

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from fgreg.drivers.options import Connection, IgtlBmodeOptions, IgtlMotionOptions, IgtlProbeOptions, IgtlSinkOptions
 
 SILENT_S = 0.8
-"""A stream that stops for this long counts as lost, unless told otherwise: it is said within a second."""
+"""Default time after which a silent stream counts as lost, so that the loss is reported within a second."""
 
 
 class _IgtlDevice(LinkedDevice[Message]):
-    """A device of which some messages are wanted."""
+    """A connection from which some messages are read."""
 
     _role = "OpenIGTLink"
 
@@ -75,7 +75,7 @@ class IgtlReceiver(_IgtlDevice):
     Args:
         endpoint: the sender.
         wanted: pairs of type (``TRANSFORM``, ``IMAGE``, ``STRING``, ``STATUS``) and device; an empty device takes all.
-        silent_s: as for the sources below; None where a silent sender is fine.
+        silent_s: as for the sources below; None if the sender may be silent.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class IgtlReceiver(_IgtlDevice):
 
 
 class _Images(_IgtlDevice):
-    """Two-dimensional images of one device, counted."""
+    """Numbered two-dimensional images of one device."""
 
     def __init__(self, endpoint: Endpoint, device: str, silent_s: float | None) -> None:
         super().__init__(endpoint, [("IMAGE", check_name(device))], silent_s)
@@ -109,14 +109,14 @@ class _Images(_IgtlDevice):
 
 
 class IgtlPhotoacoustic(_Images):
-    """PhotoacousticSource: each IMAGE of a device is what the probe heard after one laser pulse.
+    """PhotoacousticSource: each IMAGE of a device holds the probe's data after one laser pulse.
 
     Args:
         endpoint: PLUS or the scanner.
         device: e.g. ``Image_Probe``.
-        transposed: where the sender's rows are what the session's frames have as columns. A session wants channel data
-            with one row per element, envelope images with one row per depth.
-        silent_s: None where the laser may pause.
+        transposed: whether the sender's rows are the columns of the session's frames, which have one row per element
+            (channel data) or per depth (envelope images).
+        silent_s: None if the laser may pause.
     """
 
     _role = "photoacoustic source"
@@ -141,15 +141,15 @@ class IgtlPhotoacoustic(_Images):
 class IgtlBmode(_Images):
     """BmodeSource: 8-bit B-mode images of a device, for overlay; rows are depths.
 
-    Images tell the size of their pixels, but not where they lie in the image plane.
+    Images carry the size of their pixels, but not their position in the image plane.
 
     Args:
         endpoint: PLUS or the scanner.
         device: e.g. ``Image_Reference``.
-        silent_s: None where the picture may be frozen.
-        origin_mm: depth and lateral position (TRUS x) of the centre of the pixel that is shown at the upper left; None
-            where that is not known.
-        flip: where the columns run against TRUS x.
+        silent_s: None if the picture may be frozen.
+        origin_mm: depth and lateral position (TRUS x) of the centre of the upper left pixel as displayed; None if
+            unknown.
+        flip: whether the columns run against TRUS x.
     """
 
     _role = "B-mode source"
@@ -185,7 +185,7 @@ class IgtlMotion(_IgtlDevice):
     Args:
         endpoint: the sender.
         device: e.g. ``CameraToBase``: the matrix maps camera points to the holder's base.
-        inverted: where the sender has it the other way round, ``BaseToCamera``.
+        inverted: whether the sender has the inverse, ``BaseToCamera``.
 
     Left out and counted: transforms that PLUS marks with a ``TransformStatus`` other than ``OK``, and matrices that are
     not rigid.
@@ -217,11 +217,11 @@ class IgtlMotion(_IgtlDevice):
 
 
 class IgtlTransformSink(_IgtlDevice):
-    """TransformSink: see ``igtl_registration`` for what goes out, and what a refused registration looks like.
+    """TransformSink: ``igtl_registration`` describes the messages, also those of a refused registration.
 
     Args:
-        endpoint: ``Endpoint.listening(18944)`` for receivers that connect (several may), or a receiver's address. Who
-            connects later gets the newest registration at once.
+        endpoint: ``Endpoint.listening(18944)`` for receivers that connect (several may), or a receiver's address. A
+            receiver that connects later gets the newest registration at once.
         names: of the devices.
         header_version: 2 for 3D Slicer and PLUS of 2017 and later; 1, without metadata, for receivers of OpenIGTLink 1
             and 2, which lose the stream at a header they do not know.
@@ -241,7 +241,7 @@ class IgtlTransformSink(_IgtlDevice):
         super().__init__(endpoint, keep_latest=True)
 
     def send(self, registration: Registration) -> None:
-        """Hand it on; where a receiver is slow only the newest is kept. Raises DeviceLost."""
+        """Send the registration; for a slow receiver only the newest is kept. Raises DeviceLost."""
         sent_s = time.time() - (host_now() - registration.stamp.host_s)
         self._link.offer(registration_messages(registration, max(sent_s, 0.0), self._names, self._version))
         self._raise_loss()
@@ -268,11 +268,11 @@ def open_motion(_context: DriverContext, options: IgtlMotionOptions) -> MotionSo
 
 
 def open_sink(_context: DriverContext, options: IgtlSinkOptions) -> TransformSink:
-    """Whoever takes the registration."""
+    """Receiver of the registration over OpenIGTLink."""
     names = DeviceNames(options.registration, options.plane, options.status, options.verdict)
     return IgtlTransformSink(endpoint(options), names, options.header_version)
 
 
 def endpoint(options: Connection) -> Endpoint:
-    """Where the peer is, or where to wait for it."""
+    """The peer's address, or the address to listen at."""
     return Endpoint(options.host, options.port, options.listen)

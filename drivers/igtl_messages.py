@@ -1,9 +1,9 @@
-"""OpenIGTLink messages: bytes to typed content and back, with everything checked that a sender can get wrong.
+"""OpenIGTLink messages: bytes to typed content and back, with checks of everything that a sender can get wrong.
 
 Packing and parsing of contents is pyigtl's; header, checksum, sizes and STATUS are checked or made here, since pyigtl
 does none of it. Its own client and server are not used: they keep only the newest message of each device, so laser
-pulses would be lost; they take any body size and any checksum, do not connect again after the other side hung up, and
-spin for ever where it does so inside a header.
+pulses would be lost. They accept any body size and any checksum, do not reconnect after the other side hangs up, and
+loop for ever if it hangs up inside a header.
 
 Header version 2 (OpenIGTLink 3) carries metadata; receivers of protocol 1 and 2 cannot read it and lose the stream.
 """
@@ -27,7 +27,7 @@ from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import FloatArray
 
 PORT = 18944
-"""What 3D Slicer and PLUS use unless told otherwise."""
+"""Default port of 3D Slicer and PLUS."""
 NAME_BYTES = 20
 MAX_BODY_BYTES = 32 << 20
 """Largest message taken: 128 elements of 60,000 samples in floats, a volume of 256 x 256 x 256 bytes."""
@@ -78,7 +78,7 @@ class Message:
         device: the sender's name for it.
         sent_s: its time stamp (s since 1970 as a rule), None where the sender gives none.
         host_s: when it was complete here, ``time.monotonic()``.
-        index: counts the messages that were asked for alike (by device, or all of a type), those left out included.
+        index: counts the messages of one entry of ``wanted`` (a device, or all of a type), including those left out.
         metadata: of header version 2.
     """
 
@@ -109,7 +109,7 @@ class Header:
 
 
 def check_name(name: str) -> str:
-    """A device name as OpenIGTLink takes it. Raises InputError: the protocol would cut it without a word."""
+    """A valid OpenIGTLink device name. Raises InputError for others, which the protocol would cut silently."""
     if not (name.isascii() and name.isprintable() and 1 <= len(name) <= NAME_BYTES) or name != name.strip():
         raise InputError("OpenIGTLink device name", repr(name), f"1 to {NAME_BYTES} printable ASCII characters")
     return name
@@ -119,7 +119,7 @@ def parse_header(data: bytes) -> Header:
     """A header (58 bytes).
 
     Raises:
-        StreamBroken: it cannot be one, or announces a body that is too large: there is no way to find the next message.
+        StreamBroken: not a header, or a body that is too large, so that the next message cannot be found.
     """
     version, kind, device, seconds, fraction, body_bytes, checksum = HEADER.unpack(data)
     if version not in (1, 2):
@@ -140,7 +140,7 @@ def parse_body(header: Header, body: bytes, host_s: float, index: int = 0) -> Me
     """A message from its parts.
 
     Raises:
-        ValueError: wrong checksum, or a content that is not what its type says.
+        ValueError: wrong checksum, or content that does not fit its type.
     """
     library = _pyigtl()
     if library.messages.CRC64(body) != header.checksum:
@@ -157,7 +157,7 @@ def parse_body(header: Header, body: bytes, host_s: float, index: int = 0) -> Me
     try:
         raw.unpack(fields, body)
         content = _content(header.kind, raw)
-    except Exception as error:  # a third party's parser on bytes that anybody sent: it raises whatever it comes to
+    except Exception as error:  # a third party's parser on untrusted bytes may raise anything
         raise ValueError(f"{header.kind} {header.device}: {error}") from error
     return Message(header.device, header.sent_s, host_s, index, content, dict(raw.metadata))
 
@@ -170,7 +170,7 @@ def pack_transform(
 
 
 def pack_text(device: str, text: str, sent_s: float, metadata: Mapping[str, str], version: int = 2) -> bytes:
-    """STRING, ASCII; what is beyond 65,535 bytes is cut."""
+    """STRING, ASCII; cut to 65,535 bytes."""
     return _pack(_pyigtl().StringMessage(_ascii(text)[:65535]), device, sent_s, metadata, version)
 
 
@@ -187,13 +187,13 @@ def pack_image(device: str, pixels: npt.NDArray[Any], sent_s: float, version: in
 
 
 class MessageDecoder:
-    """One connection's bytes to the messages of those devices that are wanted.
+    """Turns one connection's bytes into the messages of the wanted devices.
 
     Args:
-        rejections: counts messages with wrong checksums or contents. They are left out; the stream goes on, since their
-            length is known.
-        wanted: (type, device) pairs; an empty device takes every device of that type. All others are skipped unread.
-        counts: of messages by (type, device) so far; goes on from one connection to the next.
+        rejections: counts messages with a wrong checksum or content. They are left out; the stream continues, since
+            their length is known.
+        wanted: (type, device) pairs; an empty device takes every device of that type. Other messages are skipped.
+        counts: number of messages up to now by (type, device), across connections.
     """
 
     def __init__(
@@ -224,7 +224,7 @@ class MessageDecoder:
             header, self._header = self._header, None
             if not {(header.kind, header.device), (header.kind, "")} & self._wanted:
                 continue
-            # Only so many devices are told apart: names are the sender's, and he may think of ever new ones.
+            # Only wanted devices are counted separately: the sender may invent any number of names.
             key = (header.kind, header.device if (header.kind, header.device) in self._wanted else "")
             index = self._counts[key]
             self._counts[key] += 1
@@ -235,7 +235,7 @@ class MessageDecoder:
 
 
 def require_pyigtl() -> None:
-    """Raises MissingExtraError where pyigtl is not installed."""
+    """Raises MissingExtraError if pyigtl is not installed."""
     _pyigtl()
 
 
@@ -252,7 +252,7 @@ def _status_class() -> Any:
     base = _pyigtl().MessageBase
 
     class StatusMessage(base):  # type: ignore[misc, valid-type]
-        """STATUS, which pyigtl has not."""
+        """STATUS, which pyigtl lacks."""
 
         def __init__(self) -> None:
             base.__init__(self)
@@ -305,5 +305,5 @@ def _padded(raw: bytes) -> str:
 
 
 def _ascii(text: str) -> str:
-    """Other characters as escapes: receivers differ in what they make of them."""
+    """ASCII text with other characters as escapes, since receivers treat them differently."""
     return text.encode("ascii", "backslashreplace").decode("ascii")

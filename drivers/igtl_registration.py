@@ -1,4 +1,4 @@
-"""What a registration looks like on an OpenIGTLink connection.
+"""OpenIGTLink messages of a registration.
 
 | message | device | when | content |
 |---|---|---|---|
@@ -8,15 +8,15 @@
 | TRANSFORM | `PlaneToTrus` | usable, angle known | the image plane (its z axis) turned to where the beam points |
 
 **Refused means no TRANSFORM at all.** 3D Slicer puts the matrix of every TRANSFORM into its node, whatever the status
-in the metadata, so a matrix that must not be used must not be sent; PLUS, with `SendValidTransformsOnly`, does the
-same. Receivers keep the last valid matrix meanwhile: that it is out of date shows in the STATUS and STRING messages, in
-its time stamp, and in SlicerIGT's Watchdog module, which marks a transform that is no longer updated.
+in the metadata, so a matrix that must not be used must not be sent; PLUS with `SendValidTransformsOnly` does the same.
+Receivers keep the last valid matrix meanwhile. The STATUS and STRING messages, its time stamp and SlicerIGT's Watchdog
+module, which marks a transform that is no longer updated, show that it is out of date.
 
 Metadata (header version 2 only): `TransformStatus`, the key that PLUS reads and Slicer hands on (`OK`; `INVALID` on the
 STATUS and STRING of a refused registration), `Verdict`, `Reasons`, and for a transform `Covariance` (36 numbers, row by
 row, rad and mm, over the right tangent: rotation, then translation) with `CovarianceFrame`; `StageDeg`, `PlaneDeg`,
-`SigmaDeg`. `stage_deg` is what the stage reads where the beam is in the plane, by its own zero and direction, as in
-result files; `plane_deg` is the plane's angle there in the TRUS frame, (0, sin, cos).
+`SigmaDeg`. `stage_deg` is the stage's reading, with its own zero and direction as in result files, at which the beam
+is in the plane; `plane_deg` is the plane's angle there in the TRUS frame, (0, sin, cos).
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transf
 
 USABLE = ("ok", "warning")
 TEXT_CHARACTERS = 4000
-"""Reasons are cut to this: a receiver shows them in a line."""
+"""Reasons are cut to this length, since a receiver shows them in one line."""
 SUMMARY_BYTES = 60_000
-"""Of the JSON text; a STRING holds 65,535."""
+"""Largest JSON text; a STRING holds 65,535 bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceNames:
-    """What the messages are called; each 1 to 20 ASCII characters. Raises InputError."""
+    """Device names of the messages, each 1 to 20 ASCII characters. Raises InputError."""
 
     registration: str = "CameraToTrus"
     plane: str = "PlaneToTrus"
@@ -79,9 +79,9 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
     if usable and matrix is not None and not (np.isfinite(matrix).all() and is_rigid(matrix)):
         usable, reasons = False, ("the transform is not rigid", *reasons)
     verdict = registration.verdict if usable else "refused"
-    told = "; ".join(reasons)[:TEXT_CHARACTERS]
-    common = {"TransformStatus": "OK" if usable else "INVALID", "Verdict": verdict, "Reasons": told}
-    status = Status(STATUS_OK if usable else STATUS_NOT_READY, 0, verdict.upper(), told)
+    text = "; ".join(reasons)[:TEXT_CHARACTERS]
+    common = {"TransformStatus": "OK" if usable else "INVALID", "Verdict": verdict, "Reasons": text}
+    status = Status(STATUS_OK if usable else STATUS_NOT_READY, 0, verdict.upper(), text)
     angles = _angles(registration) if usable else {}
     summary = _summary(verdict, angles, reasons)
     messages = [
@@ -99,7 +99,7 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
 
 
 def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:
-    """JSON, ASCII; as many of the reasons as fit."""
+    """JSON text, ASCII, with as many reasons as fit."""
     cut = [reason[:TEXT_CHARACTERS] for reason in reasons]
     told = {f"{what.lower()}_deg": angles.get(f"{what}Deg") for what in ("Stage", "Plane", "Sigma")}
     while True:

@@ -1,7 +1,7 @@
-"""A folder of pictures played as a video: the same few methods as cv2.VideoCapture.
+"""A folder of pictures played as a video, with the methods of cv2.VideoCapture that are used.
 
-Pictures go by the last number in their names, where all have one, else by their names. The number is also the time, at
-``fps`` numbers a second from the lowest one: a picture that is missing in one of two folders then shifts nothing.
+Pictures are ordered by the last number in their names if all have one, else by name. The number also gives the time, at
+``fps`` numbers per second from the lowest one, so a picture that is missing in one of two folders shifts no other.
 """
 
 from __future__ import annotations
@@ -52,15 +52,15 @@ class FolderCapture:
         return cls(sorted(found), [i / fps for i in range(len(found))])
 
     def again(self) -> FolderCapture:
-        """The same from its beginning."""
+        """The same folder from the beginning."""
         return FolderCapture(self.pictures, self.times_s)
 
     def isOpened(self) -> bool:
-        """Always: the folder was read."""
+        """Always True: the folder has been read."""
         return True
 
     def read(self) -> tuple[bool, Any]:
-        """The next picture; one that cannot be decoded is left out."""
+        """The next picture; pictures that cannot be decoded are left out."""
         while self._next < len(self.pictures):
             try:
                 picture = read_picture(self.pictures[self._next])
@@ -78,4 +78,4 @@ class FolderCapture:
         return float(np.nan)
 
     def release(self) -> None:
-        """Nothing is held."""
+        """Does nothing: no resource is held."""

@@ -1,9 +1,9 @@
 """Interlaced video: one frame holds two fields, taken half a frame period apart, on its even and its odd lines.
 
-Anything that moves is torn apart by that, so each field is a picture of its own: half as high, with ``fy`` half of the
-whole frame's (so ``fx`` is about twice ``fy``), and a centre that depends on the field. Line ``v`` of the frame is line
-``(v - parity) / 2`` of the field, hence ``fy' = fy / 2``, ``cy' = (cy - parity) / 2``; distortion acts on normalised
-coordinates and stays.
+Moving objects are torn apart by that, so each field becomes a picture of its own: half as high, with half of the whole
+frame's ``fy`` (so ``fx`` is about twice ``fy``), and a centre that depends on the field. Line ``v`` of the frame is
+line ``(v - parity) / 2`` of the field, hence ``fy' = fy / 2``, ``cy' = (cy - parity) / 2``; distortion acts on
+normalised coordinates and stays.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Picture = npt.NDArray[np.uint8]
 
 
 class Fields(StrEnum):
-    """What to make of a video frame."""
+    """How a video frame is split into pictures."""
 
     WHOLE = "whole"
     """The frame as it is: progressive video, or a device that delivers single fields."""
@@ -72,6 +72,6 @@ def field_camera(camera: CameraModel, fields: Fields) -> CameraModel:
 
 
 def field_rig(rig: StereoRig, fields: Fields) -> StereoRig:
-    """:func:`field_camera` of both cameras; where they stand to each other does not change."""
+    """:func:`field_camera` of both cameras; their relative pose does not change."""
     right = None if rig.right is None else field_camera(rig.right, fields)
     return replace(rig, left=field_camera(rig.left, fields), right=right)

@@ -1,7 +1,7 @@
-"""The operator at the terminal: lines on standard input, answers by whoever shows text.
+"""The operator at the terminal: commands as lines on standard input, messages through a given function.
 
-A thread waits for lines and reads them by the file's descriptor, past Python's own buffers: those are locked while a
-thread waits in them, and a program could not end then.
+A thread waits for lines and reads from the file descriptor, not through Python's buffers: these are locked while a
+thread waits in them, and the program could not end.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 MOST_WAITING = 64
 MAX_LINE_BYTES = 1000
 BACKGROUND_S = 0.5
-"""A program in the background may not read from its terminal: it would be stopped, and the stage with it."""
+"""Time between checks for the foreground. A background program that reads from its terminal would be suspended."""
 
 
 class KeyboardOperator:
-    """An Operator (fgreg.drivers.base): see ``operator_words`` for what it understands.
+    """An Operator (fgreg.drivers.base); ``operator_words`` defines the commands.
 
-    At the end of the input nothing more comes; that is no loss.
+    The end of the input is no loss; no more commands come.
 
     Args:
-        say: shows one line; called from this driver's thread, too.
-        fd: to read from. Default: standard input.
-        corners: columns and rows of the board's inner corners; aims at others are answered.
+        say: shows one line; also called from this driver's thread.
+        fd: file descriptor to read from. Default: standard input.
+        corners: columns and rows of the board's inner corners; aims at others are rejected with a message.
     """
 
     def __init__(
@@ -53,32 +53,32 @@ class KeyboardOperator:
 
     @property
     def name(self) -> str:
-        """What the user calls it."""
+        """Name shown to the user."""
         return "keyboard"
 
     @property
     def connected(self) -> bool:
-        """Whether lines can still come."""
+        """Whether more lines can come."""
         return self._open
 
     @property
     def dropped(self) -> int:
-        """Commands dropped because nobody fetched them in time."""
+        """Number of commands dropped because they were not fetched in time."""
         return self._dropped
 
     def poll(self) -> list[OperatorCommand]:
-        """What was said since the last call."""
+        """Commands since the last call."""
         with self._lock:
             commands = list(self._waiting)
             self._waiting.clear()
         return commands
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
-        """One line."""
+        """Show a message as one line."""
         self._say(asked(text, wants))
 
     def close(self) -> None:
-        """End the thread; the input stays open, it is not ours."""
+        """End the thread; the input stays open."""
         with self._lock:
             if self._closed:
                 return
@@ -97,7 +97,7 @@ class KeyboardOperator:
             *lines, held = (held + data).split(b"\n")
             if not data:
                 self._open = False
-                lines, held = [held] if held else [], b""  # a last line without an end; nothing is no empty line
+                lines, held = [held] if held else [], b""  # a last line without a newline; empty input is no line
             for line in lines:
                 self._take(line, too_long or len(line) > MAX_LINE_BYTES)
                 too_long = False
@@ -105,7 +105,7 @@ class KeyboardOperator:
                 held, too_long = b"", True
 
     def _read(self) -> bytes | None:
-        """What is there; nothing at the end of the input; None where it was not waited for, or not allowed."""
+        """New bytes; empty at the end of the input; None if nothing came, or reading is not allowed now."""
         fd = self._fd
         if fd is None:
             return b""
@@ -129,14 +129,14 @@ class KeyboardOperator:
         with self._lock:
             self._waiting.append(command)
             while len(self._waiting) > MOST_WAITING:
-                # The oldest goes, but never a stop.
+                # Drop the oldest command, but never a stop.
                 old = next((c for c in self._waiting if c.kind is not CommandKind.STOP), self._waiting[0])
                 self._waiting.remove(old)
                 self._dropped += 1
 
 
 def standard_input() -> int | None:
-    """Its descriptor; None where there is none."""
+    """File descriptor of standard input; None if there is none."""
     try:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
@@ -144,7 +144,7 @@ def standard_input() -> int | None:
 
 
 def _in_foreground(fd: int) -> bool:
-    """Whether reading is allowed now: not from the terminal of another job."""
+    """Whether reading is allowed now: not if another job has the terminal."""
     try:
         return not os.isatty(fd) or os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:  # a terminal that does not control this program, or has hung up: reading does no harm
@@ -152,12 +152,12 @@ def _in_foreground(fd: int) -> bool:
 
 
 def open_keyboard(context: DriverContext, _options: NoOptions) -> Operator:
-    """Whoever sits at the terminal."""
+    """The operator at the terminal."""
     return KeyboardOperator(context.say, corners=context.corners)
 
 
 def ask_keyboard(_context: DriverContext, _options: NoOptions) -> str:
-    """What standard input is; nothing is read. Raises DeviceLost where it is closed."""
+    """Describe standard input without reading. Raises DeviceLost if it is closed."""
     fd = standard_input()
     if fd is None:
         raise DeviceLost("standard input is closed")

@@ -12,7 +12,7 @@ import numpy as np
 from fgreg.errors import InputError
 
 Storage = dict[str, object]
-"""Top-level names: arrays of doubles (matrices, lists of numbers), floats, texts; anything else is left out."""
+"""Top-level names: arrays of doubles (matrices, lists of numbers), floats, texts; other values are left out."""
 
 
 def is_storage(data: bytes) -> bool:
@@ -40,7 +40,7 @@ def read_storage(path: Path, name: str) -> Storage:
     """
     expected = "a file of cv2.FileStorage (YAML, XML, JSON)"
     try:
-        # From memory: OpenCV takes the kind from the content then, whatever the file is called.
+        # From memory, so that OpenCV takes the format from the content and not from the file's name.
         text = path.read_bytes().decode("utf-8-sig")
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, UnicodeDecodeError, SystemError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What an operator can say, in words: the same at a keyboard and over a network."""
+"""The operator's commands in words, for the keyboard and the network."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ LETTERS = {
     "m": CommandKind.MOVED,
     "x": CommandKind.STOP,
 }
-"""One letter for a word. ``s`` is search: stopping has an empty line, and ``x``. ``reset`` has none: a slip of the
-finger must not free a stage that stopped for trouble."""
+"""One-letter commands. ``s`` is search; an empty line and ``x`` stop. ``reset`` has no letter: a typing error must not
+release a stage that has latched."""
 
 EXPECTED = (
     "home (h), aim COLUMN ROW (a), register (r), search (s), follow (f), next (n), moved (m), "
     "stop (x, or an empty line), reset"
 )
 LARGEST_CORNER = 199
-"""Of a board, as session.yaml bounds it."""
+"""Largest corner index of a board in session.yaml."""
 
 _WORDS: dict[str, CommandKind] = {**{said.value: said for said in CommandKind}, **LETTERS}
 _NUMBER = re.compile(r"[0-9]{1,3}")
@@ -33,13 +33,13 @@ _STOP = re.compile(r"\bstop\b")
 
 
 def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCommand | str:
-    """The command that a line is, or what was expected instead.
+    """Parse a line into a command; returns a message with what was expected if that fails.
 
-    A line with the word ``stop`` anywhere is one, as is an empty line: whoever wants the stage to stop need not spell.
+    A line with the word ``stop`` anywhere is a stop, and so is an empty line: stopping needs no correct spelling.
 
     Args:
         line: as typed; case does not matter.
-        corners: columns and rows of the board's inner corners, where an aim is to be checked against them.
+        corners: columns and rows of the board's inner corners, to check an aim against; None for no check.
     """
     words = line.lower().replace(",", " ").split()
     if not words or _STOP.search(line.lower()):
@@ -66,7 +66,7 @@ def _aim(words: list[str], corners: tuple[int, int] | None) -> OperatorCommand |
 
 
 def asked(text: str, wants: CommandKind | None) -> str:
-    """What the operator is told, on one line, with what he is asked to say."""
+    """A message to the operator as one line, with the command that is asked for."""
     if wants is None:
         return one_line(text)
     letter = next((f" ({letter})" for letter, said in LETTERS.items() if said is wants), "")

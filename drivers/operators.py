@@ -1,4 +1,4 @@
-"""Operators by other ways than the keyboard: texts over OpenIGTLink, and several operators as one."""
+"""Operators besides the keyboard: texts over OpenIGTLink, and several operators combined."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 
 class IgtlOperator(IgtlReceiver):
-    """An Operator whose words are the STRING messages of a device: a foot switch, a button in 3D Slicer.
+    """An Operator whose commands are STRING messages of a device: a foot switch, a button in 3D Slicer.
 
-    What the operator is told goes back as STRING messages, as does the answer to a word that is not understood; where
-    the other side is slow only the newest is kept.
+    Messages to the operator, and replies to commands that are not understood, go back as STRING messages; for a slow
+    receiver only the newest is kept.
 
     Args:
         endpoint: the sender, or where it connects.
-        device: of its words.
-        answers: device of what is told.
-        corners: columns and rows of the board's inner corners; aims at others are answered.
+        device: name of the device that sends commands.
+        answers: name of the device for messages to the operator.
+        corners: columns and rows of the board's inner corners; aims at others are rejected with a message.
     """
 
     _role = "operator"
@@ -43,7 +43,7 @@ class IgtlOperator(IgtlReceiver):
         super().__init__(endpoint, [("STRING", check_name(device))])
 
     def poll(self) -> list[OperatorCommand]:  # type: ignore[override]
-        """What was said since the last call. Raises DeviceLost."""
+        """Commands since the last call. Raises DeviceLost."""
         commands = []
         for message in self._messages():
             if not isinstance(message.content, Text):
@@ -57,7 +57,7 @@ class IgtlOperator(IgtlReceiver):
         return commands
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
-        """Send it."""
+        """Send a message."""
         self._offer(asked(text, wants))
 
     def _offer(self, text: str) -> None:
@@ -65,7 +65,7 @@ class IgtlOperator(IgtlReceiver):
 
 
 class Operators:
-    """Several operators as one: whoever says something is heard, and all are told."""
+    """Several operators combined: commands come from any of them, messages go to all."""
 
     def __init__(self, operators: Sequence[Operator]) -> None:
         self._operators = tuple(operators)
@@ -84,21 +84,21 @@ class Operators:
 
     @property
     def dropped(self) -> int:
-        """Commands that nobody fetched in time."""
+        """Number of commands that were not fetched in time."""
         return sum(operator.dropped for operator in self._operators)
 
     def poll(self) -> list[OperatorCommand]:
-        """What was said since the last call, by any of them; a loss is told with nothing of that lost.
+        """Commands of all operators since the last call; none is dropped when a loss is raised.
 
         Raises:
-            DeviceLost: one of them is gone; once for each loss.
+            DeviceLost: one of them is lost; once for each loss.
         """
         for operator in self._operators:
             try:
                 self._held += operator.poll()
             except DeviceLost as error:
                 self._losses.append(error)
-        if self._held:  # a stop does not wait for a loss to be told
+        if self._held:  # commands first: a stop must not wait for a loss to be raised
             commands, self._held = self._held, []
             return commands
         if self._losses:
@@ -106,12 +106,12 @@ class Operators:
         return []
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
-        """All of them."""
+        """Send a message to all operators."""
         for operator in self._operators:
             operator.tell(text, done=done, wants=wants)
 
     def close(self) -> None:
-        """Let go of all."""
+        """Close all operators."""
         for operator in self._operators:
             operator.close()
 

@@ -1,4 +1,4 @@
-"""What each driver can be told in a configuration: its keys, with type, unit, default, bounds and a line of help."""
+"""The configuration keys of each driver, with type, unit, default, bounds and a line of help."""
 
 import re
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ def _matches(path: Path) -> bool:
 
 
 def _check_device(text: str) -> None:
-    """Raises InputError where OpenIGTLink would cut it."""
+    """Raises InputError for a name that OpenIGTLink would cut."""
     from fgreg.drivers.igtl_messages import check_name
 
     check_name(text)
@@ -260,7 +260,7 @@ class BkOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IgtlSinkOptions(Connection):
-    """Who takes the registration."""
+    """Receiver of the registration."""
 
     port: Annotated[int, Key("TCP port", _PORT)] = SINK_PORT
     listen: Annotated[bool, Key("wait for the other side to connect")] = True

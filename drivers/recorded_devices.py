@@ -1,4 +1,4 @@
-"""Recordings played back in their own time, as the devices that they were made of."""
+"""Recordings played back in real time in place of the devices that were recorded."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """When recorded messages are due: ``bag_start_s`` at ``host_start_s``, then ``speed`` times as fast as it was.
+    """When recorded messages are due: ``bag_start_s`` at ``host_start_s``, then ``speed`` times as fast as recorded.
 
     Devices that play one recording together share one.
     """
@@ -64,7 +64,7 @@ class _Player:
         self._counts = dict.fromkeys(topics, 0)
 
     def due(self) -> list[tuple[Recorded, int]]:
-        """What is due, each with its number on its topic; raises DeviceLost once at the end of the recording."""
+        """Messages that are due, each with its index in its topic. Raises DeviceLost once, at the recording's end."""
         found: dict[str, deque[tuple[Recorded, int]]] = {}
         now = host_now()
         while not self.ended and self._next is not None and self._pace.due_s(self._next.bag_ns / 1e9) <= now:
@@ -96,9 +96,9 @@ class RecordedMotion:
     Args:
         path: rosbag2 folder, .mcap or .db3.
         topic: PoseStamped, TransformStamped or PoseWithCovarianceStamped. Default: ``/ECM/measured_cp``.
-        tip_T_camera: (4, 4) where the camera is on what the topic's pose is of, mm. Default: the same.
-        pace: shared with other devices that play the recording. Default: from now, as it was.
-        room: samples that one poll may give.
+        tip_T_camera: (4, 4), mm, camera pose in the frame that the topic's poses are of. Default: identity.
+        pace: shared with other devices that play the recording. Default: from now, at recorded speed.
+        room: largest number of samples of one poll.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class RecordedMotion:
 
     @property
     def dropped(self) -> int:
-        """Samples that were not fetched in time, or that hold no pose."""
+        """Number of samples that were not fetched in time or hold no valid pose."""
         return self._player.dropped + self._bad
 
     def poll(self) -> list[MotionSample]:
@@ -145,7 +145,7 @@ class RecordedMotion:
             try:
                 transform, covariance = pose_of(message)
             except ValueError:
-                self._bad += 1  # a robot that is not ready sends poses that are none
+                self._bad += 1  # a robot that is not ready sends invalid poses
                 continue
             if covariance is not None:
                 covariance = as_float_array(tip_from_camera @ covariance @ tip_from_camera.T)
@@ -163,10 +163,10 @@ class RecordedCamera:
 
     Args:
         path: rosbag2 folder, .mcap or .db3.
-        left, right: topics. Default: by their names; one camera where there is no right one.
-        pace: as of RecordedMotion.
-        max_gap_s: most time between left and right.
-        room: frames that one poll may give.
+        left, right: topics. Default: found by name; one camera if there is no right topic.
+        pace: as in RecordedMotion.
+        max_gap_s: longest time between left and right.
+        room: largest number of frames of one poll.
     """
 
     def __init__(

@@ -1,9 +1,9 @@
 """Rectified stereo pictures: without distortion, both cameras parallel, the same line for the same point.
 
-What that means for everything behind it: the ``camera`` frame is then the *rectified* left camera, turned about the
-same centre: ``rectified_p = rectified_R_left * left_p``. A registration from rectified pictures maps rectified
-coordinates; ``trus_T_left = trus_T_rectified * [rectified_R_left, 0]``. Marker detection does not need rectified
-pictures, it takes the model with distortion; rectify where another program wants it, and never in one half of a chain.
+The ``camera`` frame is then the *rectified* left camera, rotated about the same centre: ``rectified_p =
+rectified_R_left * left_p``. A registration from rectified pictures maps rectified coordinates; ``trus_T_left =
+trus_T_rectified * [rectified_R_left, 0]``. Marker detection does not need rectified pictures, since it uses the model
+with distortion. Rectify only if another program needs it, and then in the whole processing chain.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from fgreg.schema.record import Record, record
 
 
 class Role(StrEnum):
-    """What a device is for; also the key of a configuration."""
+    """Role of a device; also its key in a configuration."""
 
     CAMERA = "camera"
     PHOTOACOUSTIC = "photoacoustic"

@@ -1,7 +1,7 @@
 """ROS 2 messages as this package's types: metres become millimetres, quaternions rotations, images arrays.
 
 Functions take any object with the message's fields, so that neither ROS nor a reader of recordings is needed here.
-Each raises ValueError, in a few words, where a message does not hold what it should.
+Each raises ValueError with a short text if a message's content is invalid.
 """
 
 from __future__ import annotations
@@ -44,8 +44,10 @@ _ARRAYS: dict[str, str] = {"32FC1": "f4", "16SC1": "i2", "16UC1": "u2", "mono16"
 
 
 def stamp_ns(message: Any, recorded_ns: int) -> int:
-    """Time in a message's header (ns: as seconds since 1970 a double would round it to 0.2 us); that of recording
-    where it has none, or zero."""
+    """Time in a message's header, or the recording time if it has none or zero.
+
+    In ns, since a double with seconds since 1970 would round to 0.2 us.
+    """
     header = getattr(message, "header", None)
     if header is None:
         return recorded_ns
@@ -56,7 +58,7 @@ def stamp_ns(message: Any, recorded_ns: int) -> int:
 def pose_of(message: Any) -> tuple[FloatArray, FloatArray | None]:
     """(4, 4) transform ``frame_id_T_child`` in mm, and its (6, 6) covariance over the right tangent where there is one.
 
-    ROS has covariances over (x, y, z, turns about x, y, z) along the parent's axes.
+    ROS states covariances over (x, y, z, rotations about x, y, z) along the parent's axes.
     """
     pose = getattr(message, "pose", None)
     covariance = None
@@ -84,7 +86,7 @@ def scan_deg_of(message: Any, joint: str | None, unit: str) -> float:
 
     Args:
         message: of one of SCAN_TYPES.
-        joint: name of the joint; the only one where None.
+        joint: name of the joint; None if there is only one.
         unit: ``rad`` or ``deg`` of numbers; joint states and poses are in rad.
     """
     if hasattr(message, "position") and hasattr(message, "name"):
@@ -128,7 +130,7 @@ def picture_of(message: Any) -> Picture:
 def array_of(message: Any) -> npt.NDArray[Any]:
     """A probe's frame: an Image with one channel, or a MultiArray with two dimensions; (rows, columns) as sent.
 
-    What has no business being float32 or int16 keeps its numbers: 8 and 16 bit unsigned images become float32.
+    The result is float32 or int16; 8 and 16 bit unsigned images become float32 with the same values.
     """
     if hasattr(message, "encoding"):
         encoding = str(message.encoding)
@@ -164,7 +166,7 @@ def info_of(message: Any, where: str) -> CameraInfo:
     """A CameraInfo message; ``where`` names it in messages.
 
     Raises:
-        InputError: a part of the image only, or arrays that are too short.
+        InputError: only a part of the image, or arrays of the wrong size.
     """
     size = int(message.width), int(message.height)
     roi = message.roi

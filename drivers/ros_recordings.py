@@ -15,7 +15,7 @@ from fgreg.errors import InputError, MissingExtraError
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 ECM_POSE = "ECM/measured_cp"
-"""The endoscope holder's pose as CRTK names it, below whatever namespace."""
+"""CRTK's topic of the endoscope holder's pose, in any namespace."""
 
 _EXPECTED = "a ROS 2 recording: a rosbag2 folder, .mcap or .db3"
 
@@ -65,12 +65,12 @@ class Recording:
             raise InputError(
                 str(path), "a folder without metadata.yaml" if path.is_dir() else "another file", _EXPECTED
             )
-        # Files that bring no definitions of their messages have those of ROS 2 itself.
+        # Files without message definitions use those of ROS 2.
         self._reader: Any = None
         try:
             reader: Any = AnyReader([path], default_typestore=_common_types())
             reader.open()
-        except Exception as error:  # a damaged file makes the parsers under it raise whatever they run into
+        except Exception as error:  # on a damaged file the underlying parsers may raise anything
             raise self._damaged(error) from None
         self._reader = reader
         connections: list[Any] = reader.connections
@@ -89,7 +89,7 @@ class Recording:
         self.close()
 
     def close(self) -> None:
-        """Close the files; twice does no harm."""
+        """Close the files; may be called twice."""
         reader, self._reader = self._reader, None
         if reader is not None:
             reader.close()
@@ -115,7 +115,7 @@ class Recording:
         """The message as an object with ROS's fields.
 
         Raises:
-            InputError: its bytes are not what its type says.
+            InputError: its bytes do not fit its type.
         """
         try:
             return self._reader.deserialize(recorded.raw, recorded.kind)
@@ -124,10 +124,10 @@ class Recording:
             raise InputError(where, f"a message that cannot be read ({_words(error)})", recorded.kind) from None
 
     def topic(self, name: str, kinds: Collection[str], what: str) -> str:
-        """A topic that has to be there and be of one of some types.
+        """Check that a topic exists and has one of some types.
 
         Raises:
-            InputError: absent (names what is there), or of another type.
+            InputError: no such topic (with those that exist), or another type.
         """
         found = self.topics.get(name)
         where = f"{self.path.name}: {name}"
@@ -145,7 +145,7 @@ class Recording:
             side: ``left`` or ``right``.
 
         Raises:
-            InputError: several cameras' could be meant.
+            InputError: several topics match.
         """
         word = re.compile(rf"(?:^|[/_]){side}(?=[/_]|$)", re.IGNORECASE)
         found = [n for n, t in self.topics.items() if t.kind in IMAGE_TYPES and t.count and word.search(n)]
@@ -158,7 +158,7 @@ class Recording:
         return best[0]
 
     def endoscope_pose_topic(self) -> str | None:
-        """The topic of the endoscope holder's pose (CRTK), or None where there is none, or more than one."""
+        """The topic of the endoscope holder's pose (CRTK); None if there is none or more than one."""
         found = [n for n, t in self.topics.items() if t.kind in POSE_TYPES and f"/{n}".endswith(f"/{ECM_POSE}")]
         found = [name for name in found if "local" not in name]
         return found[0] if len(found) == 1 else None

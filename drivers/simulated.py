@@ -1,6 +1,6 @@
 """Drivers of the simulated room's devices: they connect to its process (fgreg.drivers.simulated_room).
 
-A connection that is lost is looked for again by itself, as with a real device.
+A lost connection is opened again automatically, as with a real device.
 """
 
 from __future__ import annotations
@@ -57,15 +57,15 @@ if TYPE_CHECKING:
     from fgreg.drivers.options import NoOptions, RoomStageOptions
 
 AGAIN_S = 0.2
-"""Between attempts to connect."""
+"""Time between attempts to connect."""
 SILENT_S = 0.5
-"""A device that sends by itself and has not for so long is gone."""
+"""A device that sends by itself is lost after this long without data."""
 START_S = 60.0
 TRUTH_S = 20.0
-"""So long a room may take to tell the truth."""
+"""Longest time that a room may take to send the ground truth."""
 
 BEGINS_RAD = math.radians(-17.0)
-"""Where the stage stands at power-on; it does not know."""
+"""True device angle of the stage at power-on, which the stage does not know."""
 
 Item = TypeVar("Item")
 
@@ -81,7 +81,7 @@ class RoomProcess:
         path: of the socket that its devices are reached by.
 
     Raises:
-        FgregError: it did not start.
+        FgregError: the room did not start.
     """
 
     def __init__(
@@ -112,10 +112,10 @@ class RoomProcess:
         self.close()
 
     def fault(self, device: str, what: str) -> None:
-        """Break one of its devices, or mend it with an empty word (fgreg.drivers.simulated_room.FAULTS).
+        """Give one of its devices a fault, or remove it with an empty text (fgreg.drivers.simulated_room.FAULTS).
 
         Raises:
-            FgregError: there is no such device or fault, or no room any more.
+            FgregError: there is no such device or fault, or the room has ended.
         """
         self._worker.send((device, what))
         self._worker.fetch(math.inf)
@@ -123,13 +123,13 @@ class RoomProcess:
             raise FgregError(self._worker.failure)
 
     def close(self) -> None:
-        """End it."""
+        """End the room's process."""
         self._worker.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class _Feed(Generic[Item]):
-    """What one of the room's devices sends, received by a thread; the base of its drivers."""
+    """Receives the data of one of the room's devices in a thread; base class of the drivers."""
 
     def __init__(
         self, role: str, path: Path, most: int, made: Callable[[dict[str, Any], bytearray], Item], *, sends: bool
@@ -146,30 +146,30 @@ class _Feed(Generic[Item]):
 
     @property
     def name(self) -> str:
-        """What the user calls it."""
+        """Name shown to the user."""
         return f"simulated {self._role}"
 
     @property
     def connected(self) -> bool:
-        """Whether the device is there, and sends where it should."""
+        """Whether the device is connected, and sends if it has to."""
         if self._connection is None:
             return False
         return host_now() - self._heard_s < SILENT_S if self._sends else self._steady()
 
     def _steady(self) -> bool:
-        """Whether the room has kept the connection: one to a device that is out of order it closes at once."""
+        """Whether the room has kept the connection; it closes one to a device with a fault at once."""
         return host_now() - self._since_s > AGAIN_S
 
     @property
     def dropped(self) -> int:
-        """How many were lost on the way because nobody fetched them in time."""
+        """Number of items that were lost because they were not fetched in time."""
         return self._dropped
 
     def poll(self) -> Sequence[Item]:
-        """What came since the last call.
+        """Items since the last call.
 
         Raises:
-            DeviceLost: the connection is gone; told once.
+            DeviceLost: the connection is lost; raised once.
         """
         with self._lock:
             items, lost = list(self._waiting), self._lost
@@ -180,7 +180,7 @@ class _Feed(Generic[Item]):
         return items
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the connection."""
         self._end.set()
         self._shut()
         self._thread.join(2.0)
@@ -283,13 +283,13 @@ class SimulatedScanner(_Feed[BmodeFrame]):
 
 
 class SimulatedOperator(_Feed[OperatorCommand]):
-    """The surgeon, who says what he does and goes on when he is told that a spot is done (Operator)."""
+    """The surgeon, who sends commands and goes on when told that a spot is done (Operator)."""
 
     def __init__(self, path: Path) -> None:
         super().__init__("operator", path, 64, _command, sends=False)
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
-        """He goes on to the next spot, and says what he is asked to say."""
+        """Send a message: the surgeon goes on to the next spot, and sends the command that is asked for."""
         connection = self._connection
         if connection is not None and (done or wants is not None):
             with contextlib.suppress(WireClosed):
@@ -297,14 +297,14 @@ class SimulatedOperator(_Feed[OperatorCommand]):
 
 
 class RoomStage(SimulatedStage):
-    """The room's stage: turns here, in the watchdog's process, and tells the room where it is at every look.
+    """The room's stage. It turns in the watchdog's process, and sends the room its true angle at every status query.
 
     Args:
         model: direction and zero.
         path: of the room's socket.
 
     Raises:
-        StageLost: the room is not there.
+        StageLost: the room does not answer.
     """
 
     def __init__(self, model: StageModel, path: Path) -> None:
@@ -319,7 +319,7 @@ class RoomStage(SimulatedStage):
         self._room.settimeout(MAX_CALL_S)
 
     def status(self) -> StageStatus:
-        """What it reports now; the room hears where it truly is."""
+        """The reported status; the room gets the true angle."""
         status = super().status()
         try:
             send(self._room, {"scan": self.model.scan_from_device(self.device_rad)})
@@ -329,7 +329,7 @@ class RoomStage(SimulatedStage):
         return status
 
     def close(self) -> None:
-        """Brake and let go."""
+        """Brake and close."""
         super().close()
         self._room.close()
 
@@ -346,12 +346,12 @@ def ask_truth(path: Path, camera_s: Sequence[float], spots_s: Sequence[float]) -
             connection.connect(os.fspath(path))
             send(connection, {"role": "truth"})
             send(connection, {}, json.dumps({"camera_s": [*camera_s], "spots_s": [*spots_s]}).encode())
-            told = json.loads(receive(connection)[1])
+            truth = json.loads(receive(connection)[1])
         except (OSError, WireClosed, ValueError) as error:
-            raise FgregError(f"the simulated room does not tell the truth ({error})") from None
-    if not isinstance(told, dict):
-        raise FgregError("the simulated room does not tell the truth")
-    return told
+            raise FgregError(f"the simulated room does not send its ground truth ({error})") from None
+    if not isinstance(truth, dict):
+        raise FgregError("the simulated room does not send its ground truth")
+    return truth
 
 
 def open_stage(model: StageModel, path: str) -> RoomStage:
@@ -360,7 +360,7 @@ def open_stage(model: StageModel, path: str) -> RoomStage:
 
 
 def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:
-    """Whether a condition came true within some seconds."""
+    """Wait for a condition; whether it became true within ``seconds``."""
     end = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > end:

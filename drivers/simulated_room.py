@@ -1,10 +1,10 @@
-"""The simulated operating room, a process of its own: the devices that drivers in fgreg.drivers.simulated connect to.
+"""The simulated operating room in a process of its own, with the devices that fgreg.drivers.simulated connects to.
 
-Devices, each by a connection that begins with ``{"role": ...}``: ``camera``, ``probe``, ``scanner`` (B-mode pictures)
-and ``motion`` (the holder of the endoscope) only send; ``stage`` tells where its plane is; ``operator`` is the surgeon,
-who says what he does and can be asked to go on. No device is ``truth``, which answers how things truly were, for
-whoever judges a recorded session. Camera and probe stamp with clocks of their own. The process is a worker of whoever
-started it, for whom it breaks devices and mends them (:data:`FAULTS`).
+Each connection begins with ``{"role": ...}``. ``camera``, ``probe``, ``scanner`` (B-mode pictures) and ``motion`` (the
+endoscope's holder) only send; ``stage`` receives the plane's angle; ``operator`` is the surgeon, who sends commands and
+can be asked to go on. ``truth`` is no device: it sends the ground truth, to evaluate a recorded session. Camera and
+probe have their own clocks. The process is a worker process; its work is to set and remove devices' faults
+(:data:`FAULTS`).
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from fgreg.simulation.room import Room, room_config
 from fgreg.workers.worker_process import Work
 
 CAMERA_CLOCK_S, PROBE_CLOCK_S = 1000.0, 52000.0
-"""What the devices' clocks read when the room begins."""
+"""Readings of the devices' clocks when the room starts."""
 PICTURE_RATE = 4.0
-"""B-mode pictures per second, at most: they come between pulses."""
+"""Largest number of B-mode pictures per second; they come between pulses."""
 FRAMES_WAITING, PULSES_WAITING = 2, 64
-"""What a slow receiver may leave unread before the oldest is dropped."""
+"""Largest number of unread frames and pulses; after that the oldest is dropped."""
 SETTLE_S = 0.4
-"""The surgeon says that he aims once the fibre has been still for so long."""
+"""The surgeon sends an aim once the fibre has been still for this long."""
 SAY_AGAIN_S = 3.0
-"""And says so again while nothing comes of it."""
+"""Time after which an aim without an effect is sent again."""
 LOOKS_S = 1.5
-"""Asked to reset the stage, he looks at it first for so long."""
+"""Time that the surgeon takes to inspect the stage before a reset."""
 FAULTS = {
     "camera": ("", "gone", "silent", "frozen", "black"),
     "probe": ("", "gone", "silent"),
@@ -47,12 +47,12 @@ FAULTS = {
     "stage": ("", "gone"),
     "operator": ("", "gone"),
 }
-"""What can be wrong with each device: nothing; its cable is out; it sends nothing; the same, or a black, picture."""
+"""Faults of each device: none; unplugged; sends nothing; repeats one picture; sends black pictures."""
 
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    """A connected driver, and what waits to be sent to it."""
+    """A connected driver and the messages that wait to be sent to it."""
 
     role: str
     connection: socket.socket
@@ -60,7 +60,7 @@ class _Client:
     gone: threading.Event = field(default_factory=threading.Event)
 
     def put(self, header: dict[str, Any], *payload: bytes | memoryview) -> None:
-        """Send soon; where the receiver is slow the oldest is dropped, and its header's ``index`` tells."""
+        """Queue a message; for a slow receiver the oldest is dropped, which shows in the headers' ``index``."""
         while True:
             try:
                 self.waiting.put_nowait((header, payload))
@@ -93,13 +93,13 @@ class RoomServer:
     """Runs a room in real time and serves its devices.
 
     Args:
-        room: the world.
-        path: of the Unix socket; its folder should be this user's alone.
+        room: the simulated scene.
+        path: of the Unix socket; only this user should have access to its folder.
         frame_rate, pulse_rate: of camera and laser, per second.
-        roam_s: where the stage follows him, the surgeon goes on by himself after so long at a place.
+        roam_s: while the stage follows, the surgeon goes on by himself after this time at a place.
 
     Attributes:
-        start_s: host time of the room's begin.
+        start_s: host time of the room's start.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class RoomServer:
         self._answers: list[tuple[float, str]] = []  # of the surgeon, and when he gives them
 
     def fault(self, device: str, what: str) -> None:
-        """Break a device, or mend it. Raises ValueError where it is none of :data:`FAULTS`."""
+        """Set a device's fault, or remove it. Raises ValueError if it is none of :data:`FAULTS`."""
         if what not in FAULTS.get(device, ()):
             raise ValueError(f"{device} {what!r}, expected one of {FAULTS}")
         self._faults[device], self._frozen = what, None
@@ -163,7 +163,7 @@ class RoomServer:
             self._turn(connection)
             return
         if role == "truth":
-            self._tell_truth(connection)
+            self._send_truth(connection)
             return
         if role not in ("camera", "probe", "scanner", "motion", "operator"):
             connection.close()
@@ -185,7 +185,7 @@ class RoomServer:
             self._clients.remove(client)
 
     def _turn(self, connection: socket.socket) -> None:
-        """The stage tells where it is."""
+        """Receive the stage's angle."""
         with self._lock:
             self._stages.append(connection)
         try:
@@ -197,16 +197,16 @@ class RoomServer:
         with self._lock:
             self._stages.remove(connection)
 
-    def _tell_truth(self, connection: socket.socket) -> None:
-        """As :meth:`Room.truth_at`, all times on the host's clock."""
+    def _send_truth(self, connection: socket.socket) -> None:
+        """Send the result of :meth:`Room.truth_at`, with all times on the host's clock."""
         start = self.start_s
         try:
             _, payload = receive(connection)
             asked = json.loads(payload)
             camera, spots = ([float(t) - start for t in asked[key]] for key in ("camera_s", "spots_s"))
-            told = self.room.truth_at(camera, spots)
-            told["moved_s"] = [t + start for t in told["moved_s"]]
-            send(connection, {}, json.dumps(told).encode())
+            truth = self.room.truth_at(camera, spots)
+            truth["moved_s"] = [t + start for t in truth["moved_s"]]
+            send(connection, {}, json.dumps(truth).encode())
         except (WireClosed, ValueError, KeyError, TypeError):
             pass
         connection.close()
@@ -218,11 +218,11 @@ class RoomServer:
     # --- time -------------------------------------------------------------------------------------------------------
 
     def now_s(self) -> float:
-        """Seconds since the room began."""
+        """Seconds since the room started."""
         return time.monotonic() - self.start_s
 
     def run(self) -> None:
-        """Until :meth:`stop`."""
+        """Run until :meth:`stop`."""
         threading.Thread(target=self._accept, daemon=True).start()
         frame = pulse = 0
         while not self._end.is_set():
@@ -294,7 +294,7 @@ class RoomServer:
     # --- the surgeon ------------------------------------------------------------------------------------------------
 
     def _live(self, now_s: float) -> None:
-        """What the surgeon does now, and what happens by itself."""
+        """Step the surgeon's actions and the room's events."""
         room = self.room
         room.pass_to(now_s)
         go_on = False
@@ -324,7 +324,7 @@ class RoomServer:
 
 @contextlib.contextmanager
 def serving(server: RoomServer) -> Iterator[Work[tuple[str, str], None]]:
-    """Run a room. The work is to break a device, or to mend it: :meth:`RoomServer.fault` with the request."""
+    """Run a room. The work is to set or remove a device's fault: :meth:`RoomServer.fault` with the request."""
     thread = threading.Thread(target=server.run, name="room")
     thread.start()
     try:

@@ -1,7 +1,7 @@
-"""A simulated rotation stage: turns with a limited speed and acceleration, loses its zero at power-off, can misbehave.
+"""A simulated rotation stage with limited speed and acceleration; it loses its zero at power-off, and can have faults.
 
-Where it is follows from the time alone: a trapezoid of speed towards its target, integrated in short steps whenever it
-is asked. It keeps its own truth (``device_rad``) beside what it reports, as a motor does after power-on.
+Its position follows from time alone: a trapezoidal speed profile towards the target, integrated in short steps at each
+call. The true angle (``device_rad``) is kept apart from the reported one, which is wrong before homing.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _STANDS_RAD_S = 1e-9
 
 @dataclass(slots=True)
 class Misbehaviour:
-    """What the stage does wrong, for tests and rehearsals.
+    """Faults of the stage, for tests and rehearsals.
 
     Attributes:
-        deaf: takes no command any more, stops included.
+        deaf: ignores all commands, stops included.
         lost: every call raises, as if unplugged.
-        frozen: reports the status of the moment it froze.
-        speed_factor: turns faster or slower than told.
-        reversed: turns the other way.
+        frozen: repeats the last status.
+        speed_factor: ratio of the actual to the ordered speed.
+        reversed: turns the wrong way.
     """
 
     deaf: bool = False
@@ -44,12 +44,12 @@ class Misbehaviour:
 
 
 class SimulatedStage:
-    """A stage with real limits of speed and acceleration.
+    """A stage with realistic limits of speed and acceleration.
 
     Args:
         model: direction and zero.
-        device_rad: where it stands at power-on; it does not know.
-        homed: whether it knows all the same.
+        device_rad: true angle at power-on, which the stage does not know.
+        homed: whether it knows its zero position at power-on.
         max_speed_rad_s, acceleration_rad_s2: of the motor; default a PRM1Z8's.
         clock: host time, s.
     """
@@ -75,14 +75,14 @@ class SimulatedStage:
         self._last: StageStatus | None = None
 
     def home(self, speed_rad_s: float) -> None:
-        """Begin to turn to the zero position."""
+        """Start homing."""
         self._advance()
         if not self.wrong.deaf:
             self._homed, self._homing = False, True
             self._target, self._speed = 0.0, min(speed_rad_s, self._max_speed)
 
     def move_to(self, scan_rad: float, speed_rad_s: float) -> None:
-        """Begin to turn to a plane angle."""
+        """Start to turn to a plane angle."""
         self._advance()
         if not self.wrong.deaf:
             self._homing = False
@@ -96,7 +96,7 @@ class SimulatedStage:
             self._target, self._homing = None, False
 
     def status(self) -> StageStatus:
-        """What it reports now."""
+        """The reported status."""
         self._advance()
         if self.wrong.frozen and self._last is not None:
             return self._last
@@ -114,7 +114,7 @@ class SimulatedStage:
         return self._last
 
     def close(self) -> None:
-        """Brake and let go."""
+        """Brake and close."""
         self._target, self._homing = None, False
 
     def _advance(self) -> None:
@@ -128,7 +128,8 @@ class SimulatedStage:
         self._at = now
 
     def _step(self, dt: float) -> None:
-        """A short time: speed towards what still can be braked before the target, bounded by the acceleration."""
+        """Integrate a short time: the largest speed from which the stage can still brake before its target, limited by
+        the acceleration."""
         wanted, way = 0.0, 0.0
         if self._target is not None:
             way = self._target - self.device_rad

@@ -1,7 +1,7 @@
 """Messages between the simulated room's process and the drivers of its devices: a JSON header and raw bytes.
 
-One message is two little-endian lengths (4 bytes each), the header, the payload. Both ends are ours, on one machine, by
-a Unix socket in a folder that is this user's alone.
+One message is two little-endian lengths (4 bytes each), the header, the payload. Both ends are this package, on one
+machine, over a Unix socket in a folder that only this user can access.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ MOST_HEADER, MOST_PAYLOAD = 1 << 16, 1 << 26
 
 
 class WireClosed(Exception):  # noqa: N818
-    """The other end is gone, or sent something that is no message."""
+    """The other end has closed the connection, or sent an invalid message."""
 
 
 def send(connection: socket.socket, header: dict[str, Any], *payload: bytes | memoryview) -> None:
     """Send one message.
 
     Raises:
-        WireClosed: the other end is gone.
+        WireClosed: the other end has closed the connection.
     """
     text = json.dumps(header, allow_nan=False).encode()
     try:
@@ -38,7 +38,7 @@ def receive(connection: socket.socket) -> tuple[dict[str, Any], bytearray]:
     """The next message, waiting for it.
 
     Raises:
-        WireClosed: the other end is gone, or this is no message.
+        WireClosed: the other end has closed the connection, or sent an invalid message.
     """
     header_length, payload_length = _LENGTHS.unpack(_read(connection, _LENGTHS.size))
     if header_length > MOST_HEADER or payload_length > MOST_PAYLOAD:
@@ -57,7 +57,7 @@ def _read(connection: socket.socket, count: int) -> bytearray:
     view, done = memoryview(data), 0
     while done < count:
         try:
-            # All of it in one call where that can be: each call has to wait for the interpreter's lock again.
+            # In one call if possible, since each call waits for the interpreter's lock again.
             got = connection.recv_into(view[done:], 0, socket.MSG_WAITALL)
         except OSError as error:
             raise WireClosed(str(error)) from None

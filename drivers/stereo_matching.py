@@ -1,4 +1,4 @@
-"""Left and right pictures of one moment, from two inputs that run by themselves."""
+"""Matches left and right pictures from two unsynchronised inputs."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from fgreg.drivers.video_input import Grabbed
 
 
 class StereoMatcher:
-    """Pairs frames by time: to each left one the nearest right one, where that is near enough; each is used once.
+    """Pairs each left frame with the nearest right frame in time, if it is near enough; each is used once.
 
-    A left frame is decided when a right one of its time or later is there, or none is to be expected. What finds no
-    partner is dropped and counted; what waits is bounded.
+    A left frame is decided once a right frame of its time or later has come, or none is expected. Frames without a
+    partner are dropped and counted; the number of waiting frames is bounded.
 
     Args:
-        max_gap_s: most time between left and right.
-        time: of a frame, on a clock that both inputs share.
-        room: frames of one side that may wait.
+        max_gap_s: longest time between left and right.
+        time: gives a frame's time on a clock that both inputs share.
+        room: largest number of waiting frames per side.
     """
 
     def __init__(self, max_gap_s: float, time: Callable[[Grabbed], float], room: int = 16) -> None:
@@ -29,11 +29,11 @@ class StereoMatcher:
     def take(
         self, left: Iterable[Grabbed], right: Iterable[Grabbed], *, right_expected: bool = True
     ) -> list[tuple[Grabbed, Grabbed | None]]:
-        """Add new frames; the pairs that are decided by now, in time order.
+        """Add new frames; returns the decided pairs in time order.
 
         Args:
             left, right: in time order.
-            right_expected: whether the right input delivers; if not, what has no partner goes out alone.
+            right_expected: whether the right input delivers; if not, left frames without a partner are returned alone.
         """
         self._left.extend(left)
         self._right.extend(right)

@@ -1,4 +1,4 @@
-"""What all devices at the end of a TcpLink have in common: address, losses, counts."""
+"""Base of all devices on a TcpLink: address, losses, counts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fgreg.drivers.tcp_link import Endpoint, Item, TcpLink
 
 
 class LinkedDevice(Generic[Item]):
-    """A device that is a link; its roles add ``poll`` or ``send``."""
+    """A device on a TcpLink; subclasses add ``poll`` or ``send``."""
 
     _role = ""
 
@@ -23,22 +23,22 @@ class LinkedDevice(Generic[Item]):
 
     @property
     def endpoint(self) -> Endpoint:
-        """Its address, with the port that was taken."""
+        """Its address, with the actual port."""
         return self._link.endpoint
 
     @property
     def connected(self) -> bool:
-        """Whether anybody is at the other end, and not silent."""
+        """Whether the other end is connected and not silent."""
         return self._link.connected
 
     @property
     def dropped(self) -> int:
-        """Messages dropped because nobody fetched or took them in time."""
+        """Number of messages dropped because they were not fetched or taken in time."""
         return self._link.dropped
 
     @property
     def rejected(self) -> int:
-        """Messages left out: cut off, wrong checksum, broken content, not usable in this role."""
+        """Number of messages left out: cut off, wrong checksum, invalid content, not usable in this role."""
         return self._link.rejections.count
 
     @property
@@ -51,7 +51,7 @@ class LinkedDevice(Generic[Item]):
         self._link.close()
 
     def _messages(self) -> list[Item]:
-        """What came; a loss is raised once what came before it is fetched."""
+        """New messages; a loss is raised once the messages before it have been fetched."""
         messages = self._link.poll()
         if not messages:
             self._raise_loss()

@@ -1,10 +1,9 @@
-"""TCP to a device, run by a thread of its own: bounded in memory and in time, whatever the other side sends.
+"""TCP to a device in a thread of its own, with bounded memory and time whatever the other side sends.
 
-One class for both ends. As a client it connects, and connects again after a loss; as a server it takes a few peers.
-What comes in goes through a decoder (one for each peer) into a queue that keeps the newest; what goes out is one block
-of bytes per peer at a time, and a block that a slow peer has not begun to take is replaced by the newer one. Nothing a
-peer does ends the thread: a broken stream, a stall in the middle of a message or of a block ends that peer's connection
-only.
+One class for both ends. As a client it connects, and reconnects after a loss; as a server it accepts a few peers.
+Incoming bytes go through a decoder (one for each peer) into a queue that keeps the newest messages. Outgoing data are
+one block of bytes per peer at a time; a block that a slow peer has not begun to take is replaced by the newer one. No
+peer can end the thread: a broken stream, or a stall within a message or a block, ends only that peer's connection.
 """
 
 from __future__ import annotations
@@ -25,21 +24,21 @@ from fgreg.errors import InputError, one_line
 
 CHUNK_BYTES = 1 << 18
 TICK_S = 0.05
-"""The thread looks at its clocks at least this often."""
+"""The thread checks its time limits at least this often."""
 RETRY_S, CONNECT_S = 0.5, 2.0
-"""Between two attempts to connect, and how long one may take."""
+"""Time between two attempts to connect, and the longest time of one."""
 MESSAGE_S = 5.0
-"""A message has to be complete, and a block taken, this long after its first byte: a slow sender holds nothing up."""
+"""Time after its first byte within which a message has to be complete, or a block taken."""
 MAX_PEERS = 8
 QUEUE_ITEMS, QUEUE_BYTES = 256, 128 << 20
 
 
 class StreamBroken(Exception):  # noqa: N818
-    """What arrived cannot be followed any further: hang up. The text says why."""
+    """The stream cannot be decoded any further, and the connection has to be closed. The text says why."""
 
 
 class Sized(Protocol):
-    """Anything that says how much memory it holds."""
+    """An object that knows the memory it holds."""
 
     @property
     def nbytes(self) -> int:
@@ -62,9 +61,9 @@ class Decoder(Protocol[Item]):
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where to connect to, or to listen.
+    """An address to connect to or to listen at.
 
-    Listening is on loopback unless another address is given; port 0 takes a free one.
+    Listening is on loopback unless another address is given; port 0 takes a free port.
     """
 
     host: str
@@ -79,7 +78,7 @@ class Endpoint:
 
     @classmethod
     def listening(cls, port: int, bind: str = "127.0.0.1") -> Endpoint:
-        """A server; ``bind="0.0.0.0"`` lets other machines in: the protocols here know no passwords."""
+        """A server; ``bind="0.0.0.0"`` lets other machines connect, and the protocols have no passwords."""
         return cls(bind, port, listen=True)
 
     def __str__(self) -> str:
@@ -88,13 +87,13 @@ class Endpoint:
 
 @dataclass(slots=True)
 class Rejections:
-    """Messages that were left out, and why the last one was."""
+    """Count of the messages left out, and the reason of the last one."""
 
     count: int = 0
     last: str = ""
 
     def add(self, reason: str) -> None:
-        """One more."""
+        """Count one more."""
         self.count += 1
         self.last = one_line(reason, 200)
 
@@ -117,14 +116,14 @@ class TcpLink(Generic[Item]):
 
     Args:
         endpoint: the other side, or where to listen.
-        decoder: makes a peer's decoder; it counts what it leaves out in the Rejections given.
+        decoder: makes a peer's decoder, which counts the messages it leaves out in the given Rejections.
         greeting: sent to every new peer first.
         farewell: sent on close, as far as the peer takes it at once.
         keep_latest: whether a new peer gets the block that was offered last.
-        silent_s: a peer that sends no message for this long counts as lost; None: it may be silent.
+        silent_s: a peer that sends no message for this long counts as lost; None if it may be silent.
 
     Raises:
-        InputError: listening where it is not possible.
+        InputError: listening at this address is not possible.
     """
 
     def __init__(
@@ -167,21 +166,21 @@ class TcpLink(Generic[Item]):
 
     @property
     def endpoint(self) -> Endpoint:
-        """As given, with the port that was taken."""
+        """As given, with the actual port."""
         return self._endpoint
 
     @property
     def connected(self) -> bool:
-        """Whether anybody is at the other end, and not silent."""
+        """Whether the other end is connected and not silent."""
         return self._state == "there"
 
     @property
     def dropped(self) -> int:
-        """Messages nobody fetched in time and blocks nobody took in time."""
+        """Number of messages not fetched in time and of blocks not taken in time."""
         return self._dropped
 
     def poll(self) -> list[Item]:
-        """Messages since the last call, oldest first; at once."""
+        """Messages since the last call, oldest first; never waits."""
         with self._lock:
             items = list(self._items)
             self._items.clear()
@@ -189,12 +188,12 @@ class TcpLink(Generic[Item]):
         return items
 
     def take_loss(self) -> str | None:
-        """Why the last peer was lost; once for each loss, None where there was none since the last call."""
+        """Why the last peer was lost, once for each loss; None if there was none since the last call."""
         with self._lock:
             return self._losses.popleft() if self._losses else None
 
     def offer(self, block: bytes) -> None:
-        """Send this to every peer; at once, whatever they do."""
+        """Queue a block for every peer; never waits."""
         with self._lock:
             self._offered = block
             if self._keep_latest:
@@ -208,7 +207,7 @@ class TcpLink(Generic[Item]):
         self._thread.join(timeout=2.0 * CONNECT_S)
 
     def _wake_up(self) -> None:
-        with contextlib.suppress(OSError):  # full: it wakes up anyway; closed: nobody to wake
+        with contextlib.suppress(OSError):  # full: it wakes up anyway; closed: the thread has ended
             self._wake.send(b"\0")
 
     # What follows runs in the thread, but for _listen.
@@ -284,7 +283,7 @@ class TcpLink(Generic[Item]):
         return peer
 
     def _greet(self, peer: _Peer[Item]) -> None:
-        """The connection stands."""
+        """The connection is established."""
         peer.connecting = False
         with contextlib.suppress(OSError):
             peer.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -310,7 +309,7 @@ class TcpLink(Generic[Item]):
                 if failed:
                     raise StreamBroken(os.strerror(failed))
                 if peer.socket.getsockname() == peer.socket.getpeername():
-                    raise StreamBroken("nobody listens there")  # the system connected the socket to itself
+                    raise StreamBroken("no one listens there")  # the system connected the socket to itself
                 self._greet(peer)
             elif events & selectors.EVENT_READ:
                 self._read(peer)
@@ -400,9 +399,9 @@ class TcpLink(Generic[Item]):
             self._lost("gone", f"{peer.name}: {reason}")
 
     def _lost(self, state: Literal["silent", "gone"], reason: str) -> None:
-        """Nobody is there any more: said once, however many attempts to connect fail after it.
+        """Note a loss, once, however many attempts to connect fail after it.
 
-        A client that cannot connect in the first place says so, too; a server waits for its first peer in silence.
+        A client also notes that it could not connect in the first place; a server waits silently for its first peer.
         """
         with self._lock:
             if self._state == "there" or (self._state == "new" and self._server is None):
@@ -427,5 +426,5 @@ class TcpLink(Generic[Item]):
 
 
 def _text(error: Exception) -> str:
-    """What went wrong, without error numbers."""
+    """The error's text, without its number."""
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)

@@ -3,9 +3,9 @@
 A message is six bytes (id, then two parameters or the length of what follows, destination, source), little endian, with
 bit 7 of the destination set where data follow. There is no checksum. Source: Thorlabs, "APT Communications Protocol".
 
-The parser is made for a serial line on which bytes get lost: what cannot be a message is skipped byte by byte, and so
-is a message that names another channel or is followed by what cannot begin one: its end was lost, and it has swallowed
-the beginning of the next.
+The parser tolerates lost bytes: bytes that cannot be a message are skipped one by one. So is a message that names
+another channel, or that is followed by bytes that cannot begin a message: its end was lost, and it contains the
+beginning of the next one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _DATA_BYTES: dict[int, tuple[int, ...]] = {
     **{GET_INFO: (84,), GET_VELOCITY: (_CHANNEL_BYTES,), GET_HOME: (_CHANNEL_BYTES,), GET_STATUS: (_CHANNEL_BYTES,)},
     **{MOVE_COMPLETED: (0, _CHANNEL_BYTES), STOPPED: (0, _CHANNEL_BYTES), HOMED: (0,)},
 }
-"""Messages of the cube that are understood, and how many bytes of data they come with."""
+"""Messages of the cube that are understood, with their possible numbers of data bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class CubeStatus:
 
 @dataclass(frozen=True, slots=True)
 class HomeSettings:
-    """How the cube looks for its zero, in its own units."""
+    """The cube's homing settings, in its own units."""
 
     direction: int
     switch: int
@@ -80,13 +80,13 @@ def set_velocity(acceleration: int, velocity: int) -> bytes:
 
 
 def set_home(settings: HomeSettings) -> bytes:
-    """How to look for the zero position."""
+    """Set the homing settings."""
     fields = (settings.direction, settings.switch, settings.velocity, settings.offset)
     return long(SET_HOME, struct.pack("<HHHii", CHANNEL, *fields))
 
 
 def read_status(data: bytes) -> CubeStatus:
-    """Of a status message's data."""
+    """Read a status message's data."""
     _, position, _, _, bits = struct.unpack("<HiHHI", data)
     return CubeStatus(position, bits)
 
@@ -98,13 +98,13 @@ def read_velocity(data: bytes) -> tuple[int, int]:
 
 
 def read_home(data: bytes) -> HomeSettings:
-    """How the cube looks for its zero position."""
+    """Read the homing settings."""
     _, direction, switch, velocity, offset = struct.unpack("<HHHii", data)
     return HomeSettings(direction, switch, velocity, offset)
 
 
 def read_model(data: bytes) -> str:
-    """Model of the cube, as it calls itself."""
+    """Model name of the cube."""
     return data[4:12].split(b"\0")[0].decode("ascii", "replace").strip()
 
 
@@ -114,7 +114,11 @@ def read_serial(data: bytes) -> int:
 
 
 class AptParser:
-    """Bytes in, messages out; keeps what is not complete yet."""
+    """Parses bytes into messages; keeps incomplete ones.
+
+    Attributes:
+        skipped: number of bytes skipped.
+    """
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -146,5 +150,5 @@ def _names_channel(data: bytes) -> bool:
 
 
 def _may_begin(rest: bytes) -> bool:
-    """Whether bytes can be the beginning of a message, as far as they go; none can."""
+    """Whether bytes can be the beginning of a message; no bytes can."""
     return not rest or any(struct.pack("<H", known).startswith(rest[:2]) for known in _DATA_BYTES)

@@ -1,4 +1,4 @@
-"""Who a Thorlabs cube is: two questions that change nothing. The motor is not even switched on."""
+"""Identifies a Thorlabs cube by two queries that change nothing. The motor stays switched off."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fgreg.drivers.options import ThorlabsOptions
 
 ANSWER_S = 1.0
-"""How long a cube may take for both answers."""
+"""Longest time that a cube may take for both replies."""
 
 
 _QUESTIONS = {
@@ -27,8 +27,7 @@ _QUESTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class CubeIdentity:
-    """What a cube says of itself: model, serial number, device angle (deg, from where it was switched on unless
-    ``homed``)."""
+    """A cube's model, serial number and device angle (deg; unless ``homed``, from the angle at power-on)."""
 
     port: str
     model: str
@@ -45,8 +44,8 @@ def identify(port: str) -> CubeIdentity:
     """Ask the cube at a serial port.
 
     Raises:
-        StageLost: the port cannot be opened (somebody else has it), or nobody answers there.
-        StageError: somebody else answers.
+        StageLost: the port cannot be opened (another program has it), or no device answers.
+        StageError: another device answers.
         MissingExtraError: pyserial is not installed.
     """
     line = open_port(port)
@@ -63,7 +62,7 @@ def identify(port: str) -> CubeIdentity:
             if now - asked > ASK_AGAIN_S:
                 asked = now
                 for answer, question in _QUESTIONS.items():
-                    if answer not in told:  # the others get in the way of lost replies
+                    if answer not in told:  # other replies would be mixed with repeated ones
                         line.write(question)
             time.sleep(0.002)
             told |= {message.id: message.data for message in parser.feed(line.read(4096))}

@@ -1,10 +1,10 @@
 """Thorlabs PRM1Z8 rotation stage on a KDC101 or TDC001 cube, over its USB serial line.
 
-The cube is asked for its status at every call of :meth:`ThorlabsStage.status`; nothing ever waits for it but the
-opening. Cubes sometimes leave a question unanswered: it is asked again, and only when nothing was heard for a while the
-stage counts as lost. Speeds are the cube's to keep, so it is asked what it took in after every order.
+:meth:`ThorlabsStage.status` queries the cube at every call; only opening waits for a reply. Cubes sometimes leave a
+query unanswered: it is repeated, and the stage counts as lost only after ``LOST_S`` without any reply. The cube
+controls the speed, so its setting is read back after every order.
 
-Before it is homed, its angle counts from where it was switched on.
+Before homing, the angle counts from its value at power-on.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ MODELS = ("KDC101", "TDC001")
 USB_ID = (0x0403, 0xFAF0)
 
 ASK_AGAIN_S = 0.06
-"""A question not answered by then is asked again."""
+"""A query without a reply is repeated after this time."""
 LOST_S = 1.0
-"""A cube that says nothing for this long is gone."""
+"""A cube that sends nothing for this long is lost."""
 OPEN_S = 0.2
-"""How long the cube may take for each of the questions at the start."""
+"""Longest time that the cube may take for each query at the start."""
 _SETTLE_S = 0.05
 _WRITE_S = 0.05
 _VELOCITY_SLACK = 0.02
@@ -49,8 +49,8 @@ class ThorlabsStage:
         acceleration_rad_s2: of every motion.
 
     Raises:
-        StageLost: the port cannot be opened, or nobody answers there.
-        StageError: somebody else answers.
+        StageLost: the port cannot be opened, or no device answers.
+        StageError: another device answers.
         MissingExtraError: pyserial is not installed.
     """
 
@@ -75,7 +75,7 @@ class ThorlabsStage:
             raise
 
     def home(self, speed_rad_s: float) -> None:
-        """Look for the zero position, as the cube is set up to, but no faster than this."""
+        """Start homing with the cube's own settings, but at most at this speed."""
         if self._home is None:
             raise StageError(f"{self._name} has not told how it looks for its zero position")
         velocity = min(self._home.velocity, _velocity(speed_rad_s))
@@ -98,7 +98,7 @@ class ThorlabsStage:
         self._write(thorlabs_apt.short(thorlabs_apt.MOVE_STOP, thorlabs_apt.CHANNEL, thorlabs_apt.STOP_AT_ONCE))
 
     def status(self) -> StageStatus:
-        """The newest that the cube told, with the time at which it came; asks for a newer one."""
+        """The newest status with its time of arrival; asks the cube for a newer one."""
         self._read()
         now = time.monotonic()
         if now - self._heard_s > LOST_S:
@@ -109,7 +109,7 @@ class ThorlabsStage:
         return self._as_status()
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         self._lost = self._lost or f"{self._name} is closed"
         try:
             self._port.close()
@@ -119,7 +119,7 @@ class ThorlabsStage:
     # -- the line
 
     def _start(self) -> None:
-        """What the cube wants first, and what has to be known of it."""
+        """Initialise the cube, and read its model, homing settings and status."""
         time.sleep(_SETTLE_S)
         self._port.reset_input_buffer()
         self._write(thorlabs_apt.short(thorlabs_apt.NO_FLASH))
@@ -165,7 +165,7 @@ class ThorlabsStage:
             case thorlabs_apt.GET_STATUS | thorlabs_apt.MOVE_COMPLETED | thorlabs_apt.STOPPED if message.data:
                 status = thorlabs_apt.read_status(message.data)
                 if self._status is not None and (status.bits ^ self._status.bits) & thorlabs_apt.HOMED_BIT:
-                    self._before, self._velocity = None, 0.0  # the zero was set: the position leaps, the stage does not
+                    self._before, self._velocity = None, 0.0  # the zero was set: the position jumps, the stage does not
                 self._follow(now, status.position)
                 self._status, self._heard_s = status, now
             case thorlabs_apt.GET_HOME:
@@ -184,7 +184,7 @@ class ThorlabsStage:
                 pass
 
     def _follow(self, now: float, position: int) -> None:
-        """Velocity from the positions: what the cube reports of it differs from model to model."""
+        """Velocity from the positions, since the cube's own velocity differs between models."""
         if self._before is None:
             self._before = (now, position)
             return
@@ -226,10 +226,10 @@ class ThorlabsStage:
 
 
 def open_stage(model: StageModel, *, port: str | None = None, acceleration_deg_s2: float = 20.0) -> ThorlabsStage:
-    """The stage at a port; without one, the only cube that is plugged in.
+    """The stage at a port; without a port, the only cube that is plugged in.
 
     Raises:
-        StageLost: none is there, or it does not answer. StageError: several are there, or it is something else.
+        StageLost: there is no cube, or it does not answer. StageError: there are several, or it is another device.
         MissingExtraError: pyserial is not installed.
     """
     return ThorlabsStage(model, only_port() if port is None else port, math.radians(acceleration_deg_s2))
@@ -239,7 +239,7 @@ def only_port() -> str:
     """The serial port of the only cube that is plugged in.
 
     Raises:
-        StageLost: none is there. StageError: several are. MissingExtraError: pyserial is not installed.
+        StageLost: there is no cube. StageError: there are several. MissingExtraError: pyserial is not installed.
     """
     ports = find_ports()
     if not ports:
@@ -263,7 +263,7 @@ def _velocity(speed_rad_s: float) -> int:
 
 
 def open_port(port: str) -> serial.Serial:
-    """The line to a cube, for nobody else. Raises StageLost, MissingExtraError."""
+    """Open a cube's serial line for exclusive use. Raises StageLost, MissingExtraError."""
     try:
         import serial
     except ImportError as error:

@@ -1,8 +1,8 @@
-"""One video input, read by a thread of its own: a capture that is opened, read, lost and opened again.
+"""One video input, read in a thread of its own, which opens the capture again after a loss.
 
-The thread does nothing but read and stamp. What it read waits in a queue of few frames; where nobody fetches them in
-time the oldest go, and are counted. A capture that ends, fails or falls silent is told once by :meth:`VideoInput.poll`;
-the thread goes on trying to open it.
+The thread only reads and stamps. Frames wait in a short queue; if they are not fetched in time, the oldest are dropped
+and counted. :meth:`VideoInput.poll` raises once if a capture ends, fails or falls silent; the thread keeps trying to
+open it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from fgreg.drivers.base import DeviceLost, Stamp, host_now
 from fgreg.drivers.interlacing import Picture
 
 SILENCE_S = 0.7
-"""Without a frame for so long a device counts as lost: with the caller's own loop that is told within a second."""
+"""A device without a frame for this long counts as lost, so that the loss is reported within a second."""
 _RETRY_S = 0.3
 _CLOSE_S = 2.0
 _PERIOD_S = 1.0 / 30.0
 
 
 class Capture(Protocol):
-    """What of cv2.VideoCapture is used here; image folders and tests have the same."""
+    """The part of cv2.VideoCapture that is used here; image folders and tests implement it too."""
 
     def isOpened(self) -> bool: ...
     def read(self) -> tuple[bool, Any]: ...
@@ -42,10 +42,10 @@ class Timing:
 
     Attributes:
         device_clock: take the capture's own time (``CAP_PROP_POS_MSEC``: the driver's for V4L2, the position for
-            files); otherwise, and where it does not advance, the host's time of arrival.
-        delay_s: from the middle of the exposure to what the device stamps; subtracted.
-        paced: hand frames on when their time has come, as a device would (files and folders).
-        loop: begin again at the end (files and folders).
+            files); otherwise, and if it does not advance, the host's time of arrival.
+        delay_s: from the middle of the exposure to the device's stamp; subtracted.
+        paced: hand frames on in real time, as a device would (files and folders).
+        loop: start again at the end (files and folders).
         silence_s: longest time without a frame.
     """
 
@@ -62,7 +62,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grabbed:
-    """One frame of one input; ``index`` counts what the device delivered, fetched or not."""
+    """One frame of one input; ``index`` counts all frames of the device, fetched or not."""
 
     stamp: Stamp
     picture: Picture
@@ -70,7 +70,7 @@ class Grabbed:
 
 
 class Origin:
-    """Where played time begins: shared by inputs that play together, set by the first frame of either."""
+    """Start of playback: shared by inputs that play together, set by the first frame of any of them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -88,11 +88,11 @@ class VideoInput:
     """A capture, kept open.
 
     Args:
-        name: what the user calls it.
-        open_capture: makes the capture; None, or one that is not opened, where the device is not there.
+        name: shown to the user.
+        open_capture: makes the capture; None, or one that is not opened, if the device is absent.
         timing: of its frames.
-        queue: frames that may wait.
-        origin: of played time, where inputs play together.
+        queue: largest number of waiting frames.
+        origin: of playback, shared by inputs that play together.
     """
 
     def __init__(
@@ -129,19 +129,19 @@ class VideoInput:
 
     @property
     def ended(self) -> bool:
-        """Whether this was a file that is played to its end."""
+        """Whether a file has been played to its end."""
         return self._ended
 
     @property
     def dropped(self) -> int:
-        """Frames that nobody fetched in time."""
+        """Number of frames that were not fetched in time."""
         return self._dropped
 
     def poll(self) -> list[Grabbed]:
         """Frames since the last call, oldest first.
 
         Raises:
-            DeviceLost: once for each loss, after the frames that came before it were fetched.
+            DeviceLost: once for each loss, after the frames before it have been fetched.
         """
         with self._lock:
             found = list(self._waiting)
@@ -156,7 +156,7 @@ class VideoInput:
             return []
 
     def close(self) -> None:
-        """Stop reading and let go of the device; twice does no harm."""
+        """Stop reading and release the device; may be called twice."""
         self._stop.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(_CLOSE_S)
@@ -166,11 +166,11 @@ class VideoInput:
 
     def _silent(self) -> bool:
         if self._timing.paced and self._count:
-            return False  # as slow as its pace; it says when it is at its end
+            return False  # it waits for its pace, and reports its end
         return host_now() - self._heard_s > self._timing.silence_s
 
     def _silent_or_failed(self) -> bool:
-        # A device that was never there gets the same time to show up as one that fell silent.
+        # A device that has not connected yet gets the same time as one that fell silent.
         return self._count > 0 or self._silent()
 
     def _run(self) -> None:
@@ -198,12 +198,12 @@ class VideoInput:
             if capture is None or capture.isOpened():
                 return capture
             capture.release()
-        except Exception as error:  # whatever a device's library raises, the thread has to live on
+        except Exception as error:  # the thread has to survive any error of a device's library
             self._why = f"it could not be opened ({' '.join(str(error).split())[-100:]})"
         return None
 
     def _read_all(self, capture: Capture) -> bool:
-        """Reads until nothing more comes; whether anything came."""
+        """Read until the capture ends; whether any frame came."""
         self._clock.restart()
         delivered = False
         while not self._stop.is_set():
@@ -239,7 +239,7 @@ class VideoInput:
 
 
 class _Clock:
-    """Times of an input's frames, and how long a played one has to wait for its own."""
+    """Stamps an input's frames, and computes how long a played frame has to wait."""
 
     def __init__(self, timing: Timing, origin: Origin) -> None:
         self._timing, self._origin = timing, origin
@@ -249,7 +249,7 @@ class _Clock:
         self._period_s = _PERIOD_S
 
     def restart(self) -> None:
-        """The capture was opened anew: a file starts at zero again, a device's clock goes on or does not."""
+        """The capture was opened again: a file starts at zero, a device's clock may continue or restart."""
         if self._timing.paced and math.isfinite(self._last_s):
             self._shift_s = self._last_s + self._period_s
         else:
@@ -257,10 +257,10 @@ class _Clock:
             self._trust = self._timing.device_clock
 
     def stamp(self, position_s: float, host_s: float) -> tuple[Stamp, float]:
-        """The frame's stamp, and how long it has to wait (s) where it is played."""
+        """The frame's stamp, and how long a played frame has to wait (s)."""
         device_s = position_s + self._shift_s
         if self._timing.paced and not (math.isfinite(device_s) and device_s > self._last_s):
-            # A file that does not know its positions is played at the pace it had so far.
+            # A file without positions continues at its last frame period.
             device_s = self._last_s + self._period_s if math.isfinite(self._last_s) else 0.0
         if self._trust and math.isfinite(device_s) and device_s > self._last_s:
             if math.isfinite(self._last_s):

@@ -91,5 +91,5 @@ def test_the_room_tells_it_over_its_socket_in_host_time(tmp_path: Path) -> None:
     np.testing.assert_allclose(told["trus_T_camera"][1], room.trus_T_camera(9.0))
     assert np.shape(told["spots_mm"]) == (1, 3)
     assert abs(told["moved_s"][0] - (began + 0.1)) < 5.0
-    with pytest.raises(FgregError, match="does not tell the truth"):
+    with pytest.raises(FgregError, match="does not send its ground truth"):
         ask_truth(tmp_path / "nowhere", [0.0], [])
