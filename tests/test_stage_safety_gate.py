@@ -316,7 +316,7 @@ def test_backlog_of_a_stall_is_worth_nothing() -> None:
     [
         (lambda room: room.do(room.gate.handle(Stop(room.now, True, "button"), room.now)), "emergency stop: button"),
         (lambda room: room.do(room.gate.tick(room.now - 0.01, None)), "the clock went back by 0.010 s"),
-        (lambda room: room.do(room.gate.tick(room.now + 0.6, None)), "the clock leapt by 0.600 s"),
+        (lambda room: room.do(room.gate.tick(room.now + 0.6, None)), "the clock jumped by 0.600 s"),
         (lambda room: room.do(room.gate.tick(math.nan, None)), "the clock shows no time"),
         (lambda room: room.do(room.gate.fault("unplugged", room.now)), "unplugged"),
         (lambda room: room.do(room.gate.handle(Beat(room.now + 1.0), room.now)), "heartbeat from the future"),
@@ -420,13 +420,13 @@ def test_stage_that_does_not_stop_is_told_again_and_again() -> None:
     room.stage.wrong.deaf = True
     room.do(room.gate.handle(Stop(room.now, False, "test"), room.now))
     assert len(_halts(room.run(3.0))) > 20
-    assert room.gate.latched == "the stage moves, and should not"
+    assert room.gate.latched == "the stage moves without a command"
 
 
 def test_stage_that_is_turned_by_its_own_knob_is_stopped() -> None:
     room = _room()
     room.stage.move_to(math.radians(20.0), math.radians(3.0))
-    assert _halts(room.run(0.1))[0] == "the stage moves, and should not"
+    assert _halts(room.run(0.1))[0] == "the stage moves without a command"
 
 
 def test_stage_that_stops_by_itself_ends_the_request() -> None:

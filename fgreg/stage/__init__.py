@@ -1,5 +1,6 @@
-"""Motion of the rotation stage, such that it cannot hurt anyone.
+"""Safe motion of the rotation stage.
 
-One way leads from a planner to a stage: ``link`` (main program) -> ``watchdog`` (a process of its own, which owns the
-connection to the device) -> ``gate`` (pure, decides) -> ``device`` (the driver). Nothing else may hold a driver.
+Commands reach the stage in one way only: ``client`` (main program) -> ``watchdog`` (a process of its own, which owns
+the connection to the device) -> ``safety_gate`` (pure; decides) -> the driver (``interface``). Nothing else may hold a
+driver.
 """

@@ -1,16 +1,16 @@
-"""The main program's end of the stage: what it wants goes to the watchdog, what happened comes back.
+"""The main program's link to the stage: orders go to the watchdog, reports and status come back.
 
     with StageLink.open("fgreg.drivers.simulated_stage:open_stage", {}, limits, log=sink) as stage:
         while running:
-            stage.beat(marker_s, "ok")               # once in every turn of the main loop, from that loop
+            stage.beat(marker_s, "ok")               # once in every step of the main loop, from that loop
             for report in stage.poll(): ...
-            stage.request(MotionKind.TRACK, "foot pedal")    # the operator's doing
+            stage.request(MotionKind.TRACK, "foot pedal")    # only on an operator's action
             stage.track_to(scan_rad, sigma_rad, "the beam moved")
 
-The heartbeat has to come from the loop whose stalling matters: a thread of its own would go on beating. Every order is
-handed to ``log`` before it is sent; if that raises, it is not sent, but for stops. Leaving the ``with`` block by an
-exception, Ctrl-C, an uncaught exception in any thread, the end of the interpreter and ``guard.emergency_stop_all`` all
-stop the stage; so does a main program that is killed or stalls, by the watchdog.
+The heartbeat has to come from the loop whose stalling matters; a separate thread would go on beating. Every order is
+passed to ``log`` before it is sent; if that raises, only a stop is still sent. Leaving the ``with`` block by an
+exception, Ctrl-C, an uncaught exception in any thread, the end of the interpreter and
+``stop_on_exit.emergency_stop_all`` all stop the stage. If the main program is killed or stalls, the watchdog stops it.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from fgreg.stage.messages import Beat, Command, Message, Request, Reset, Stop, e
 from fgreg.stage.watchdog import WatchdogSetup
 
 START_S = 20.0
-"""How long the watchdog may take to start."""
+"""Longest start of the watchdog."""
 SEND_S = 0.5
-"""How long a message may wait for the watchdog to take it."""
+"""Longest time until the watchdog takes a message."""
 CLOSE_S = 5.0
-"""How long the watchdog may take to bring the stage to rest when it is let go."""
+"""Longest time that the watchdog may take to stop the stage when the link is closed."""
 READINGS = 100
-"""Stage angles that are kept, one every 50 ms."""
+"""Number of stage angles kept, one every 50 ms."""
 SILENT_S = 0.7
-"""A watchdog that says nothing for this long is gone: it tells of the stage every 50 ms."""
+"""A watchdog that is silent for this long is lost: it sends the stage's status every 50 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ LogSink = Callable[[StageRecord], None]
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Something that happened at the watchdog.
+    """An event at the watchdog.
 
     Attributes:
         what: ``refused`` (a command or request, ``number`` of the command), ``stopped``, ``arrived`` (``number``),
@@ -89,10 +89,14 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class StageView:
-    """The newest that the watchdog told: is the stage there, what does it say, what is going on.
+    """The newest state that the watchdog reported.
 
-    ``status`` None: not heard. ``moving``, ``requested``: kind of motion under way, and allowed by the operator.
-    ``latched``: why nothing may move until a reset.
+    Attributes:
+        at_s: host time of the report.
+        connected: whether the stage is connected.
+        status: of the stage; None if unknown.
+        moving, requested: kind of motion under way, and kind requested by the operator.
+        latched: why nothing may move until a reset; None if the stage may move.
     """
 
     at_s: float
@@ -104,7 +108,7 @@ class StageView:
 
 
 class StageLink:
-    """See the module. Made by :meth:`open`; may be used from several threads.
+    """Link to the watchdog, made by :meth:`open`; may be used from several threads.
 
     Attributes:
         view: the newest status, as of the last :meth:`poll`.
@@ -143,16 +147,16 @@ class StageLink:
         watchdog_log: Path | None = None,
         start_s: float = START_S,
     ) -> Self:
-        """Start the watchdog and wait until it watches. The stage need not be there yet.
+        """Start the watchdog and wait until it is ready. The stage may connect later.
 
         Args:
             driver: ``package.module:factory`` of the stage's driver.
             options: keyword arguments of the factory, as JSON holds them.
-            log: gets every order before it is sent, and stops that the watchdog decided on as they become known.
-            watchdog_log: a file of the watchdog's own, in which stops stand, too, that nobody was left to hear of.
+            log: gets every order before it is sent, and each stop of the watchdog's own once it is reported.
+            watchdog_log: the watchdog's own log file, which also has stops after the main program has ended.
 
         Raises:
-            StageError: the watchdog or the driver did not start; says why.
+            StageError: the watchdog or the driver did not start, with the reason.
         """
         ours, theirs = socket.socketpair()
         emergency_read, emergency_write = os.pipe()
@@ -193,28 +197,28 @@ class StageLink:
         """Process id of the watchdog: ``kill -USR1`` is an emergency stop from outside of the program."""
         return self._process.pid
 
-    # -- what the main program says
+    # -- messages to the watchdog
 
     def beat(self, marker_s: float | None = None, registration: str | None = None) -> None:
-        """The main loop lives. What tracking rests on: when the marker was last seen (host time of the exposure), and
-        the verdict of the registration that holds for where the camera is now; None for none."""
+        """Send the main loop's heartbeat, with what tracking depends on: the host time of the exposure in which the
+        marker was last detected, and the verdict of the current registration; None for none."""
         self._send(Beat(time.monotonic(), marker_s, registration))
 
     def request(self, kind: MotionKind, by: str) -> None:
-        """The operator asks for motion of a kind; call it for nothing but an operator's action."""
+        """Request motion of a kind for the operator; call it only on an operator's action."""
         self._log(StageRecord(time.monotonic(), f"request {kind}", None, by))
         self._send(Request(time.monotonic(), kind, by))
 
     def home(self, reason: str, speed_rad_s: float | None = None) -> int:
-        """To the zero position. Returns the command's number, which reports name."""
+        """Turn to the zero position. Returns the command's number, which reports refer to."""
         return self._command(MotionKind.HOME, None, speed_rad_s, None, reason)
 
     def search_to(self, scan_rad: float, reason: str, speed_rad_s: float | None = None) -> int:
-        """To the next position of a search."""
+        """Turn to the next position of a search."""
         return self._command(MotionKind.SEARCH, scan_rad, speed_rad_s, None, reason)
 
     def track_to(self, scan_rad: float, sigma_rad: float, reason: str, speed_rad_s: float | None = None) -> int:
-        """After the beam: to a tracking answer of this standard deviation."""
+        """Follow the beam: turn to a tracking result with this standard deviation."""
         return self._command(MotionKind.TRACK, scan_rad, speed_rad_s, sigma_rad, reason)
 
     def stop(self, reason: str) -> None:
@@ -225,16 +229,16 @@ class StageLink:
             self._send(Stop(time.monotonic(), False, reason))
 
     def emergency_stop(self, reason: str) -> None:
-        """Stop now, and let nothing move until :meth:`reset`. From any thread, and where the socket is stuck."""
+        """Stop now, and latch until :meth:`reset`. Works from any thread, and if the socket is blocked."""
         self.press()
         self._log(StageRecord(time.monotonic(), "emergency stop", None, reason))
 
     def latch(self, reason: str) -> None:
-        """Let nothing move until :meth:`reset`, for a reason that is told; the stage is stopped, too."""
+        """Stop the stage, and latch it until :meth:`reset`, with a reason."""
         self._send(Stop(time.monotonic(), True, reason))
 
     def reset(self, by: str) -> None:
-        """The operator has looked: motion may be requested again. Refused while the stage moves or is silent."""
+        """Reset the latch after the operator's inspection. Refused while the stage moves or is silent."""
         self._log(StageRecord(time.monotonic(), "reset", None, by))
         self._send(Reset(time.monotonic(), by))
 
@@ -263,10 +267,10 @@ class StageLink:
                 while line:
                     wait = max(0.0, until - time.monotonic())
                     if not select.select([], [self._socket], [], wait)[1]:
-                        raise TimeoutError("it takes nothing in")
+                        raise TimeoutError("it takes no message")
                     line = line[self._socket.send(line) :]
         except (OSError, ValueError) as error:  # a line cut short is unreadable: the watchdog stops the stage for it
-            raise self._give_up(f"the stage's watchdog does not listen: {error}") from error
+            raise self._give_up(f"the stage's watchdog takes no orders: {error}") from error
 
     def press(self) -> None:
         """Emergency stop by the pipe: one byte, no lock, safe in a signal handler."""
@@ -278,14 +282,14 @@ class StageLink:
         self.press()
         return StageLost(reason)
 
-    # -- what comes back
+    # -- messages from the watchdog
 
     def poll(self) -> list[Report]:
-        """What happened since the last call, at once; :attr:`view` is the newest status after it.
+        """Reports since the last call, without waiting; updates :attr:`view`.
 
         Raises:
-            StageLost: the watchdog is gone or says nothing any more. It stopped the stage if it could. The link stays
-                lost: close it and open a new one, whose watchdog stops the stage first of all.
+            StageLost: the watchdog has ended or is silent. It stopped the stage if it could. The link stays lost: close
+                it and open a new one, whose watchdog stops the stage first.
         """
         if self._lost is not None:
             raise StageLost(self._lost)
@@ -293,12 +297,12 @@ class StageLink:
             received = self._receive()
             self._unlogged += [report for report in received if report.what == "stopped"]
             self._reports += received
-        while self._unlogged:  # where the log refuses, nothing is lost: the next call goes on here
+        while self._unlogged:  # if the log raises, the next call continues here
             self._log(StageRecord(time.monotonic(), "stop", None, self._unlogged[0].reason))
             self._unlogged.pop(0)
         reports, self._reports = self._reports, []
         if time.monotonic() - self._heard_s > SILENT_S and not reports:
-            raise self._give_up(f"the stage's watchdog has said nothing for {SILENT_S} s")
+            raise self._give_up(f"the stage's watchdog has been silent for {SILENT_S} s")
         return reports
 
     def _receive(self) -> list[Report]:
@@ -356,7 +360,7 @@ class StageLink:
     # -- the end
 
     def close(self) -> None:
-        """Let go: the watchdog brings the stage to rest and ends. May be called twice."""
+        """Close the link: the watchdog stops the stage and ends. May be called twice."""
         if self._closed:
             return
         self._let_go()
@@ -367,20 +371,20 @@ class StageLink:
             self._process.wait()
 
     def abandon(self, grace_s: float = 0.0) -> None:
-        """Let go of a watchdog that is gone, or may hang: it is ended, after a moment in which it can still stop."""
+        """End a watchdog that is lost or may hang, after ``grace_s`` in which it can still stop the stage."""
         if not self._closed:
             self._let_go()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(grace_s)
             return
         self._process.kill()
-        with contextlib.suppress(subprocess.TimeoutExpired):  # one that the system holds in a call to the device
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it may be blocked in a system call to the device
             self._process.wait(CLOSE_S)
 
     def _let_go(self) -> None:
         self._closed = True
         stop_on_exit.release(self)
-        emergency_fd, self._emergency_fd = self._emergency_fd, -1  # the number may soon be somebody else's
+        emergency_fd, self._emergency_fd = self._emergency_fd, -1  # the number may be reused
         self._socket.close()
         os.close(emergency_fd)
 

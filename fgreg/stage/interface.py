@@ -1,4 +1,4 @@
-"""What the watchdog needs of a rotation stage, and what drivers raise."""
+"""Interface of a rotation stage for the watchdog, and the errors of its drivers."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from fgreg.errors import FgregError
 from fgreg.model.time_sync import Stamp
 
 MAX_CALL_S = 0.1
-"""No call of a driver may take longer, whatever the device does: a stop waits for no answer."""
+"""Longest call of a driver, whatever the device does; a stop waits for no reply."""
 
 
 class StageError(FgregError):
-    """The stage did not do what it was told, or cannot: says which device, what happened, and what to look at."""
+    """The stage did not or cannot carry out a call; the text names device, symptom and what to check."""
 
 
 class StageLost(StageError):  # noqa: N818
-    """The connection is gone (unplugged, switched off, silent): a new one has to be opened."""
+    """The connection is lost (unplugged, switched off, silent); a new one has to be opened."""
 
 
 @dataclass(frozen=True, slots=True)
 class StageStatus:
-    """What the stage says of itself.
+    """Status that the stage reports.
 
     Attributes:
-        stamp: when it was so.
-        scan_rad: plane angle, TRUS convention; without meaning until ``homed``, but its changes are real.
-        velocity_rad_s: as the device has it, same sign convention; 0 where it does not tell.
-        moving, homing: a motion, the search for the zero position, is going on.
-        homed: the zero position was found since power-on.
-        fault: what the device complains of (limit switch, overcurrent, motor off), in words; empty: nothing.
+        stamp: time of the status.
+        scan_rad: plane angle, TRUS convention; only its changes have a meaning until ``homed``.
+        velocity_rad_s: from the device, same sign convention; 0 if unknown.
+        moving, homing: whether a motion, or homing, is under way.
+        homed: whether the zero position was found since power-on.
+        fault: the device's fault (limit switch, overcurrent, motor off), in words; empty if there is none.
     """
 
     stamp: Stamp
@@ -52,16 +52,16 @@ class RotationStage(Protocol):
     """
 
     def home(self, speed_rad_s: float) -> None:
-        """Begin to look for the zero position, no faster than this."""
+        """Start homing, at most at this speed."""
 
     def move_to(self, scan_rad: float, speed_rad_s: float) -> None:
-        """Begin to turn to an angle, no faster than this; replaces a motion under way."""
+        """Start to turn to an angle, at most at this speed; replaces a motion under way."""
 
     def stop(self) -> None:
-        """Stop as fast as the device can, from any state; also where nothing moves."""
+        """Stop as fast as the device can, in any state, also at rest."""
 
     def status(self) -> StageStatus:
-        """The newest status; asks for it where the device does not tell by itself."""
+        """The newest status; queries the device if it does not report by itself."""
 
     def close(self) -> None:
-        """Let go of the device; never raises."""
+        """Release the device; never raises."""

@@ -1,4 +1,4 @@
-"""What motion is allowed: three kinds, each with its conditions. The figures are the session's and the operator's."""
+"""Kinds of motion and their limits, from the session and the configuration."""
 
 import math
 from collections.abc import Mapping
@@ -16,12 +16,12 @@ _SPEED = Number(0.0, 30.0, above=True, unit="deg/s", degrees=True)
 
 
 class MotionKind(StrEnum):
-    """Why the stage turns. Each kind needs a request of its own by the operator; none ever becomes another.
+    """Purpose of a motion. Each kind needs its own request by the operator; none ever becomes another.
 
-    ``home``: to the zero position. Limits, speed, heartbeat, request.
-    ``search``: a step of a sweep or its refinement. Besides: homed, inside the sweep range.
-    ``track``: after the beam. Besides (homed): marker not too old, a current registration that is not refused, sigma
-    below its limit; for as long as the stage turns.
+    ``home``: to the zero position. Needs limits, speed, heartbeat, request.
+    ``search``: a step of a sweep or its refinement. Also needs: homed, inside the sweep range.
+    ``track``: follows the beam. Also needs (besides homed): a recent marker, a current registration that is not
+    refused, sigma below its limit; for as long as the stage turns.
     """
 
     HOME = "home"
@@ -35,17 +35,17 @@ class MotionLimits:
 
     Attributes:
         stage: direction, zero, and the limits that no motion may leave (device angles).
-        home_travel_rad: homing is stopped after this much travel. Until the zero position is found nobody knows where
-            the stage stands; where it stood inside its limits, homing takes no more than their span.
-        heartbeat_s: the main program has to be heard from at least this often, or the stage stops.
-        command_age_s: a command that was on its way for longer is refused: it comes from before a stall.
-        status_age_s: the stage has to be heard from at least this often while it moves.
-        clock_gap_s: the watchdog looks at its clock far more often than this; a longer gap means it did not run.
+        home_travel_rad: homing is stopped after this much travel; None for the span of the limits. The angle is unknown
+            until the zero position is found; from inside the limits, homing takes no more than their span.
+        heartbeat_s: longest time between heartbeats of the main program; after that the stage stops.
+        command_age_s: an older command is refused, since it comes from before a stall.
+        status_age_s: longest time between statuses of a moving stage.
+        clock_gap_s: longest time between two clock readings of the watchdog; a longer gap means that it did not run.
         tolerance_rad: of positions: reading, settling, overshoot.
-        deceleration: least of a stage that is told to stop or to turn about, rad/s^2.
-        overspeed: factor above the commanded speed that is taken for a fault.
-        stop_s: time in which a stopped stage has to stand, where its deceleration does not ask for more.
-        slack_s: time that a motion may take beyond its distance at its speed.
+        deceleration: least deceleration of a stage that is stopped or reversed, rad/s^2.
+        overspeed: factor above the commanded speed that counts as a fault.
+        stop_s: time in which a stopped stage has to come to rest, unless its deceleration needs more.
+        slack_s: time that a motion may take beyond its distance divided by its speed.
     """
 
     stage: StageModel
@@ -122,7 +122,7 @@ class MotionLimits:
         return cls(stage, **{"sweep_rad": (low, high), **changes})
 
     def inside(self, scan_rad: float, tolerance_rad: float = 0.0) -> bool:
-        """Whether a plane angle is inside the stage's limits; no number is not."""
+        """Whether a plane angle is inside the stage's limits; False for NaN."""
         device = self.stage.device_from_scan(scan_rad)
         low, high = self.stage.limits_device_rad
         return low - tolerance_rad - 1e-12 <= device <= high + tolerance_rad + 1e-12
@@ -141,30 +141,30 @@ class MotionLimits:
         return speeds[kind]
 
     def reach_rad(self, speed: float, age_s: float) -> float:
-        """How far from where it was told ``age_s`` ago a stage can get before an order of now has turned it about.
+        """How far a stage can get from its reported angle, ``age_s`` old, before an order given now has reversed it.
 
-        It goes on at its speed until the order reaches it, at most a driver's call from now, and then brakes:
+        It continues at its speed until the order reaches it, at most one driver call from now, and then brakes:
         ``speed (age + call) + speed^2 / (2 deceleration)``.
         """
         return speed * (age_s + MAX_CALL_S) + speed * speed / (2.0 * self.deceleration)
 
     def standing_s(self) -> float:
-        """Time after a stop from which on the stage has to be heard standing."""
+        """Time after a stop by which the stage has to report that it is at rest."""
         fastest = max(self.speed(kind) for kind in MotionKind)
         return max(self.stop_s, MAX_CALL_S + fastest / self.deceleration + self.status_age_s)
 
     def homing_travel(self) -> float:
-        """Most travel of homing: the limits' span unless said otherwise."""
+        """Largest travel of homing; by default the span of the limits."""
         low, high = self.stage.limits_device_rad
         return high - low if self.home_travel_rad is None else self.home_travel_rad
 
     def document(self) -> dict[str, Any]:
-        """As JSON can hold it."""
+        """As a JSON document."""
         return asdict(self)
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> Self:
-        """Back from :meth:`document`. Raises ValueError, TypeError, KeyError where it is not one."""
+        """Inverse of :meth:`document`. Raises ValueError, TypeError, KeyError on an invalid document."""
         fields = dict(document)
         stage = dict(fields.pop("stage"))
         low, high = stage.pop("limits_device_rad")
@@ -173,4 +173,4 @@ class MotionLimits:
 
 
 LIMITS = Section("MotionLimits", record(MotionLimits).fields)
-"""``limits`` of a stage in a configuration: reads to what :meth:`MotionLimits.of_session` takes."""
+"""``limits`` of a stage in a configuration: reads to arguments of :meth:`MotionLimits.of_session`."""

@@ -1,7 +1,7 @@
-"""What the main program may say to the watchdog, what the gate lets out, and both as lines of JSON.
+"""Messages of the main program to the watchdog as lines of JSON, and the actions of the safety gate.
 
-Times are seconds of the host's clock. A line that is not exactly one of these messages raises :class:`MessageError`:
-whoever sent it is not well.
+Times are seconds of the host's clock. A line that is not exactly one of these messages raises :class:`MessageError`,
+since its sender is faulty.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from fgreg.errors import FgregError
 from fgreg.stage.limits import MotionKind
 
 MAX_LINE = 4096
-"""Bytes of a line at most."""
+"""Largest number of bytes of a line."""
 MAX_TEXT = 300
-"""Characters of a reason at most; longer ones are cut by the sender."""
+"""Largest number of characters of a reason; the sender cuts longer ones."""
 
 
 class MessageError(FgregError):
-    """A line that is none of the messages."""
+    """A line that is not a valid message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Beat:
-    """The main program lives, and this is what tracking may rest on.
+    """Heartbeat of the main program, with what tracking depends on.
 
     Attributes:
-        sent_s: when the main loop came by.
+        sent_s: time of the main loop's step.
         marker_s: exposure of the newest frame in which the marker was found.
-        registration: verdict of the *current* registration (``ok``, ``warning``, ``refused``); None where there is
-            none, or none for where the camera is now.
+        registration: verdict of the *current* registration (``ok``, ``warning``, ``refused``); None if there is none
+            that is valid for the camera's current pose.
     """
 
     sent_s: float
@@ -42,7 +42,7 @@ class Beat:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """The operator wants motion of a kind; ``by`` says who, or by which control."""
+    """The operator's request for a kind of motion; ``by`` names the operator or the control."""
 
     sent_s: float
     kind: MotionKind
@@ -51,7 +51,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A motion: ``scan_rad`` None for homing, ``sigma_rad`` of the answer for tracking."""
+    """A motion: ``scan_rad`` is None for homing, ``sigma_rad`` is that of the tracking result, else None."""
 
     sent_s: float
     number: int
@@ -64,7 +64,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Stop and forget the operator's request; ``emergency``: and refuse everything until a :class:`Reset`."""
+    """Stop and drop the operator's request; ``emergency``: also refuse everything until a :class:`Reset`."""
 
     sent_s: float
     emergency: bool
@@ -73,7 +73,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class Reset:
-    """The operator has looked: motion may be requested again."""
+    """Reset after the operator's inspection: motion may be requested again."""
 
     sent_s: float
     by: str
@@ -93,7 +93,7 @@ _OPTIONAL = {"marker_s", "registration", "scan_rad", "sigma_rad"}
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Let the stage move: the only thing that ever sets it in motion."""
+    """Move the stage; the only action that ever sets it in motion."""
 
     kind: MotionKind
     scan_rad: float | None
@@ -112,7 +112,7 @@ class Halt:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """What was asked for is not done; ``number`` of the command, None where it was something else."""
+    """A refused message; ``number`` of the command, None if it was no command."""
 
     reason: str
     number: int | None = None
@@ -141,7 +141,7 @@ def decode(line: bytes) -> Message:
     """The message of a line.
 
     Raises:
-        MessageError: it is none.
+        MessageError: not a valid message.
     """
     try:
         document = json.loads(line.decode("utf-8"), parse_constant=_no_number)

@@ -1,12 +1,12 @@
-"""The stage's link, made anew by itself where its watchdog is gone: killed, hung, or ended by a defect.
+"""A link to the stage that reconnects by itself after its watchdog was killed, hung or failed.
 
     stage = ReconnectingStage(lambda: StageLink.open(...))
     while running:
         reports = stage.poll()          # raises StageLost as long as there is no link
         if stage.link is not None: stage.link.beat(...)
 
-The loop never waits: what is gone is taken down and a new watchdog started in a thread. Its first order to the stage is
-a stop, and it is latched before it is handed on, so that nothing moves until the operator has looked and said so.
+The loop never waits: a thread ends the lost watchdog and starts a new one. The new watchdog's first order to the stage
+is a stop, and it is latched before it is used, so that nothing moves until the operator's reset.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from fgreg.stage.client import CLOSE_S, Report, StageLink, StageView
 from fgreg.stage.interface import StageLost
 
 RETRY_S = 1.0
-"""Between attempts to start a watchdog."""
+"""Time between attempts to start a watchdog."""
 GRACE_S = 0.15
-"""A watchdog that still lives has told its stage to stop long before; then it is ended."""
+"""Time before a lost watchdog is killed; one that still works has stopped its stage by then."""
 
 
 class ReconnectingStage:
-    """Keeps one link to a stage. Use it as a context manager, or close it.
+    """Keeps one link to a stage open. Use it as a context manager, or close it.
 
     Args:
-        open_link: opens a link, and may take its time.
+        open_link: opens a link; may take long.
 
     Attributes:
-        link: the present one; None while there is none.
+        link: the current link; None while there is none.
 
     Raises:
         StageError: the first link could not be opened.
@@ -55,7 +55,7 @@ class ReconnectingStage:
         """As :meth:`StageLink.poll`.
 
         Raises:
-            StageLost: there is no link; a new one is being made. Says why.
+            StageLost: there is no link, with the reason; a new one is being opened.
         """
         if self.link is None and self._renewal is not None and not self._renewal.is_alive():
             self.link, self._fresh, self._renewal = self._fresh, None, None
@@ -70,13 +70,13 @@ class ReconnectingStage:
             raise
 
     def _renew(self, gone: StageLink, reason: str) -> None:
-        """End a lost watchdog, which may hold the device, and start another."""
+        """End a lost watchdog, which may hold the device, and start a new one."""
         gone.abandon(GRACE_S)
         while not self._ending.is_set():
             try:
                 fresh = self._open()
                 fresh.latch(reason)
-            except Exception as error:  # a driver's, a process's, the system's: the next attempt is worth it
+            except Exception as error:  # any error of driver, process or system: try again
                 self._reason = one_line(str(error), 300)
                 self._ending.wait(RETRY_S)
             else:
@@ -86,13 +86,13 @@ class ReconnectingStage:
             self._fresh.close()
 
     def close(self) -> None:
-        """Let go of the stage, which is brought to rest. May be called twice."""
+        """Close the link, which stops the stage. May be called twice."""
         self._ending.set()
         link, self.link = self.link, None
         if link is not None:
             link.close()
         if self._renewal is not None:
-            self._renewal.join(CLOSE_S)  # one that still waits for a driver closes what comes of it
+            self._renewal.join(CLOSE_S)  # if it still waits for a driver, it closes the link itself
             self._renewal = None
 
     def __enter__(self) -> ReconnectingStage:

@@ -1,12 +1,12 @@
-"""The one gate between whoever plans and the stage: decides what may move, and when motion has to stop.
+"""The safety gate between planner and stage: decides what may move, and when motion has to stop.
 
-Pure: it is told messages, the stage's status and the time, and says what to do; it never looks at a clock or a device.
-It lives in the watchdog process, as the last thing before the driver.
+It is pure: it gets messages, the stage's status and the time, and returns actions; it reads no clock and no device. It
+runs in the watchdog process, as the last step before the driver.
 
 Three ways to stop:
-- *hold*: this motion ends; the operator's request stays (the marker was lost for a moment).
-- *halt*: and the operator has to request again (the main program stalled, somebody pressed stop).
-- *latch*: and nothing moves until a reset (emergency, clock, stage misbehaves).
+- *hold*: the motion ends; the operator's request stays (the marker was lost for a moment).
+- *halt*: the operator also has to request again (the main program stalled, stop was pressed).
+- *latch*: nothing moves until a reset (emergency, clock, faulty stage).
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from fgreg.stage.limits import MotionKind, MotionLimits
 from fgreg.stage.messages import Action, Arrived, Beat, Command, Drive, Halt, Message, Refusal, Request, Reset, Stop
 
 FUTURE_S = 1e-3
-"""What is stamped later than now by more than this was stamped by another clock."""
+"""A stamp that is later than now by more than this comes from another clock."""
 START_S = 0.3
-"""A stage that does not move this long after a command will not, or is there already."""
+"""A stage that has not moved by this time after a command will not move, or is at its target already."""
 TRACKABLE = ("ok", "warning")
 """Verdicts with which a registration may be followed."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """A motion under way: within ``low_rad`` and ``high_rad``, over by ``deadline_s``, no faster than its command says
-    or, until ``carried_until_s``, than the motion before it that it has to brake (``carried_speed``)."""
+    """A motion under way: between ``low_rad`` and ``high_rad``, finished by ``deadline_s``, at most at the commanded
+    speed or, until ``carried_until_s``, at the speed of the motion before it (``carried_speed``), which it brakes."""
 
     command: Command
     began_s: float
@@ -47,10 +47,10 @@ class _Motion:
 
 
 class Gate:
-    """State of what is allowed now. All methods take the time ``now`` (s, host clock) and return what to do.
+    """State of the safety gate. All methods take the time ``now`` (s, host clock) and return actions.
 
     Attributes:
-        latched: why nothing may move until a reset; None: it may.
+        latched: why nothing may move until a reset; None if the stage may move.
     """
 
     def __init__(self, limits: MotionLimits) -> None:
@@ -67,12 +67,12 @@ class Gate:
 
     @property
     def moving(self) -> MotionKind | None:
-        """The kind of motion under way."""
+        """The kind of motion under way, or None."""
         return None if self._motion is None else self._motion.command.kind
 
     @property
     def requested(self) -> MotionKind | None:
-        """What the operator's request allows."""
+        """The kind of motion that the operator has requested, or None."""
         return None if self._request is None else self._request[0]
 
     def handle(self, message: Message, now: float) -> list[Action]:
@@ -97,17 +97,17 @@ class Gate:
                 return [*actions, *self._on_command(message, now)]
 
     def tick(self, now: float, status: StageStatus | None) -> list[Action]:
-        """Time has passed; ``status`` where the stage was heard. Call it at least every few hundredths of a second."""
+        """Time has passed; ``status`` is a new status or None. Call it at least every few hundredths of a second."""
         actions = self._clock(now)
         if status is not None:
             actions += self._on_status(status, now)
         return actions + self._supervise(now)
 
     def fault(self, reason: str, now: float) -> list[Action]:
-        """Something is wrong that only the watchdog can know: the stage is lost, a message unreadable, a signal."""
+        """Latch on a fault that only the watchdog can know: a lost stage, an unreadable message, a signal."""
         return self._clock(now) + self._latch(reason)
 
-    # -- what stops
+    # -- ways to stop
 
     def _hold(self, reason: str) -> list[Action]:
         """End the motion; the request stays."""
@@ -117,7 +117,7 @@ class Gate:
         return [Halt(reason, latched=self.latched is not None)]
 
     def _halt(self, reason: str) -> list[Action]:
-        """Stop, and drop the request. The stage is told in any case: it costs nothing."""
+        """Stop, and drop the request. The stop is sent in any case."""
         self._request = None
         self._come_to_rest()
         return [Halt(reason, latched=self.latched is not None)]
@@ -136,7 +136,7 @@ class Gate:
     # -- time
 
     def _clock(self, now: float) -> list[Action]:
-        """Notice a clock that cannot be trusted. What was stamped before means nothing after."""
+        """Latch if the clock cannot be trusted; earlier stamps are then invalid."""
         last, self._now = self._now, now
         if last is None and math.isfinite(now):
             return []
@@ -146,7 +146,7 @@ class Gate:
         elif last is not None and now < last:
             reason = f"the clock went back by {last - now:.3f} s"
         elif last is not None and now - last > self.limits.clock_gap_s:
-            reason = f"the clock leapt by {now - last:.3f} s: the watchdog did not run"
+            reason = f"the clock jumped by {now - last:.3f} s: the watchdog did not run"
         else:
             return []
         self._beat = self._status = None
@@ -159,7 +159,7 @@ class Gate:
         status = self._status
         return status if status is not None and now - status.stamp.host_s <= self.limits.status_age_s else None
 
-    # -- what is asked for
+    # -- requests and commands
 
     def _on_request(self, request: Request, now: float) -> list[Action]:
         reason = self._stale(request.sent_s, now)
@@ -212,10 +212,10 @@ class Gate:
         return [Drive(command.kind, target, command.speed_rad_s, command.reason, command.number)]
 
     def _carried(self, status: StageStatus, now: float) -> tuple[float, float, float]:
-        """Where the motion before may still take the stage (lowest and highest angle), and how fast.
+        """Lowest and highest angle that the stage may still reach from the motion before, and its highest speed.
 
-        As far as it can get before it has turned about (:meth:`MotionLimits.reach_rad`), but never off the way it was
-        on: whatever it is told now, it goes no farther than it would have gone.
+        It may go as far as it can before it has reversed (:meth:`MotionLimits.reach_rad`), but never beyond the range
+        of the motion before.
         """
         here, limits, old = status.scan_rad, self.limits, self._motion
         speed = 0.0
@@ -236,7 +236,7 @@ class Gate:
         return "from the future: the clocks disagree" if age < -FUTURE_S else None
 
     def _forbidden(self, command: Command, now: float) -> str | None:
-        """Why a command is not allowed now; None: it is."""
+        """Why a command is not allowed now; None if it is allowed."""
         limits, status = self.limits, self._fresh_status(now)
         if self.latched is not None:
             return f"latched: {self.latched}"
@@ -287,10 +287,10 @@ class Gate:
         return self._untrackable(now)
 
     def _untrackable(self, now: float) -> str | None:
-        """Why tracking has nothing to rest on; None: it has."""
+        """Why tracking is not allowed: marker or registration; None if it is allowed."""
         beat = self._beat
         if beat is None or beat.marker_s is None:
-            return "no marker seen"
+            return "no marker detected"
         age = now - beat.marker_s
         if age > self.limits.marker_age_s:
             return f"the marker is {1e3 * age:.0f} ms old, at most {1e3 * self.limits.marker_age_s:.0f} ms allowed"
@@ -300,11 +300,11 @@ class Gate:
             return "there is no current registration"
         return None if beat.registration in TRACKABLE else f"the registration is {beat.registration}"
 
-    # -- what happens while it moves
+    # -- supervision of motions
 
     def _on_status(self, status: StageStatus, now: float) -> list[Action]:
         if not (math.isfinite(status.scan_rad) and math.isfinite(status.velocity_rad_s)):
-            return self._latch("the stage tells no angle")
+            return self._latch("the stage reports no angle")
         if status.stamp.host_s > now + FUTURE_S:
             return self._latch("a status from the future: the clocks disagree")
         before, self._status = self._status, status
@@ -319,7 +319,7 @@ class Gate:
         return self._ended(self._motion, status)
 
     def _at_rest(self, status: StageStatus, now: float) -> list[Action]:
-        """Nothing is to move; braking takes a moment."""
+        """Check a stage that should be at rest, or be braking."""
         if not (status.moving or status.homing):
             return []
         if status.homed and not self.limits.inside(status.scan_rad, self.limits.tolerance_rad):
@@ -328,9 +328,9 @@ class Gate:
         if braking:
             return []
         halted = self._halted_s
-        actions = self._latch("the stage moves, and should not")
+        actions = self._latch("the stage moves without a command")
         if halted is not None:
-            self._halted_s = halted  # not braking: told again at every status until it stands
+            self._halted_s = halted  # not braking: the stop is repeated at every status until it is at rest
         return actions
 
     def _misbehaves(self, motion: _Motion, before: StageStatus | None, status: StageStatus, now: float) -> str | None:
@@ -381,7 +381,7 @@ class Gate:
         return []
 
     def _supervise(self, now: float) -> list[Action]:
-        """Whether what is under way may go on."""
+        """Stop a motion whose conditions no longer hold."""
         if not self._alive(now) and (self._motion is not None or self._request is not None):
             return self._halt("the main program's heartbeat is missing")
         if self._request is not None and now - self._request[1] > self.limits.request_s:

@@ -1,4 +1,4 @@
-"""Links to stages that are stopped whatever becomes of this program: Ctrl-C, an exception nobody catches, its end."""
+"""Stops all stages when this program ends: by Ctrl-C, by an uncaught exception, or normally."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class Guarded(Protocol):
         """Emergency stop; takes no lock, never raises."""
 
     def close(self) -> None:
-        """Let go of the stage."""
+        """Close the link, which stops the stage."""
 
 
 _links: tuple[Guarded, ...] = ()
-"""Those that are open; replaced, never changed, so that a signal handler can go through it at any time."""
+"""The open links; replaced, never changed, so that a signal handler can iterate over it at any time."""
 _GUARDED = threading.Lock()
 _guards_set = False
 
 
 def release(link: Guarded) -> None:
-    """It looks after itself from now on."""
+    """Remove a link that is being closed."""
     global _links
     with _GUARDED:
         _links = tuple(other for other in _links if other is not link)

@@ -1,10 +1,9 @@
-"""The process that owns the stage: it alone talks to the driver, and stops the stage when the main program fails.
+"""The watchdog process owns the stage: only it calls the driver, and it stops the stage if the main program fails.
 
-It is started by :mod:`fgreg.stage.client` in a session of its own, so that Ctrl-C reaches the main program only. What
-it
-watches: lines on a socket (messages.py), an emergency pipe (any byte, or its end, stops the stage), the stage's status,
-and the clock. It ends when the main program lets go of the socket, however that comes about; before it ends, the stage
-stands. Signals: SIGUSR1 is an emergency stop; SIGTERM and SIGHUP stop the stage and end the process.
+:mod:`fgreg.stage.client` starts it in a session of its own, so that Ctrl-C reaches the main program only. It watches
+lines on a socket (messages.py), an emergency pipe (any byte, or its end, stops the stage), the stage's status, and the
+clock. It ends when the main program closes the socket for any reason, and stops the stage before. Signals: SIGUSR1 is
+an emergency stop; SIGTERM and SIGHUP stop the stage and end the process.
 
     python -m fgreg.stage.watchdog SOCKET_FD EMERGENCY_FD
 """
@@ -34,9 +33,9 @@ from fgreg.stage.safety_gate import Gate
 
 TICK_S = 0.02
 RETRY_S = 0.5
-"""Between attempts to reach a stage that is gone."""
+"""Time between attempts to reach a lost stage."""
 REST_S = 2.0
-"""How long the end of the process waits for the stage to stand."""
+"""Longest wait for the stage to come to rest before the process ends."""
 STATUS_EVERY_S = 0.05
 _OUTBOX_BYTES = 1 << 20
 
@@ -45,7 +44,7 @@ OpenStage = Callable[..., RotationStage]
 
 @dataclass(frozen=True, slots=True)
 class WatchdogSetup:
-    """What the main program hands over, as one line of JSON.
+    """Set-up from the main program, as one line of JSON.
 
     Attributes:
         driver: ``package.module:factory``, called with the stage's model and ``options``.
@@ -58,7 +57,7 @@ class WatchdogSetup:
     log: str | None = None
 
     def line(self) -> bytes:
-        """As handed over."""
+        """As a line of JSON."""
         document = {
             "driver": self.driver,
             "options": self.options,
@@ -69,7 +68,7 @@ class WatchdogSetup:
 
     @staticmethod
     def read(line: bytes) -> WatchdogSetup:
-        """Back from :meth:`line`."""
+        """Inverse of :meth:`line`."""
         document = json.loads(line)
         limits = MotionLimits.from_document(document["limits"])
         return WatchdogSetup(document["driver"], document["options"], limits, document["log"])
@@ -84,7 +83,7 @@ def load(dotted: str) -> OpenStage:
 
 
 class Watchdog:
-    """The loop around the gate. ``clock`` and the open stage are handed in, so that it can be run in a test."""
+    """The loop around the safety gate. ``clock`` and ``open_stage`` are arguments, so that tests can replace them."""
 
     def __init__(
         self,
@@ -108,13 +107,13 @@ class Watchdog:
         main.setblocking(False)
 
     def on_signal(self, number: int, _frame: FrameType | None) -> None:
-        """Handler: takes effect at the next turn of the loop, at the latest after a tick."""
+        """Signal handler; takes effect at the next step of the loop, after a tick at the latest."""
         self._signal = number
 
     def run(self) -> None:
-        """Tell that it is ready, then watch until the main program is gone or a signal ends it.
+        """Report ready, then run until the main program ends or a signal comes.
 
-        On return the stage stands, as far as it listens.
+        On return the stage is at rest, if it obeys.
         """
         self._tell({"report": "ready"})
         try:
@@ -124,7 +123,7 @@ class Watchdog:
             self._rest(self._ended or "the watchdog failed")
 
     def turn(self) -> None:
-        """One turn of the loop: at most a tick, and a call or two of the driver."""
+        """One step of the loop: at most a tick, and one or two calls of the driver."""
         main_fd = self._main.fileno()
         ready, _, _ = select.select([main_fd, self._emergency_fd], [main_fd] if self._out else [], [], TICK_S)
         if self._emergency_fd in ready:
@@ -144,7 +143,7 @@ class Watchdog:
         if self._stop_owed:  # the stage did not take the last one
             self._stop_owed = False
             self._order("stop", None, self._last_halt, lambda stage: stage.stop(), said=True)
-        status = self._status()  # before the clock is read: a status must not be younger than the time it is judged at
+        status = self._status()  # before the clock is read: a status must not be younger than the time of its check
         self._do(self._gate.tick(self._clock(), status))
         self._tell_status(status)
         self._flush()
@@ -184,7 +183,7 @@ class Watchdog:
         self._do(self._gate.fault(reason, self._clock()))
 
     def _tell(self, document: dict[str, Any]) -> None:
-        """To the main program, if it listens: a stalled one must never hold the watchdog up."""
+        """Queue a report to the main program; a stalled one must never block the watchdog."""
         line = json.dumps(document).encode() + b"\n"
         if len(self._out) + len(line) <= _OUTBOX_BYTES:
             self._out += line
@@ -204,7 +203,7 @@ class Watchdog:
         if now - self._said_s < STATUS_EVERY_S and now >= self._said_s:
             return
         self._said_s = now
-        if self._out:  # what it has not read yet comes first; a newer status will do
+        if self._out:  # unread reports come first; a later status will do
             return
         gate = self._gate
         self._tell(
@@ -235,9 +234,9 @@ class Watchdog:
         return None
 
     def connect(self) -> None:
-        """Look for the stage, where it is not there and was not looked for a moment ago. Stops it first of all.
+        """Connect to the stage unless that was tried within ``RETRY_S``, and stop it first.
 
-        Raises whatever the driver's factory raises, but for StageError: then the stage may come later.
+        Raises whatever the driver's factory raises except StageError, after which the stage may connect later.
         """
         now = self._clock()
         if 0.0 <= now - self._retry_s < RETRY_S:
@@ -257,7 +256,7 @@ class Watchdog:
         self._do(self._gate.fault(reason, self._clock()))
 
     def _do(self, actions: list[Action]) -> None:
-        """Carry out what the gate says, each written down first."""
+        """Carry out the gate's actions; each is logged first."""
         for action in actions:
             match action:
                 case Drive():
@@ -291,7 +290,7 @@ class Watchdog:
         call: Callable[[RotationStage], None],
         said: bool = False,
     ) -> bool:
-        """Write an order down, then give it. What cannot be written down is not given, but for a stop."""
+        """Log an order, then give it. If it cannot be logged, only a stop is given."""
         if not said and not self._write_down(command, scan_rad, reason) and command != "stop":
             return False
         if self._stage is None:
@@ -320,10 +319,10 @@ class Watchdog:
         return True
 
     def _rest(self, reason: str) -> None:
-        """Stop the stage, again and again until it stands, then let go of it."""
+        """Repeat stops until the stage is at rest, then release it."""
         until = time.monotonic() + REST_S
         while self._stage is not None and time.monotonic() < until:
-            with contextlib.suppress(Exception):  # whatever a driver raises, the next attempt is worth it
+            with contextlib.suppress(Exception):  # try again after any error of a driver
                 self._order("stop", None, reason, lambda stage: stage.stop(), said=reason == self._last_halt)
                 self._last_halt = reason
                 if self._stage is None or not self._stage.status().moving:
@@ -334,7 +333,7 @@ class Watchdog:
 
 
 def _asleep() -> float:
-    """Seconds that the machine has slept since it was started; 0 where that cannot be told."""
+    """Seconds that the machine has slept since it was started; 0 if unknown."""
     clock = getattr(time, "CLOCK_BOOTTIME", None)
     return 0.0 if clock is None else time.clock_gettime(clock) - time.monotonic()
 
@@ -362,7 +361,7 @@ def main(arguments: list[str]) -> int:
         watchdog.connect()
     except EOFError:
         return 0
-    except Exception as error:  # the driver's import and set-up are somebody else's code: all goes to the main program
+    except Exception as error:  # the driver's import and set-up may raise anything: report it to the main program
         reason = one_line(str(error) if isinstance(error, FgregError) else f"{type(error).__name__}: {error}", 500)
         link.setblocking(True)
         link.sendall(json.dumps({"report": "failed", "reason": reason}).encode() + b"\n")
