@@ -1,1 +1,1 @@
-"""Child processes that work for this one, and how many threads each of them takes."""
+"""Worker processes, and the number of threads of each process."""

@@ -1,6 +1,6 @@
-"""How many threads linear algebra and OpenCV take: one a process, where there are as many processes as cores.
+"""Limits linear algebra and OpenCV to one thread per process, since there are as many processes as cores.
 
-Their libraries read that from the environment when they are loaded, so this module loads nothing.
+The libraries read the number from the environment when they are loaded, so this module loads nothing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NAMES = (
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """What is started or imported within uses one thread for these, unless the user has said how many."""
+    """Processes started and libraries imported in the block use one thread, unless the user has set a number."""
     before = {name: os.environ.get(name) for name in NAMES}
     os.environ.update({name: "1" for name, value in before.items() if value is None})
     try:
@@ -34,13 +34,13 @@ def one_thread_each() -> Iterator[None]:
 
 
 SWITCH_S = 0.0005
-"""After so long a thread at work lets another have the interpreter (Python's own: 0.005). One that receives or records
-asks for it several times a frame, and so does the loop after each call into NumPy or OpenCV."""
+"""The interpreter's switch interval (default 0.005). Threads that receive or record need the interpreter several times
+per frame, and so does the loop after each call into NumPy or OpenCV."""
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Short turns for each thread, and no search for garbage in what there is by now: that takes 40 ms each time."""
+    """A short switch interval, and existing objects kept out of garbage collection, which takes 40 ms each time."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     gc.collect()

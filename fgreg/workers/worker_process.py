@@ -1,8 +1,8 @@
 """A child process that works on one request after another; one that ends or hangs is reported and replaced.
 
 Written on multiprocessing. pebble kills a process whose task is overdue, loky replaces one that has died, but both
-then run the next task in a new process, and say nothing of it. A worker that keeps state from one request to the next,
-as the registration does, must not go on like that. Nor do they notice a process that hangs while it is idle.
+then run the next task in a new process without a report. That is wrong for a worker that keeps state between requests,
+as the registration does. Nor do they detect a process that hangs while it is idle.
 """
 
 from __future__ import annotations
@@ -21,47 +21,47 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
 NICENESS = 5
-"""A worker gives way to its owner by so much; the processes that a worker starts give way to it in turn."""
+"""Added to the owner's niceness, so that a worker gives way to its owner, and its own workers to it."""
 START_S, ANSWER_S, END_S = 60.0, 120.0, 0.5
-"""Longest start, answer and end, where the owner does not say otherwise."""
+"""Default limits of start, answer and end."""
 SLOW_S = 2.0
 """An answer that takes longer is reported as trouble."""
 RESTART_S = 1.0
-"""Between two starts: a worker that cannot start must not keep a processor busy."""
+"""Time between two starts: a worker that cannot start must not keep a processor busy."""
 PING_S = 0.2
-"""An idle worker is asked whether it is there after so long."""
+"""Time between two pings of an idle worker."""
 IDLE_S = 0.1
-"""Between calls of the work's ``idle``."""
+"""Time between two calls of the work's ``idle``."""
 
 Request = TypeVar("Request")
 Answer = TypeVar("Answer")
 Work = Callable[[Request], Answer]
 Kind = Literal["ready", "ping", "request", "failed", "broken"]
-"""Of a message. To the process: ping, request. From it: the same in answer, ready to work, a request that failed, and
-why it ends. The message None ends it."""
+"""Kind of a message. To the process: ping, request. From it: their answers, ``ready`` to work, a ``failed`` request,
+and ``broken`` with the reason why it ends. The message None ends the process."""
 
 
 class WorkerProcess(Generic[Request, Answer]):
     """One child process. For one thread at a time. Close it when it is no longer needed.
 
-    The process is seen to have ended, or to hang, in :meth:`send`, :meth:`fetch` and :meth:`check`; each of them starts
-    the next one where that is due. A request that was under way is lost: ``failure`` tells, and the owner may send it
-    again. One that had not been handed over yet goes to the next process. Ctrl-C does not reach a worker.
+    :meth:`send`, :meth:`fetch` and :meth:`check` detect a process that has ended or hangs, and start the next one if
+    that is due. The request under way is then lost: ``failure`` gives the reason, and the owner may send it again. A
+    request that is still waiting goes to the next process. Ctrl-C does not reach a worker.
 
     Args:
         make: called in the child with ``arguments`` at each start; a function of a module. Returns the work: a function
             of a request, or a context manager that gives one and is left when the worker is closed. If the work has a
             method ``idle``, that is called every 0.1 s while no request comes.
-        name: of the process; top shows its first 15 letters. what: it is, in messages: ``the full solve's process``.
+        name: of the process; top shows its first 15 letters. what: its name in messages: ``the full solve's process``.
         niceness: added to the owner's.
         start_s, answer_s, end_s: longest start, answer and end; then the process is killed.
-        restart: start another process where one has ended; without it every request fails from then on.
-        daemon: False where the work starts processes itself.
+        restart: whether to start another process after one has ended; if not, every request fails from then on.
+        daemon: False if the work starts processes itself.
 
     Attributes:
-        failure: what went wrong with the last request; empty where it was answered.
+        failure: why the last request failed; empty if it was answered.
         lost: whether the last request failed because its process has ended or was killed.
-        trouble: what is wrong with the process now; empty where it answers.
+        trouble: what is wrong with the process now; empty if it answers.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class WorkerProcess(Generic[Request, Answer]):
 
     @property
     def ready(self) -> bool:
-        """Whether the process has started and is there, as far as is known."""
+        """Whether the process has started, and is not known to have ended."""
         return self._child is not None and self._awaited != "ready"
 
     @property
@@ -106,11 +106,11 @@ class WorkerProcess(Generic[Request, Answer]):
 
     @property
     def pid(self) -> int | None:
-        """Of the process; None where there is none."""
+        """Id of the process; None if there is none."""
         return None if self._child is None else self._child.process.pid
 
     def send(self, request: Request) -> None:
-        """Hand over a request, as soon as the process is ready for it.
+        """Hand over a request; it waits until the process is ready.
 
         Raises:
             RuntimeError: the worker is busy.
@@ -121,10 +121,10 @@ class WorkerProcess(Generic[Request, Answer]):
         self._advance(0.0)
 
     def fetch(self, wait_s: float = 0.0) -> tuple[Answer | None] | None:
-        """The answer that has come back, None in it where the request failed; None where nothing has come.
+        """The answer as a tuple of one, (None,) if the request failed; None if there is no answer yet.
 
         Args:
-            wait_s: wait for it, no longer than this.
+            wait_s: longest wait for it.
         """
         until = time.monotonic() + wait_s
         self._advance(0.0)
@@ -134,7 +134,7 @@ class WorkerProcess(Generic[Request, Answer]):
         return reply
 
     def check(self) -> None:
-        """See that the process is there, also where it has nothing to do. Call it often."""
+        """Check that the process is alive, also while it is idle. Call it often."""
         self._advance(0.0)
         if self._child is not None and self._awaited is None and time.monotonic() - self._heard_s > PING_S:
             self._post(self._child, "ping", None)
@@ -156,7 +156,7 @@ class WorkerProcess(Generic[Request, Answer]):
             self._awaited = "ready"
 
     def _advance(self, wait_s: float) -> None:
-        """Take in what the process has sent, hand over what waits, and see whether it has ended or hangs."""
+        """Take in the process's messages, hand over a waiting request, and detect whether it has ended or hangs."""
         now_s, child = time.monotonic(), self._child
         if child is None:
             if not self._restart:
@@ -197,12 +197,12 @@ class WorkerProcess(Generic[Request, Answer]):
         self._awaited, self._heard_s, self.trouble = None, time.monotonic(), ""
 
     def _post(self, child: _Child, kind: Kind, request: Request | None) -> None:
-        """To a process that waits for it."""
+        """Send a message to an idle process."""
         child.send((kind, request))
         self._awaited, self._sent_s = kind, time.monotonic()
 
     def _lose(self, why: str) -> None:
-        """The process is no longer there, or is to be killed."""
+        """The process has ended or has to be killed."""
         self.trouble = f"it {why}"
         if self._awaited == "request" or (self._waiting is not None and not self._restart):
             self._fail()
@@ -221,20 +221,20 @@ class WorkerProcess(Generic[Request, Answer]):
 
 
 class _Child:
-    """A process, the connection to it, and a thread that writes there: nothing waits for a process that does not read.
+    """A process, its connection, and a thread that writes to it, so that a process that does not read blocks nothing.
 
     Raises:
-        OSError: it cannot be started.
+        OSError: the process cannot be started.
     """
 
     def __init__(self, arguments: tuple[Any, ...], name: str, daemon: bool) -> None:
-        import multiprocessing  # not before it is needed: a cold start takes time for it
+        import multiprocessing  # imported late to keep the cold start short
         from multiprocessing import resource_tracker
 
         context = multiprocessing.get_context("spawn")  # a fork would inherit the threads of libraries in any state
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, *arguments), name=name, daemon=daemon)
-        # The process begins with Ctrl-C blocked: its owner ends it. The tracker's start would unblock it again.
+        # The process starts with SIGINT blocked: its owner ends it. The tracker's start would unblock it again.
         resource_tracker.ensure_running()
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -255,13 +255,13 @@ class _Child:
                 self.connection.send_bytes(message)
 
     def send(self, message: object) -> None:
-        """Raises what pickling the message raises."""
+        """Queue a message. Raises what pickling it raises."""
         from multiprocessing.reduction import ForkingPickler
 
         self._messages.put(ForkingPickler.dumps(message))
 
     def end(self, patience_s: float) -> None:
-        """Let it end, then kill it."""
+        """Ask the process to end, then kill it."""
         self.send(None)
         self.process.join(patience_s)
         self.process.kill()
@@ -274,7 +274,7 @@ class _Child:
 def _serve(
     connection: Connection[Any, Any], niceness: int, make: Callable[..., Any], arguments: tuple[Any, ...]
 ) -> None:
-    """The child, until the owner closes the connection, or ends."""
+    """Main function of the child; returns when the owner closes the connection or ends."""
     import multiprocessing
 
     os.nice(niceness)
@@ -292,7 +292,7 @@ def _serve(
 
 
 def _answer(connection: Connection[Any, Any], work: Any) -> None:
-    """Until the owner says so. Raises EOFError, OSError when it is gone."""
+    """Answer requests until the owner sends None. Raises EOFError, OSError if the owner has ended."""
     idle = getattr(work, "idle", None)
     while True:
         while idle is not None and not connection.poll(IDLE_S):
@@ -306,7 +306,7 @@ def _answer(connection: Connection[Any, Any], work: Any) -> None:
             continue
         try:
             answer = ("request", work(request))
-        except Exception as error:  # one request's: the next one may be answered
+        except Exception as error:  # a fault of one request; the next may be answered
             answer = ("failed", f"{type(error).__name__}: {error}")
         connection.send(answer)
 
