@@ -1,1 +1,1 @@
-"""From frames to numbers: markers and boards in camera images, photoacoustic arrivals in ultrasound frames."""
+"""Frames to measurements: pose of markers and boards in camera images, photoacoustic arrivals in ultrasound frames."""

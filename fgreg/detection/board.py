@@ -25,17 +25,17 @@ from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.session_model import BoardModel, CameraModel, StereoRig
 
 CORNER_SIGMA_PX = 0.03
-"""Of a refined inner corner. Four squares meet there: the picture is symmetric, so blur does not bias it."""
+"""Sigma of a refined inner corner. Four squares meet there: the image is symmetric, so blur does not bias it."""
 COMMON_PX = 0.01
-"""Error of a corner that is the same in both views (grid of pixels, print)."""
+"""Sigma of a corner error that is the same in both views (pixel grid, print)."""
 MIN_CORNERS = 6
 SMALL_WIDTH_PX = 640
 HALF_ENOUGH = 0.5
-"""Share of the corners that has to be found at half the resolution."""
+"""Share of the corners that must be found at half resolution; else the full resolution is used."""
 
 
 def _find_chessboard(image: Image, board: BoardModel) -> FloatArray | None:
-    """Inner corners (rows * columns, 2), in rows, from any of the ends; None where the board is not all in view."""
+    """Inner corners (rows * columns, 2), row by row, from any end; None where the whole board is not in view."""
     size = (board.columns, board.rows)
     pad = BORDER_PX
     whole = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=255)
@@ -53,16 +53,16 @@ def _find_chessboard(image: Image, board: BoardModel) -> FloatArray | None:
 
 
 def _unscaled(corners: npt.NDArray[np.generic], scale: float) -> FloatArray:
-    """Corners (n, 2) in the image, of those found in its padded copy of ``scale`` times the size."""
+    """Image coordinates (n, 2) px of corners found in the padded copy, which has ``scale`` times the size."""
     px = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     return np.asarray((px + 0.5) / scale - 0.5 - BORDER_PX)
 
 
 def order_corners(image: Image, corners_px: FloatArray, board: BoardModel) -> FloatArray | None:
-    """Corners (rows * columns, 2) put in the order row * columns + column; None where the squares are not told apart.
+    """Corners (rows * columns, 2) in the order row * columns + column; None where squares are not distinct.
 
     Args:
-        corners_px: in rows, from any end, in either sense.
+        corners_px: (rows * columns, 2) row by row, from any end, in either direction.
     """
     grid = corners_px.reshape(board.rows, board.columns, 2)
     right = (grid[:, 1:] - grid[:, :-1]).mean(axis=(0, 1))
@@ -77,9 +77,9 @@ def order_corners(image: Image, corners_px: FloatArray, board: BoardModel) -> Fl
     y = np.clip(np.rint(centres[..., 1]).astype(int), 0, height - 1)
     level = blurred[y, x].astype(np.float64)
     even = (np.add.outer(np.arange(level.shape[0]), np.arange(level.shape[1])) % 2) == 0
-    if even.all():  # a 2 x 2 board has one inner square only; it is refused elsewhere
+    if even.all():  # a 2 x 2 board has only one inner square; session.yaml's check refuses it
         return None
-    # Neighbours are compared, so that light falling off over the board does not matter.
+    # Compare neighbours, so that uneven light over the board does not matter.
     sign = np.where(even, -1.0, 1.0)
     across = (level[:, 1:] - level[:, :-1]) * sign[:, 1:]
     along = (level[1:] - level[:-1]) * sign[1:]
@@ -92,7 +92,7 @@ def order_corners(image: Image, corners_px: FloatArray, board: BoardModel) -> Fl
 
 
 def _spacing_px(corners_px: FloatArray, ids: IntArray, board: BoardModel) -> float:
-    """Smallest distance between neighbouring corners that were found."""
+    """Smallest distance (px) between detected neighbouring corners; 0 where there are none."""
     grid = np.full((board.rows, board.columns, 2), np.nan)
     grid[ids // board.columns, ids % board.columns] = corners_px
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)]
@@ -102,7 +102,7 @@ def _spacing_px(corners_px: FloatArray, ids: IntArray, board: BoardModel) -> flo
 
 
 def _find_charuco(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray] | None:
-    """Corners (n, 2) and their ids."""
+    """Corners (n, 2) px and their ids (n,); None where the board is not found."""
     assert board.charuco is not None
     pattern = cv2.aruco.CharucoBoard(
         (board.columns + 1, board.rows + 1),
@@ -114,7 +114,7 @@ def _find_charuco(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray
     detector = cv2.aruco.CharucoDetector(pattern, cv2.aruco.CharucoParameters(), detector_parameters())
     pad = BORDER_PX
     padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=255)
-    # At half the resolution first, in a third of the time; refined at full resolution by the caller either way.
+    # Half resolution first: it takes a third of the time. The caller refines at full resolution in both cases.
     for scale, picture in ((2.0, halved(padded)), (1.0, padded)):
         if scale > 1.0 and image.shape[1] < 2 * SMALL_WIDTH_PX:
             continue
@@ -142,7 +142,7 @@ def find_board_corners(image: Image, board: BoardModel) -> tuple[FloatArray, Int
         if found is None:
             return None
         corners, ids = found
-        # Not so far that the markers in the white squares come into the window.
+        # The refinement must not reach the markers in the white squares.
         gap = 0.5 * (1.0 - board.charuco.marker_mm / board.square_mm)
         reach = gap * _spacing_px(corners, ids, board) - 1.0
     corners = refine_subpixel(image, corners, int(np.clip(reach, 2, 9)))
@@ -182,7 +182,7 @@ def _view_corners(
 
 
 def _strays(corners: CornerSet) -> BoolArray:
-    """(n,) corners far off the pose that most of them agree on: a glint, a finger, a marker read wrongly."""
+    """(n,) outliers: corners far from the pose of the majority (a glint, a finger, a misread marker)."""
     fit = robust_pose(corners)
     if fit is None:
         return np.zeros(len(corners.view), dtype=bool)

@@ -1,4 +1,7 @@
-"""One pose from all corners of a body: hypotheses, strays, the choice between two planar poses, or why not."""
+"""One pose from all corners of a body: hypotheses, outlier tags, the choice between two planar poses.
+
+Where there is no unique pose, the result is a reason.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,17 @@ from fgreg.geometry.transforms import FloatArray
 
 VIEW_NAMES = ("left", "right")
 MAX_RMS_PX = 4.0
-"""Residual beyond which the corners do not belong to one body as modelled."""
+"""RMS residual above which the corners do not fit the modelled body."""
 OTHER_POSE_RAD = 0.02
-"""Minima closer than this are one pose."""
+"""Minima whose rotations differ by less are the same pose."""
 AMBIGUITY_SIGMA_PX = 0.15
-"""Corner noise against which two hypotheses are told apart: more than what is measured, for what is not modelled (a
-tag that is not quite flat, a lens not quite as calibrated)."""
+"""Corner noise for the comparison of two hypotheses. It is larger than the measured noise, to cover model errors (a
+tag that is not flat, a calibration error of the lens)."""
 STRAY_PX, STRAY_START_PX = 2.0, 15.0
-"""RMS of a tag beyond which it is not part of the body: at the pose fitted, and at the pose of another tag."""
+"""RMS above which a tag is an outlier: at the fitted pose, and at the pose of another tag."""
 AMBIGUITY_CHI2 = 25.0
-"""Difference in chi-square at that noise (or at the residuals', where they are larger) below which a pose is ambiguous:
-odds of 2.7e5 to 1."""
+"""A pose is ambiguous below this difference in chi-square, at that noise or at the residuals where they are larger.
+Odds of 2.7e5 to 1."""
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
@@ -43,13 +46,13 @@ def rms_px(residual_px: FloatArray) -> float:
 
 
 def _ranked_hypotheses(corners: CornerSet) -> list[FloatArray]:
-    """Starting poses, the likeliest first."""
+    """Starting poses (4, 4), lowest capped cost first."""
     white = whitener(corners.covariance)
     ranked: list[tuple[float, FloatArray]] = []
     for pose in pose_hypotheses(corners):
         residual, _, in_front = corner_residuals(corners, pose)
         if in_front:
-            # Capped, so that one bad tag does not decide which hypothesis is tried first.
+            # Capped, so that one outlier tag does not decide the order.
             size = np.sum((white @ residual.ravel()).reshape(-1, 2) ** 2, axis=1)
             ranked.append((float(np.minimum(size, 4.0 * np.median(size) + 1e-12).sum()), pose))
     return [pose for _, pose in sorted(ranked, key=lambda item: item[0])]
@@ -69,7 +72,7 @@ def best_poses(corners: CornerSet) -> list[PoseFit]:
         if len(tried) >= 4:
             break
     if fits:
-        # Where the perspective is weak the other hypothesis mirrors the tilt; a solver may have given only one.
+        # Under weak perspective the second minimum has the mirrored tilt. A solver may have returned only one of them.
         fit = fit_pose(corners, _mirrored(corners, fits[0].camera_T_body))
         if fit is not None and all(angle_between(fit.camera_T_body, f.camera_T_body) > OTHER_POSE_RAD for f in fits):
             fits.append(fit)
@@ -77,13 +80,13 @@ def best_poses(corners: CornerSet) -> list[PoseFit]:
 
 
 def _mirrored(corners: CornerSet, camera_T_body: FloatArray) -> FloatArray:
-    """The same place with the body plane's normal mirrored at the line of sight."""
+    """Pose (4, 4) at the same position with the plane's normal mirrored at the line of sight."""
     points = corners.body_p_mm - corners.body_p_mm.mean(axis=0)
     normal = np.linalg.svd(points)[2][2]
     centre = camera_T_body[:3, :3] @ corners.body_p_mm.mean(axis=0) + camera_T_body[:3, 3]
     sight = centre / np.linalg.norm(centre)
     out = camera_T_body.copy()
-    # Half a turn about the sight mirrors the tilt and turns the body round; half a turn about its normal undoes that.
+    # Half a turn about the sight mirrors the tilt and rotates the body; half a turn about its normal undoes that.
     out[:3, :3] = _half_turn(sight) @ camera_T_body[:3, :3] @ _half_turn(normal)
     out[:3, 3] = centre - out[:3, :3] @ corners.body_p_mm.mean(axis=0)
     return out
@@ -94,23 +97,22 @@ def _half_turn(axis: FloatArray) -> FloatArray:
 
 
 def robust_pose(corners: CornerSet) -> PoseFit | None:
-    """One minimum, from the likeliest hypothesis, with corners that do not fit weighing less."""
+    """Huber fit from the best hypothesis; None where there is none."""
     ranked = _ranked_hypotheses(corners)
     return fit_pose(corners, ranked[0], huber=3.0) if ranked else None
 
 
 def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, list[str]]:
-    """Drop tags that do not fit the body where most of them do (a tag read wrongly, or one that came off).
+    """Drop outlier tags (a misread tag, or one that came off) where most tags fit the body.
 
-    Two ways to a pose that strays do not spoil: a robust fit to all corners, good where tags are many and small; and
-    the hypothesis of one tag that most others agree with, good where they are few and large. The one with which more
-    tags agree decides.
+    Two candidates are robust to outliers: a Huber fit to all corners, which suits many small tags, and the pose of one
+    tag with which most others agree, which suits few large tags. The one with the lower capped RMS sum is used.
 
     Args:
-        names: of each group, for the reasons.
+        names: of each group, for the messages.
 
     Returns:
-        the corners kept, and what was left out.
+        the inlier corners, and a message for each outlier tag.
     """
     groups = np.unique(corners.group)
     if len(groups) < 3:
@@ -136,22 +138,22 @@ def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, lis
 
 
 def _agreement(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArray, float]:
-    """RMS (px) of each group at a pose, and their sum with each capped: small where many groups agree."""
+    """RMS (px) of each group at a pose, and the sum of the capped RMS: small where many groups agree."""
     residual, _, in_front = corner_residuals(corners, camera_T_body)
     rms = np.array([rms_px(residual[corners.group == g]) for g in np.unique(corners.group)])
     return rms, float(np.minimum(rms, STRAY_START_PX).sum()) if in_front else np.inf
 
 
 def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit | NotFound:
-    """The pose of a body, from the better of its planar hypotheses where they can be told apart.
+    """The pose of a body from the better planar hypothesis, if the other one fits significantly worse.
 
     Args:
-        what: the body's name for the reasons, e.g. ``marker``.
-        left_out: passed on.
+        what: the body's name in messages, e.g. ``marker``.
+        left_out: messages about dropped corners, copied to the result.
     """
     if len(corners.view) < 4:
         return NotFound(f"{what}: only {len(corners.view)} corners seen, at least 4 are needed")
-    # Hypotheses are weighed at a noise that forgives what is not modelled; the chosen one is then fitted at its own.
+    # Hypotheses are compared at a noise that covers model errors. The chosen one is then fitted at the stated noise.
     hypotheses = best_poses(corners.with_excess(AMBIGUITY_SIGMA_PX**2))
     chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
     if chosen is None:

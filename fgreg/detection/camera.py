@@ -28,7 +28,7 @@ def _principal_px(camera: CameraModel) -> FloatArray:
 
 
 def distort(camera: CameraModel, normalized: FloatArray) -> FloatArray:
-    """Where ideal normalised points (..., 2) really appear: normalised, distorted, (..., 2)."""
+    """Distorted normalised coordinates (..., 2) of ideal normalised points (..., 2)."""
     k1, k2, p1, p2, k3 = (float(v) for v in camera.distortion)
     x, y = normalized[..., 0], normalized[..., 1]
     r2 = x * x + y * y
@@ -70,7 +70,7 @@ def project(camera: CameraModel, camera_p_mm: FloatArray) -> FloatArray:
 def normalized_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArray:
     """Ideal normalised points (..., 2) of pixels (..., 2), by Newton's method.
 
-    NaN where the distortion model cannot be inverted: no root near, or one past the fold of the radial polynomial.
+    NaN where the distortion model cannot be inverted: no root nearby, or one beyond the fold of the radial polynomial.
     """
     observed = (np.asarray(pixels, dtype=np.float64) - _principal_px(camera)) / focal_px(camera)
     if not camera.distortion.any():

@@ -1,4 +1,4 @@
-"""Channel data made ready: live channels, common flash removed, complex baseband in a frequency band.
+"""Preprocessing of channel data: live channels, removal of the common flash, complex baseband in a frequency band.
 
 Arrays are (elements, samples); times in us after the laser pulse, frequencies in MHz.
 """
@@ -21,14 +21,14 @@ Complex64Array = npt.NDArray[np.complex64]
 Float32Array = npt.NDArray[np.float32]
 
 PAD_US = 2.0
-"""Zeros after the record, so that the filters' circular ends do not meet."""
+"""Zero padding after the record, against wrap-around of the circular filters."""
 MIN_RATE_MHZ = 30.0
-"""Sampling of the baseband: fine enough that linear interpolation of an envelope costs nothing."""
+"""Least sampling rate of the baseband: linear interpolation of an envelope has no relevant error at it."""
 LOUD = 2.0
-"""A channel this many times noisier than the typical one is scaled down to it."""
+"""A channel this many times noisier than the median channel is scaled down to it."""
 FLASH_SIGMA = 0.6
-"""Level of the channels' median, in noise sigmas, from which on a common flash is suspected: the median of 128
-channels of noise stays below 0.5, and a source, which reaches few channels at any one time, moves it by 0.1."""
+"""Level of the channels' median, in noise sigmas, above which a common flash is suspected. The median of 128
+noise channels stays below 0.5. A source reaches few channels at any one time and moves it by 0.1."""
 FLASH_PARTICIPATION = 0.5
 FLASH_GUARD_US = 0.4
 
@@ -47,10 +47,10 @@ class Channels:
 
     Attributes:
         spectrum: (elements, bins) one-sided spectrum of the zero-padded records.
-        live: (elements,) channels that carry anything at all.
+        live: (elements,) channels that are not constant.
         samples, padded: length of the record and of its transform.
         sampling_mhz: of the record.
-        start_us: arrival time, pulse delay taken off, of a wave whose maximum is at sample 0.
+        start_us: arrival time, less the pulse delay, of a wave whose maximum is at sample 0.
         noise: standard deviation of a sample, robust over the live channels, frame's units.
         peak: largest sample, frame's units.
     """
@@ -72,7 +72,7 @@ class Baseband:
     Attributes:
         data: (samples + 1, elements), time first; the last row is zero and stands for "outside the record".
         rate_mhz: sampling of ``data``; row 0 is at ``start_us``.
-        carrier_mhz: frequency taken off.
+        carrier_mhz: frequency of the demodulation.
         start_us: as in :class:`Channels`.
         variance: of the complex noise, the median over the channels.
     """
@@ -85,17 +85,17 @@ class Baseband:
 
 
 def prepare_channels(frame: npt.NDArray[Any], sampling: ChannelModel) -> Channels:
-    """Take offsets off, find dead channels, remove a flash that all channels have in common.
+    """Subtract offsets, find dead channels, remove a flash common to all channels.
 
     Args:
         frame: (elements, samples) real numbers, finite.
-        sampling: how it was sampled.
+        sampling: rate and time origin of the samples.
 
     Raises:
         EstimationError: every channel is dead (constant): nothing was recorded.
     """
     data = np.array(frame, dtype=np.float32)
-    # Zero where it does not change: a dead channel with an offset is as dead as one without.
+    # A dead channel is constant, whatever its offset.
     live = np.asarray(np.ptp(data, axis=1) > 0.0)
     if not live.any():
         raise EstimationError("all channels are constant: nothing was recorded")
@@ -124,13 +124,13 @@ def prepare_channels(frame: npt.NDArray[Any], sampling: ChannelModel) -> Channel
 
 
 def remove_flash(data: Float32Array, live: BoolArray, noise: float, sampling_mhz: float) -> None:
-    """Take away, in place, what reaches all channels at the same time (the laser's light, interference).
+    """Remove, in place, the signal that reaches all channels at the same time (the laser's light, interference).
 
     A source's wavefront is curved: at any one time it is in few channels, so the channels' median does not see it.
-    Where the median does rise, each channel's share of it is fitted and subtracted there, if most channels share.
+    Where the median rises, each channel's gain is fitted and its share subtracted, if most channels take part.
     """
     level = FLASH_SIGMA * noise * math.sqrt(max(1.0, 100.0 / int(live.sum())))
-    # What all channels share is in their mean too, which costs less to look at.
+    # Early exit: a common signal is in the mean too, which is cheaper than the median.
     if float(np.abs(data[live].mean(axis=0)).max()) < 0.7 * level:
         return
     common = np.median(data[live], axis=0)
@@ -147,7 +147,7 @@ def remove_flash(data: Float32Array, live: BoolArray, noise: float, sampling_mhz
 
 
 def baseband(channels: Channels, band: Band) -> Baseband:
-    """Complex envelopes of all channels in a pass band, resampled to a rate that suits an envelope.
+    """Complex envelopes of all channels in a pass band, resampled to a lower rate that an envelope needs.
 
     The filter has zero phase: it does not move the maximum of a symmetric envelope.
     """
@@ -175,7 +175,7 @@ def baseband(channels: Channels, band: Band) -> Baseband:
 
 
 def phasor(phase_rad: Float32Array) -> Complex64Array:
-    """exp(i phase), in a fiftieth of the time that the complex exponential takes."""
+    """exp(i phase); 50 times faster than the complex exponential."""
     out = np.empty(phase_rad.shape, dtype=np.complex64)
     np.cos(phase_rad, out=out.real)
     np.sin(phase_rad, out=out.imag)
@@ -183,10 +183,10 @@ def phasor(phase_rad: Float32Array) -> Complex64Array:
 
 
 def check_frame(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The frame as an array, if it is two-dimensional, not empty, real and finite.
+    """Check that a frame is two-dimensional, not empty, real and finite; returns it as an array.
 
     Raises:
-        ValueError: it is not; says what it is.
+        ValueError: it is not; the message gives its shape or type.
     """
     data = np.asarray(frame)
     if data.ndim != 2 or 0 in data.shape:

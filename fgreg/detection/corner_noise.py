@@ -1,9 +1,9 @@
-"""Corner noise of a session: what the detections' own residuals say, pooled, with a prior.
+"""Corner noise of a session: a variance scale, pooled from the residuals of the detections, with a prior.
 
-Each corner comes with a stated covariance (corners.py). How much too small or large that is in this camera's pictures
-is one number, the *scale* (a variance ratio), about which one detection says little: two views of one tag leave 10
-degrees of freedom, one view 2. So the residuals of the session are pooled over an inverse-gamma prior, and each
-detection's own residuals then count against the pooled value in the same way.
+Each corner comes with a stated covariance (corners.py). Its error for this camera's images is
+one number, the *scale* (a variance ratio). One detection determines it poorly: two views of one tag leave 10 degrees
+of freedom, one view 2. So the residuals of the session are pooled with an inverse-gamma prior. The pooled value is in
+turn the prior for each detection's own scale.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray
 
 PRIOR_DOF = 20.0
-"""How many degrees of freedom the stated corner noise is worth."""
+"""Degrees of freedom of the prior at the stated corner noise."""
 SHARED_DOF = 30.0
-"""How many degrees of freedom the pooled value is worth against a detection's own: detections differ."""
+"""Degrees of freedom of the pooled value as the prior of one detection: detections differ."""
 
 
 class Weighed(Protocol):
-    """What a fit leaves: whitened sum of squares, its degrees of freedom."""
+    """A fit with its whitened sum of squares and degrees of freedom."""
 
     @property
     def cost(self) -> float: ...
@@ -41,7 +41,7 @@ class Misfit:
 
 
 class Residuals(Weighed, Protocol):
-    """What a fit leaves, with its information and common errors."""
+    """A fit with its information and the covariance of its common errors, both (6, 6)."""
 
     @property
     def information(self) -> FloatArray: ...
@@ -56,8 +56,8 @@ class CornerNoise:
 
     Attributes:
         scale: variance of the corners over their stated variance.
-        dof: degrees of freedom behind it, the prior's included.
-        detections: how many were pooled.
+        dof: its degrees of freedom, including the prior's.
+        detections: number of pooled detections.
     """
 
     scale: float = 1.0
@@ -70,8 +70,8 @@ def pool_corner_noise(
 ) -> CornerNoise:
     """Corner noise of a session from its detections (all of one kind: markers, or boards).
 
-    A detection whose residuals are far off the others' (beyond nine times the median per degree of freedom) is no
-    measure of the common noise and is left out here; it keeps its own residuals in :func:`fit_covariance`.
+    A detection whose residuals exceed nine times the median (per degree of freedom) is an outlier and is not pooled.
+    Its own residuals still enter :func:`fit_covariance`.
     """
     costs = np.array([[fit.cost, fit.dof] for fit in fits], dtype=np.float64).reshape(-1, 2)
     costs = costs[costs[:, 1] > 0]
@@ -83,7 +83,7 @@ def pool_corner_noise(
 
 
 def detection_scale(fit: Residuals, noise: CornerNoise) -> float:
-    """The corner noise scale of one detection: the pooled one, moved by the detection's own residuals."""
+    """The corner noise scale of one detection: the pooled one, updated with the detection's own residuals."""
     weight = min(SHARED_DOF, noise.dof)
     return (weight * noise.scale + fit.cost) / (weight + fit.dof)
 

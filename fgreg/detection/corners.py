@@ -1,11 +1,11 @@
 """Corners of printed squares with their covariance, from the straight edges of the squares.
 
-OpenCV's sub-pixel refinement pulls the corner of a black square inwards by a few hundredths of a pixel once the
-picture is blurred (+0.1 to 0.2 mm of depth for a 30 mm tag), because it sees one quadrant of black and three of
-white. Straight lines through the four edges, intersected, have no such bias: see edges.py. Two corners that share an
-edge then share its error, so the covariance is kept per square, (8, 8), and not per corner.
+OpenCV's sub-pixel refinement moves the corner of a black square inwards by a few hundredths of a pixel in a blurred
+image (+0.1 to 0.2 mm of depth for a 30 mm tag), because one quadrant is black and three are white. Intersections
+of lines fitted to the four edges have no such bias: see edges.py. Two corners that share an edge also share its
+error, so the covariance is kept per square, (8, 8), not per corner.
 
-Where an edge is too short or too poor, its corners fall back to sub-pixel refinement with a larger sigma.
+Where an edge is too short or too faint, its corners fall back to sub-pixel refinement with a larger sigma.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.session_model import CameraModel
 
 CORNER_FLOOR_PX = 0.003
-"""Added to the sigma of corners from edges: independent errors that averaging along an edge does not remove."""
+"""Added to the sigma of corners from edges: independent errors that remain after averaging along an edge."""
 FALLBACK_SIGMA_PX = 0.3
-"""Of a corner from sub-pixel refinement of a small or poor square."""
+"""Sigma of a corner from sub-pixel refinement of a small or low-contrast square."""
 COMMON_PX, COMMON_FALLBACK_PX = 0.0025, 0.1
-"""Error of a corner that is the same in both views, so that their residuals do not show it: where the edges fall on
-the grid of pixels, how straight they were printed. That from edges is for edges of COMMON_LENGTH_PX, see below."""
+"""Sigma of a corner error that is the same in both views and so does not show in the residuals (pixel grid, print).
+The value for corners from edges holds for edges of COMMON_LENGTH_PX; see _with_common."""
 COMMON_LENGTH_PX = 200.0
 OUTWARD_PX, OUTWARD_FALLBACK_PX = 0.002, 0.1
-"""Error of all corners of all squares outwards together (the method's own bias): what makes depth too small."""
+"""Sigma of an outward error common to all corners of all squares (bias of the method). It makes the depth too small."""
 BORDER_MARGIN_PX = 7.0
-"""Corners nearer to the image's border than this have to come from edges."""
+"""Corners nearer to the image's border than this are used only if they come from edges."""
 MAX_FALLBACK_EDGE_PX = 60.0
-"""Longer edges than this can be fitted: where they cannot, the detector took something else for the outline."""
+"""Longer edges can always be fitted. If the fit fails, the detector found something other than the outline."""
 MIN_EDGE_PX = 12.0
-"""Edges shorter than this are left to sub-pixel refinement."""
+"""Corners of shorter edges come from sub-pixel refinement."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,8 +48,8 @@ class SquareCorners:
         covariance: (n, 8, 8) px^2 over (x0, y0, x1, ...), at unit corner noise scale.
         found: (n, 4) which corners may be used.
         from_edges: (n, 4) whether a corner is an intersection of edges, else sub-pixel refinement.
-        common_px: (n, 4) sigma of the error that a corner has in common in both views.
-        outward_px: (n, 4, 2) one sigma of the outward error that all squares have in common.
+        common_px: (n, 4) sigma of the corner error that is the same in both views.
+        outward_px: (n, 4, 2) one sigma of the outward error common to all squares.
     """
 
     ideal_px: FloatArray
@@ -71,7 +71,7 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
         raise ValueError(f"image of shape {image.shape}, expected (h, w), (h, w, 3) or (h, w, 4)")
     if image.dtype == np.uint16:
-        # Ten and twelve bits come in sixteen: scale by what is there.
+        # 10 and 12 bit images are stored in 16 bits: scale by the largest value.
         image = (image.astype(np.float32) * (255.0 / max(int(image.max()), 1))).astype(np.uint8)
     if image.dtype != np.uint8:
         raise ValueError(f"image of type {image.dtype}, expected uint8 or uint16")
@@ -83,7 +83,7 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
 
 
 def refine_subpixel(image: Image, corners_px: FloatArray, half_window_px: int) -> FloatArray:
-    """OpenCV's sub-pixel refinement of corners (n, 2); a corner that ran away keeps its starting place."""
+    """OpenCV's sub-pixel refinement of corners (n, 2); a corner that left its window keeps its start."""
     height, width = image.shape
     inside = ((corners_px >= 0.0) & (corners_px <= np.array([width, height]) - 1.0)).all(axis=1)
     if not inside.all():
@@ -107,7 +107,7 @@ def square_corners(
         image: (h, w) uint8.
         corners_px: (n, 4, 2) from a detector, clockwise as seen.
         cells: squares along the side, border included: the black border is one cell wide.
-        edges: False leaves everything to sub-pixel refinement (for comparison).
+        edges: False uses sub-pixel refinement only (for comparison).
     """
     n = len(corners_px)
     height, width = image.shape
@@ -120,8 +120,8 @@ def square_corners(
         reach = int(np.clip(np.floor(0.6 * cell_px[k]), 2, 5))
         fallback[k] = refine_subpixel(image, corners_px[k], reach)
     ideal = ideal_from_pixels(camera, fallback)
-    # At the image's border the refinement sees too little, and the corner may not be the tag's at all but the place
-    # where the border cuts it: only edges that are seen on both sides count there.
+    # At the image's border sub-pixel refinement lacks pixels, and the corner may be the point where the border cuts
+    # the tag. Only corners from edges are used there.
     margin = np.minimum(corners_px, np.array([width, height]) - 1.0 - corners_px).min(axis=2)
     found = np.isfinite(ideal).all(axis=2) & (margin > BORDER_MARGIN_PX)
     from_edges = np.zeros((n, 4), dtype=bool)
@@ -138,7 +138,7 @@ def square_corners(
     middle, direction, normal, half = (a.reshape(-1, 4, *a.shape[1:]) for a in segment_frames(start, end))
     line, good = fit.line.reshape(-1, 4, 2), fit.good.reshape(-1, 4)
     line_covariance = fit.covariance.reshape(-1, 4, 2, 2)
-    # Sub-pixel refinement of a corner counts only on small squares, whose outline lies between dark and light.
+    # A sub-pixel corner is used only on small squares whose outline separates dark from light.
     step = (fit.step > MIN_CONTRAST).reshape(-1, 4)
     found[usable] &= step & np.roll(step, 1, axis=1) & (sides[usable].min(axis=1) < MAX_FALLBACK_EDGE_PX)[:, None]
     for row, k in enumerate(usable.tolist()):
@@ -176,7 +176,7 @@ def square_corners(
 def _with_common(
     ideal: FloatArray, covariance: FloatArray, found: BoolArray, from_edges: BoolArray, sides_px: FloatArray
 ) -> SquareCorners:
-    """Add the common errors: short edges average less of theirs away."""
+    """Add the common errors. They are larger for short edges, which average over fewer pixels."""
     from_edge = COMMON_PX * np.sqrt(COMMON_LENGTH_PX / np.maximum(sides_px.min(axis=1), 1.0))
     common = np.where(from_edges, from_edge[:, None], COMMON_FALLBACK_PX)
     arm = ideal - ideal.mean(axis=1, keepdims=True)

@@ -1,17 +1,17 @@
-"""Straight edges in an image to a small part of a pixel, with covariance.
+"""Straight edges in an image with sub-pixel accuracy and covariance.
 
-An edge between a dark and a light surface is fitted to the pixels about it as a blurred step,
+An edge between a dark and a light surface is fitted to the pixels near it as a blurred step,
 
     I = (1 + g e) (B + (W - B) Phi(e / s)) + g s (W - B) phi(e / s),   e = d - o - m u,  B = b0 + b1 u,  W = w0 + w1 u,
 
 with Phi, phi the normal distribution and density, d the distance of a pixel from the starting line (towards the light
-side), u in [-1, 1] the place along it, and g the fall-off of light across the edge: the Gaussian blur of a step in
+side), u in [-1, 1] the position along it, and g the fall-off of light across the edge: the Gaussian blur of a step in
 albedo under light that varies linearly. o, m, s, the levels and g are found by damped Gauss-Newton for all edges at
-once. Any symmetric blur leaves o and m unbiased, and so does light that falls off along or across the edge (without
-g: 0.005 px, and the same in both views). The pixels are used where they are (nothing is interpolated), so their noise
-is independent and the normal equations give the covariance.
+once. Symmetric blur does not bias o and m, nor does light that falls off along or across the edge (without g the bias
+is 0.005 px, the same in both views). No pixel is interpolated, so the noise is independent and the normal equations
+give the covariance.
 
-Lengths are *ideal* pixels (camera.py): the edges of a square are straight in them whatever the lens does.
+Lengths are *ideal* pixels (camera.py), without lens distortion: the edges of a square are straight in them.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ from fgreg.model.session_model import CameraModel
 Image = npt.NDArray[np.uint8]
 
 MAX_ROWS = 112
-"""Pixel rows across an edge that are used; longer edges are sampled evenly."""
+"""Largest number of pixel rows used across an edge; longer edges are sampled evenly."""
 CURVE_NODES = 17
 SECTIONS, MIN_SECTIONS = 8, 6
-"""Parts of an edge, and in how many of them both its sides have to be in the image."""
+"""Parts of an edge, and the number of parts in which both sides must be in the image."""
 MIN_CONTRAST = 12.0
-"""Grey levels between the dark and the light side below which an edge is not trusted."""
+"""Least difference in grey levels between the dark and the light side of an edge."""
 MAX_BLUR_PX = 5.0
 LEVEL_SLOPE_SIGMA = 0.3
-"""Prior on b1 and w1 as a share of the contrast: short edges cannot tell them."""
+"""Prior sigma of b1 and w1 as a share of the contrast: short edges do not determine them."""
 LOG_BLUR_SIGMA = 0.7
-"""Prior on log s about log of the starting blur: so does a step as sharp as a pixel."""
+"""Prior sigma of log s about the starting blur: a step as sharp as a pixel does not determine it."""
 FALL_OFF_SIGMA = 0.004
-"""Prior on g, per px: light that changes by half over a hundred pixels."""
+"""Prior sigma of g, per px: light changes by about half over a hundred pixels."""
 PARAMETERS = 8
 REWEIGH_AT = 2
-"""Iteration from which on pixels that do not belong weigh less."""
+"""First iteration that down-weights outlier pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeFit:
-    """Edges found about starting segments (n of them).
+    """Edges found near n starting segments.
 
     Attributes:
         line: (n, 2) offset o at the middle and m at the end of the segment (u = 1), ideal px, along ``normal``.
         covariance: (n, 2, 2) of ``line``, px^2, at the pixel noise that the fit leaves.
         blur_px: (n,) standard deviation s of the step.
-        step: (n,) grey levels by which the left hand of the starting segment is lighter than its right.
-        good: (n,) whether there is an edge that can be trusted.
+        step: (n,) grey levels, left side of the starting segment less its right side.
+        good: (n,) whether the edge passed all checks.
     """
 
     line: FloatArray
@@ -72,7 +72,7 @@ class EdgeFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Band:
-    """Pixels about n edges, p each: distance d, place u, grey level, and which of them count."""
+    """p pixels for each of n edges, all (n, p): distance d, position u, grey level, and whether the pixel is used."""
 
     d: FloatArray
     u: FloatArray
@@ -83,7 +83,7 @@ class _Band:
 def segment_frames(start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """(middle, direction, normal, half length) of segments (n, 2) -> (n, 2).
 
-    The normal points to the left hand of the direction as drawn (y down), which is outside a tag whose corners run
+    The normal points to the left of the direction as drawn (y down), which is outside a tag whose corners run
     clockwise as seen.
     """
     half = 0.5 * (end - start)
@@ -102,10 +102,10 @@ def _band(
     trim: FloatArray,
     rows: int,
 ) -> _Band:
-    """Gather pixels: one row per pixel step along the edge's major axis, across it the pixels within half_width."""
+    """Gather pixels: one row per pixel step along the edge's major axis, and across it the pixels within half_width."""
     middle, direction, normal, half_length = segment_frames(start, end)
     n = len(start)
-    # The ideal segment, trimmed at its ends, as the lens draws it.
+    # The ideal segment, trimmed at its ends, in distorted pixels.
     s_nodes = np.linspace(-1.0, 1.0, CURVE_NODES) * (half_length - trim)[:, None]
     nodes = pixels_from_ideal(camera, middle[:, None] + s_nodes[..., None] * direction[:, None])
     chord = np.abs(nodes[:, -1] - nodes[:, 0])
@@ -127,12 +127,12 @@ def _band(
     reach = int(np.ceil(half_width.max() * np.sqrt(2.0))) + 1
     offsets = np.arange(-reach, reach + 1)
     nearest = np.rint(centre)
-    # Ideal distance of a pixel by first order about its row's centre: the band is narrow.
+    # Ideal distance of a pixel to first order about its row's centre: the band is narrow.
     f = focal_px(camera)
     inverse_jacobian = np.linalg.inv(f[:, None] * distort_jacobian(camera, ideal / f) / f)
     height, width = image.shape
     parts = []
-    for k in range(n):  # pixel (row, offset) of one edge after the other: its numbers stay in the cache
+    for k in range(n):  # one edge at a time: its arrays stay in the cache
         minor, other = 1 - major[k], major[k]
         across = nearest[k, :, minor, None] + offsets
         off = across - centre[k, :, minor, None]
@@ -152,7 +152,7 @@ def _band(
 
 
 def _joined(parts: list[tuple[FloatArray, FloatArray, Image]]) -> _Band:
-    """The pixels (d, u, grey) of each edge side by side, as wide as the edge with the most asks for."""
+    """The pixels (d, u, grey) of each edge as rows of one array, padded to the longest row."""
     shape = len(parts), max(1, *(len(d) for d, _, _ in parts)) if parts else 1
     band = _Band(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool))
     for k, (d, u, grey) in enumerate(parts):
@@ -213,7 +213,7 @@ def _fit_band(
     for iteration in range(iterations):
         if iteration in (0, REWEIGH_AT, iterations - 2):
             if iteration > 0:
-                # Pixels that do not belong (a speck, a glint) lose their say.
+                # Down-weight outlier pixels (a speck, a glint).
                 sigma = _spread(residual, np.minimum(weight, 9.0 * sigma[:, None] ** 2 / (residual**2 + 1e-12)), weight)
                 weight = band.used / (1.0 + np.square(np.square(residual / (4.0 * sigma[:, None]))))
             cost = np.sum(weight * residual**2, axis=1) / sigma**2 + np.sum(prior * (x - centre) ** 2, axis=1)
@@ -247,13 +247,13 @@ def _fit_band(
 
 
 def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> FloatArray:
-    """Standard deviation of the pixels about their model, at least that of rounding to whole grey levels."""
+    """Standard deviation (n,) of the pixels about the model, at least that of rounding to whole grey levels."""
     dof = np.maximum(counted.sum(axis=1) - PARAMETERS, 1.0)
     return np.asarray(np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3))
 
 
 def _sections_seen(band: _Band, x: FloatArray, reach: FloatArray, margin_px: FloatArray) -> IntArray:
-    """(n,) in how many sections of |u| < reach (n,) there are pixels beyond ``margin_px`` (n,) on both sides."""
+    """Number (n,) of sections of |u| < reach (n,) with pixels beyond ``margin_px`` (n,) on both sides."""
     e = band.d - x[:, :1] - x[:, 1:2] * band.u
     section = np.floor((band.u / reach[:, None] + 1.0) * (SECTIONS / 2)).astype(np.intp)
     seen = np.zeros((len(x), SECTIONS), dtype=np.int64)
@@ -279,7 +279,7 @@ def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> Fl
 def _locate(
     camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray, widest_px: float
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """A first look: (parameters (n, 8), whether an edge is near (n,), light less dark level about the start (n,))."""
+    """First pass: (parameters (n, 8), whether an edge is near (n,), light less dark level about the start (n,))."""
     half_width = np.clip(0.55 * cell_px, 2.0, widest_px)
     trim = np.clip(0.12 * np.linalg.norm(end - start, axis=1), 2.0, 12.0)
     band = _band(camera, image, start, end, half_width, trim, 40)
@@ -291,25 +291,25 @@ def _locate(
 
 
 def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray) -> EdgeFit:
-    """Find the edges near starting segments, dark on the right hand of their direction as drawn (y down).
+    """Find the edges near starting segments, dark on the right of their direction as drawn (y down).
 
     Args:
         image: (h, w) uint8.
         start, end: (n, 2) ideal px, within about half of ``cell_px`` (and 15 px) of the true corners.
-        cell_px: (n,) width of the dark band beside the edge: what may be looked at on either side.
+        cell_px: (n,) width of the dark band along the edge: limits the pixels used on either side.
     """
     length = np.linalg.norm(end - start, axis=1)
     x, near, step = _locate(camera, image, start, end, cell_px, 8.0)
     far = np.flatnonzero(~near & (cell_px > 15.0))
     if far.size:
-        # The detector may have taken the inner outline of a thick border, up to some ten pixels inside.
+        # The detector may have found the inner outline of a thick border, up to about ten pixels inside.
         shift = np.minimum(0.3 * cell_px[far], 6.0)
         _, _, normal, _ = segment_frames(start[far], end[far])
         outward = shift[:, None] * normal
         x[far], near[far], _ = _locate(camera, image, start[far] + outward, end[far] + outward, cell_px[far], 18.0)
         x[far, 0] += shift
 
-    # Second pass: about the line found, as wide as its blur asks for.
+    # Second pass: about the line found, with a width that fits its blur.
     _, _, normal, _ = segment_frames(start, end)
     start2 = start + (x[:, 0] - x[:, 1])[:, None] * normal
     end2 = end + (x[:, 0] + x[:, 1])[:, None] * normal
@@ -321,7 +321,7 @@ def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatAr
     x[:, 2] = np.log(np.clip(blur, 0.4, MAX_BLUR_PX))
     x, inverse_normal, sigma = _fit_band(band, x, 8, 1e-3)
 
-    # Back to the starting segments' frame: both frames differ by the small turn of the first pass.
+    # Back to the starting segments' frame: they differ by the small rotation of the first pass.
     middle, direction, _, half_length = segment_frames(start, end)
     _, _, normal2, _ = segment_frames(start2, end2)
     ends = np.stack([start2 + (x[:, 0] - x[:, 1])[:, None] * normal2, end2 + (x[:, 0] + x[:, 1])[:, None] * normal2], 1)

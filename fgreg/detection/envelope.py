@@ -1,9 +1,9 @@
-"""Where the photoacoustic source is, from a beamformed envelope image: sub-pixel peak with covariance.
+"""Position of the photoacoustic source in a beamformed envelope image: sub-pixel peak with covariance.
 
-Power (envelope squared) is measured against the background at the same depth, smoothed at a few scales, and its highest
-value judged by the tail of the image's own distribution: an exponential fitted between two high quantiles, extended to
-the chance that is allowed, further where few independent grains of speckle tell that tail. That needs no model of
-speckle. A bell is then fitted to the power about the peak.
+Power (envelope squared) is divided by the background at the same depth and smoothed at a few scales. Its maximum is
+tested against the tail of the image's own distribution: an exponential fitted between two high quantiles and
+extrapolated to the false-alarm rate, further where few independent speckle grains determine the tail. That needs no
+model of speckle. A bell is then fitted to the power near the peak.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from fgreg.model.session_model import ImageModel, ProbeModel
 
 FALSE_ALARMS = 4e-4
 SCALES_MM = ((0.0, 0.0), (0.1, 0.15), (0.2, 0.4))
-"""Standard deviations (range, x) of the smoothing; the first looks at single pixels."""
+"""Standard deviations (range, x) of the smoothing; the first is none."""
 LOW_QUANTILE, HIGH_QUANTILE = 0.97, 0.997
 AWAY_MM = (1.5, 2.5)
-"""Half size (range, x) of the surroundings of a peak that do not count as background."""
+"""Half size (range, x) of the region around a peak that is excluded from the background."""
 ROWS, ROWS_SHARE = 15, 8
 """The background's level is smoothed along depth over an eighth of the rows, at least 15."""
 FIT_LEVEL = 0.25
-"""Power, as a share of the peak's, down to which pixels enter the fit (half the envelope)."""
+"""Pixels above this share of the peak's power enter the fit (half the envelope)."""
 FLOOR_PIXELS = 0.01
 TYPICAL_MM, SIZE_SIGMA = (0.14, 0.2), 0.8
-"""Widths (range, x) of a source's envelope, and how far the logarithm of them may be off."""
+"""Prior of the widths (range, x) of a source's envelope, and the sigma of their logarithms."""
 SKEW_SIGMA, TILT_SIGMA = 0.2, 0.5
 MAX_FIT_PIXELS = 400
 
@@ -51,13 +51,13 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     """Find the photoacoustic source in one envelope image.
 
     Args:
-        frame: (depth, lateral) envelope pixels, linear (not log-compressed), >= 0. Rows go with range, columns with
-            TRUS x, both increasing; ``probe.flip`` is about the order of channels and does not turn the image.
+        frame: (depth, lateral) envelope pixels, linear (not log-compressed), >= 0. Rows are range, columns
+            TRUS x, both increasing; ``probe.flip`` is the order of channels and does not flip the image.
         probe: with ``image``: pixel pitch and centre of pixel [0, 0], (range, x) mm.
 
     Returns:
-        The find, or why there is none. ``range_mm`` is the image's: computed with the assumed sound speed. There is no
-        ratio of sound speeds in it (None): the wavefront is gone.
+        The find, or why there is none. ``range_mm`` is computed with the assumed sound speed, as in the
+        image. The ratio of sound speeds is None: an envelope image does not hold the wavefront.
 
     Raises:
         ValueError: the probe has no image geometry, or the frame is no envelope image.
@@ -80,7 +80,7 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     level = background(power)
     relative = power / level[:, None]
     peak = _find_peak(relative, probe.image)
-    # The exponential's scale is known from so many independent excesses only: its predictive tail is (1 + t / n)^-n.
+    # The exponential's scale is known from n independent excesses only: its predictive tail is (1 + t / n)^-n.
     head = -math.log(1 - LOW_QUANTILE)
     excess = math.log(len(SCALES_MM) * relative.size / FALSE_ALARMS) - head
     threshold = head + peak.clusters * math.expm1(min(excess / max(peak.clusters, 1), 50.0))
@@ -110,8 +110,7 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
 def background(power: FloatArray) -> FloatArray:
     """Mean power of the background at each depth, (rows,), from medians along rows (exponential: median = ln 2 mean).
 
-    A row that is bright all over (a flash, the probe's face) is measured against itself, others against their
-    neighbourhood.
+    A row that is bright as a whole (a flash, the probe's face) has its own level, others that of their neighbourhood.
     """
     each = np.median(power, axis=1) / math.log(2.0)
     smooth = ndimage.median_filter(each, size=min(max(ROWS, each.size // ROWS_SHARE), each.size), mode="nearest")
@@ -199,7 +198,7 @@ def _fit_bell(
     jacobian = np.asarray(result.jac)
     remaining = np.asarray(result.fun)[: z.size]
     data = z.size
-    # Pixels are correlated as the background is; the root of the correlation of powers is that of the amplitudes.
+    # Pixels are correlated like the background. The root of the power correlation is that of the amplitudes.
     correlation = _correlation(relative, rows, columns)
     bread = np.linalg.pinv(jacobian.T @ jacobian)
     meat = jacobian[:data].T @ correlation @ jacobian[:data] + jacobian[data:].T @ jacobian[data:]
@@ -210,7 +209,7 @@ def _fit_bell(
 
 
 def _correlation(relative: FloatArray, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> FloatArray:
-    """(n, n) correlation between pixels, from the image's background; peaks are cut off so that they do not count."""
+    """(n, n) correlation between pixels, from the image's background: peaks are clipped to exclude the source."""
     calm = np.minimum(relative, 6.0)
     calm = calm - calm.mean()
     spans = int(np.ptp(rows)), int(np.ptp(columns))
@@ -222,7 +221,7 @@ def _correlation(relative: FloatArray, rows: npt.NDArray[np.intp], columns: npt.
         # Both diagonal directions: speckle need not be symmetric.
         table[i] = np.maximum(raw[i, : spans[1] + 1], raw[i, -np.arange(spans[1] + 1)])
     table /= raw[0, 0]
-    # Chance correlation of so many pixels is not correlation.
+    # Set correlations within the chance level of this many pixels to zero.
     chance = 4.0 / math.sqrt(relative.size)
     table = np.where(table > chance, np.sqrt(np.clip(table, 0.0, 1.0)), 0.0)
     return np.asarray(table[np.abs(rows[:, None] - rows[None, :]), np.abs(columns[:, None] - columns[None, :])])

@@ -1,7 +1,7 @@
 """Marker, board and photoacoustic source in the frames that events name, detected in threads.
 
-OpenCV, numpy and scipy's transforms release the interpreter lock. Loads OpenCV: events with poses and points do without
-this module.
+OpenCV, numpy and scipy's transforms release the interpreter lock. This module loads OpenCV: events with poses and
+points do not need it.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from fgreg.model.session_model import SessionModel, StereoRig
 from fgreg.session.frame_files import check_camera_frame, check_trus_frame
 
 Progress = Callable[[int, int], None]
-"""Called with frames done and frames in all."""
+"""Called with (frames done, total frames)."""
 Image = npt.NDArray[np.uint8]
 
 
 def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Image:
-    """An endoscope frame that an event names.
+    """Read an endoscope frame that an event names.
 
     Raises:
         InputError: missing, not a PNG image of the camera's size, or not decodable.
@@ -56,10 +56,10 @@ def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Imag
 
 
 def load_trus_frame(path: Path, line: int, key: str, model: SessionModel) -> npt.NDArray[Any]:
-    """A probe frame that an event names.
+    """Read a probe frame that an event names.
 
     Raises:
-        InputError: missing, not an NPY array that this probe can have recorded, or with numbers that are not finite.
+        InputError: missing, not an NPY array that fits this probe, or not finite.
     """
     where = f"events.jsonl: line {line}: {key}"
     check_trus_frame(path, path.name, where, model.probe)
@@ -81,7 +81,7 @@ def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Im
 
 @contextmanager
 def _refusing(where: str) -> Iterator[None]:
-    """Turns a detector's refusal of a frame into an input error that names the place.
+    """Turn a detector's error about a frame into an input error that names the event.
 
     Raises:
         InputError: instead of ValueError, OverflowError or LinAlgError.
@@ -89,22 +89,22 @@ def _refusing(where: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, OverflowError, np.linalg.LinAlgError) as error:
-        raise InputError(where, f"a frame that cannot be worked with ({error})", "one as session.yaml says") from error
+        raise InputError(where, f"a frame that cannot be used ({error})", "one as session.yaml says") from error
 
 
 def detect_in_frames(
     events: Sequence[Event], model: SessionModel, *, redetect: bool = False, progress: Progress | None = None
 ) -> FrameResults:
-    """Look for what the events need from their frames.
+    """Detect marker, board and photoacoustic source in the frames, as far as the events need them.
 
     Args:
         events: as read.
         model: the session's set-up.
-        redetect: look at the frames even where a pose is recorded.
-        progress: called as frames are done.
+        redetect: use the frames even where a pose is recorded.
+        progress: called after each frame.
 
     Raises:
-        InputError: a frame that is missing or not what it should be; of several the first in the events' order.
+        InputError: a frame is missing or invalid; of several the first in the events' order.
     """
     found = FrameResults()
     rig, marker, board = model.camera, model.marker, model.board
@@ -141,7 +141,7 @@ def detect_in_frames(
 
 
 def _run(jobs: Sequence[Callable[[], None]], progress: Progress | None) -> None:
-    """All jobs, in threads; the first error in the events' order is raised."""
+    """Run all jobs in threads; raises the first error in the events' order."""
     if not jobs:
         return
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:

@@ -1,7 +1,7 @@
-"""Recorded events to measurements: frames are looked at, defaults of the noise filled in, epochs and shots numbered.
+"""Recorded events to measurements: detect in frames, fill in default noise, number epochs and shots.
 
-A shot whose marker or PM is not found is no error: it gets a reason and is left out. The corner noise is pooled over
-the session before any covariance is formed.
+A shot whose marker or PM is not found is not an error: it gets a reason and is left out. The corner noise is pooled
+over the session before any covariance is computed.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ from fgreg.model.measurements import (
 from fgreg.model.session_model import SessionModel
 
 Progress = Callable[[int, int], None]
-"""Called with frames done and frames in all."""
+"""Called with (frames done, total frames)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recognised:
-    """What the session's events say, and what became of each.
+    """Measurements of a session, and the result for each event.
 
     Attributes:
-        measurements: aims, pairs and epochs that can be used.
-        tracks: queries whose marker was found.
+        measurements: usable aims, pairs and epochs.
+        tracks: tracking queries whose marker was found.
         aim_events, pair_events, track_events: index into the session's events of each aim, pair, track.
-        unused: reason, by event index, for every aim, pair or track left out; unused_aims: those that are aims.
-        markers: what was detected for each event whose marker came from frames.
-        boards: likewise of the board.
-        finds: what was located in each PA frame, by (event index, look).
+        unused: reason, by event index, for every unused aim, pair or track; unused_aims: indices of unused aims.
+        markers: detection of each event whose marker came from frames.
+        boards: the same for the board.
+        finds: PA localisation in each frame, by (event index, look).
         marker_noise, board_noise: pooled corner noise.
         epoch_of: camera epoch of every event.
     """
@@ -85,7 +85,7 @@ class Recognised:
 
 
 def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
-    """Equal for the same frames, or the same matrix."""
+    """Key of a marker observation: equal for the same frames or the same matrix."""
     if needs_marker_frames(record, redetect=redetect) or record.camera_T_marker is None:
         return record.left, record.right
     return record.camera_T_marker.tobytes()
@@ -99,11 +99,11 @@ def recognise(
     Args:
         events: as read.
         model: the session's set-up.
-        redetect: look at the frames even where a pose is recorded.
-        progress: called as frames are done.
+        redetect: use the frames even where a pose is recorded.
+        progress: called after each frame.
 
     Raises:
-        InputError: a frame that is missing or not what it should be.
+        InputError: a frame is missing or invalid.
     """
     found = _detect(events, model, redetect, progress)
     marker_fits = [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
@@ -142,8 +142,8 @@ def recognise(
 def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tuple[int, ...]]:
     """Camera epochs, and the epoch of every event.
 
-    An epoch starts with its ``camera_moved`` (unless that was refused); where the program found the move out by itself,
-    with the first event at or after ``since_t``.
+    An epoch starts with its ``camera_moved`` event (unless that was refused). A detected move starts its epoch at the
+    first event at or after ``since_t``.
     """
     refused = refused_lines(events)
     first = events[0].t if events else 0.0
@@ -163,7 +163,7 @@ def number_epochs(events: Sequence[Event]) -> tuple[tuple[EpochStart, ...], tupl
 def _detect(events: Sequence[Event], model: SessionModel, redetect: bool, progress: Progress | None) -> FrameResults:
     if not any(needs_frames(event, redetect=redetect) for event in events):
         return FrameResults()
-    from fgreg.detection.event_frames import detect_in_frames  # loads OpenCV, which poses and points do without
+    from fgreg.detection.event_frames import detect_in_frames  # loads OpenCV, which poses and points do not need
 
     return detect_in_frames(events, model, redetect=redetect, progress=progress)
 
@@ -192,7 +192,7 @@ class _Builder:
         self.next_id = 0
 
     def add(self, index: int, event: Event, epoch: int) -> None:
-        """Turn one event into a measurement, or note why not."""
+        """Turn one event into a measurement, or store the reason why not."""
         if not isinstance(event, AimEvent | PairEvent | TrackEvent):
             return
         marker = self._marker(index, event)
@@ -220,8 +220,8 @@ class _Builder:
                 self.pair_events.append(index)
             return
         if event.looks and not looks:
-            return  # heard nothing: the reason is noted
-        self.unused.pop(index, None)  # one look heard is enough for a query
+            return  # no source found in any look: the reason is stored
+        self.unused.pop(index, None)  # one look with a source is enough for a query
         scan = None if event.scan_deg is None else self.model.stage.scan_from_device(math.radians(event.scan_deg))
         self.tracks.append(Track(event.t, epoch, marker, tuple(looks), scan))
         self.track_events.append(index)
@@ -250,7 +250,7 @@ class _Builder:
         return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number)
 
     def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray] | str:
-        """The aimed-at spot (3,) in camera axes and its covariance (3, 3): where the corner is, and where the laser."""
+        """The aimed-at spot (3,) mm, camera frame, and its covariance (3, 3): errors of the corner and of the laser."""
         laser = np.diag(np.square(self.model.noise.aim_mm))
         if event.camera_p_spot_mm is not None:
             return event.camera_p_spot_mm, laser if event.covariance is None else event.covariance
@@ -289,11 +289,11 @@ class _Builder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recollection:
-    """What an :class:`EventRecogniser` remembers of the events before, but for which marker got which number.
+    """State of an :class:`EventRecogniser` after the previous events, except for the markers' numbers.
 
     Attributes:
-        markers, boards: what detections left, in order.
-        next_id: the next new marker's number.
+        markers, boards: cost and degrees of freedom of the detections, in order.
+        next_id: number of the next new marker.
     """
 
     markers: tuple[Misfit, ...] = ()
@@ -302,10 +302,10 @@ class Recollection:
 
 
 class EventRecogniser:
-    """Recognises events one after another, as they come: corner noise is pooled over the frames so far.
+    """Turns events into measurements one by one; corner noise is pooled over the frames up to now.
 
-    What it makes of an event depends on the aims and pairs before it that were taken in, and on nothing else, so that
-    the same events give the same measurements however often a session is interrupted.
+    The measurement of an event depends only on the accepted aims and pairs before it. The same events therefore give
+    the same measurements, however often a session is interrupted.
     """
 
     def __init__(self, model: SessionModel) -> None:
@@ -316,10 +316,12 @@ class EventRecogniser:
         self._before = (0, 0)
 
     def add(self, event: AimEvent | PairEvent | TrackEvent, epoch: int) -> Aim | Pair | Track | str:
-        """The event as a measurement in camera epoch ``epoch``, or why there is none. A query leaves no trace.
+        """The event as a measurement in camera epoch ``epoch``, or the reason why there is none.
+
+        A query does not change the state.
 
         Raises:
-            InputError: a frame that is missing or not what it should be.
+            InputError: a frame is missing or invalid.
         """
         builder = self._builder
         found = builder.found = _detect([event], builder.model, redetect=False, progress=None)
@@ -341,20 +343,20 @@ class EventRecogniser:
         return made[0] if made else reason
 
     def take_back(self) -> None:
-        """Forget the last event: it was not taken in, and will not be there when the session is opened again."""
+        """Undo the last event: it was not accepted, and is absent when the session is opened again."""
         if self._before != (len(self._markers), len(self._boards)):
             del self._markers[self._before[0] :], self._boards[self._before[1] :]
             self._pool()
 
     def recollection(self) -> Recollection:
-        """What this recogniser goes by for the events to come."""
+        """The state that the next events depend on."""
         return Recollection(tuple(self._markers), tuple(self._boards), self._builder.next_id)
 
     def recollect(self, markers: Iterable[tuple[MarkerRecord, int]], recollection: Recollection) -> None:
-        """Go on as the recogniser that gave these markers these numbers.
+        """Restore the state of a recogniser, and its numbers of these markers.
 
         Raises:
-            ValueError: a number that had not been given out.
+            ValueError: a number that is not below ``next_id``.
         """
         for record, number in markers:
             if not 0 <= number < recollection.next_id:

@@ -18,7 +18,7 @@ def read_picture(path: Path) -> npt.NDArray[np.uint8] | None:
 
 
 def read_array(path: Path) -> npt.NDArray[Any] | None:
-    """A probe's frame as it was stored; None where the file cannot be read. Arrays of Python objects are refused."""
+    """A probe frame as stored; None where the file cannot be read. Arrays of Python objects are refused."""
     try:
         return np.asarray(np.load(path, allow_pickle=False))
     except (ValueError, OSError, EOFError):

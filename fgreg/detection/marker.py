@@ -1,9 +1,8 @@
-"""Pose of the fibre's marker from one or two frames, with covariance; refused where the frames cannot tell it.
+"""Pose of the fibre's marker from one or two frames, with covariance; refused where the frames do not determine it.
 
 Tags are found in each view (tags.py), their corners refined by their edges (corners.py), and one pose is fitted to all
-corners of both views (body_pose.py) from every planar hypothesis. A flat body in one view has a second pose that may
-fit
-as well: that is reported, not guessed.
+corners of both views (body_pose.py) from every planar hypothesis. A flat body in one view may have a second pose that
+fits equally well: then the result is a reason, not a pose.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig
 
 LARGE_WIDTH_PX = 1000
-"""From this width on a single tag is looked for at half the resolution first."""
+"""In images of at least this width a single tag is first searched at half resolution."""
 
 
 def _own_tags(found: list[FoundTag], marker: MarkerModel, view: str) -> tuple[list[FoundTag], list[str]]:
-    """The body's tags, each once: an id seen in two places is not used."""
+    """The body's tags, each once, and messages: an id seen at two positions is not used."""
     ids = {tag.id for tag in marker.tags}
     kept: dict[int, FoundTag] = {}
     twice: set[int] = set()
@@ -55,8 +54,8 @@ def _side(tag: FoundTag) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewCorners:
-    """What one view shows of the body: its corners, the tag id of each of their groups, what was left out, and the
-    tags' outlines (4 n, 2) in pixels as the detector has them."""
+    """Detection in one view: the corners, the tag id of each group, messages about what was left out, and the outlines
+    (4 n, 2) px of the tags from the detector."""
 
     corners: CornerSet | None
     ids: tuple[int, ...]
@@ -65,11 +64,11 @@ class ViewCorners:
 
 
 Window = tuple[int, int, int, int]
-"""Part of a picture, px: first and last column, first and last row, the last ones exclusive."""
+"""Part of an image, px: first and last column, first and last row, the last ones exclusive."""
 
 
 def _tags_in(picture: Image, marker: MarkerModel, view: str, near: Window | None) -> tuple[list[FoundTag], list[str]]:
-    """The body's tags, and what was left out; anywhere, or within a window."""
+    """The body's tags in the whole image or within ``near``, and messages about what was left out."""
     large = len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX
     if near is not None:
         left, right, top, bottom = near
@@ -97,7 +96,7 @@ def view_corners(
     edges: bool = True,
     near: Window | None = None,
 ) -> ViewCorners:
-    """The body's corners in one view, ``view`` 0 (left) or 1 (right); ``near``: tags are looked for there only."""
+    """The body's corners in one view, ``view`` 0 (left) or 1 (right); ``near``: search only there."""
     picture = grey(image)
     tags, left_out = _tags_in(picture, marker, VIEW_NAMES[view], near)
     if not tags:
@@ -165,7 +164,7 @@ def right_corners(
 
 
 def marker_from_views(left: ViewCorners | None, right: ViewCorners | None, marker: MarkerModel) -> MarkerFit | NotFound:
-    """The marker's pose from what its views show; None for a view that was not looked into: ValueError for both."""
+    """The marker's pose from its views; a view without a frame is None. Raises ValueError where both are None."""
     seen = [(name, view) for name, view in zip(VIEW_NAMES, (left, right), strict=True) if view is not None]
     if not seen:
         raise ValueError("no frame to detect in")

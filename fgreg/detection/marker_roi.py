@@ -1,4 +1,4 @@
-"""One camera's pictures one after another: the marker is looked for where it was, and everywhere now and then."""
+"""Marker detection in a camera's image stream: near the last position, and in the whole image now and then."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel, MarkerModel
 
 EVERYWHERE = 10
-"""One picture in so many is looked into as a whole: a tag of the same id elsewhere makes both of no use."""
+"""The whole image is searched once in this many images: a second tag of the same id makes both unusable."""
 MARGIN, MARGIN_PX = 0.5, 24.0
-"""The marker is looked for within its last outline and so much of its size, and so many pixels, beside it."""
+"""Margin around the last outline for the search: a share of the marker's size, plus pixels."""
 
 
 class MarkerRoi:
-    """State of one view.
+    """Detector of one view with its state.
 
     Args:
         camera, view, view_T_camera, marker: as of :func:`fgreg.detection.marker.view_corners`.
@@ -28,7 +28,7 @@ class MarkerRoi:
         self._since = 0
 
     def see(self, image: npt.NDArray[np.generic]) -> ViewCorners:
-        """The body's corners in the next picture: those that are found in the whole of it."""
+        """The body's corners in the next image. If the search window loses a tag, the whole image is searched."""
         last, found = self._last, None
         if last is not None and self._since < EVERYWHERE:
             self._since += 1
@@ -46,7 +46,7 @@ class MarkerRoi:
 
 
 def window_about(outlines_px: FloatArray, shape: tuple[int, int]) -> Window:
-    """Where to look in a picture of this shape (h, w); begins at even pixels, as halved pictures do."""
+    """Search window in an image of shape (h, w); starts at even pixels, so that halving keeps the pixel grid."""
     low, high = outlines_px.min(axis=0), outlines_px.max(axis=0)
     margin = MARGIN * float((high - low).max()) + MARGIN_PX
     left, top = (2 * int(max(0.0, value - margin) // 2) for value in low)

@@ -1,11 +1,11 @@
-"""Where the photoacoustic source is: from channel data, or from an envelope image (envelope.py).
+"""Position of the photoacoustic source from channel data, or from an envelope image (envelope.py).
 
-Channel data hold one-way travel times. A wavefront is looked for by delay and sum over the image plane
-(wavefront_search.py) and, where there is one, fitted for x, range and the ratio of sound speeds (wavefront_fit.py). A
-frame without a source is answered with :class:`NoSignal`, not with a point.
+Channel data hold one-way travel times. A wavefront is searched by delay and sum over the image plane
+(wavefront_search.py). If there is one, x, range and the ratio of sound speeds are fitted (wavefront_fit.py). A frame
+without a source gives :class:`NoSignal`, not a point.
 
-The ratio of sound speeds is always fitted along. Fixing it at 1 gains little (tools/study_photoacoustic.py has the
-figures), while a speed 2 % off would then move the range without a word.
+The ratio of sound speeds is always fitted too. Fixing it at 1 gains little (tools/study_photoacoustic.py has the
+figures), and a sound speed that is 2 % off would then move the range unnoticed.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.session_model import ProbeModel
 
 FALSE_ALARMS = 2e-4
-"""Share of frames of noise in which a source may be found by mistake."""
+"""False-alarm rate: share of noise frames in which a source is found."""
 INDEPENDENT = 15.0
 """Independent points per grid point near the threshold, measured on frames of noise (tools/study_photoacoustic.py)."""
 FLAT_PERIODS = 0.9
 FLAT_SHARE = 0.4
-"""A flat wave (light, interference) fits a spherical one only where that is flat to half a period. A source is heard
-over more than FLAT_PERIODS periods of path, or FLAT_SHARE of all that the array could hear of it where that is less."""
+"""A flat wave (light, interference) fits a spherical one only where the latter is flat to half a period. A source is
+received over more than FLAT_PERIODS periods of path, or FLAT_SHARE of what the array could receive if that is less."""
 
 MISFIT, SCATTER_PERIODS = 4.0, 0.14
-"""Arrival times that scatter more than this, beyond what noise explains, are not those of one source: a flat wave that
-part of the channels share comes to 0.19 where it gets so far, one that tissue delays by 50 ns RMS to 0.12."""
+"""Arrival times with more scatter than this, beyond the noise, are not from one source. A flat wave in part of the
+channels has 0.19, a wave that tissue delays by 50 ns RMS 0.12."""
 
 
 def locate_in_channels(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
@@ -50,15 +50,15 @@ def locate_in_channels(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | N
 
     Args:
         frame: (elements, samples) real numbers (float32, int16, ...), rows in the order of ``probe.element_x_mm``
-            (which holds ``probe.flip``). Offsets, dead (constant) channels and a flash common to all channels are no
-            obstacle. Nothing need be known of the pulse but that its spectrum lies between 1 and 12 MHz.
+            (which holds ``probe.flip``). Offsets, dead (constant) channels and a flash common to all channels are
+            handled. The pulse may be unknown; its spectrum must lie between 1 and 12 MHz.
         probe: with ``channels``.
 
     Returns:
-        The find, or why there is none, with the figure. ``range_mm`` is the assumed sound speed times the arrival time
-        at the apex of the wavefront (where the element at the source's x would be), *whatever the true speed is*: with
-        the ratio of sound speeds the true range is ``ratio * range_mm``. ``x_mm`` needs no correction. The covariance
-        is that with the ratio unknown (prior 1 +- 3 %).
+        The find, or the reason for none with the figure. ``range_mm`` is the assumed sound speed times the arrival
+        time at the apex of the wavefront (where the element at the source's x would be), *whatever the true speed is*:
+        with the ratio of sound speeds the true range is ``ratio * range_mm``. ``x_mm`` needs no correction. The
+        covariance holds for an unknown ratio (prior 1 +- 3 %).
 
     Raises:
         ValueError: the probe has no channel sampling, or the frame is not one of this probe.
@@ -123,7 +123,7 @@ def locate_in_channels(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | N
 def locate_in_frame(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
     """Find the photoacoustic source in a frame of either kind.
 
-    Of a probe with both ``channels`` and ``image``, what :meth:`ProbeModel.is_channel_data` says is channel data.
+    For a probe with both ``channels`` and ``image``, :meth:`ProbeModel.is_channel_data` decides.
 
     Raises:
         ValueError: the probe has neither, or the frame fits neither.
@@ -141,7 +141,7 @@ def locate_in_frame(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
 def heard_periods(
     fit: WavefrontFit, live: BoolArray, element_x_mm: FloatArray, speed_mm_us: float
 ) -> tuple[float, float]:
-    """Spread of path, in periods, over the elements that heard the wave, and over all that could have."""
+    """Spread of path, in periods, over the elements that received the wave, and over all that could have."""
     path = path_mm(fit.x_mm, fit.range_mm, fit.ratio, element_x_mm)
     could = live & (np.abs(element_x_mm - fit.x_mm) < MAX_TANGENT * fit.range_mm)
     periods = fit.band.centre_mhz / speed_mm_us

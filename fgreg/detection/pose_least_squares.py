@@ -38,8 +38,8 @@ class CornerSet:
         view: (n,) 0 left, 1 right.
         group: (n,) which tag (or board) of which view a corner belongs to.
         covariance: (2n, 2n) px^2 at unit corner noise scale, block diagonal over groups.
-        common_px: (n,) sigma of an error that a corner of the body has in common in both views.
-        outward_px: (n, 2) error of all corners at once, one sigma of one number: the bias of the corner method.
+        common_px: (n,) sigma of a corner error that is the same in both views.
+        outward_px: (n, 2) one sigma of a single error common to all corners: the bias of the corner method.
         focal_px: (n, 2) of the corner's camera.
         view_T_camera: (n, 4, 4) of the corner's camera from the left.
     """
@@ -70,12 +70,12 @@ class CornerSet:
         )
 
     def with_excess(self, variance_px2: float) -> CornerSet:
-        """The same corners with so much independent variance added to each coordinate."""
+        """The same corners with this independent variance added to each coordinate."""
         return replace(self, covariance=self.covariance + variance_px2 * np.eye(len(self.covariance)))
 
 
 def join(parts: list[CornerSet]) -> CornerSet:
-    """All corners of several sets, groups kept apart."""
+    """All corners of several sets; their groups stay distinct."""
     groups, offset = [], 0
     for part in parts:
         groups.append(part.group + offset)
@@ -143,7 +143,7 @@ def fit_pose(corners: CornerSet, start: FloatArray, *, huber: float | None = Non
     """The minimum next to ``start`` (4, 4), by Levenberg-Marquardt; None where there is none in front of the camera.
 
     Args:
-        huber: with it, corners beyond so many sigma of their own weigh less (a start for the plain fit).
+        huber: threshold of the Huber loss, in sigma of a corner (a start for the plain fit); None: plain fit.
     """
     white = whitener(corners.covariance)
     pose, damping = start.copy(), 1e-4
@@ -193,11 +193,10 @@ def fit_pose(corners: CornerSet, start: FloatArray, *, huber: float | None = Non
 
 
 def fit_with_excess(corners: CornerSet, start: FloatArray) -> tuple[CornerSet, PoseFit] | None:
-    """The plain fit, unless the corners disagree far beyond their stated noise: then with more noise for all of them.
+    """The plain fit; where the residuals far exceed the stated noise, with more variance for all corners.
 
-    A body that was not made quite as modelled, or a lens calibrated not quite right, gives all corners errors of a
-    like size, whatever the picture's own noise says of each. The added variance is the one with which the residuals
-    are no more than three sigma above what they should be.
+    Errors of the body's model or of the lens calibration give all corners errors of similar size, independent of the
+    image noise. The added variance brings chi-square down to three sigma above its expectation.
 
     Returns:
         the corners with the covariance used, and the fit; None where there is no minimum in front of the camera.
@@ -227,10 +226,10 @@ def fit_with_excess(corners: CornerSet, start: FloatArray) -> tuple[CornerSet, P
 
 
 def common_covariance(corners: CornerSet, fit: PoseFit) -> FloatArray:
-    """(6, 6) covariance, right tangent, that the corners' common errors give the pose: residuals do not show it.
+    """(6, 6) covariance of the pose, right tangent, from the corners' common errors, which residuals do not show.
 
-    With the pose's answer to corner errors A = (J' C^-1 J)^-1 J' C^-1, it is A (S + b b') A': S correlates a corner of
-    the body with itself across views, b is the outward error.
+    With the pose's response to corner errors A = (J' C^-1 J)^-1 J' C^-1, it is A (S + b b') A': S correlates a corner
+    of the body with itself across views, b is the outward error.
     """
     _, jacobian, _ = corner_residuals(corners, fit.camera_T_body)
     answer = np.linalg.solve(fit.information, jacobian.reshape(-1, 6).T @ np.linalg.inv(corners.covariance))
@@ -245,7 +244,7 @@ def _rigid(rotation_vector: FloatArray, translation: FloatArray) -> FloatArray:
 
 
 def pose_hypotheses(corners: CornerSet) -> list[FloatArray]:
-    """Starting poses ``camera_T_body`` from every group of four coplanar corners or more, and from each whole view."""
+    """Starting poses ``camera_T_body`` from every group of at least four corners, and from each whole view."""
     sets: list[BoolArray] = [corners.group == g for g in np.unique(corners.group)]
     for v in np.unique(corners.view):
         whole = corners.view == v

@@ -1,6 +1,6 @@
-"""What a frame can answer: the pose of marker or board, a photoacoustic point, or why there is none.
+"""Results of detection in a frame: the pose of marker or board, a photoacoustic point, or a reason.
 
-Apart from the detectors, so that who reads results need not load OpenCV.
+Separate from the detectors, so that code that reads results does not load OpenCV.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fgreg.model.session_model import BoardModel
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """Nothing that can be used; the reason as a plain sentence part."""
+    """No usable detection; the reason as part of a sentence."""
 
     reason: str
 
@@ -33,12 +33,12 @@ class RigidFit:
         common_covariance: (6, 6) of the errors that residuals cannot show (method bias, errors common to both views).
         cost: whitened sum of squared residuals, chi-square of ``dof`` at scale 1.
         dof: residuals less 6.
-        corners: how many, over all views.
+        corners: number of corners over all views.
         views: names of the views used.
         rms_px: root mean square distance of predicted from observed corners, undistorted pixels.
         residual_sum_px2: sum of those squared distances.
         second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
-        left_out: what was seen but not used, with the reason.
+        left_out: tags or corners that were seen but not used, with the reason.
     """
 
     camera_T_body: FloatArray
@@ -56,7 +56,7 @@ class RigidFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerFit:
-    """A marker found: its pose with all that goes with it, and the ids of the tags used."""
+    """A detected marker: the fit of its pose, and the ids of the tags used."""
 
     pose: RigidFit
     tags: tuple[int, ...]
@@ -74,7 +74,7 @@ def marker_covariance(fit: MarkerFit, noise: CornerNoise) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardFit:
-    """A board found: its pose with all that goes with it."""
+    """A detected board: the fit of its pose, and the board's model."""
 
     pose: RigidFit
     board: BoardModel
@@ -91,9 +91,9 @@ def board_covariance(fit: BoardFit, noise: CornerNoise) -> FloatArray:
 
 
 def board_corner(fit: BoardFit, column: int, row: int, noise: CornerNoise) -> tuple[FloatArray, FloatArray]:
-    """Where a corner is: (camera_p_mm (3,), covariance (3, 3) along the camera's axes).
+    """Position of a board corner: (camera_p_mm (3,), covariance (3, 3) mm^2, camera frame).
 
-    From the pose fitted to all corners, so it is as good as the board is flat, and need not itself be in view.
+    It is computed from the pose of the whole board, so it need not be in view; it assumes a flat board.
 
     Raises:
         ValueError: the board has no such corner.
@@ -114,18 +114,18 @@ class PaFind:
 
     Attributes:
         x_mm: TRUS x of the source.
-        range_mm: distance from the element row along the image plane, as the *assumed* sound speed has it: assumed
-            speed times the arrival time at the apex of the wavefront. Multiplied by the true ratio of sound speeds
-            (``sound_speed_ratio`` once it is known well enough) it is the true range.
+        range_mm: distance from the element row along the image plane at the *assumed* sound speed: assumed speed
+            times the arrival time at the apex of the wavefront. The true range is this times the true ratio of sound
+            speeds (``sound_speed_ratio`` where it is known well enough).
         covariance: (2, 2) over (x_mm, range_mm), mm^2.
         amplitude: peak of the wave's envelope at the strongest elements (channel data) or in the image, in the
-            frame's units; comparable within one source only.
+            frame's units; comparable only for the same source.
         snr_db: amplitude / sqrt(2) over the standard deviation of the noise, per sample.
-        sound_speed_ratio: true over assumed sound speed as the wavefront's shape alone tells it; None for images,
-            which do not hold the wavefront.
+        sound_speed_ratio: true over assumed sound speed from the wavefront's shape alone; None for images, which do
+            not hold the wavefront.
         sound_speed_ratio_sigma: its standard deviation.
-        elements_used: number of elements that heard the source and entered the fit; None for images.
-        statistic, threshold: the detection statistic (log likelihood ratio) and what it had to exceed.
+        elements_used: number of elements that received the source and entered the fit; None for images.
+        statistic, threshold: the detection statistic (log likelihood ratio) and its threshold.
     """
 
     x_mm: float
@@ -142,7 +142,7 @@ class PaFind:
 
 @dataclass(frozen=True, slots=True)
 class NoSignal:
-    """There is no source in the frame; ``reason`` says so with the figure behind it."""
+    """No source in the frame; ``reason`` gives the statistic and the threshold."""
 
     reason: str
 
@@ -150,14 +150,14 @@ class NoSignal:
 def pool_sound_speed_ratio(finds: Iterable[PaFind]) -> tuple[float, float] | None:
     """Ratio of true to assumed sound speed over many finds, weighted by their variances.
 
-    The sigma is enlarged by the spread of the finds where that is larger than their sigmas explain.
+    The sigma is enlarged where the spread of the finds exceeds their sigmas.
 
     Args:
-        finds: finds in channel data; those without a ratio are passed over.
+        finds: finds in channel data; those without a ratio are ignored.
 
     Returns:
-        (ratio, sigma), or None where no find has a ratio. Worth a warning where ``abs(ratio - 1)`` exceeds both 3
-        sigma and 0.005.
+        (ratio, sigma), or None where no find has a ratio. Warn where ``abs(ratio - 1)`` exceeds both 3 sigma
+        and 0.005.
     """
     pairs = [
         (find.sound_speed_ratio, find.sound_speed_ratio_sigma**-2)
@@ -174,11 +174,11 @@ def pool_sound_speed_ratio(finds: Iterable[PaFind]) -> tuple[float, float] | Non
 
 @dataclass(slots=True, eq=False)
 class FrameResults:
-    """What was found in a session's frames.
+    """Detections in a session's frames.
 
     Attributes:
-        markers, boards: by the event's index; of every event whose marker or board is looked for in frames.
-        finds: by (the event's index, number of the look).
+        markers, boards: by event index, for every event whose marker or board is detected in frames.
+        finds: by (event index, number of the look).
     """
 
     markers: dict[int, MarkerFit | NotFound] = field(default_factory=dict)

@@ -1,8 +1,8 @@
 """Tags of one dictionary in one image: OpenCV's ArUco detector, also at the image's border.
 
 Corner order is top left, top right, bottom right, bottom left *as OpenCV's generateImageMarker draws the tag*. For
-the AprilTag dictionaries OpenCV (4.x and 5.0) draws the official pictures turned by half a turn: with a tag printed
-from those pictures, ``marker_T_tag`` has to hold that half turn about z.
+the AprilTag dictionaries OpenCV (4.x and 5.0) draws the official tags rotated by half a turn: for a tag printed from
+the official images, ``marker_T_tag`` must include that half turn about z.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from fgreg.detection.edges import Image
 from fgreg.geometry.transforms import FloatArray
 
 BORDER_PX = 12
-"""The image is continued by so much: a tag whose quiet zone the image's edge cuts off is still a closed square."""
+"""Padding of the image: a tag whose quiet zone is cut by the image's edge is then still a closed square."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundTag:
-    """A tag as the detector reports it: id and corners (4, 2) in pixels, good to a pixel or two."""
+    """A tag as the detector reports it: id and corners (4, 2) px, accurate to a pixel or two."""
 
     id: int
     corners_px: FloatArray
@@ -47,7 +47,7 @@ def tag_cells(name: str) -> int:
 
 
 def detector_parameters() -> cv2.aruco.DetectorParameters:
-    """Tuned for tags from about 15 px to most of the image, in light or dark surroundings."""
+    """Parameters for tags from about 15 px to most of the image, on a light or dark background."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.minMarkerPerimeterRate = 0.02
@@ -61,11 +61,11 @@ def halved(image: npt.NDArray[Any]) -> Image:
 
 
 def find_tags(image: Image, dictionary: str, *, half: bool = False, faint: bool = False) -> list[FoundTag]:
-    """All tags of a dictionary in a grey image (h, w); one id may come several times.
+    """All tags of a dictionary in a grey image (h, w); one id may occur several times.
 
     Args:
-        half: look at half the resolution: a quarter of the time, and enough for tags of some 40 px and more.
-        faint: at half the resolution and at lower contrast, for tags that blur and noise hide at full size.
+        half: search at half resolution: a quarter of the time, enough for tags of about 40 px and more.
+        faint: search at half resolution and lower contrast, for blurred or noisy tags.
     """
     half = half or faint
     padded = cv2.copyMakeBorder(image, BORDER_PX, BORDER_PX, BORDER_PX, BORDER_PX, cv2.BORDER_REPLICATE)

@@ -1,13 +1,13 @@
 """Fit of a spherical wavefront to channel data: source x, arrival at the apex, ratio of sound speeds.
 
 With q = assumed speed times arrival time, a source at x whose wave reaches the apex at q = r obeys, for a true speed
-``ratio`` times the assumed one, ``q_i^2 = r^2 + ((x - x_i) / ratio)^2``. All channels carry the same pulse s, unknown:
-``b_i(t) = a_i s(t - q_i / c)``. Two kinds of knowledge, and they are independent in white noise:
+``ratio`` times the assumed one, ``q_i^2 = r^2 + ((x - x_i) / ratio)^2``. All channels carry the same unknown pulse s:
+``b_i(t) = a_i s(t - q_i / c)``. There are two kinds of information, independent in white noise:
 
 * *relative* delays, to a fraction of a period: with the channels shifted by the current delays, the weighted mean S is
   the pulse, and ``delta_i = -Re <S', b_i - a_i S> / (a_i <S', S'>)`` is each channel's remaining delay. That is linear
-  in the data, so nothing breaks down where a single channel is below its noise;
-* the *absolute* time, which an unknown pulse gives only by its definition: the maximum of the envelope of S.
+  in the data, so it also works where each single channel is below its noise;
+* the *absolute* time, which for an unknown pulse is a definition: the maximum of the envelope of S.
 
 Gauss-Newton on both gives (x, r, ratio) and, from the noise's measured autocovariance, their covariance.
 """
@@ -30,25 +30,25 @@ Complex128Array = npt.NDArray[np.complex128]
 
 WIDE_BAND = Band(5.0, 3.0)
 RATIO_FLOOR = 2e-4
-"""The same for the ratio of sound speeds."""
+"""Standard deviation added to the ratio of sound speeds for the same errors as FLOOR_MM."""
 FLOOR_MM = 0.0003
-"""Standard deviation added to x and range for what sampling, interpolation and filters leave without noise."""
+"""Standard deviation added to x and range for errors of sampling, interpolation and filters."""
 SMOOTHINGS = (1.0, 1.4, 2.0, 3.0, 4.5, 7.0)
 """Widths of the filters before the envelope's maximum is taken, in widths of the pulse's spectrum."""
 ASYMMETRY = 0.12
-"""By what share of its length a pulse's maximum may move under a matched filter, standard deviation: 0 for a symmetric
+"""Shift of a pulse's maximum under a matched filter, as a share of its length, standard deviation: 0 for a symmetric
 pulse, 0.10 for one that falls 1.25 times as slowly as it rises, 0.19 for 1.5 times (measured without noise)."""
 LINEAR = 0.3
-"""Curvature of the noise over the pulse's at its top, up to which the maximum is near enough linear in the noise."""
+"""Curvature of the noise over the pulse's at its maximum up to which the maximum is about linear in the noise."""
 MISMATCH = 0.07
-"""Share of that movement that does not go as one over the filter's width."""
+"""Share of that shift that is not proportional to one over the filter's width."""
 FINE_RATE_MHZ = 100.0
 MAX_SIGNAL_MHZ = 16.0
 SIGNIFICANT = 3.0
-"""Standard deviations from which on an element counts as hearing the wave."""
+"""An element receives the wave if its gain exceeds this many standard deviations."""
 ITERATIONS = 8
 SETTLED = 0.03
-"""Last step, in standard deviations."""
+"""Converged where the step is below this many standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,8 +56,8 @@ class WavefrontFit:
     """Result of :func:`fit_wavefront`; x and range mm, covariance (2, 2), ratio without the prior on it.
 
     ``gain`` (elements,): the wave's amplitude in each element's channel, relative; ``amplitude`` at the strongest.
-    ``misfit``: squared remaining delays over their variance, per degree of freedom; ``beyond_noise_us``: RMS of what
-    of them noise does not explain.
+    ``misfit``: squared remaining delays over their variance, per degree of freedom; ``beyond_noise_us``: RMS of the
+    remaining delays less the noise.
     """
 
     x_mm: float
@@ -108,7 +108,7 @@ def aligned(signal: Baseband, delay_us: FloatArray, half: int) -> Complex128Arra
         half: half width of the window, in samples of the baseband.
 
     Returns:
-        (elements, 2 half + 1), carrier turned to zero phase at the middle, cubic interpolation between samples.
+        (elements, 2 half + 1), carrier at zero phase at the middle, cubic interpolation between samples.
     """
     outside = signal.data.shape[0] - 1
     position = (delay_us - signal.start_us) * signal.rate_mhz
@@ -129,9 +129,9 @@ def aligned(signal: Baseband, delay_us: FloatArray, half: int) -> Complex128Arra
 
 
 def pulse_band(pulse: Complex128Array, noise_power: FloatArray, carrier_mhz: float, rate_mhz: float) -> Band:
-    """Centre and width of the pulse's spectrum from a noisy sight of it.
+    """Centre and width of the pulse's spectrum from a noisy pulse.
 
-    Moments of the squared power spectrum, less the noise's power: squaring keeps noise out of the tails; for a
+    Moments of the squared power spectrum, less the noise's power: squaring suppresses noise in the tails; for a
     Gaussian amplitude spectrum of standard deviation s the squared power has s / 2.
     """
     size = 4 * pulse.size
@@ -150,8 +150,8 @@ def _gains(
 ) -> FloatArray:
     """Amplitude of the pulse in each channel, smoothed along the array; zero where not audible or not significant.
 
-    An element that does not hear the wave must not pass for one that does: its delays are noise, and far elements have
-    the longest lever on the ratio of sound speeds.
+    An element that does not receive the wave must not enter: its delays are noise, and far elements have the largest
+    effect on the ratio of sound speeds.
     """
     energy = float((np.abs(pulse) ** 2).sum())
     raw = np.where(audible, (window @ pulse.conj()).real / energy, 0.0)
@@ -174,7 +174,7 @@ def _noise_about(signal: Baseband, delay_us: FloatArray, live: BoolArray, guard_
     time = signal.start_us + np.arange(kept) / signal.rate_mhz
     quiet = np.abs(time[:, None] - delay_us[None, channels]) > guard_us
     if quiet.mean() < 0.25:
-        # A record hardly longer than the pulse: the median level and the filter's own shape are all there is.
+        # The record is hardly longer than the pulse: use the median noise level, without correlation.
         flat = np.zeros(lags, dtype=np.complex128)
         flat[0] = signal.variance
         return _Noise(flat)
@@ -207,12 +207,12 @@ def _aligned_spectrum(channels: Channels, delay_us: FloatArray, gain: FloatArray
 def _envelope_maximum(
     frequency: FloatArray, spectrum: Complex128Array, band: Band, padded: int, sampling_mhz: float
 ) -> tuple[float, float, float]:
-    """Maximum of the pulse's envelope: time from where it was expected (us), its sigma, and the height there.
+    """Maximum of the pulse's envelope: time after the expected one (us), its sigma, and the height.
 
-    A matched filter is best for a symmetric envelope, but moves the maximum of one that is not; with less smoothing
-    there is less of that and more noise. So the maximum is taken after filters of several widths w (in widths of the
-    pulse's spectrum); it moves as 1 / w, by an amount that is one unknown with a prior. Generalised least squares over
-    all of them is the matched filter where noise is all that counts and the bare envelope where there is none.
+    A matched filter is optimal for a symmetric envelope, but shifts the maximum of an asymmetric one. Less smoothing
+    gives less shift and more noise. So the maximum is taken after filters of several widths w (in widths of the
+    pulse's spectrum). The shift is proportional to 1 / w with one unknown factor that has a prior. Generalised least
+    squares over all filters tends to the matched filter where noise dominates and to the bare envelope without noise.
 
     Raises:
         EstimationError: there is no maximum near the expected time.
@@ -235,7 +235,7 @@ def _envelope_maximum(
     guard = math.ceil(6 * pulse_us * rate)
     quiet = slopes[:, guard : min(size - guard, guard + round(0.8 * padded / sampling_mhz * rate)) : 3]
     if quiet.shape[1] < 10:
-        raise EstimationError("the record is too short to tell the wave from the noise")
+        raise EstimationError("the record is too short to separate the wave from the noise")
     noise = np.sqrt(0.5 / math.log(2.0) * np.median(quiet.real**2 + quiet.imag**2, axis=1))
     middle, reach = 0, math.ceil((1.5 * pulse_us + 0.25) * rate)
     width = max(1, round(0.2 * pulse_us * rate))
@@ -252,7 +252,7 @@ def _envelope_maximum(
         if bend >= 0.0:
             break
         middle = middle - reach - width + at
-        # What a Gaussian pulse bends after this filter: noise may make a peak look sharper than the pulse is.
+        # Curvature of a Gaussian pulse after this filter: noise can make a peak sharper than the pulse.
         expected = smoothing**2 / (1.0 + smoothing**2) / pulse_us**2
         sigma = float(level) / (math.exp(centre) * min(-bend * (rate / width) ** 2, expected))
         if times and sigma * rapidity > LINEAR:
@@ -263,7 +263,7 @@ def _envelope_maximum(
             height = math.exp(centre) * math.sqrt(1.0 + smoothing**-2)
         reach = math.ceil(0.7 * pulse_us * rate)
     if not times:
-        raise EstimationError("the wave has no maximum where it should be")
+        raise EstimationError("the wave has no maximum near the expected time")
     count = len(times)
     weighted = gains[:count] * offset
     correlation = weighted @ weighted.T
@@ -278,7 +278,7 @@ def _envelope_maximum(
 
 
 def _correlated_elements(residual: FloatArray) -> float:
-    """Over how many neighbours a residual goes together: 1 + 2 sum of its autocorrelation up to where that ends."""
+    """Correlation length of a residual in elements: 1 + 2 sum of its autocorrelation up to where that ends."""
     together = 1.0
     power = float(residual @ residual)
     for lag in range(1, residual.size // 2):
@@ -307,7 +307,7 @@ def fit_wavefront(
         ratio_sigma: prior on the ratio about 1.
 
     Raises:
-        EstimationError: the fit leaves the frame, or does not settle.
+        EstimationError: the fit leaves the frame, or does not converge.
     """
     state = np.array([x_mm, range_mm, ratio])
     wide = baseband(channels, WIDE_BAND)
@@ -347,7 +347,7 @@ def fit_wavefront(
         gain = _gains(window, _mean_pulse(window, gain), noise, audible, element_x_mm)
         used = gain > 0.0
         if used.sum() < 4:
-            raise EstimationError("too few elements hear the wavefront")
+            raise EstimationError("too few elements receive the wavefront")
         pulse = _mean_pulse(window, gain)
         slope = np.gradient(pulse) * signal.rate_mhz + 2j * np.pi * signal.carrier_mhz * pulse
         energy = float((np.abs(slope) ** 2).sum())
@@ -374,11 +374,11 @@ def fit_wavefront(
         step = np.clip(step, [-0.5, -0.8, -0.03], [0.5, 0.8, 0.03])
         state = state + step
         if not (np.isfinite(state).all() and 0.5 < state[1] < 310.0 and 0.8 < state[2] < 1.25):
-            raise EstimationError("the fit of the wavefront does not settle")
+            raise EstimationError("the fit of the wavefront does not converge")
         if np.abs(step[:2]).max() < 0.02 and float(np.max(step**2 * np.diag(information))) < SETTLED**2:
             break
-    # What noise does not explain (a lens, layers of other speed) goes together over neighbouring elements: as many of
-    # them count as one, and it moves the mean, hence the range, too.
+    # Errors beyond the noise (a lens, layers of another speed) are correlated over neighbouring elements: correlated
+    # elements count as one, and the errors move the mean, hence the range, too.
     count = int(used.sum())
     beyond_us = math.sqrt(max(misfit - 1.0, 0.0) * max(count - 4, 1) / float(weight.sum()))
     scale, common_us2 = max(1.0, misfit), 0.0
@@ -388,7 +388,7 @@ def fit_wavefront(
         common_us2 = beyond_us**2 * min(1.0, together / count)
     information = relative / scale + absolute / (1.0 + common_us2 / off_sigma_us**2)
     covariance = np.linalg.inv(information + prior)[:2, :2] + np.eye(2) * FLOOR_MM**2
-    # The ratio as the data alone have it: information about it with x and range free, and the prior's pull undone.
+    # The ratio from the data alone: its information with x and range free, and the prior removed.
     own = information[2, 2] - information[2, :2] @ np.linalg.solve(information[:2, :2], information[:2, 2])
     alone = state[2] + (state[2] - 1.0) * ratio_sigma**-2 / own
     return WavefrontFit(

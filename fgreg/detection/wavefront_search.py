@@ -1,11 +1,11 @@
-"""Is there a spherical wavefront in channel data, and roughly where from: delay and sum over a grid.
+"""Detection of a spherical wavefront in channel data and its rough origin: delay and sum over a grid.
 
 One-way travel: a wave from (x, r) in the image plane reaches the element at x_i at sqrt((x - x_i)^2 + r^2) / c. For
-every point of a grid the channels' complex envelopes are taken at those times, turned to a common phase, weighted by
-(r / d)^2 (obliquity times spreading, d the distance) and summed. Over noise alone the squared magnitude, divided by its
-variance, is exponential with mean 1: it is the gain in log likelihood of a wave from there over none. The best points
-are looked at again on a finer grid, sound speed included, so that nothing is lost between grid points. Two pass bands
-between them cover pulses of 3 to 7 MHz.
+every grid point the channels' complex envelopes are taken at those times, rotated to a common phase, weighted by
+(r / d)^2 (obliquity times spreading, d the distance) and summed. For noise alone the squared magnitude, divided by its
+variance, is exponential with mean 1: it is the log likelihood ratio of a wave from there against none. The best points
+are refined on a finer grid that includes the sound speed, so that no source is lost between grid points. Two pass
+bands together cover pulses of 3 to 7 MHz.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ SUBDIVISIONS = (2, 3)
 """Grid points per element pitch in x, for each band."""
 RANGE_STEP_MM = (0.35, 0.25)
 MAX_TANGENT = 1.3
-"""Elements further off to the side than this times the range are not listened to: they hardly hear the source."""
+"""Elements further to the side than this times the range are not used: they hardly receive the source."""
 MARGIN = 12
-"""Pitches beyond either end of the array in which a source is still looked for."""
+"""Search region beyond either end of the array, in pitches."""
 MIN_RANGE_MM, MAX_RANGE_MM = 2.0, 300.0
 FINE_RANGE_MM = (-0.12, -0.06, 0.0, 0.06, 0.12)
 COARSE_RANGE_MM = tuple(0.15 * k for k in range(-5, 6))
 RATIOS = (0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06)
 SIDELOBES_MM = tuple(0.075 * k for k in range(-4, 5))
-"""Where the sound speed is off, the best point of the assumed speed's grid may be on a sidelobe this far off."""
+"""If the assumed sound speed is wrong, the best grid point may be on a sidelobe at this distance in x."""
 RATIO_SIGMA = 0.03
-"""How far the sound speed may reasonably be off."""
+"""Prior standard deviation of the ratio of sound speeds about 1."""
 MIN_SUPPORT = 6.0
-"""Least sum of squared weights of the elements that could hear a point (a twentieth of a 128-element array)."""
+"""Least sum of squared weights of the elements that could receive a point (a twentieth of a 128-element array)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """All that delay and sum needs for one geometry; ``lags`` are distances element to point along x, >= 0.
+    """Tables of delay and sum for one geometry; ``lags`` are distances from element to point along x, >= 0.
 
     Attributes:
         range_mm: (rows,) of the grid.
-        first: per lag, the first row that listens so far to the side.
+        first: per lag, the first row whose points use elements this far to the side.
         index: per lag, (rows - first,) row of the baseband.
         turn: per lag, (rows - first, 1) weight times phase.
         weight2: (rows, lags) squared weights, zero where outside the record or too far to the side.
@@ -64,7 +64,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peak:
-    """A likely source: TRUS x (mm), range (mm), ratio of sound speeds, log likelihood ratio, and the data it is in."""
+    """A candidate source: TRUS x (mm), range (mm), ratio of sound speeds, log likelihood ratio, and its baseband."""
 
     x_mm: float
     range_mm: float
@@ -164,12 +164,12 @@ def _plan_and_support(
 
 
 def statistic_image(signal: Baseband, live: BoolArray, plan: Plan, live_support: FloatArray) -> FloatArray:
-    """|sum|^2 over its variance under noise alone: exponential with mean 1. Zero where hardly any element listens."""
+    """|sum|^2 over its variance under noise alone: exponential with mean 1. Zero where too few elements receive."""
     image = delay_and_sum(signal.data, plan)
     power = image.real**2 + image.imag**2
     enough = live_support >= min(MIN_SUPPORT, 0.25 * float(live.sum()))
     out = np.where(enough, power / (signal.variance * np.where(enough, live_support, 1.0)), 0.0)
-    # Noise that channels share, or clutter all over, lifts the whole image: measure against the image's own level.
+    # Noise common to the channels, or clutter, raises the whole image: normalise by the image's own median.
     some = out[enough][::7]
     level = float(np.median(some)) / math.log(2.0) if some.size else 1.0
     return np.asarray(out / max(1.0, level))
@@ -193,7 +193,7 @@ def best_points(image: FloatArray, plan: Plan, count: int) -> list[tuple[float, 
 
 
 def find_peaks(channels: Channels, probe: ProbeModel, speed_mm_us: float, count: int = 4) -> tuple[list[Peak], int]:
-    """The likeliest sources, best first, and the number of grid points that were looked at."""
+    """The most likely sources, best first, and the number of grid points searched."""
     rough: list[Peak] = []
     points = 0
     middle = 0.5 * (probe.elements - 1)
@@ -236,7 +236,7 @@ def search_nearby(
     ratios: tuple[float, ...],
     x_offsets_mm: tuple[float, ...] | None = None,
 ) -> Peak:
-    """The best point of a fine grid about a peak, sound speeds included (under their prior); never worse than it."""
+    """The best point of a fine grid near a peak, including sound speeds with their prior; never worse than the peak."""
     x_offsets = peak.x_step_mm * np.linspace(-0.5, 0.5, 5) if x_offsets_mm is None else np.array(x_offsets_mm)
     grid = np.meshgrid(ratios, peak.range_mm + np.array(range_offsets_mm), peak.x_mm + x_offsets, indexing="ij")
     ratio, range_mm, x_mm = (axis.ravel() for axis in grid)
