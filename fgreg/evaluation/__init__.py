@@ -1,1 +1,1 @@
-"""How good is it: errors against a truth, held-out pairs, number of pairs, influence of each; tables and plots."""
+"""Evaluation: errors against ground truth, cross-validation, number of pairs, influence of each pair, tables, plots."""

@@ -1,4 +1,4 @@
-"""Advice for people and for programs."""
+"""The advice about the next shot as a table and as plain data."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from fgreg.evaluation.tables import number
 from fgreg.registration.next_shot import Advice, AdvisedShot
 
 UPRIGHT_DEG = 1.0
-"""Leans below this are not worth a word."""
+"""Smaller tilts are not shown."""
 
 
 def lean_in_words(shot: AdvisedShot) -> str:
-    """How the beam leans from the mean beam, as seen in the image: such as ``12 right, 6 up`` (degrees)."""
+    """Tilt of the beam from the mean beam, in the image, e.g. ``12 right, 6 up`` (degrees)."""
     right, down = math.degrees(shot.tilt_right_rad), math.degrees(shot.tilt_down_rad)
     words = []
     if abs(right) >= UPRIGHT_DEG:
@@ -30,7 +30,7 @@ def lean_in_words(shot: AdvisedShot) -> str:
 
 
 def print_advice(name: str, advice: Advice, console: Console | None = None) -> None:
-    """Print the shots as a table."""
+    """Print the advised shots as a table."""
     console = console or Console(highlight=False, emoji=False)
     page = Group(*_page(name, advice))
     if console.is_terminal:
@@ -75,7 +75,7 @@ def _page(name: str, advice: Advice) -> list[RenderableType]:
 
 
 def advice_dict(name: str, advice: Advice) -> dict[str, Any]:
-    """Advice as plain types."""
+    """The advice as plain types, for JSON."""
     out: dict[str, Any] = plain(
         {
             "session": name,

@@ -1,4 +1,4 @@
-"""What is evaluated, and how: a session's measurements with the truth where it is known."""
+"""Input of an evaluation: a session's measurements, the ground truth where it is known, and the settings."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from fgreg.model.solve_config import SolveConfig
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is known of the truth.
+    """The known part of the ground truth.
 
     Attributes:
         trus_T_camera: (4, 4) of each epoch.
         marker_T_laser: (4, 4), or None.
-        track_stage_rad: absolute device angle that answers each of the case's tracks, None where not known.
+        track_stage_rad: true absolute device angle of each of the case's tracks, None where not known.
     """
 
     trus_T_camera: tuple[FloatArray, ...]
@@ -30,7 +30,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One session: what was measured, the queries, and the truth where it is known."""
+    """One session: measurements, tracking queries, and the ground truth where it is known."""
 
     name: str
     model: SessionModel
@@ -40,16 +40,16 @@ class Case:
 
     @property
     def pms(self) -> tuple[int, ...]:
-        """The PMs in the order in which they were first heard."""
+        """The PMs in the order of their first look."""
         return tuple(dict.fromkeys(pair.pm for pair in self.measurements.pairs))
 
     def pms_of_epoch(self, epoch: int) -> tuple[int, ...]:
-        """The PMs heard in one camera epoch."""
+        """The PMs of one camera epoch, in the order of their first look."""
         return tuple(dict.fromkeys(pair.pm for pair in self.measurements.pairs if pair.epoch == epoch))
 
     @property
     def largest_epoch(self) -> int:
-        """The camera epoch with the most PMs, the latest of them."""
+        """The camera epoch with the most PMs; the latest one if several have as many."""
         count = len(self.measurements.epochs)
         return max(range(count), key=lambda k: (len(self.pms_of_epoch(k)), k))
 
@@ -59,10 +59,13 @@ class EvaluationConfig:
     """What to compute.
 
     Attributes:
-        folds: of the k-fold cross-validation; 0: none.
-        leave_one_out: also leave out each PM by itself, up to ``most_left_out`` PMs (beyond: evenly spread ones).
-        sizes: numbers of pairs of the curve; None: from 4 in steps that give at most ``most_sizes``.
-        subsets: most subsets of each size; all of them where there are no more.
+        folds: number of folds of the cross-validation; 0: none.
+        leave_one_out: also leave out each PM alone.
+        most_left_out: largest number of these PMs; where there are more, evenly spread ones are used.
+        curve: compute the error against the number of pairs.
+        sizes: numbers of pairs of the curve; None: from 4, at most ``most_sizes`` of them.
+        most_sizes: largest number of sizes where ``sizes`` is None.
+        subsets: largest number of subsets of each size.
         seed: of folds and subsets.
         solve: settings of the estimate.
     """
@@ -87,7 +90,7 @@ class EvaluationConfig:
 
 
 def folds_of(case: Case, count: int, seed: int) -> tuple[tuple[int, ...], ...]:
-    """The PMs dealt into ``count`` folds at random, each camera epoch evenly; empty folds are left out."""
+    """Random folds of the PMs, stratified by camera epoch; empty folds are left out."""
     rng = np.random.default_rng([seed, 1])
     folds: list[list[int]] = [[] for _ in range(count)]
     place, dealt = 0, set()
@@ -101,7 +104,7 @@ def folds_of(case: Case, count: int, seed: int) -> tuple[tuple[int, ...], ...]:
 
 
 def left_out_one_by_one(case: Case, most: int) -> tuple[tuple[int, ...], ...]:
-    """Each PM by itself; evenly spread ones where there are more than ``most``."""
+    """Each PM alone; evenly spread ones where there are more than ``most``."""
     pms = case.pms
     if len(pms) > most:
         pms = tuple(pms[i] for i in np.linspace(0, len(pms) - 1, most).round().astype(int))

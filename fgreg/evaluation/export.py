@@ -1,4 +1,4 @@
-"""Evaluations as plain data: one JSON document, one long table."""
+"""Evaluations as plain data: a JSON document and a long CSV table."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from fgreg.evaluation.summary import (
 )
 
 COLUMNS = ("session", "table", "epoch", "pm", "pairs", "quantity", "value")
-"""Of the CSV file: one figure a line; ``quantity`` ends in its unit."""
+"""Columns of the CSV file: one figure per line; ``quantity`` ends in its unit."""
 
 
 def plain(value: Any) -> Any:
-    """Numbers that JSON can hold, None for those that are not finite; containers likewise."""
+    """A value as JSON types, also within containers; numbers that are not finite become None."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -38,12 +38,12 @@ def plain(value: Any) -> Any:
         return value
     if isinstance(value, int | np.integer):
         return int(value)
-    # Nine digits: sums in linear algebra libraries depend on where arrays lie in memory, in the last ones.
+    # Nine digits: the last digits of sums in linear algebra libraries depend on the alignment of arrays in memory.
     return float(f"{value:.9g}") if math.isfinite(value) else None
 
 
 def as_dict(evaluations: Sequence[SessionEvaluation]) -> dict[str, Any]:
-    """All figures as plain types; those that are not finite are None."""
+    """All figures as plain types; numbers that are not finite are None."""
     together: dict[str, Any] = {
         "sessions": len(evaluations),
         "tre_mm": _maybe(spread_of(all_tre_mm(evaluations))),

@@ -1,4 +1,4 @@
-"""What each PM does to the answer: what would change if it were left out, in closed form at the optimum.
+"""Influence of each PM on the registration: the change without it, in closed form at the optimum.
 
 The reduced problem is a sum over PMs, half cost = rest + part i. At the optimum the gradients cancel, so without part i
 (gradient g, Hessian A) a Newton step moves the shared variables by (H - A)^-1 g. No solve is repeated.
@@ -24,7 +24,7 @@ class Influence:
         pm, epoch: which.
         step: (6,) right tangent by which leaving it out moves ``trus_T_camera``; infinite where the rest does not
             determine it.
-        moved_mm: mean distance that moves the targets; worst_moved_mm: the largest.
+        moved_mm: mean distance by which the targets then move; worst_moved_mm: the largest.
         expected_mm, expected_without_mm: predicted TRE (mean over targets) with and without it.
     """
 

@@ -1,8 +1,8 @@
-"""The published figure of merit (Eq. 12), under its own name: it is *not* a target registration error.
+"""The published figure of merit (Eq. 12), the pair residual: it is *not* a target registration error.
 
-A held-out pair's beam is carried into TRUS by the registration of the others; lambda and theta' are refitted for that
-pair alone, and the distance that remains between line and arc is the ``pair_residual``. Both refits absorb error: a
-registration that has rolled about the probe's axis by 25 mm can read 0.7 mm.
+The beam of a held-out pair is transformed to TRUS by the registration of the others. lambda and theta' are refitted for
+that pair alone; the remaining distance between line and arc is the ``pair_residual``. Both refits absorb error: a
+registration that is rotated about the probe's axis by 25 mm can have a residual of 0.7 mm.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray
 
 HALF_ARC_RAD = math.pi / 2.0
-"""The arc that is searched reaches this far to either side of the image plane."""
+"""The arc is searched up to this angle on either side of the image plane."""
 GRID = 181
 NEWTON_STEPS = 8
 
@@ -39,8 +39,8 @@ def line_to_arc(
 ) -> LineToArc:
     """Least distance between beams and the arcs of looks, over lambda and theta' (within 90 deg of the plane).
 
-    With P the projector across the beam and a(theta') the arc point, ``f = |P (a - p)|^2`` is searched on a grid of one
-    degree and polished by Newton steps: f has up to two minima on the half circle, so no local search alone will do.
+    With P the projector normal to the beam and a(theta') the arc point, ``f = |P (a - p)|^2`` is searched on a 1 deg
+    grid and refined by Newton steps: f has up to two minima on the half circle, so a local search is not enough.
 
     Args:
         trus_p, trus_d: (n, 3) a point on each beam (mm) and its unit direction, TRUS.

@@ -24,7 +24,7 @@ MOST_BARS = 60
 
 
 def new_figure(width: float = 6.4, height: float = 4.0) -> Figure:
-    """An empty figure that no display and no global state is tied to.
+    """An empty figure without a display or global state.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -37,7 +37,7 @@ def new_figure(width: float = 6.4, height: float = 4.0) -> Figure:
 
 
 def save_plots(evaluations: Sequence[SessionEvaluation], folder: Path, file_format: str = "png") -> list[Path]:
-    """Write the plots that these evaluations have figures for; returns the files.
+    """Write the plots for which these evaluations have figures; returns the files.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -57,7 +57,7 @@ def save_plots(evaluations: Sequence[SessionEvaluation], folder: Path, file_form
         for name, figure in figures.items():
             if figure is not None:
                 path = folder / f"{name}.{file_format}"
-                # No date in the file: the same figures give the same bytes.
+                # No date in the file, so that the same figures give the same bytes.
                 figure.savefig(path, metadata={"Date": None} if file_format == "svg" else None)
                 written.append(path)
     except OSError as error:
@@ -145,7 +145,7 @@ def held_out_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
 
 
 def influence_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
-    """How far the targets move if a PM is left out; the session where one moves them farthest."""
+    """Distance by which the targets move if a PM is left out, in the session with the largest influence."""
     chosen = [e for e in evaluations if any(np.isfinite(i.moved_mm) for i in e.whole.influence)]
     if not chosen:
         return None

@@ -1,4 +1,4 @@
-"""Solve again from some of the PMs, and see what that says about the others."""
+"""Cross-validation: solve from some of the PMs and predict the others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ REFINEMENTS = 5
 
 @dataclass(frozen=True, slots=True)
 class HeldOutPm:
-    """How well a PM was predicted by a solve without it.
+    """Prediction error of a PM by a solve without it.
 
     Attributes:
         pm, epoch: which.
@@ -47,9 +47,9 @@ class Resolved:
 
     Attributes:
         kept: their numbers.
-        failure: why there is no answer; empty where there is one.
+        failure: why there is no registration; empty where there is one.
         trus_T_camera: (4, 4) of each of the session's epochs, None where not solved.
-        ambiguous: two registrations explain the pairs and cannot be told apart; this is the better one.
+        ambiguous: a second registration explains the pairs about as well; this is the better one.
         expected_mm: predicted TRE (root of the expected square, mean over targets) of each epoch, from the Hessian.
         tre_mm: errors (n,) at the targets of each epoch against the truth, None where not known.
         held_out: the PMs left out, where their epoch was solved.
@@ -65,7 +65,7 @@ class Resolved:
 
 
 def resolve(case: Case, kept: Sequence[int], config: EvaluationConfig, held: Sequence[int] | None = None) -> Resolved:
-    """Register from the kept PMs (and all aims), from no guess, and predict the held-out ones.
+    """Register from the kept PMs and all aims, without an initial guess, and predict the held-out PMs.
 
     Args:
         case: the session.
@@ -114,7 +114,8 @@ def pair_residuals(state: SharedState, epochs: Sequence[int], pairs: Sequence[Pa
     """Eq. 12 for pairs (n,): distances (mm) between beam and arc, lambda and theta' refitted.
 
     Args:
-        state: the estimate (one hypothesis). epochs: the pairs' numbers of its epochs, in its order.
+        state: the estimate (one hypothesis).
+        epochs: epoch numbers of the pairs, in the order of the state's epochs.
         pairs: of those epochs.
     """
     marker = np.stack([pair.marker.camera_T_marker for pair in pairs])
@@ -134,12 +135,12 @@ def pair_residuals(state: SharedState, epochs: Sequence[int], pairs: Sequence[Pa
 
 
 def predict(registration: Registration, pairs: Sequence[Pair]) -> tuple[HeldOutPm, ...]:
-    """PMs that did not enter a registration against what it predicts; those of unsolved epochs are left out.
+    """Prediction errors of PMs that did not enter a registration; those of unsolved epochs are left out.
 
-    NIS: with everything private to the PM eliminated its cost around the estimate is c + 2 g'd + d'Ad in the shared
-    deviation d, which has information H from the others. The least of the sum with d'Hd is c - g'(H + A)^-1 g: the
-    squared misfit over its predicted covariance. Degrees of freedom: two equations a beam and three a look, less the
-    PM's three coordinates.
+    NIS: with all private variables of the PM eliminated, its cost near the estimate is c + 2 g'd + d'Ad in the shared
+    deviation d, which has information H from the others. The minimum of the sum with d'Hd is c - g'(H + A)^-1 g: the
+    squared misfit over its predicted covariance. Degrees of freedom: two equations per beam and three per look, less
+    the PM's three coordinates.
     """
     pairs = [pair for pair in pairs if pair.epoch in registration.epochs]
     if not pairs:

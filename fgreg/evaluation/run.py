@@ -1,7 +1,7 @@
-"""Evaluate sessions: all the solves it takes, over all cores, in a fixed order.
+"""Evaluate sessions: all solves, over all cores, in a fixed order.
 
-What is computed does not depend on the number of processes: tasks are listed first, with their subsets drawn by seed,
-and results come back in that order.
+The results do not depend on the number of processes: tasks are listed first, with subsets drawn by seed, and results
+are returned in that order.
 """
 
 from __future__ import annotations
@@ -30,20 +30,21 @@ from fgreg.registration.verdict import Condition
 from fgreg.workers.threads import one_thread_each
 
 Progress = Callable[[str, int, int], None]
-"""Called with the step's name, items done and items in all."""
+"""Called with (name of the step, items done, total items)."""
 STEP = "evaluating"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WholeSolve:
-    """The solve of everything, and its errors where the truth is known.
+    """The solve of all measurements, and its errors where the truth is known.
 
     Attributes:
         verdict, reasons: of the session.
-        trus_T_camera: (4, 4) of each epoch, None where none. epoch_pms: PMs of each.
-        predicted: TRE that the posterior predicts, per epoch.
+        trus_T_camera: (4, 4) of each epoch, None where not solved.
+        epoch_pms: number of PMs of each epoch.
+        predicted: TRE predicted by the posterior, per epoch.
         tre_mm: errors (n,) at the targets, per epoch. beam_angle_rad, beam_offset_mm: of the laser line.
-        track_error_rad, track_sigma_rad: answer less truth, and its predicted sigma, per track; None where unknown.
+        track_error_rad, track_sigma_rad: result less truth, and its predicted sigma, per track; None where unknown.
         influence: of every PM used.
     """
 
@@ -62,7 +63,7 @@ class WholeSolve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizedSolves:
-    """The solves of the curve with one number of pairs."""
+    """The solves of the curve from ``pairs`` pairs."""
 
     pairs: int
     solves: tuple[Resolved, ...]
@@ -70,10 +71,10 @@ class SizedSolves:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionEvaluation:
-    """All that was found about one session.
+    """The evaluation of one session.
 
     Attributes:
-        name: of the session. whole: the solve of everything.
+        name: of the session. whole: the solve of all measurements.
         leave_one_out, k_fold: solves without one PM, and without one fold of them.
         curve: solves from fewer PMs of ``curve_epoch``, by size.
     """
@@ -88,7 +89,7 @@ class SessionEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One solve: of everything where ``kept`` is None; ``held``: PMs to predict."""
+    """One solve from the PMs ``kept``, or from all measurements where None; ``held``: PMs to predict."""
 
     case: int
     kept: tuple[int, ...] | None
@@ -97,7 +98,7 @@ class _Task:
 
 @dataclass(slots=True, eq=False)
 class _Work:
-    """What every process holds: filled once, when the process starts."""
+    """Shared input of the tasks, set once when a worker process starts."""
 
     cases: Sequence[Case] = ()
     conditions: Sequence[Sequence[Condition]] = ()
@@ -155,7 +156,7 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
 
 
 def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, int, _Task]]:
-    """(kind, size, task) of everything to be computed for one case, in order."""
+    """(kind, size, task) of all solves for one case, in order."""
     pms = case.pms
     out: list[tuple[str, int, _Task]] = [("whole", 0, _Task(index, None))]
 
@@ -187,9 +188,9 @@ def evaluate(
     Args:
         cases: the sessions.
         config: what to compute.
-        jobs: processes; 1 stays in this one. More need the caller's script to be importable (guard its main).
-        progress: called as solves are done.
-        conditions: of each case, found before (detection), for its verdict.
+        jobs: number of processes; 1 uses this one. More require an importable main script (guard its main).
+        progress: called after each solve.
+        conditions: conditions of each case's verdict from its detection.
     """
     config = config or EvaluationConfig()
     listed = [_tasks(index, case, config) for index, case in enumerate(cases)]
@@ -241,7 +242,7 @@ def _results(
         finally:
             _load((), (), EvaluationConfig())
         return
-    # Fresh processes: a fork would inherit the threads of linear algebra libraries in whatever state they are.
+    # spawn: a fork would inherit the threads of the linear algebra libraries in an undefined state.
     context = multiprocessing.get_context("spawn")
     with one_thread_each(), ProcessPoolExecutor(jobs, context, _load, (cases, conditions, config)) as pool:
         try:

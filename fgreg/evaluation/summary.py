@@ -1,4 +1,4 @@
-"""Figures from evaluations: what the tables, files and plots show."""
+"""Summary statistics of evaluations, for tables, files and plots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUANTILE = 0.95
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Mean, standard deviation, 95 % quantile and largest of some figures; ``count`` of them."""
+    """Mean, standard deviation, 95 % quantile and maximum of ``count`` values."""
 
     count: int
     mean: float
@@ -28,7 +28,7 @@ class Spread:
 
 
 def spread_of(values: Sequence[float] | np.ndarray[Any, Any]) -> Spread | None:
-    """None of no values."""
+    """Statistics of absolute values; None where there are none."""
     array = np.abs(np.asarray(values, dtype=np.float64).ravel())
     if array.size == 0:
         return None
@@ -43,13 +43,13 @@ def spread_of(values: Sequence[float] | np.ndarray[Any, Any]) -> Spread | None:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """How held-out PMs were predicted.
+    """Prediction errors of held-out PMs.
 
     Attributes:
         pair_residual_mm: Eq. 12 over the PMs (not a TRE).
         nis_per_degree: sum of NIS over sum of degrees of freedom; 1 where the stated noise is right.
         beyond_95: share of PMs whose NIS is beyond the 95 % quantile of its chi square.
-        failed: solves without an answer.
+        failed: solves without a registration.
     """
 
     pair_residual_mm: Spread
@@ -59,7 +59,7 @@ class Prediction:
 
 
 def prediction_of(solves: Sequence[Resolved]) -> Prediction | None:
-    """None where no PM was predicted."""
+    """Pooled prediction errors of solves; None where no PM was predicted."""
     held: list[HeldOutPm] = [pm for solve in solves for pm in solve.held_out]
     residual = spread_of([pm.pair_residual_mm for pm in held])
     if residual is None:
@@ -78,8 +78,8 @@ class CurvePoint:
     """The curve at one number of pairs.
 
     Attributes:
-        pairs: used. subsets: tried. failed: of them without an answer. ambiguous: share of two registrations that
-            cannot be told apart.
+        pairs: number used. subsets: number solved. failed: those without a registration.
+        ambiguous: share of subsets with a second registration that explains the pairs about as well.
         tre_mm: over subsets and targets, where the truth is known. expected_mm: mean predicted TRE over subsets.
         pair_residual_mm: of the PMs not used (Eq. 12), where there are any.
         tre_rms_mm: root mean square over subsets and targets.
@@ -96,7 +96,7 @@ class CurvePoint:
 
 
 def curve_point(sized: SizedSolves, epoch: int) -> CurvePoint:
-    """Figures of one size."""
+    """Statistics of one size."""
     answered = [solve for solve in sized.solves if not solve.failure]
     errors = [e for solve in answered if (e := solve.tre_mm[epoch]) is not None]
     expected = [mm for solve in answered if (mm := solve.expected_mm[epoch]) is not None]
@@ -123,7 +123,7 @@ def pooled_curve(evaluations: Sequence[SessionEvaluation]) -> tuple[CurvePoint, 
     by_size: dict[int, list[Resolved]] = {}
     for evaluation in evaluations:
         for sized in evaluation.curve:
-            # Only the curve's own epoch counts: bring it to the front.
+            # Only the curve's epoch is used: move it to index 0.
             k = evaluation.curve_epoch
             for solve in sized.solves:
                 moved = (
@@ -149,5 +149,5 @@ def all_tre_mm(evaluations: Sequence[SessionEvaluation]) -> np.ndarray[Any, Any]
 
 
 def all_track_errors_deg(evaluations: Sequence[SessionEvaluation]) -> np.ndarray[Any, Any]:
-    """Errors of all answered tracks with a known truth, degrees."""
+    """Errors of all solved tracks with a known truth, degrees."""
     return np.degrees([e for item in evaluations for e in item.whole.track_error_rad if e is not None])

@@ -1,4 +1,4 @@
-"""Evaluations for people: tables in a terminal, plain 80 columns elsewhere."""
+"""Evaluations as tables: in colour in a terminal, plain text of 80 columns elsewhere."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fgreg.model.estimate import Verdict
 
 MOST_ROWS = 40
 MOST_INFLUENCES = 4
-"""Tables of influence are printed for so many sessions."""
+"""Tables of influence are printed for up to this many sessions."""
 STYLES = {Verdict.OK: "bold green", Verdict.WARNING: "bold yellow", Verdict.REFUSED: "bold red"}
 NOT_A_TRE = (
     "pair residual: line to arc of a pair held out, lambda and theta refitted (Eq. 12 of the publication). It is not a "
@@ -34,7 +34,7 @@ NOT_A_TRE = (
 
 
 def print_evaluation(evaluations: Sequence[SessionEvaluation], console: Console | None = None) -> None:
-    """Print all tables; in colour on a terminal, without trailing blanks elsewhere."""
+    """Print all tables; in colour in a terminal, without trailing blanks elsewhere."""
     console = console or Console(highlight=False, emoji=False)
     tables = Group(*_everything(evaluations))
     if console.is_terminal:
