@@ -107,7 +107,7 @@ def test_a_bmode_picture_lies_in_the_plane_with_its_pixels_size_and_goes_when_it
 
 def test_a_picture_whose_place_is_not_known_is_shown_beside_only_and_says_so(tmp_path: Path) -> None:
     rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), bmode(placed=False))])
-    assert "where it lies in the plane is not known" in rows["/bmode/caption"][-1].values["Points2D:labels"][0]
+    assert "its position in the plane is not known" in rows["/bmode/caption"][-1].values["Points2D:labels"][0]
     (plane,) = rows["/world/stage/plane"]
     assert len(plane.values["Mesh3D:albedo_texture_buffer"][0]) == 3
 

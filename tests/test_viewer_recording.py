@@ -426,7 +426,7 @@ def test_a_folder_that_does_not_exist_is_bad_input(tmp_path: Path) -> None:
 def test_nothing_but_a_recording_is_written_over(tmp_path: Path) -> None:
     path = tmp_path / "events.jsonl"
     path.write_text("{}")
-    with pytest.raises(InputError, match="a file that is no recording"):
+    with pytest.raises(InputError, match="a file that is not a recording"):
         open_viewer(path, "a")
     assert path.read_text() == "{}"
 

@@ -1,1 +1,1 @@
-"""The Rerun recording of a session: what is drawn, where, and the blueprint that shows it."""
+"""The Rerun recording of a session: its entities and its blueprint."""

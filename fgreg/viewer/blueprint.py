@@ -1,4 +1,4 @@
-"""How a recording looks when it is opened: the views, their places, and where the 3D view is seen from."""
+"""The blueprint of a recording: its views, their layout, and the eye of the 3D view."""
 
 from __future__ import annotations
 
@@ -24,14 +24,17 @@ BACKGROUND = {
     Verdict.REFUSED: (58, 10, 12),
 }
 ACCUMULATED = ("world/looks/arc", "world/looks/beam", "world/looks/pm", "world/looks/pm_95")
-"""Entities of which every shot up to the time cursor is shown, not only the newest."""
+"""Entities that are shown for every shot up to the time cursor, not only for the newest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What there is to show, so that no view stands empty; ``pa_size`` in pixels, (rows, columns).
+    """What a recording contains, so that no view is empty.
 
-    ``online``: moments; ``now``: of a session under way, which ``registered`` tells to have a registration.
+    Attributes:
+        left, right: endoscope images. bmode: B-mode images. result: text of a result.
+        pa_size: photoacoustic frames, (rows, columns) px; None without.
+        online: states per shot. now: of a live session. registered: the live session has a registration.
     """
 
     left: bool = False
@@ -45,7 +48,7 @@ class Contents:
 
 
 def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None) -> rrb.Blueprint:
-    """The blueprint: the world large at the left; at the right images, text, residuals; at the last shot."""
+    """The blueprint: the 3D world at the left; images, text and plots at the right; the cursor at the last shot."""
     import rerun.blueprint as rrb
 
     until_now = rrb.VisibleTimeRanges(
@@ -106,7 +109,7 @@ def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None)
     rows_right.append(rrb.Tabs(*text, active_tab=0))
     shares.append(1.1)
     if contents.online:
-        second = ("online/stage_deg", "Stage, deg") if contents.now else ("online/nis", "NIS as it came")
+        second = ("online/stage_deg", "Stage, deg") if contents.now else ("online/nis", "NIS per pair")
         rows_right.append(
             rrb.Horizontal(
                 rrb.TimeSeriesView(

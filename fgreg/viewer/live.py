@@ -1,4 +1,4 @@
-"""Draws shots with what is known at their time: the registration moves as pairs come in."""
+"""Draws shots with the estimate at their time: the registration changes as pairs come in."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fgreg.viewer import shapes as shapes
 from fgreg.viewer.status_line import Now, goal_line, now_markdown
 
 LARGEST_PLOTTED_MM = 30.0
-"""A predicted error beyond this says no more than that nothing is known yet."""
+"""Larger predicted errors are plotted at this value."""
 
 
 Reach = Callable[[FloatArray, FloatArray], float | None]
@@ -26,17 +26,17 @@ Reach = Callable[[FloatArray, FloatArray], float | None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One shot, and what was known right after it.
+    """One shot, and the estimate right after it.
 
     Attributes:
         t: seconds. number: of the shot among all aims, pairs and tracks, from 0.
-        shot: the measurement; None where nothing was recognised, and where it is a move of the camera.
+        shot: the measurement; None where nothing was detected, and for a camera move.
         note: a line for the log.
         trus_T_camera: (4, 4), None where there is none yet. covariance: (6, 6) over its right tangent.
-        marker_T_laser: (4, 4) the beam.
+        marker_T_laser: (4, 4), None where there is none yet.
         tre, verdict, reasons, pairs, nis, used: as in an online estimate.
-        answer: to a track.
-        now: of a session that is under way; None where one is replayed.
+        answer: result of a track.
+        now: status of a live session; None in a replay.
         epoch: of the camera.
     """
 
@@ -59,7 +59,7 @@ class Moment:
 
 
 class LivePainter:
-    """Draws moments, one after another, into a recording that :meth:`fgreg.viewer.recording.Viewer.session` began."""
+    """Draws moments in order into a recording that :meth:`fgreg.viewer.recording.Viewer.session` started."""
 
     def __init__(self, rec: shapes.Recorder, model: SessionModel) -> None:
         self._rec, self._model = rec, model
@@ -69,7 +69,7 @@ class LivePainter:
         self._depth_mm = beyond + 5.0
 
     def draw(self, moment: Moment, *, textured: bool) -> None:
-        """Draw one; ``textured``: its frame is on the image plane already."""
+        """Draw one moment; ``textured``: its frame is already on the image plane."""
         self._last = (moment.t, moment.number)
         self._rec.at(*self._last)
         self._registration(moment)
@@ -94,7 +94,7 @@ class LivePainter:
         self._figures(moment)
 
     def _now(self, moment: Moment, now: Now) -> None:
-        """Where the stage is and where it should be, and the verdict as a colour."""
+        """Draw the current and the desired stage angle, and the verdict as a colour."""
         import rerun as rr
 
         rec, stage = self._rec, self._model.stage
@@ -180,7 +180,7 @@ class LivePainter:
         self._rec.log("world/stage/label", shapes.point(corner, shapes.SOUND, 1.0, label))
 
     def _beam(self, moment: Moment, shot: Pair | Track, reach: Reach, *, keep: bool) -> FloatArray | None:
-        """The shot's beam to its end, which it returns: ``reach`` gives its length in TRUS."""
+        """Draw the shot's beam; returns its end (3,), TRUS mm. ``reach`` gives its length, ``keep`` keeps it drawn."""
         transform, laser = moment.trus_T_camera, moment.marker_T_laser
         if transform is None or laser is None:
             self._rec.clear("world/shot/beam")
@@ -222,12 +222,12 @@ class LivePainter:
         )
 
     def to_end(self) -> None:
-        """What is logged next belongs to the last moment."""
+        """Set the time to that of the last moment for what is logged next."""
         self._rec.at(*self._last)
 
 
 def banner(moment: Moment) -> tuple[str, shapes.Color]:
-    """The verdict in a word and a colour; a lost device counts for more than a good registration."""
+    """The verdict as a word and a colour; a lost device overrides the colour of a good registration."""
     lost = () if moment.now is None else moment.now.lost
     gone = f"; LOST: {', '.join(lost)}" if lost else ""
     if moment.trus_T_camera is None:
@@ -239,7 +239,7 @@ def banner(moment: Moment) -> tuple[str, shapes.Color]:
 
 
 def moment_markdown(moment: Moment) -> str:
-    """The summary page of a moment: what was known then."""
+    """The summary page of a moment, with the estimate at that time."""
     tre = moment.tre
     worst = "not known" if tre is None else f"{tre.worst_mm:.2f} mm"
     state = "No registration yet" if moment.trus_T_camera is None else f"At {moment.t:.1f} s: {moment.verdict.value}"
@@ -249,7 +249,7 @@ def moment_markdown(moment: Moment) -> str:
 
 
 def nearest_on(strip_mm: FloatArray) -> Reach:
-    """How far along a beam (origin (3,), unit direction (3,)) it comes nearest to a curve (n, 3), mm."""
+    """The length (mm) along a beam at which it is nearest to a curve (n, 3)."""
 
     def reach(origin: FloatArray, direction: FloatArray) -> float | None:
         along = (strip_mm - origin) @ direction

@@ -1,6 +1,6 @@
-"""The viewer's null twin, which takes the same calls and does nothing, and the choice between the two.
+"""The null viewer, which takes the same calls and does nothing, and the choice between the two.
 
-Loads nothing: a run without a recording need not import what draws one.
+A run without a recording does not import Rerun or the code that draws.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class NullViewer:
 
 
 def open_viewer(rrd: Path | None, session_name: str, url: str | None = None) -> Viewer | NullViewer:
-    """A viewer that records to ``rrd``, shows in the running viewer at ``url``, or its null twin where both are None.
+    """A viewer that records to ``rrd`` and shows in the running viewer at ``url``; the null viewer where both are None.
 
     Raises:
         InputError: the folder of ``rrd`` does not exist or cannot be written to, or ``rrd`` is a folder.

@@ -1,4 +1,4 @@
-"""A photoacoustic frame as a picture with square pixels in (x, range), and where a detection lies on it."""
+"""A photoacoustic frame as an image with square pixels in (x, range), and the pixel coordinates of points."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from fgreg.model.session_model import ProbeModel
 DYNAMIC_RANGE_DB = 30.0
 """Largest range shown between black and white, below the frame's own maximum."""
 NOISE_QUANTILE = 0.92
-"""Black is not below this quantile of the pixels: most of a frame is noise."""
+"""Pixels below this quantile are black: most of a frame is noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaPicture:
-    """A frame as shown: rows are range, downwards; columns are TRUS x, to the right.
+    """A frame as an image: rows are range, downwards; columns are TRUS x, to the right.
 
     Attributes:
-        image: (rows, columns) uint8, compressed logarithmically.
+        image: (rows, columns) uint8, logarithmic.
         range_mm, x_mm: of the centre of pixel [0, 0].
         pixel_mm: side of a pixel.
         wavefront: whether rows of a column are arrival times, so that a point shows as a curve (channel data).
@@ -53,7 +53,7 @@ class PaPicture:
 
 
 def sample_ranges_mm(samples: int, probe: ProbeModel) -> FloatArray:
-    """(samples,) range that a wave arriving at each sample of channel data has come from: c (t0 + s / fs - delay)."""
+    """(samples,) range in mm of each sample of channel data: c (t0 + s / fs - delay)."""
     if probe.channels is None:
         raise ValueError("the probe has no channels")
     time_us = probe.channels.t0_us + np.arange(samples) / probe.channels.sampling_mhz - probe.channels.pulse_delay_us
@@ -61,9 +61,9 @@ def sample_ranges_mm(samples: int, probe: ProbeModel) -> FloatArray:
 
 
 def pa_picture(frame: npt.NDArray[np.generic], probe: ProbeModel, largest_side: int = 480) -> PaPicture | None:
-    """The picture of a frame, None where the probe does not say how its frames are sampled.
+    """The image of a frame; None where the probe does not define the sampling of its frames.
 
-    Each pixel is the largest absolute value of the samples it covers, so a short pulse is never lost between pixels.
+    Each pixel is the largest absolute value of the samples it covers, so that no short pulse is lost.
     """
     if frame.ndim != 2:
         return None
@@ -96,7 +96,7 @@ def pa_picture(frame: npt.NDArray[np.generic], probe: ProbeModel, largest_side: 
 
 
 def _resampled(values: FloatArray, at_mm: FloatArray, pixel_mm: float) -> FloatArray:
-    """Rows at increasing ``at_mm`` as rows every ``pixel_mm``: the largest where several fall in, else the nearest."""
+    """Rows at increasing ``at_mm`` resampled to ``pixel_mm``: the maximum of several in one, else the nearest."""
     count = round((at_mm[-1] - at_mm[0]) / pixel_mm) + 1
     edges = at_mm[0] + (np.arange(count) - 0.5) * pixel_mm
     starts = np.searchsorted(at_mm, edges)
@@ -109,7 +109,7 @@ def _resampled(values: FloatArray, at_mm: FloatArray, pixel_mm: float) -> FloatA
 
 
 def _compressed(values: FloatArray) -> npt.NDArray[np.uint8]:
-    """Absolute values as grey levels, logarithmically from the noise up; all black where there is no signal."""
+    """Absolute values as logarithmic grey levels above the noise; all black without a signal."""
     values = np.where(np.isfinite(values), values, 0.0)
     top = float(values.max())
     if top <= 0.0:
@@ -120,7 +120,7 @@ def _compressed(values: FloatArray) -> npt.NDArray[np.uint8]:
 
 
 def texture(picture: PaPicture, largest_side: int = 160) -> npt.NDArray[np.uint8]:
-    """(rows, columns, 3) a small blue version of a picture, for the image plane in the 3D view."""
+    """(rows, columns, 3) a small blue version of an image, for the image plane in the 3D view."""
     rows, columns = picture.image.shape
     step = max(1, -(-max(rows, columns) // largest_side))
     small = np.maximum.reduceat(

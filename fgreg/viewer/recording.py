@@ -1,15 +1,15 @@
-"""The Rerun recording of a session; its null twin is in null_viewer.py.
+"""The Rerun recording of a session; the null viewer is in null_viewer.py.
 
 Entities, all in TRUS millimetres unless a parent's transform says otherwise:
 
 - ``world/probe``, ``world/trus``: the housing and the axes of TRUS.
-- ``world/stage``: turned to the shot's plane; ``plane`` (with the shot's frame on it), ``elements``, ``label`` below.
+- ``world/stage``: rotated to the shot's plane; ``plane`` (with the shot's frame on it), ``elements``, ``label`` below.
 - ``world/looks/{arc,beam,pm,pm_95}``: one entry per look; the blueprint shows all up to the time cursor.
 - ``world/shot/{arc,beam,pm,sound}``: those of the shot at the cursor, bold, with labels.
 - ``world/camera``: ``trus_T_camera`` of the epoch; ``left`` and ``right`` are pinholes with the endoscope's images,
   ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines below.
 - ``world/targets``: 95 % ellipsoids of the predicted error; ``world/truth``: PMs and camera where they are known.
-- Of a session under way: ``world/goal``, the plane in which the beam will be heard; ``bmode``; ``verdict``.
+- In a live session: ``world/goal``, the plane in which the PM will be detected; ``bmode``; ``verdict``.
 - ``pa``: the shot's photoacoustic frame with its detection; ``plots/*``; ``summary``; ``log``.
 
 Timelines: ``shot`` (number among all aims, pairs and tracks, from 0) and ``time`` (seconds, as in the events).
@@ -42,11 +42,11 @@ from fgreg.viewer.shapes import Image8
 from fgreg.viewer.status_line import BmodePicture
 
 LARGEST_TEXTURE = 160
-"""Larger side of a B-mode picture on the image plane, pixels."""
+"""Larger side of a B-mode image on the image plane, px."""
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a file is a Rerun recording: nothing else is ever written over."""
+    """Whether a file is a Rerun recording: no other file is overwritten."""
     if path.is_symlink() or not path.is_file():
         return False
     with path.open("rb") as file:
@@ -54,7 +54,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _part_of(rrd: Path) -> Path:
-    """The temporary file that becomes ``rrd``, made.
+    """Create the temporary file that becomes ``rrd``.
 
     Raises:
         InputError: ``rrd`` cannot be written.
@@ -62,26 +62,26 @@ def _part_of(rrd: Path) -> Path:
     if not rrd.parent.is_dir():
         raise InputError(str(rrd), "a folder that does not exist", "an existing folder for the recording")
     if os.path.lexists(rrd) and not _is_recording(rrd):
-        found = "a folder" if rrd.is_dir() else "a file that is no recording"
+        found = "a folder" if rrd.is_dir() else "a file that is not a recording"
         raise InputError(str(rrd), found, "a new name, or that of an older recording")
     part = rrd.with_name(f".{rrd.name}.{os.getpid()}.part")
     try:
         part.touch()
     except OSError as error:
-        raise InputError(str(rrd), f"a place that refuses files ({error.strerror})", "a writable one") from error
+        raise InputError(str(rrd), f"no access ({error.strerror})", "a writable one") from error
     return part
 
 
 class Viewer:
-    """Writes a recording while a session is worked on. Use as a context manager: the file appears at its end.
+    """Writes the recording of a session. Use as a context manager: the file appears at its end.
 
-    It is written under a temporary name beside its own and renamed when all is done; an exception leaves no file, and
-    an older one there as it was.
+    It is written under a temporary name in the same folder and then renamed. After an exception there is no new file,
+    and an older one is unchanged.
 
     Args:
-        rrd: the file to write; its folder has to exist. None: no file.
-        session_name: shown as the recording's name.
-        url: of a running viewer to show it in as well.
+        rrd: the file to write; its folder must exist. None: no file.
+        session_name: the recording's name.
+        url: of a running viewer that shows it too.
 
     Raises:
         InputError: the folder does not exist or cannot be written to, or ``rrd`` is a folder.
@@ -110,7 +110,7 @@ class Viewer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Finish the file and give it its name, or remove it after an exception."""
+        """Finish and rename the file, or remove it after an exception."""
         try:
             if not self._finished and self._live is None:
                 self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
@@ -125,7 +125,7 @@ class Viewer:
             self._part.unlink(missing_ok=True)
 
     def session(self, model: SessionModel) -> None:
-        """Draw what does not change: probe, array, axes, cameras, the marker's outline, the plots' styles."""
+        """Draw the static parts: probe, array, axes, cameras, the marker's outline, the plots' styles."""
         import rerun as rr
 
         self._model = model
@@ -144,7 +144,7 @@ class Viewer:
             rec.static("world/camera/marker/tags", shapes.strips(outlines, shapes.MARKER, 1.5))
         rec.static("world/camera/marker/axes", shapes.axes(8.0))
         rec.static("world/camera/marker/label", shapes.point([0.0, 0.0, 0.0], shapes.MARKER, 1.0, "marker"))
-        limit = rr.SeriesLines(colors=[shapes.UNUSED], names=["95 % of good looks are below"], widths=[1.0])
+        limit = rr.SeriesLines(colors=[shapes.UNUSED], names=["95 % of inlier looks are below"], widths=[1.0])
         rec.static("plots/nis/limit_95", limit)
         for name, color in (("plane", shapes.SOUND), ("beam", shapes.GOAL)):
             rec.static(f"online/stage_deg/{name}", rr.SeriesLines(colors=[color], names=[name], widths=[2.0]))
@@ -215,7 +215,7 @@ class Viewer:
             frame: (elements, samples) channel data or (depth, lateral) envelope.
             x_mm, range_mm: where the PM was found; None where it was not.
             covariance: (2, 2) over both, mm^2.
-            probe: how the frame is sampled; a frame it cannot be read with is left out.
+            probe: defines the sampling; a frame that does not fit it is left out.
         """
         picture = pa_picture(frame, probe)
         if picture is None:
@@ -231,7 +231,7 @@ class Viewer:
         corners = np.array([[low_x, 0.0, near], [high_x, 0.0, near], [high_x, 0.0, far], [low_x, 0.0, far]])
         rec.log("world/stage/plane", shapes.plane_mesh(corners, texture(picture)))
         rec.log("world/stage/outline", shapes.plane_outline(corners))
-        # The number of the shot is part of the caption: at later shots without a frame this one stays.
+        # The caption has the shot's number, because the frame stays at later shots without one.
         found = "no source found" if x_mm is None or range_mm is None else f"x {x_mm:.1f} mm, range {range_mm:.1f} mm"
         above = np.array([[0.5 * picture.image.shape[1], -0.1 * picture.image.shape[0]]])
         rec.log("pa/caption", shapes.points_2d(above, shapes.PM, 0.5, [f"shot {index}: {found}"]))
@@ -250,19 +250,19 @@ class Viewer:
             strip = picture.pixels(outline[:, 0], outline[:, 1])
             rec.log("pa/detection/ellipse", shapes.strips_2d([strip], shapes.PM, 0.8))
         if picture.wavefront:
-            # Dots, so that the wave itself can be seen between them.
+            # Dots, so that the wave is visible between them.
             x = np.sort(probe.element_x_mm)[::5]
             front = picture.pixels(x, np.hypot(x - x_mm, range_mm))
             front = front[front[:, 1] <= picture.image.shape[0]]
             rec.log("pa/detection/wavefront", shapes.points_2d(front, shapes.PM, 1.3))
 
     def bmode(self, t: float, index: int, picture: BmodePicture | None) -> None:
-        """Show a scanner's picture beside the others and, where it is known how it lies, on the image plane.
+        """Show a B-mode image in its view and, where its geometry is known, on the image plane.
 
         Args:
             t: seconds.
-            index: number of the moment, which is to be drawn next.
-            picture: None where the scanner is gone: then the last one is taken away.
+            index: number of the moment that is drawn next.
+            picture: None where the scanner is lost: then the last one is removed.
         """
         if self._model is None:
             raise AssertionError("the session comes first")
@@ -277,7 +277,7 @@ class Viewer:
         image, pixel_mm, origin_mm = picture.image, picture.pixel_mm, picture.origin_mm
         self._shown.add("bmode")
         rec.log("bmode", shapes.picture(shapes.canvas(image)))
-        text = f"t = {t:.1f} s" + ("" if pixel_mm and origin_mm else "; where it lies in the plane is not known")
+        text = f"t = {t:.1f} s" + ("" if pixel_mm and origin_mm else "; its position in the plane is not known")
         rec.log("bmode/caption", shapes.points_2d(caption, shapes.SOUND, 0.5, [text]))
         if pixel_mm is None or origin_mm is None:
             return
@@ -298,16 +298,16 @@ class Viewer:
         truth: Truth | None = None,
         tracks: Sequence[Track] = (),
     ) -> None:
-        """Draw the answer: registration, beams, arcs, PMs, targets, tracks, plots and text.
+        """Draw the result: registration, beams, arcs, PMs, targets, tracks, plots and text.
 
-        Where moments were drawn before, the shots stay as they were then, and only plots and text are added.
+        Where moments were drawn before, the shots stay unchanged, and only plots and text are added.
 
         Args:
             model: the session's set-up.
-            measurements: what entered the estimate.
-            estimate: the answer; its looks are matched to the measured pairs by time and PM.
+            measurements: those that entered the estimate.
+            estimate: the result; its looks are matched to the measured pairs by time and PM.
             truth: where it is known.
-            tracks: the queries behind ``estimate.tracks``, told apart by time; without one only the plane is shown.
+            tracks: the queries of ``estimate.tracks``, matched by time; without one only the plane is shown.
         """
         painter = ResultPainter(
             rec=self._rec,
@@ -341,9 +341,9 @@ class Viewer:
         )
 
     def moment(self, moment: Moment) -> None:
-        """Draw a shot with what is known at its time: the recording then shows the registration as it moves.
+        """Draw a shot with the estimate at its time, so that the recording shows how the registration changes.
 
-        To be called after :meth:`session` and the shot's images.
+        Call it after :meth:`session` and after drawing the shot's images.
         """
         if self._model is None:
             raise AssertionError("the session comes first")
@@ -354,7 +354,7 @@ class Viewer:
             if moment.trus_T_camera is not None and moment.verdict is not Verdict.REFUSED:
                 self._shown.add("registered")
         contents = self._contents(result=True)
-        if contents != self._arranged:  # seldom: whoever looks may have turned the view
+        if contents != self._arranged:  # rare, because it resets a view that the user may have rotated
             self._arranged = contents
             eye = None
             if moment.now is not None:
@@ -363,7 +363,7 @@ class Viewer:
                     points = np.vstack([points, moment.trus_T_camera[:3, 3]])
                 eye = scene.best_eye(points)
             self._rec.blueprint(make_blueprint(contents, None, eye))
-        if moment.now is not None and "camera" in moment.now.lost:  # an old picture would look like a new one
+        if moment.now is not None and "camera" in moment.now.lost:  # an old image would look like a new one
             self._rec.at(moment.t, moment.number)
             for side, shape in self._shapes.items():
                 self._rec.log(f"world/camera/{side}", shapes.no_picture(shape))

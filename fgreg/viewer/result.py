@@ -1,4 +1,4 @@
-"""Draws a session's answer into its recording: what each shot shows, plots, summary, and what the eye has to see."""
+"""Draws a session's result into its recording: shots, plots, summary, and the points that the view must contain."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from fgreg.viewer import shapes as shapes
 from fgreg.viewer.summary_page import summary_markdown
 
 FAR_MM = 1000.0
-"""A camera farther from the probe than this is not what the opening picture is fitted to."""
+"""A camera farther from the probe than this is not included in the initial view."""
 
 
 class Truth(Protocol):
-    """What is known of the truth: ``trus_T_camera`` per epoch, and the PMs (3,) by number."""
+    """The known part of the ground truth: ``trus_T_camera`` per epoch, and the PMs (3,) mm by number."""
 
     @property
     def trus_T_camera(self) -> Sequence[FloatArray]: ...
@@ -32,13 +32,13 @@ class Truth(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResultPainter:
-    """One answer on its way into one recording.
+    """Draws one result into one recording.
 
     Attributes:
         rec: where to draw.
         model, measurements, estimate, truth: of the session.
-        tracks: the queries behind ``estimate.tracks`` whose marker was found.
-        textured: numbers of the shots whose frame is on the image plane already.
+        tracks: the queries of ``estimate.tracks`` whose marker was found.
+        textured: numbers of the shots whose frame is already on the image plane.
     """
 
     rec: shapes.Recorder
@@ -79,7 +79,7 @@ class ResultPainter:
     def paint_end(self, *, judged_last: bool = False) -> None:
         """Draw what does not belong to a shot: plots, summary, the true PMs.
 
-        ``judged_last``: the judgement belongs to the present moment and those after it only, not to all.
+        ``judged_last``: the verdict holds from the present moment on, not for all times.
         """
         if self.estimate.verdict is Verdict.REFUSED:
             shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
@@ -87,7 +87,7 @@ class ResultPainter:
         self._static(self.rec.log if judged_last else self.rec.static)
 
     def eye_points(self) -> FloatArray:
-        """(n, 3) what the opening picture has to hold: probe, planes, cameras and markers."""
+        """(n, 3) points that the initial view must contain: probe, planes, cameras and markers."""
         probe = self.model.probe
         half = scene.array_length_mm(probe) / 2.0 + 10.0
         corners = scene.plane_corners_mm(probe, self._depth_mm())
@@ -139,7 +139,7 @@ class ResultPainter:
         else:
             label = f"PM {pair.pm}" + ("" if pair.used else " (not used)")
             self.rec.log("world/shot/pm", shapes.point(pair.trus_p_pm_mm, color, 5.0, label))
-            # The point, of one size at every zoom, is for ellipsoids too small to be seen.
+            # The point has the same size at every zoom, for ellipsoids that are too small to see.
             centre = shapes.small_points(pair.trus_p_pm_mm[None], color, 3.5)
             self.rec.log("world/looks/pm", centre)
             if pair.covariance is not None:
@@ -148,7 +148,7 @@ class ResultPainter:
         self._say(f"pair, PM {pair.pm}", pair.used, pair.reason, pair.residual_mm)
 
     def _sound(self, pair: PairEstimate, look: Look | None) -> None:
-        """The arc, the way the sound took along it, and the plane it was heard in."""
+        """Draw the arc, the sound path, and the image plane of a look."""
         if look is None:
             self.rec.clear("world/shot/arc", "world/shot/sound")
             return
@@ -200,7 +200,7 @@ class ResultPainter:
     def _beam(
         self, marker: MarkerObservation | None, lambda_mm: float | None, epoch: int, *, keep: bool
     ) -> FloatArray | None:
-        """The shot's beam from the laser frame's origin to its spot, which it returns; ``keep`` adds it to the rest."""
+        """Draw the beam from the laser frame's origin to its spot (3,), which is returned; ``keep`` keeps it drawn."""
         trus_T_camera, laser = self._trus_T_camera(epoch), self.estimate.laser
         if marker is None or lambda_mm is None or trus_T_camera is None or laser is None:
             self.rec.clear("world/shot/beam")
@@ -267,7 +267,7 @@ class ResultPainter:
             judge("world/verdict", shapes.point(above, shapes.REFUSED, 9.0, "REFUSED: do not use"))
 
     def _camera_errors(self) -> list[tuple[float, float]]:
-        """Per epoch with a known truth: how far off the camera is, mm and rad."""
+        """Per epoch with a known truth: error of the camera, mm and rad."""
         true = () if self.truth is None else self.truth.trus_T_camera
         errors = []
         for epoch, true_trus_T_camera in zip(self.estimate.epochs, true, strict=False):
@@ -288,21 +288,21 @@ class ResultPainter:
         return max(0, sum(epoch.start_s <= shot.t for epoch in self.estimate.epochs) - 1)
 
     def _query_of(self, answer: TrackEstimate) -> Track | None:
-        """The query of an answer; None where its marker was not found."""
+        """The query of a track's result; None where its marker was not found."""
         return next((track for track in self.tracks if track.t == answer.t), None)
 
     def _depth_mm(self) -> float:
-        """How deep the image plane is drawn: beyond the farthest PM and the farthest target."""
+        """Depth of the drawn image plane: beyond the farthest PM and the farthest target."""
         ranges = [pair.look.range_mm for pair in self.measurements.pairs]
         beyond = float(np.linalg.norm(self.model.targets_mm[:, 1:], axis=1).max()) - self.model.probe.radius_mm
         return max([*ranges, beyond]) + 5.0
 
 
 def measured_pairs(pairs: Sequence[PairEstimate], measurements: Measurements) -> tuple[Pair | None, ...]:
-    """The measured pair behind each estimated look, None where nothing was measured (no marker, no sound).
+    """The measured pair of each estimated look; None where nothing was measured (no marker, no sound).
 
-    Estimates list every look of the session, measurements only those that were detected; both are in event order, and
-    ``t`` and ``pm`` tell them apart. Where several looks share both, those in use are served first.
+    Estimates list every look of the session, measurements only the detected ones. Both are in event order and are
+    matched by ``t`` and ``pm``. Where several looks share both, used looks are matched first.
     """
     waiting: dict[tuple[float, int], list[Pair]] = {}
     for pair in measurements.pairs:

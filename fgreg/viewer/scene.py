@@ -1,6 +1,6 @@
-"""Geometry of what the recording shows, as plain arrays: no Rerun here, so that every number can be checked alone.
+"""Geometry of the recording as plain arrays, without Rerun, so that it can be tested alone.
 
-TRUS millimetres and radians unless a name says otherwise. The stage's frame ``plane`` turns with the image plane: it
+TRUS millimetres and radians unless a name says otherwise. The stage's frame ``plane`` rotates with the image plane: it
 equals ``trus`` at stage angle 0, so a point (x, 0, z) of it lies in the image plane at z from the rotation axis.
 """
 
@@ -24,16 +24,16 @@ CHI2_95_3 = 7.814728
 CHI2_95_2 = 5.991465
 """95 % quantile of chi-square with two degrees of freedom."""
 ARC_HALF_WIDTHS = 1.5
-"""How far an arc is drawn to either side, in half widths of the sensitivity window."""
+"""Drawn extent of an arc to either side, in half widths of the sensitivity window."""
 
 
 def trus_T_plane(scan_rad: float) -> FloatArray:
-    """(4, 4) from the turned image plane's frame to TRUS: +z goes to (0, sin t, cos t), a turn of -t about x."""
+    """(4, 4) from the rotated image plane's frame to TRUS: +z goes to (0, sin t, cos t), a rotation of -t about x."""
     return make_transform(exp_so3(np.array([-scan_rad, 0.0, 0.0])), np.zeros(3))
 
 
 def element_centre_mm(look: Look, probe: ProbeModel) -> FloatArray:
-    """(3,) the point of the array that the look's range is measured from."""
+    """(3,) the point of the array from which the look's range is measured."""
     t = look.scan_rad
     return np.array([look.x_mm, probe.radius_mm * math.sin(t), probe.radius_mm * math.cos(t)])
 
@@ -46,7 +46,7 @@ def arc_point_mm(look: Look, probe: ProbeModel, theta_rad: FloatArray | float) -
 
 
 def arc_strip_mm(look: Look, probe: ProbeModel, points: int = 25) -> FloatArray:
-    """(points, 3) the arc of a look over 1.5 half widths of the window to either side of its plane."""
+    """(points, 3) the arc of a look over 1.5 half widths of the sensitivity window to either side of its plane."""
     half = ARC_HALF_WIDTHS * float(probe.sensitivity.half_width_at(look.range_mm))
     rotation = np.linspace(-half, half, points)
     return arc_point_mm(look, probe, look.scan_rad + arc_of_rotation(rotation, look.range_mm, probe.radius_mm))
@@ -66,10 +66,10 @@ def plane_corners_mm(probe: ProbeModel, depth_mm: float) -> FloatArray:
 def picture_corners_mm(
     probe: ProbeModel, shape: tuple[int, int], pixel_mm: tuple[float, float], origin_mm: tuple[float, float]
 ) -> FloatArray:
-    """(4, 3) corners of a picture (rows, columns) in the image plane's frame, as :func:`plane_corners_mm` has them.
+    """(4, 3) corners of an image (rows, columns) in the image plane's frame, in the order of :func:`plane_corners_mm`.
 
     Args:
-        probe: of which the array's face is where depth begins.
+        probe: depth begins at its array's face.
         shape: rows and columns.
         pixel_mm: size of a pixel along depth and x.
         origin_mm: depth and x of the centre of the first pixel.
@@ -138,7 +138,7 @@ def marker_outlines_mm(marker: MarkerModel) -> list[FloatArray]:
 def frustum_strips_mm(camera: CameraModel | None, depth_mm: float) -> list[FloatArray]:
     """Outline of a camera in its own frame: the picture's rectangle at ``depth_mm`` and a line to each corner.
 
-    Distortion is left out. Where the camera is not known, a square of 50 degrees stands for it.
+    Distortion is ignored. An unknown camera is drawn as a square of 50 degrees.
     """
     if camera is None:
         half = depth_mm * math.tan(math.radians(25.0))
@@ -171,7 +171,7 @@ def shots_of(estimate: SessionEstimate) -> list[Shot]:
 
 
 def live_points_mm(probe: ProbeModel, targets_mm: FloatArray) -> FloatArray:
-    """(n, 3) what has to be in view before a camera stands anywhere: the probe, the targets, and room for a camera."""
+    """(n, 3) points of the view before the camera's pose is known: the probe, the targets, and room for a camera."""
     half = array_length_mm(probe) / 2.0
     beyond = 1.7 * float(np.linalg.norm(targets_mm[:, 1:], axis=1).max())
     ends = np.array([[side * half, 0.0, height] for side in (-1, 1) for height in (-probe.radius_mm, beyond)])
@@ -180,7 +180,7 @@ def live_points_mm(probe: ProbeModel, targets_mm: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
-    """Where to look from: position and what to look at, (3,) TRUS mm; up is TRUS +z."""
+    """Viewpoint of the 3D view: its position and the point it looks at, (3,) TRUS mm; up is TRUS +z."""
 
     position_mm: FloatArray
     target_mm: FloatArray
@@ -192,14 +192,14 @@ def best_eye(
     half_width: float = 0.42,
     trus_view: FloatArray | None = None,
 ) -> Eye:
-    """The eye from which points (n, 3) fill the view, seen from above and obliquely to the probe's axis.
+    """The eye from which points (n, 3) fill the view, from above and obliquely to the probe's axis.
 
-    Straight along the axis the probe is a disc, straight across it the arcs are lines: the eye stands 40 to 60 degrees
-    off the axis and 20 to 35 degrees up, in the one of the four quarters where the points are spread out most and the
-    endoscope's image is not seen edge on.
+    Along the axis the probe is a disc; across it the arcs are lines. So the eye is 40 to 60 degrees off the axis and 20
+    to 35 degrees up, in the quadrant with the largest spread of the points in the view that does not show the
+    endoscope's image edge on.
 
     Args:
-        points_mm: what has to be in view.
+        points_mm: points that must be in view.
         half_height, half_width: of the view, at distance 1 (tangents of half its angles, less a margin).
         trus_view: (3,) the direction in which the camera looks, where there is one; a unit vector.
     """
@@ -220,7 +220,7 @@ def best_eye(
     axes = np.column_stack([right, up, away])
     seen = points_mm @ axes
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2.0
-    for _ in range(6):  # what is near looks larger, so the middle of the picture is not that of the points
+    for _ in range(6):  # under perspective the centre of the view is not that of the points
         centred = seen - middle
         distance = _distance_that_shows(centred, half_height, half_width)
         projected = centred[:, :2] / (distance - centred[:, 2])[:, None]

@@ -1,6 +1,6 @@
-"""Small pieces a recording is made of: colours, a stream with two timelines, Rerun archetypes from arrays.
+"""Elements of a recording: colours, a stream with two timelines, Rerun archetypes from arrays.
 
-``rerun`` is imported when a piece is made, not when this module is: its import takes more than half a second.
+``rerun`` is imported at the first use, not with this module: its import takes more than half a second.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ TARGET: Color = (120, 112, 165)
 TRUTH: Color = (255, 80, 210)
 AXES: tuple[Color, ...] = ((235, 90, 90), (90, 210, 100), (100, 140, 255))
 IMAGE_DISTANCE_MM = 28.0
-"""From the camera to where its image is drawn."""
+"""Distance from the camera at which its image is drawn."""
 LARGEST_ELLIPSOID_MM = 50.0
-"""Half size beyond which an ellipsoid is not drawn."""
+"""Larger ellipsoids (half size) are not drawn."""
 CANVAS = 512
-"""Side of what pictures of changing sizes are shown on, pixels."""
+"""Side of the canvas for images of changing size, px."""
 BANNER = (6, 160)
 """Rows and columns of a strip of one colour."""
 NOWHERE = "not known"
@@ -72,12 +72,12 @@ class Recorder:
         self._stream.send_recording_name(name)
 
     def at(self, t: float, shot: int) -> None:
-        """What is logged next belongs to shot number ``shot``, at ``t`` seconds."""
+        """Set shot number and time (s) of what is logged next."""
         self._stream.set_time("shot", sequence=shot)
         self._stream.set_time("time", duration=t)
 
     def log(self, path: str, *what: rr.AsComponents) -> None:
-        """Log at the present moment."""
+        """Log at the current time."""
         self._stream.log(path, *what)
 
     def static(self, path: str, *what: rr.AsComponents) -> None:
@@ -85,38 +85,38 @@ class Recorder:
         self._stream.log(path, *what, static=True)
 
     def clear(self, *paths: str) -> None:
-        """From the present moment on, nothing is at or below these paths."""
+        """Clear these paths and all below them from the current time on."""
         import rerun as rr
 
         for path in paths:
             self._stream.log(path, rr.Clear(recursive=True))
 
     def series(self, path: str, shots: Sequence[int], seconds: Sequence[float], values: Sequence[float]) -> None:
-        """A whole plot at once."""
+        """Log all values of a plot at once; three sequences of the same length."""
         import rerun as rr
 
         indexes = [rr.TimeColumn("shot", sequence=shots), rr.TimeColumn("time", duration=seconds)]
         self._stream.send_columns(path, indexes=indexes, columns=rr.Scalars.columns(scalars=values))
 
     def blueprint(self, blueprint: rrb.Blueprint) -> None:
-        """How the recording opens."""
+        """Send the blueprint with which the recording opens."""
         self._stream.send_blueprint(blueprint)
 
     def close(self) -> None:
-        """Write out what is left and end the file."""
+        """Flush and end the recording."""
         self._stream.flush()
         self._stream.disconnect()
 
 
 def ui(points: float) -> float:
-    """A radius in screen points, the same at every zoom: Rerun takes negative radii so."""
+    """A radius in screen points, independent of zoom: Rerun reads negative radii that way."""
     return -points
 
 
 def transform(a_T_b: FloatArray | None) -> rr.Transform3D:
-    """A transform; where there is none, one to a frame that is nowhere: Rerun does not show what is below then.
+    """A transform; None becomes one to an unconnected frame, so that Rerun hides what is below.
 
-    A scale of 0 would not do: Rerun takes it for a mistake and shows everything at the parent's origin.
+    A scale of 0 does not work: Rerun treats it as an error and shows everything at the parent's origin.
     """
     import rerun as rr
 
@@ -169,7 +169,7 @@ def arrow(
 def ellipsoids(centres_mm: FloatArray, covariances: FloatArray, color: Color) -> rr.Ellipsoids3D:
     """95 % ellipsoids of (n, 3, 3) covariances about (n, 3) points.
 
-    Those longer than LARGEST_ELLIPSOID_MM are left out: they would hide the scene, and say no more than "unknown".
+    Those longer than LARGEST_ELLIPSOID_MM are left out: they would hide the scene and mean only "unknown".
     """
     import rerun as rr
 
@@ -193,7 +193,7 @@ def small_points(points_mm: FloatArray, color: Color, size: float) -> rr.Points3
 
 
 def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) -> rr.Mesh3D:
-    """The image plane: see-through, with a picture (rows, columns, 3) on it where there is one.
+    """The image plane: transparent, with an optional image (rows, columns, 3) on it.
 
     Args:
         corners_mm: (4, 3), the picture's first row first, each row from its first column; then back along the last.
@@ -206,14 +206,14 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
         vertex_positions=corners_mm,
         triangle_indices=triangles,
         vertex_texcoords=[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]],
-        # Without one, the picture before it would stay.
+        # Without a texture, the previous one would stay.
         albedo_texture=np.full((1, 1, 3), 255, dtype=np.uint8) if picture is None else picture,
         albedo_factor=(*PLANE, 110) if picture is None else (255, 255, 255, 160),
     )
 
 
 def plane_outline(corners_mm: FloatArray, color: Color = PLANE) -> rr.LineStrips3D:
-    """The edge of the image plane; the plane itself is hardly seen where light does not fall on it."""
+    """The outline of the image plane; the plane itself is hardly visible without light."""
     return strips([np.vstack([corners_mm, corners_mm[:1]])], color, 0.8)
 
 
@@ -248,7 +248,7 @@ def pinhole(camera: CameraModel, color: Color) -> rr.Pinhole:
 
 
 def draw_cameras(rec: Recorder, model: SessionModel, color: Color) -> None:
-    """The endoscope under ``world/camera``, in a colour; drawing again changes the colour."""
+    """Draw the endoscope under ``world/camera`` in a colour; a second call changes the colour."""
     rec.static("world/camera/label", point([0.0, 0.0, 0.0], color, 4.0, "camera"))
     rec.static("world/camera/axes", axes(10.0))
     if model.camera is None:
@@ -276,14 +276,14 @@ def flat(color: Color) -> rr.Image:
 
 
 def no_picture(shape: tuple[int, ...]) -> rr.EncodedImage | rr.Image:
-    """Black, in place of an old picture of this shape: Rerun's 2D view goes on showing one that is cleared."""
+    """A black image of this shape to replace an old one: Rerun's 2D view still shows an image after it is cleared."""
     return picture(np.zeros(shape, dtype=np.uint8))
 
 
 def canvas(image: Image8) -> Image8:
-    """(CANVAS, CANVAS, 3) BGR with a (h, w) grey or (h, w, 3) BGR picture as large as whole steps make it.
+    """(CANVAS, CANVAS, 3) BGR with a (h, w) grey or (h, w, 3) BGR image, scaled by a whole factor to fit.
 
-    Rerun takes JPEG pictures of one entity for a video, and loses it where their size or kind changes.
+    Rerun treats JPEG images of one entity as a video, and drops it where their size or kind changes.
     """
     larger = max(image.shape[:2])
     step, times = -(-larger // CANVAS), max(1, CANVAS // larger)
@@ -308,7 +308,7 @@ def strips_2d(strips_px: Sequence[FloatArray], color: Color, size: float) -> rr.
 
 
 def ruler(frame: PaPicture) -> rr.Points2D:
-    """Labelled marks every 10 mm along the left (range) and upper (x) edges of a photoacoustic picture."""
+    """Labelled marks every 10 mm along the left (range) and upper (x) edges of a photoacoustic image."""
     low_x, high_x, low_range, high_range = frame.extent_mm
     ranges = np.arange(math.ceil(low_range / 10.0) * 10.0, high_range, 10.0)
     across = np.arange(math.ceil(low_x / 10.0) * 10.0, high_x, 10.0)

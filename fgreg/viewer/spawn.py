@@ -1,4 +1,4 @@
-"""Starts Rerun's viewer on this machine, listening on the loopback interface only, to show a recording as it grows."""
+"""Starts Rerun's viewer on this machine, on the loopback interface only, to show a recording while it grows."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from fgreg.errors import FgregError
 
 START_S = 30.0
 STABLE_S = 1.5
-"""A viewer that finds no screen ends soon after it listens."""
+"""The viewer counts as started after listening for this long: without a screen it ends sooner."""
 MEMORY = "2GB"
-"""Beyond this the viewer drops what is oldest: a live session may go on for hours."""
+"""Memory limit above which the viewer drops the oldest data: a live session may take hours."""
 _INSTEAD = "record with --rrd FILE instead and open that where there is a screen"
 
 
 class ViewerError(FgregError):
-    """The viewer could not be started; says why and what to do instead."""
+    """The viewer could not be started; the message has the cause and an alternative."""
 
 
 def viewer_executable() -> Path:
-    """The viewer that the installed Rerun package brings, else one beside this interpreter, else one on PATH.
+    """The viewer of the installed Rerun package, else one next to this interpreter, else one on PATH.
 
     Raises:
         ViewerError: there is none.
     """
-    # The package's own binary comes first: the script beside the interpreter only starts it as a child, and ending the
-    # script would leave that child running.
+    # The package's own binary comes first: the script next to the interpreter only starts it as a child process, which
+    # keeps running when the script is ended.
     name = "rerun.exe" if sys.platform.startswith("win") else "rerun"
     candidates: list[Path] = []
     spec = importlib.util.find_spec("rerun_cli")
@@ -50,7 +50,7 @@ def viewer_executable() -> Path:
 
 
 def free_port() -> int:
-    """A TCP port of the loopback interface that nothing listens on now."""
+    """A free TCP port of the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -60,8 +60,8 @@ def spawn_viewer(executable: Path | None = None, instead: str = _INSTEAD) -> str
     """Start a viewer and return the address to send a recording to; the viewer stays open when this program ends.
 
     Args:
-        executable: of the viewer, where it is not the installed one.
-        instead: what to do where it cannot be started.
+        executable: of the viewer; None: the installed one.
+        instead: advice for the message where it cannot be started.
 
     Raises:
         ViewerError: no viewer, no screen for it, or it did not start in time.
@@ -102,7 +102,7 @@ def spawn_viewer(executable: Path | None = None, instead: str = _INSTEAD) -> str
 
 
 def _why(log: bytes, status: int) -> str:
-    """What a viewer's last words say."""
+    """The cause of a viewer's end, from its output (log) and exit status."""
     text = log.decode("utf-8", errors="replace")
     if "DISPLAY" in text:
         return "there is no screen: neither DISPLAY nor WAYLAND_DISPLAY is set"

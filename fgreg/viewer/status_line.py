@@ -1,4 +1,4 @@
-"""What has to be seen at a glance while a session goes on: verdict, what comes next, the stage, what is gone."""
+"""Status of a live session for the viewer: verdict, next step, stage, lost devices."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from fgreg.model.session_model import StageModel
 from fgreg.viewer.summary_page import HEADINGS
 
 NEEDED = ("camera", "probe", "stage", "operator")
-"""Without one of these a session does not go on."""
+"""Devices without which a session cannot continue."""
 
 
 class BmodePicture(Protocol):
-    """As fgreg.drivers.base.BmodeFrame has it."""
+    """Interface of fgreg.drivers.base.BmodeFrame."""
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
@@ -35,16 +35,16 @@ class BmodePicture(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Now:
-    """How a session under way stands, besides its estimate.
+    """Status of a live session besides its estimate.
 
     Attributes:
-        stage: how far the session has come.
-        task: what comes next. news: told last.
-        lost: devices that are gone, by role.
-        scan_rad: where the image plane stands; None where the stage is not there.
-        homed, moving: of the stage. latched: why it stands still until it is asked again; empty where it does not.
-        goal_rad, sigma_rad: where the beam will be heard (scan angle); None where that cannot be told, for ``reason``.
-        ended: the session is over; this is its last picture.
+        stage: phase of the session.
+        task: the next step. news: the last message.
+        lost: roles of the lost devices.
+        scan_rad: angle of the image plane; None without a stage.
+        homed, moving: of the stage. latched: why it is stopped until the next command; empty where it is not.
+        goal_rad, sigma_rad: scan angle at which the PM will be detected; None where unknown, with ``reason``.
+        ended: the session is over; this is its last status.
     """
 
     stage: str
@@ -62,12 +62,12 @@ class Now:
 
 
 def stage_line(now: Now, stage: StageModel) -> str:
-    """Where the stage is and should be, in the degrees that it shows itself."""
+    """Current and desired stage angle, in the stage's own degrees."""
     if now.scan_rad is None:
         return "LOST" if "stage" in now.lost else "there is none"
     at = math.degrees(stage.device_from_scan(now.scan_rad))
     if not now.homed:
-        return f"{at:.1f}° by its own account; it has to find its zero position"
+        return f"{at:.1f}° as it reports; it has to be homed"
     parts = [f"at {at:.1f}°" + (", turning" if now.moving else "")]
     goal = goal_line(now, stage)
     if now.goal_rad is not None:
@@ -76,7 +76,7 @@ def stage_line(now: Now, stage: StageModel) -> str:
 
 
 def goal_line(now: Now, stage: StageModel) -> str:
-    """The angle at which the beam will be heard, or why it cannot be told."""
+    """The stage angle at which the PM will be detected, or the reason why it is unknown."""
     if now.goal_rad is None:
         return now.reason
     spread = "" if now.sigma_rad is None else f" ± {math.degrees(now.sigma_rad):.1f}°"
@@ -84,13 +84,13 @@ def goal_line(now: Now, stage: StageModel) -> str:
 
 
 def next_line(now: Now) -> str:
-    """What comes next: without its devices nothing does."""
+    """The next step; with a needed device lost, to reconnect it."""
     needed = [role for role in now.lost if role in NEEDED]
     return f"get the {' and the '.join(needed)} back" if needed else now.task or "wait"
 
 
 def error_line(tre: PredictedTre | None) -> str:
-    """The predicted error."""
+    """The predicted 95 % error at the worst target, as text."""
     return "not known yet" if tre is None or not math.isfinite(tre.worst_mm) else f"{tre.worst_mm:.2f} mm"
 
 
@@ -103,9 +103,9 @@ def now_markdown(
     epoch: int,
     reasons: tuple[str, ...],
 ) -> str:
-    """The page; ``verdict`` None where there is no registration yet."""
+    """The status page as Markdown; ``verdict`` is None where there is no registration yet."""
     heading = "# No registration yet" if verdict is None else HEADINGS[verdict]
-    lines = ["# THE SESSION HAS ENDED: this is its last picture", ""] if now.ended else []
+    lines = ["# THE SESSION HAS ENDED: this is its last status", ""] if now.ended else []
     lines += [heading, ""]
     if now.lost:
         lines += [f"# LOST: {', '.join(now.lost)}", ""]
@@ -115,5 +115,5 @@ def now_markdown(
     lines += [f"**Predicted error at the worst target (95 %):** {error_line(tre)}", ""]
     lines += [f"**Session:** {now.stage}; {pairs} pairs in camera epoch {epoch}", ""]
     if now.news and now.news != now.task:
-        lines += [f"**Told last:** {now.news}", ""]
+        lines += [f"**Last message:** {now.news}", ""]
     return "\n".join([*lines, *(f"- {reason}" for reason in reasons)])

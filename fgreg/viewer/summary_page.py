@@ -15,7 +15,7 @@ HEADINGS = {
     Verdict.REFUSED: "# REFUSED: do not use this registration",
 }
 LEGEND = """
-**What is drawn.** Grey: the TRUS probe. Cyan: its image plane, and the arc on which the probe heard each source
+**What is drawn.** Grey: the TRUS probe. Cyan: its image plane, and the arc on which the probe detected each source
 (the plane is thick, so the source may be off it). Green: the laser beam from the fibre's marker (white squares).
 Orange: photoacoustic markers with their 95 % ellipsoids. Blue (red where refused): the endoscope camera. Small
 wire balls: targets with the 95 % ellipsoid of their predicted error. Magenta: the truth, where it is known.
@@ -24,11 +24,11 @@ Bold is the shot at the time cursor, thin are those before it.
 
 
 def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_errors: list[tuple[float, float]]) -> str:
-    """The page: verdict first, then reasons, registration, pairs and what the colours mean.
+    """The page: verdict, reasons, registration, pairs, and a legend of the colours.
 
     Args:
         model: the session's set-up.
-        estimate: its answer.
+        estimate: its result.
         camera_errors: per epoch, translation error (mm) and rotation error (rad), where the truth is known.
     """
     lines = [HEADINGS[estimate.verdict], ""]
