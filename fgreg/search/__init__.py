@@ -1,1 +1,1 @@
-"""Where to turn the stage in search of a PM: each next position, from what was heard so far. No devices, no motion."""
+"""Search for a PM: plans each next stage position from the looks up to now. No devices, no motion."""

@@ -1,4 +1,4 @@
-"""What is known of one PM: a distribution over its plane angle and the logarithm of its peak, on a grid."""
+"""Posterior of one PM on a grid: distribution over its plane angle and the logarithm of its peak amplitude."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ GRID_RAD = math.radians(0.1)
 GRID_LOG = 0.04
 """Spacing of log peaks: below the noise of an amplitude."""
 PEAK_SPAN = 40.0
-"""Peaks from the threshold up to this many times it, all equally likely on the logarithm."""
-KEPT_MASS = 0.98
-"""Share of the distribution that expectations are taken over: the rest is far off, and looks should not chase it."""
+"""Ratio of the largest peak to the threshold; the prior of the log peak is uniform in between."""
+CENTRAL_MASS = 0.98
+"""Central share of the distribution over which expectations are taken, so that looks do not follow far-off tails."""
 _OUTCOME_LOG = 0.05
 _NOISE_CLASSES = (1.0, 1.4, 2.0, 3.0, 6.0)
-"""Multiples of the amplitude's noise that expectations tell apart: it grows down the curve's flanks."""
+"""Multiples of the amplitude's noise that expectations distinguish; the noise grows on the curve's flanks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class Belief:
 
     @classmethod
     def flat(cls, model: HearingModel, low_rad: float, high_rad: float) -> Self:
-        """Anywhere between two angles."""
+        """Uniform between two angles."""
         count = max(2, round((high_rad - low_rad) / GRID_RAD) + 1)
         angle = np.linspace(low_rad, high_rad, count)
         top = math.log(PEAK_SPAN)
@@ -44,12 +44,12 @@ class Belief:
         return cls(model, angle, log_peak, np.full((count, log_peak.size), 1.0 / (count * log_peak.size)))
 
     def times(self, prior: FloatArray) -> Self:
-        """With a prior (J,) over the angle taken in."""
+        """Multiplied by a prior (J,) over the angle."""
         weight = self.weight * prior[:, None]
         return replace(self, weight=weight / weight.sum())
 
     def after(self, scan_rad: float, amplitude: float | None) -> Self:
-        """With one more look taken in: ``amplitude`` None where nothing was heard."""
+        """Updated with one look; ``amplitude`` is None if nothing was detected."""
         rotation = self.angle_rad - scan_rad
         expected = self.log_peak[None, :] + self.model.gain_log(rotation)[:, None]
         like = self.model.likelihood(expected, self.model.noise_log(rotation)[:, None], amplitude)
@@ -57,42 +57,42 @@ class Belief:
         return replace(self, weight=weight / weight.sum())
 
     def angle_weight(self) -> FloatArray:
-        """The distribution of the angle alone, (J,)."""
+        """Marginal distribution of the angle, (J,)."""
         return np.asarray(self.weight.sum(axis=1))
 
     def quantile(self, share: float) -> float:
-        """The angle (rad) below which ``share`` of the distribution lies, between grid points linearly."""
+        """The angle (rad) below which ``share`` of the distribution lies; linear between grid points."""
         cumulated = np.cumsum(self.angle_weight())
         half = 0.5 * (self.angle_rad[1] - self.angle_rad[0])
         return float(np.interp(share, np.r_[0.0, cumulated], np.r_[self.angle_rad[0] - half, self.angle_rad + half]))
 
     def best_rad(self) -> float:
-        """Mean angle of the kept mass."""
-        angle, weight = self._kept_angles()
+        """Mean angle over the central mass, rad."""
+        angle, weight = self._central_angles()
         return float(weight @ angle / weight.sum())
 
     def sigma_rad(self) -> float:
-        """A quarter of the width of the central 95.45 %: the standard deviation, were it a Gaussian.
+        """A quarter of the width of the central 95.45 %, rad: the standard deviation of a Gaussian.
 
-        Neither far-off lapses nor a cut-off tail mislead it; two rival angles show as their distance.
+        It is robust against far-off lapses and cut-off tails; with two separate modes it shows their distance.
         """
         tail = 0.5 * (1.0 - 0.9545)
         return 0.25 * (self.quantile(1.0 - tail) - self.quantile(tail))
 
-    def _kept_angles(self) -> tuple[FloatArray, FloatArray]:
-        low, high = self.quantile(0.5 * (1.0 - KEPT_MASS)), self.quantile(0.5 * (1.0 + KEPT_MASS))
+    def _central_angles(self) -> tuple[FloatArray, FloatArray]:
+        low, high = self.quantile(0.5 * (1.0 - CENTRAL_MASS)), self.quantile(0.5 * (1.0 + CENTRAL_MASS))
         half = 0.5 * (self.angle_rad[1] - self.angle_rad[0])
-        kept = (self.angle_rad >= low - half) & (self.angle_rad <= high + half)
-        return np.asarray(self.angle_rad[kept]), np.asarray(self.angle_weight()[kept])
+        central = (self.angle_rad >= low - half) & (self.angle_rad <= high + half)
+        return np.asarray(self.angle_rad[central]), np.asarray(self.angle_weight()[central])
 
     def expected_sigma(self, scan_rad: FloatArray) -> FloatArray:
         """Expected standard deviation of the angle after one more look at each of C positions: (C,) rad.
 
-        For each outcome (not heard, or an amplitude in one of many bins) the posterior's variance, weighted with the
-        outcome's probability. The expected log amplitudes of the distribution's points are put into bins first; the
-        noise then carries mass between bins, which makes this a product of small matrices.
+        This is the posterior variance for each outcome (no detection, or an amplitude in one of many bins), weighted
+        with the outcome's probability. The expected log amplitudes of the grid points are binned first; the noise then
+        moves mass between bins, so that the sum is a product of small matrices.
         """
-        low, high = self.quantile(0.5 * (1.0 - KEPT_MASS)), self.quantile(0.5 * (1.0 + KEPT_MASS))
+        low, high = self.quantile(0.5 * (1.0 - CENTRAL_MASS)), self.quantile(0.5 * (1.0 + CENTRAL_MASS))
         rows = np.flatnonzero((self.angle_rad >= low) & (self.angle_rad <= high))
         if rows.size == 0:
             rows = np.array([int(np.argmin(np.abs(self.angle_rad - 0.5 * (low + high))))])
@@ -122,7 +122,10 @@ class Belief:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def _carry(self, first: float, bins: int, threshold: float, noise: float) -> FloatArray:
-        """(bins, outcomes): how noise, in amplitude sigmas, spreads bins of expected log amplitude; 0: not heard."""
+        """(bins, outcomes): probability of each outcome per bin of expected log amplitude; outcome 0 is no detection.
+
+        ``noise`` is in units of ``amplitude_sigma``.
+        """
         sigma = noise * self.model.amplitude_sigma
         centre = first + _OUTCOME_LOG * (np.arange(bins) + 0.5)
         top = centre[-1] + 4.0 * self.model.amplitude_sigma

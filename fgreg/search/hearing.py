@@ -1,11 +1,11 @@
-"""How loud a PM is at a stage angle, and whether it is heard there: the model that the search plans with.
+"""Detection model of the search: amplitude of a PM at a stage angle, and probability of its detection.
 
-A PM of amplitude ``peak`` in the plane is received at rotation d off it as
+A PM of amplitude ``peak`` in the plane is received at rotation d from it with
 
     log amplitude = log peak + log gain(d) + noise,        noise ~ N(0, amplitude_sigma^2),
 
-and heard where the amplitude reaches the threshold of the detection. The peak is unknown: it depends on the tissue,
-the fibre's distance and the depth. The gain is the session's sensitivity curve.
+and is detected if the amplitude reaches the detection threshold. The peak is unknown: it depends on the tissue, the
+fibre's distance and the depth. The gain is the session's sensitivity curve.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from fgreg.model.sensitivity import AMPLITUDE_SIGMA, amplitude_curve
 from fgreg.model.session_model import SensitivityModel
 
 ASSUMED_SIGMA = 0.15
-"""Relative noise where the session has no curve, and a bell that is down to a half at the window's edge stands in."""
+"""Relative noise if the session has no curve; a bell of half height at the sensitivity window's edge is used then."""
 EDGE_MARGIN = 1.0
-"""A sweep's steps rely on the half width less this many of its sigmas."""
+"""A sweep's steps assume the half width minus this many of its sigmas."""
 LAPSE = 0.01
-"""Share of looks that say nothing about this PM: the pulse failed, or something else sounded."""
+"""Share of looks that carry no information on this PM: the pulse failed, or another source was detected."""
 _LAPSE_LOG_SPAN = 4.0
 
 
@@ -36,12 +36,12 @@ class HearingModel:
     """Gain against rotation, threshold, noise.
 
     Attributes:
-        rotation_rad, log_gain: (m,), the curve, 0 at its highest; beyond its ends it goes on falling as there.
-        threshold: least amplitude that is heard, in the unit of the amplitudes.
+        rotation_rad, log_gain: (m,), the curve, with maximum 0; extrapolated with its last slopes.
+        threshold: least amplitude of a detection, in the unit of the amplitudes.
         amplitude_sigma: relative noise of an amplitude.
-        scan_sigma_rad: of the stage reading; adds by the curve's slope.
-        width_sigma: relative uncertainty of the curve's width, the session's window edge over its half width.
-        reach_rad: how far to either side of its plane a PM is heard for certain: half width less its uncertainty.
+        scan_sigma_rad: of the stage reading; adds noise by the curve's slope.
+        width_sigma: relative uncertainty of the curve's width: sigma of the window's edge over its half width.
+        reach_rad: rotation to either side within which a PM is surely detected: half width minus its uncertainty.
     """
 
     rotation_rad: FloatArray
@@ -67,7 +67,7 @@ class HearingModel:
         amplitude_sigma: float = AMPLITUDE_SIGMA,
         scan_sigma_rad: float = 0.0,
     ) -> Self:
-        """The session's curve; without one, a bell down to a half at the smallest half width, and more noise."""
+        """The session's curve; without one, a bell of half height at the smallest half width, and more noise."""
         narrow = float(sensitivity.half_width_rad.min())
         reach = max(narrow - EDGE_MARGIN * sensitivity.edge_sigma_rad, 0.5 * narrow)
         width_sigma = sensitivity.edge_sigma_rad / narrow
@@ -80,7 +80,7 @@ class HearingModel:
         return cls(rotation, log, threshold, max(amplitude_sigma, ASSUMED_SIGMA), scan_sigma_rad, width_sigma, reach)
 
     def gain_log(self, rotation_rad: npt.ArrayLike) -> FloatArray:
-        """Log gain at rotations, any shape; beyond the curve along its last slope, falling in any case."""
+        """Log gain at rotations of any shape; beyond the curve with its last slope, decreasing in any case."""
         d = np.asarray(rotation_rad, dtype=np.float64)
         x, y = self.rotation_rad, self.log_gain
         inside = np.interp(d, x, y)
@@ -93,10 +93,10 @@ class HearingModel:
         )
 
     def noise_log(self, rotation_rad: npt.ArrayLike) -> FloatArray:
-        """Sigma of the log amplitude at rotations: noise, and by the curve's slope the stage reading and the width.
+        """Sigma of the log amplitude at rotations: amplitude noise, and stage reading and width by the curve's slope.
 
-        The width's error is common to all looks at a PM. Counted as noise of each it still has its effect: looks far
-        down the curve count less.
+        The width's error is common to all looks at a PM. It is treated as independent noise of each, which still gives
+        looks on the flanks a smaller weight.
         """
         step = 0.05 * self.reach_rad
         d = np.asarray(rotation_rad, dtype=np.float64)
@@ -105,10 +105,10 @@ class HearingModel:
         return np.asarray(np.hypot(self.amplitude_sigma, np.minimum(by_slope, 1.0)))
 
     def likelihood(self, expected_log: FloatArray, sigma: FloatArray, amplitude: float | None) -> FloatArray:
-        """Likelihood of a look where ``expected_log`` and ``sigma`` (broadcasting) of the log amplitude are expected.
+        """Likelihood of a look given mean ``expected_log`` and ``sigma`` (broadcasting) of the log amplitude.
 
         Args:
-            amplitude: what was heard; None where nothing was.
+            amplitude: of the detection; None if nothing was detected.
 
         Raises:
             ValueError: an amplitude that is not a positive number.

@@ -1,12 +1,12 @@
-"""The search for one PM: which position next, and when it is found, or given up.
+"""The search for one PM: the next position, and when the PM is found or the search is given up.
 
-Cold: sweep the field from its nearer end in steps that no window fits between, until something is heard; where nothing
-was, once more half a step aside, for PMs that are heard less far than the session says. With a prediction: begin at the
-predicted angle and stay about it; where nothing is heard there the search is over, and what to do next is the
-caller's decision: it never becomes a sweep of the field by itself.
+Without a prediction (cold), the search sweeps the field from its nearer end, in steps small enough that no sensitivity
+window fits between, until something is detected. If nothing is, a second sweep half a step aside follows, for PMs with
+a narrower window than the session says. With a prediction, the search starts at the predicted angle and stays near it.
+If nothing is detected there, it ends and the caller decides: it never becomes a sweep of the field by itself.
 
-From the first hearing on each next position is the one after which the angle is expected to be known best, from a
-distribution over angle and peak (fgreg.search.belief); of positions about as good, the nearest to where the stage is.
+After the first detection, each next position minimises the expected sigma of the angle, from a distribution over angle
+and peak (fgreg.search.belief). Of positions that are about equal, the one nearest to the stage is taken.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from fgreg.search.hearing import HearingModel
 CANDIDATE_RAD = math.radians(0.5)
 """Spacing of the positions among which the next one is chosen."""
 AS_GOOD = 0.08
-"""Positions whose expected sigma is larger than the best by no more than this share are as good."""
+"""Positions count as equal if their expected sigma is larger than the best by at most this share."""
 PREDICTION_REACH = 3.5
-"""A search from a prediction stays within this many of its sigmas, and a window."""
+"""A search from a prediction stays within this many of its sigmas plus a sensitivity window."""
 PREDICTION_WRONG = 0.05
-"""Share of predictions that are simply wrong: the PM may be anywhere in the field."""
+"""Share of wrong predictions, for which the PM may be anywhere in the field."""
 
 
 class Phase(StrEnum):
-    """What a position is for."""
+    """Purpose of a position."""
 
     SWEEP = "sweep"
     PREDICTED = "predicted"
@@ -46,7 +46,7 @@ class SearchSettings:
     Attributes:
         stop_sigma_rad: the PM is found once its angle is known to this.
         most_positions: the search is given up after this many.
-        passes: sweeps of the field, each between the positions of those before.
+        passes: number of sweeps of the field, each between the positions of the one before.
     """
 
     stop_sigma_rad: float = math.radians(0.4)
@@ -60,7 +60,7 @@ class SearchSettings:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where a registration says the PM is: plane angle and its sigma, rad."""
+    """Prediction of a PM by the registration: plane angle and its sigma, rad."""
 
     scan_rad: float
     sigma_rad: float
@@ -72,7 +72,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """Go there and listen."""
+    """Turn to this plane angle and take a look."""
 
     scan_rad: float
     phase: Phase
@@ -81,7 +81,7 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The PM's plane angle, its standard deviation, and after how many positions."""
+    """The PM's plane angle, its standard deviation, and the number of positions."""
 
     scan_rad: float
     sigma_rad: float
@@ -100,13 +100,14 @@ Step = Turn | Found | NotFound
 
 
 class SearchPlanner:
-    """One search. Ask :meth:`next`, go there, tell :meth:`listened`, until it is :class:`Found` or :class:`NotFound`.
+    """One search: turn to the position of :meth:`next` and pass the look to :meth:`listened`, until ``next`` returns
+    :class:`Found` or :class:`NotFound`.
 
     Args:
-        model: what is heard where.
+        model: detection model.
         low_rad, high_rad: the field: plane angles between which the stage may search.
-        stands_rad: where the stage stands now.
-        prediction: where a registration says the PM is; None searches cold.
+        stands_rad: current plane angle of the stage.
+        prediction: of the registration; None for a cold search.
 
     Raises:
         ValueError: an empty field, or a prediction outside of it.
@@ -136,8 +137,8 @@ class SearchPlanner:
                 f"predicted {math.degrees(prediction.scan_rad):.1f} deg, outside the field "
                 f"{math.degrees(low_rad):.1f} to {math.degrees(high_rad):.1f} deg"
             )
-        # The belief covers the whole field: a PM that is heard from where no prediction expects it is not pressed into
-        # the expected range. Only the positions stay there, and a window about it.
+        # The belief covers the whole field, so that a PM far from the prediction is not forced into its range. Only the
+        # positions are limited to that range plus a sensitivity window.
         flat = Belief.flat(model, low_rad, high_rad)
         bell = np.exp(-0.5 * ((flat.angle_rad - prediction.scan_rad) / prediction.sigma_rad) ** 2)
         self._belief = flat.times((1.0 - PREDICTION_WRONG) * bell / bell.sum() + PREDICTION_WRONG / bell.size)
@@ -147,16 +148,16 @@ class SearchPlanner:
 
     @property
     def belief(self) -> Belief:
-        """What is known by now."""
+        """The current distribution."""
         return self._belief
 
     @property
     def heard(self) -> bool:
-        """Whether anything was heard yet."""
+        """Whether anything was detected up to now."""
         return any(amplitude is not None for _, amplitude in self._looks)
 
     def listened(self, scan_rad: float, amplitude: float | None) -> None:
-        """What a look brought: the stage's angle as it was read, and the amplitude, None where nothing was heard."""
+        """Take in a look: the stage's reading (rad), and the amplitude or None if nothing was detected."""
         if not math.isfinite(scan_rad):
             raise ValueError(f"the stage's angle is {scan_rad}, expected a number")
         self._belief = self._belief.after(scan_rad, amplitude)
@@ -165,14 +166,14 @@ class SearchPlanner:
         self._queue = [position for position in self._queue if abs(position - scan_rad) > 0.5 * CANDIDATE_RAD]
 
     def next(self) -> Step:
-        """What to do now; asking twice without a look in between gives the same."""
+        """The next step; the same as before if no look came in between."""
         count = len(self._looks)
         sigma = self._belief.sigma_rad()
         if self.heard and sigma <= self.settings.stop_sigma_rad:
             return Found(self._belief.best_rad(), sigma, count)
         if count >= self.settings.most_positions:
             return NotFound(f"still not known better than {math.degrees(sigma):.1f} deg after {count} positions", count)
-        if not self.heard or sigma > self._model.reach_rad:  # the PM may be anywhere, or anywhere again
+        if not self.heard or sigma > self._model.reach_rad:  # the PM may (still or again) be anywhere
             if self._queue:
                 return self._listen(self._queue[0])
             if not self.heard:
@@ -185,7 +186,7 @@ class SearchPlanner:
         return self._refine(sigma)
 
     def _beyond(self) -> bool:
-        """Whether the PM lies outside the positions that are allowed, so that no look can come near it."""
+        """Whether the PM lies outside the allowed positions, so that no look can come near it."""
         return self._belief.quantile(0.05) > self._high or self._belief.quantile(0.95) < self._low
 
     def _listen(self, position: float) -> Turn:
@@ -211,7 +212,7 @@ class SearchPlanner:
 
 
 def best_position(candidates: FloatArray, expected_sigma: FloatArray, stands_rad: float) -> float:
-    """Of the positions after which the angle is expected to be known about best, the nearest to the stage."""
+    """Of the positions with about the smallest expected sigma, the one nearest to the stage."""
     good = candidates[expected_sigma <= (1.0 + AS_GOOD) * float(expected_sigma.min())]
     return float(good[int(np.argmin(np.abs(good - stands_rad)))])
 
@@ -219,10 +220,10 @@ def best_position(candidates: FloatArray, expected_sigma: FloatArray, stands_rad
 def sweep_positions(
     low_rad: float, high_rad: float, reach_rad: float, stands_rad: float, passes: int = 1
 ) -> list[float]:
-    """Positions that together hear every PM of a field, which each hear ``reach_rad`` to either side.
+    """Positions that together cover a field, if each covers ``reach_rad`` to either side.
 
-    Even steps of at most twice the reach, from the end that is nearer to where the stage stands; a further pass goes
-    back half a step aside, over both ends.
+    Equal steps of at most twice the reach, from the end nearer to the stage; each further pass goes back, half a step
+    aside and beyond both ends of the pass before.
     """
     count = max(1, math.ceil((high_rad - low_rad) / (2.0 * reach_rad) - 1e-9))
     step = (high_rad - low_rad) / count
@@ -239,7 +240,7 @@ def sweep_positions(
 
 
 def _around(prediction: Prediction, reach_rad: float, low_rad: float, high_rad: float) -> list[float]:
-    """Further positions about a predicted angle, nearest first, until all within its range would have been heard."""
+    """Further positions around a predicted angle, nearest first, until its range is covered."""
     step, positions = 1.5 * reach_rad, []
     for number in range(1, math.ceil(PREDICTION_REACH * prediction.sigma_rad / step) + 1):
         for sign in (1.0, -1.0):
