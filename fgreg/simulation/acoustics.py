@@ -1,4 +1,4 @@
-"""Channel data and envelope images of a point source heard by the TRUS array.
+"""Channel data and envelope images of a point source received by the TRUS array.
 
 Everything starts from positions in space: element i at stage angle t is at (x_i, R sin t, R cos t), the wave takes
 |source - element| / c to arrive, one way. An element hears less off its axis, farther away, and when the source is off
@@ -74,7 +74,7 @@ def _envelope_peak_us(pulse: Pulse) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Elevation:
-    """How the amplitude falls as the stage turns away from the source.
+    """Amplitude as a function of the stage's rotation away from the source.
 
     ``threshold ** (|rotation / half_width| ** power)``: at the half width it reaches the threshold of hearing.
     """
@@ -89,12 +89,12 @@ class Elevation:
 
 @dataclass(frozen=True, slots=True)
 class Hearing:
-    """What shapes amplitudes across the array.
+    """Directivity and losses across the array.
 
     Attributes:
         element_width: of the pitch; sets the directivity sinc(width sin(angle) / wavelength) cos(angle).
         spreading: amplitude falls with distance to the power -spreading (1 spherical, 0.5 cylindrical).
-        elevation: loss off the image plane; None: every source is heard as if it were in the plane.
+        elevation: loss off the image plane; None if every source is received as if it were in the plane.
     """
 
     element_width: float = 0.9
@@ -176,7 +176,7 @@ def simulate_channels(
 
 
 def noise_channels(probe: ProbeModel, rng: np.random.Generator, samples: int = 1600) -> ChannelArray:
-    """(elements, samples) of noise alone, standard deviation 1: no source is heard."""
+    """(elements, samples) of noise alone, standard deviation 1, without a source."""
     return rng.standard_normal((probe.elements, samples), dtype=np.float32)
 
 

@@ -1,8 +1,8 @@
-"""A simulated operating room as it goes on: where everything is at any moment, and what camera and probe take in.
+"""A simulated operating room over time: the true poses at any moment, and the data of camera and probe.
 
 A surgeon holds the fibre still at one place after another: first at corners of a calibration board, then at tissue.
-Between places the marker travels smoothly; while it is held the hand trembles a little. Now and then somebody bumps
-into the camera. Truth only, forward only; times are seconds since the room was made and never go back.
+Between places the marker moves smoothly; while it is held the hand trembles slightly. From time to time a bump moves
+the camera. Ground truth only; times are seconds since the room was made and never decrease.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ TREMOR_HZ = (0.7, 2.3, 5.1, 8.7)
 TREMOR_MM, TREMOR_RAD = 0.03, 0.0006
 """Amplitude of each tremor component and axis."""
 HOLDER_MM, HOLDER_RAD = 0.03, 0.0003
-"""Noise of what the camera's holder tells of its pose, each axis."""
+"""Noise of the camera pose that the holder reports, per axis."""
 BUMP_EVERY_S = 240.0
-"""Mean time between bumps, unless said otherwise: some registrations long."""
+"""Default mean time between bumps: long enough for several registrations."""
 BUMP_S = 0.5
-"""A bump moves the camera for so long."""
+"""Duration of a camera move by a bump."""
 SCENES = 6
-"""Scenes that are drawn before a configuration is given up as one in which the camera sees no marker."""
+"""Largest number of scenes drawn until one is found in which the camera sees the marker."""
 BMODE_PIXEL_MM, BMODE_DEPTH_MM = 0.3, 60.0
 REACH_MM = 140.0
 """Beams that meet no tissue within this distance end there."""
@@ -43,15 +43,15 @@ REACH_MM = 140.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RoomConfig:
-    """What goes on.
+    """Configuration of the room.
 
     Attributes:
         seed: of everything random.
         aims: calibration shots before the surgeon turns to the tissue.
-        bump_every_s: mean time between camera moves once that has begun; infinite: none.
+        bump_every_s: mean time between camera moves once the surgeon is at the tissue; infinite for none.
         bump_rad, bump_mm: size (sigma per axis) of a move, about the middle of the tissue.
-        tremor_hz: of the hand's tremor, four.
-        scene: cameras, probe, stage, noise of the room; ``frames`` and amplitudes on.
+        tremor_hz: the four frequencies of the hand's tremor.
+        scene: cameras, probe, stage and noise; with ``frames`` and amplitudes.
     """
 
     seed: int = 1
@@ -91,7 +91,7 @@ def room_config(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where the fibre is held: ``trus_T_marker`` (4, 4); for aims the corner [column, row] and the board's pose."""
+    """Pose at which the fibre is held: ``trus_T_marker`` (4, 4); for aims also corner [column, row] and board pose."""
 
     trus_T_marker: FloatArray
     corner: tuple[int, int] | None = None
@@ -100,7 +100,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Travel:
-    """From one pose to another between two times, at rest at either end."""
+    """Motion from one pose to another between two times, at rest at both ends."""
 
     start_s: float
     end_s: float
@@ -118,14 +118,14 @@ class Travel:
 
 
 def travel_s(start: FloatArray, end: FloatArray) -> float:
-    """How long the fibre takes from one pose (4, 4) to another."""
+    """Time (s) that the fibre takes from one pose (4, 4) to another."""
     way = float(np.linalg.norm(end[:3, 3] - start[:3, 3]))
     turn = float(np.linalg.norm(log_so3(start[:3, :3].T @ end[:3, :3])))
     return max(LEAST_TRAVEL_S, way / TRAVEL_MM_S, turn / TRAVEL_RAD_S)
 
 
 def _at(travels: list[Travel], t_s: float) -> FloatArray:
-    """Where a body is that travels one way after another."""
+    """Pose of a body that moves along successive ways."""
     return next(travel for travel in reversed(travels) if travel.start_s <= max(t_s, 0.0)).at(t_s)
 
 
@@ -174,11 +174,11 @@ class Room:
             for pose, corner, board in zip(aims.shots.camera_T_marker, aims.corner, aims.camera_T_board, strict=True)
         ]
 
-    # --- what happens -----------------------------------------------------------------------------------------------
+    # --- events -----------------------------------------------------------------------------------------------------
 
     @property
     def place(self) -> Place:
-        """Where the fibre is held, or is on its way to."""
+        """The place where the fibre is held, or to which it moves."""
         return self._place
 
     @property
@@ -187,7 +187,7 @@ class Room:
         return self.scene.marker_T_laser
 
     def arrives_s(self) -> float:
-        """When the fibre comes (came) to rest at its place."""
+        """Time at which the fibre comes (came) to rest at its place."""
         return self._travels[-1].end_s
 
     def proceed(self, t_s: float) -> Place:
@@ -201,19 +201,19 @@ class Room:
         return self._place
 
     def pass_to(self, t_s: float) -> None:
-        """Let time pass: bumps that are due happen."""
+        """Advance the time and start the bumps that are due."""
         if t_s >= self._bump_due_s:
             self.bump(self._bump_due_s)
             self._bump_due_s = self._next_bump(t_s)
 
     def bump(self, t_s: float) -> None:
-        """Somebody moves the camera, beginning at ``t_s``."""
+        """Start a move of the camera at ``t_s``."""
         before = self.trus_T_camera(t_s)
         self._cameras.append(Travel(t_s, t_s + BUMP_S, before, self._bumped(before)))
         self.moved_s.append(t_s)
 
     def _bumped(self, trus_T_camera: FloatArray) -> FloatArray:
-        """Where a bump leaves the camera."""
+        """The camera's pose after a bump."""
         rng, config = self._bump_rng, self.config
         middle = self.scene.tissue.point(np.zeros(()), np.zeros(()))
         turn = exp_so3(rng.normal(0.0, config.bump_rad, 3))
@@ -229,12 +229,12 @@ class Room:
         return self._aims[number] if number < len(self._aims) else self._spot(self._cameras[-1].end)
 
     def _spot(self, trus_T_camera: FloatArray) -> Place:
-        """A shot at tissue that a camera that stands there can see."""
+        """A shot at tissue that is visible from a camera at this pose."""
         scene = replace(self.scene, trus_T_camera=(trus_T_camera,))
         shots = draw_pm_shots(self.config.scene, scene, np.zeros(1, dtype=np.int64), self._shot_rng)
         return Place(trus_T_camera @ shots.camera_T_marker[0])
 
-    # --- where things are -------------------------------------------------------------------------------------------
+    # --- poses ------------------------------------------------------------------------------------------------------
 
     def trus_T_camera(self, t_s: float) -> FloatArray:
         """(4, 4) the true registration."""
@@ -247,18 +247,18 @@ class Room:
         return make_transform(still[:3, :3] @ exp_so3(TREMOR_RAD * wave[:3]), still[:3, 3] + TREMOR_MM * wave[3:])
 
     def camera_T_marker(self, t_s: float) -> FloatArray:
-        """(4, 4) as the camera sees it."""
+        """(4, 4) the marker in the camera frame."""
         return np.asarray(inverse(self.trus_T_camera(t_s)) @ self.trus_T_marker(t_s))
 
     def base_T_camera(self, t_s: float, index: int) -> FloatArray:
-        """(4, 4) as the camera's holder tells it, from its own base; ``index`` seeds the noise."""
+        """(4, 4) the camera pose that its holder reports, in its base frame; ``index`` seeds the noise."""
         rng = np.random.default_rng((self.config.seed, index, 3))
         true = self._base_T_trus @ self.trus_T_camera(t_s)
         noise = make_transform(exp_so3(HOLDER_RAD * rng.standard_normal(3)), HOLDER_MM * rng.standard_normal(3))
         return np.asarray(true @ noise)
 
     def spot_mm(self, t_s: float) -> FloatArray:
-        """(3,) TRUS point where the beam ends: on the tissue, or in the air where it misses it."""
+        """(3,) TRUS point where the beam ends: on the tissue, or in the air if it misses the tissue."""
         trus_T_laser = self.trus_T_marker(t_s) @ self.marker_T_laser
         low, high = 0.0, REACH_MM
         for _ in range(4):
@@ -271,22 +271,22 @@ class Room:
         return np.asarray(trus_T_laser[:3, 3] + 0.5 * (low + high) * trus_T_laser[:3, 2])
 
     def _above_tissue(self, trus_p_mm: FloatArray) -> FloatArray:
-        """How far (n,) points (n, 3) are outside the tissue's surface, away from the probe."""
+        """Distance (n,) of points (n, 3) outside the tissue's surface, away from the probe."""
         angle = sweeps.plane_angle_rad(trus_p_mm)
         surface = self.scene.tissue.point(trus_p_mm[:, 0], angle)
         return np.asarray(np.hypot(trus_p_mm[:, 1], trus_p_mm[:, 2]) - np.hypot(surface[:, 1], surface[:, 2]))
 
     def plane_rad(self, t_s: float) -> float:
-        """Angle to which the plane has to turn for the beam's end to be in it."""
+        """Plane angle at which the beam's end lies in the plane."""
         return float(sweeps.plane_angle_rad(self.spot_mm(t_s)))
 
     def truth_at(self, camera_s: Sequence[float], spots_s: Sequence[float]) -> dict[str, Any]:
-        """How things were (plain numbers), for who judges an estimate, never for who makes one.
+        """Ground truth (plain numbers), to evaluate an estimate, never to make one.
 
         Args:
-            camera_s, spots_s: times at which to tell ``trus_T_camera`` (4x4 each) and ``spots_mm`` (3 each). Told as
-                well: ``marker_T_laser`` (4x4), ``moved_s`` (when the camera began to move), ``stood`` (4x4 each: where
-                it stood at the start and after each move) and ``seed``.
+            camera_s, spots_s: times of the returned ``trus_T_camera`` (4x4 each) and ``spots_mm`` (3 each). The result
+                also has ``marker_T_laser`` (4x4), ``moved_s`` (when the camera began to move), ``stood`` (4x4 each: its
+                poses at the start and after each move) and ``seed``.
         """
         return {
             "trus_T_camera": [self.trus_T_camera(t).tolist() for t in camera_s],
@@ -297,7 +297,7 @@ class Room:
             "seed": self.config.seed,
         }
 
-    # --- what is taken in -------------------------------------------------------------------------------------------
+    # --- measurements -----------------------------------------------------------------------------------------------
 
     def pictures(self, t_s: float, index: int) -> tuple[UInt8Image, UInt8Image]:
         """Left and right image (h, w) at a time; ``index`` seeds the sensor's noise."""
@@ -318,7 +318,7 @@ class Room:
         return picture.render(self.config.scene, right=False), picture.render(self.config.scene, right=True)
 
     def channel_data(self, t_s: float, scan_rad: float, index: int) -> npt.NDArray[np.int16]:
-        """(elements, samples) what the probe records of a pulse at ``t_s`` with its plane at ``scan_rad``."""
+        """(elements, samples) the probe's data of a pulse at ``t_s`` with its plane at ``scan_rad``."""
         config, source = self.config.scene, self.spot_mm(t_s)
         depth = sweeps.range_mm(source, np.asarray(scan_rad), config.probe.radius_mm)
         width = float(sweeps.half_width_rad(config.probe.sensitivity, depth)) + self.scene.window_edge_rad

@@ -1,4 +1,4 @@
-"""Where things are: probe, tissue, camera, fibre, and the shots a surgeon takes. Truth only, no observation noise."""
+"""Scene geometry: probe, tissue, camera, fibre, and a surgeon's shots. Ground truth only, no observation noise."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.render import project_points
 
 CANDIDATES = 8
-"""Ways to take a shot that are drawn at once; the first that the camera can see is taken."""
+"""Number of candidates for a shot drawn at once; the first visible to the camera is taken."""
 
 ROUNDS = 40
 PATIENCE = 12
-"""Rounds of candidates before a shot is given up; and before its PM is moved."""
+"""Number of rounds of candidates before a shot is given up, and before its PM is moved."""
 EDGE_PX = 12.0
 
 
 class UnseenError(ValueError):
-    """No way was found to take a shot so that the camera sees its marker."""
+    """No candidate of a shot has its marker visible to the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +91,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shots:
-    """Shots taken: marker poses (n, 4, 4), distances along the beam (n,), and where the beams end (n, 3).
+    """Shots: marker poses (n, 4, 4), distances along the beam (n,), and the beams' ends (n, 3).
 
     ``spot_mm`` is in the frame the shots were planned in: TRUS for PMs, the camera for aims.
     """
@@ -267,7 +267,7 @@ class _Targets:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
-    """How n shots are to be held, in a frame of the planner's choice: TRUS for PMs, the camera for aims."""
+    """Planned marker poses of n shots, in the TRUS frame for PMs and in the camera frame for aims."""
 
     camera_T_frame: FloatArray
     beam: FloatArray
@@ -283,7 +283,7 @@ def _draw_shots(
     draw: Callable[[IntArray, int], _Targets],
     rng: np.random.Generator,
 ) -> tuple[Shots, _Targets]:
-    """Draws each shot until the camera can see its marker (and, where there is a board, the corner aimed at)."""
+    """Draw each shot until the camera can see its marker (and, with a board, the corner aimed at)."""
     n = plan.camera_T_frame.shape[0]
     camera_T_marker, lambdas, spots = np.zeros((n, 4, 4)), np.zeros(n), np.zeros((n, 3))
     boards, corners, nominals = np.zeros((n, 4, 4)), np.zeros((n, 2), dtype=np.int64), np.zeros((n, 3))
@@ -353,7 +353,7 @@ def _views(rig: StereoRig) -> list[tuple[CameraModel, FloatArray]]:
 
 def _inside(camera: CameraModel, camera_p_mm: FloatArray, margin_px: float) -> BoolArray:
     """Whether points (..., 3) are in the image, ``margin_px`` from its edge."""
-    # Ahead and within 50 deg: farther out the distortion polynomial means nothing.
+    # In front of the camera and within 50 deg: farther out the distortion polynomial is invalid.
     ahead = (camera_p_mm[..., 2] > 1.0) & (np.abs(camera_p_mm[..., :2]).max(axis=-1) < 1.2 * camera_p_mm[..., 2])
     pixel = project_points(camera, np.where(ahead[..., None], camera_p_mm, np.array([0.0, 0.0, 1.0])))
     size = np.array(camera.image_size) - 1.0
@@ -372,7 +372,7 @@ def _corner_visible(
     left_p = transform_points(camera_T_board[:, None], board_p)
     tag = config.marker.tags[0]
     outline = _outline(camera_T_marker @ tag.marker_T_tag, tag, config.marker.dictionary, grow=1.1)
-    # A plain chessboard is found only as a whole; of a ChArUco board a part will do.
+    # A plain chessboard is detected only as a whole, a ChArUco board also in part.
     enough = rows.size if board.charuco is None else min(20, rows.size)
     good = np.ones(n, dtype=bool)
     for camera, camera_T_left in _views(config.camera):

@@ -1,4 +1,4 @@
-"""A whole session from a configuration and a seed: what the files would hold, the truth, and frames on demand.
+"""A whole session from a configuration and a seed: content of its files, ground truth, and frames on demand.
 
 Forward only: beams are drawn in space, PMs are where they end, the stage is turned until the probe hears them, and
 what is recorded is measured there, with noise as ``session.yaml``'s ``noise`` block describes it.
@@ -36,7 +36,7 @@ Frame = npt.NDArray[np.uint8] | npt.NDArray[np.int16]
 Document = dict[str, Any]
 
 SCENES = 6
-"""Scenes that are drawn before a configuration is given up as one in which the camera sees no marker."""
+"""Largest number of scenes drawn until one is found in which the camera sees the marker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ def simulate(config: SimulationConfig, seed: int) -> SimulatedSession:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looks:
-    """What is recorded of looks at n PMs, all (n, looks); ``source_mm`` (n, looks, 3) is what was really heard."""
+    """Recorded looks at n PMs, all (n, looks); ``source_mm`` (n, looks, 3) is the true source."""
 
     scan_deg: FloatArray
     sweep: IntArray
@@ -138,7 +138,7 @@ class _Recorder:
         )
 
     def _plan(self, epochs: IntArray) -> tuple[Scene, AimShots, Shots]:
-        """Scene and shots; where a scene leaves the camera no view of the marker, another is drawn."""
+        """Draw scene and shots, again if the camera cannot see the marker."""
         miss = self.miss_rng.standard_normal((self.config.aims, 3))
         for attempt in range(SCENES):
             self.scene = draw_scene(self.config, self.scene_rng)
