@@ -85,5 +85,5 @@ def identify(port: str) -> CubeIdentity:
 
 
 def ask_stage(_context: DriverContext, options: ThorlabsOptions) -> str:
-    """What a cube says of itself; nothing moves. Raises StageError: nobody answers, or somebody else."""
+    """Identify a cube; nothing moves. Raises StageError: no device answers, or another one."""
     return str(identify(options.port or only_port()))
