@@ -111,8 +111,7 @@ def distinct(problem: PackedProblem, state: SharedState, at: Evaluation) -> IntA
         step = step_between(state.take([best]), others, problem.columns)
         near = np.einsum("sa,ab,sb->s", step, at.hessian[best], step) < 1.0
         same_chart = (others.marker_T_nominal == state.marker_T_nominal[best]).all(axis=(1, 2))
-        near[0] = True
-        left = left[~(near & same_chart)]
+        left = left[1:][~(near & same_chart)[1:]]  # without the best one itself, also where its numbers are not finite
     return np.array(chosen)
 
 
