@@ -1,1 +1,1 @@
-"""Recordings of other programs made sessions, and results made files that other programs read."""
+"""Conversion of recordings of other programs to sessions, and of results to files for other programs."""

@@ -1,10 +1,10 @@
-"""ROS 2 recordings: looks, marker, stage angle and endoscope images put together by time, as a session's events.
+"""ROS 2 recordings: looks, marker, stage angle and endoscope images, joined by time to a session's events.
 
-What becomes an event:
+The events:
 
 - with a ``mark`` topic (std_msgs/String, each a JSON object with an event's fields, such as ``{"type": "pair", "pm": 3,
-  "sweep": 1}`` or ``{"type": "aim", "corner": [4, 2]}``): each mark; a pair takes the look nearest to it, a track one
-  that comes with it;
+  "sweep": 1}`` or ``{"type": "aim", "corner": [4, 2]}``): each mark is one; a pair takes the nearest look, a track
+  the look at its time, if any;
 - without: each look (``look``: PointStamped, x lateral and z range; or ``frame``: the probe's data) is a pair.
 
 The marker is the pose at the look's time, interpolated, or the nearest images. Where the recording has the endoscope
@@ -53,7 +53,7 @@ from fgreg.model.session_model import StereoRig
 from fgreg.model.time_sync import PairRefused, TimedPose, interpolate, pose_at
 
 MARK_GAP_S = 1.0
-"""A mark belongs to a look that is at most so far away: people press a key when they have heard it."""
+"""Largest time between a mark and its look: the operator presses a key after the look."""
 _DEFAULTS = {role: f"/fgreg/{role}" for role in ("marker", "scan", "look", "frame", "mark")}
 _KINDS = {
     "left": IMAGE_TYPES,
@@ -73,7 +73,7 @@ Found = TypeVar("Found")
 
 @dataclass(slots=True)
 class _Streams:
-    """What a recording holds, by role, in time order: (s after the recording's start, what)."""
+    """Contents of a recording by role, in time order: (s after the recording's start, value)."""
 
     marker: list[tuple[float, tuple[FloatArray, FloatArray | None]]] = field(default_factory=list)
     scan: list[tuple[float, float]] = field(default_factory=list)
@@ -95,10 +95,10 @@ class _Look:
 
 
 def read_bag(path: Path, mapping: RecordingMapping) -> Imported:
-    """Reads a recording.
+    """Read a recording.
 
     Raises:
-        InputError: damaged, topics missing or of another type, a mark that is none.
+        InputError: a damaged file, topics missing or of another type, an invalid mark.
         MissingExtraError: ``rosbags`` is not installed.
     """
     with Recording(path) as recording:
@@ -119,7 +119,7 @@ def read_bag(path: Path, mapping: RecordingMapping) -> Imported:
 
 
 def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
-    """The topic of each role that the recording has: as the mapping says, else by its usual name."""
+    """The topic of each role in the recording: from the mapping, else by its default name."""
     found: dict[str, str] = {}
     for role, kinds in _KINDS.items():
         if role in mapping.topics:
@@ -134,11 +134,11 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
             if beside in recording.topics and recording.topics[beside].kind in INFO_TYPES:
                 found[f"{side}_info"] = beside
     if {"look", "frame"} <= found.keys():
-        told = {"look", "frame"} & mapping.topics.keys()
-        if len(told) == 2:
+        mapped = {"look", "frame"} & mapping.topics.keys()
+        if len(mapped) == 2:
             raise InputError("topics", "look and frame, both", "one of them: each would be a look at the same PM")
-        # The probe's data say more than a position that somebody took from them.
-        del found["frame" if told == {"look"} else "look"]
+        # The probe's data have more information than a position computed from them.
+        del found["frame" if mapped == {"look"} else "look"]
     if "ecm" not in found and (name := recording.endoscope_pose_topic()) is not None:
         found["ecm"] = name
     where = recording.path.name
@@ -154,7 +154,7 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
 
 
 def _read_streams(recording: Recording, topics: dict[str, str], mapping: RecordingMapping) -> _Streams:
-    """All but the pixels, in one pass."""
+    """Read all messages except pixels, in one pass."""
     streams = _Streams()
     roles: dict[str, list[str]] = {}
     for role, name in topics.items():
@@ -214,19 +214,19 @@ def _mark(text: str) -> Document:
 
 
 def _rig(path: Path, streams: _Streams) -> StereoRig | None:
-    """The endoscope's calibration, of the first camera_info of each side; of unrectified images."""
+    """The endoscope's calibration for unrectified images, from the first camera_info of each side; None without."""
     infos = {side: streams.infos.get(f"{side}_info") for side in ("left", "right")}
     if infos["left"] is None:
         return None
     left = info_of(infos["left"], f"{path.name}: left camera_info")
     right = None if infos["right"] is None else info_of(infos["right"], f"{path.name}: right camera_info")
     if not left.matrix.any():
-        return None  # a camera that was never calibrated says so with zeros
+        return None  # an uncalibrated camera has a zero matrix
     return rig_of_infos(left, right, MM_PER_M)
 
 
 class _Join:
-    """Events from streams: what goes together by time."""
+    """Joins streams to events by time."""
 
     def __init__(self, file: str, streams: _Streams, mapping: RecordingMapping) -> None:
         self._file, self._streams, self._mapping = file, streams, mapping
@@ -259,7 +259,7 @@ class _Join:
                 nearest = _nearest(self._streams.looks, t, MARK_GAP_S, "look")
                 return self._pair(*nearest, mark)
             case "aim":
-                # A corner of the board is found in images only.
+                # The board's corner is detected in images.
                 marker = self._marker(t) | (self._images(t) if "corner" in mark else {})
                 return {**mark, "t": t, "marker": marker}
             case "track":
@@ -269,7 +269,7 @@ class _Join:
                 return {**mark, "t": t}
 
     def _heard(self, t: float, mark: Document) -> Document:
-        """What a query has of the probe: the look that comes with it, else where the stage is."""
+        """The probe part of a query: the look at its time, else the stage's angle."""
         try:
             look_s, look = _nearest(self._streams.looks, t, self._mapping.max_gap_s, "look")
         except PairRefused:
@@ -304,11 +304,11 @@ class _Join:
             _, right = _nearest(self._streams.right, left_s, min(gap, 0.02), "right image")
             marker["right"] = self._name("right", right, ".png")
         except PairRefused:
-            pass  # one view is enough, and says less
+            pass  # one view is enough, with less accuracy
         return marker
 
     def _scan(self, t: float) -> float:
-        """The stage's angle: between two readings, or the nearest at either end."""
+        """The stage's angle (deg): interpolated between two readings, or the nearest at either end."""
         readings, gap = self._streams.scan, self._mapping.max_gap_s
         after = bisect.bisect_left(readings, t, key=lambda entry: entry[0])
         if 0 < after < len(readings):
@@ -321,7 +321,7 @@ class _Join:
         return self.frames.setdefault((role, index), f"frames/{role}-{index:06d}{suffix}")
 
     def _with_moves(self, drafts: list[Draft]) -> list[Draft]:
-        """Puts a ``camera_moved`` before each event since which the holder's pose has changed."""
+        """Insert a ``camera_moved`` before each event at which the holder's pose has changed."""
         if not self._streams.ecm:
             return drafts
         moves = self._mapping.moves
@@ -360,7 +360,7 @@ def _nearest(stream: list[tuple[float, Found]], t: float, gap_s: float, what: st
 def _pose_between(
     stream: list[tuple[float, tuple[FloatArray, FloatArray | None]]], t: float, gap_s: float
 ) -> tuple[FloatArray, FloatArray | None]:
-    """The pose at a time, with a covariance where the poses around it have one."""
+    """The pose at a time, with a covariance where both neighbouring poses have one."""
     after = bisect.bisect_left(stream, t, key=lambda entry: entry[0])
     around = stream[max(0, after - 1) : after + 1]
     if all(covariance is not None for _, (_, covariance) in around):
@@ -374,7 +374,7 @@ def _pose_between(
 
 
 def _write_frames(path: Path, topics: dict[str, str], frames: dict[tuple[str, int], str], folder: Path) -> None:
-    """The pixels, in a second pass: only what events name."""
+    """Write the frames that events name, in a second pass."""
     if not frames:
         return
     (folder / "frames").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""What every kind of recording is turned into before it becomes a session: events, frames, and what was left out."""
+"""The intermediate form of every recording before it becomes a session: events, frames, and what was left out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Document = dict[str, Any]
 
 @dataclass(slots=True)
 class Draft:
-    """One event: the object of its line (fgreg.session.event_writer), and where it came from, for messages."""
+    """One event: the object of its line (fgreg.session.event_writer), and its origin, for messages."""
 
     document: Document
     where: str
@@ -28,14 +28,14 @@ class Draft:
 
 @dataclass(slots=True)
 class Imported:
-    """A recording, read.
+    """The contents of a recording.
 
     Attributes:
         drafts: events in time order.
-        write_frames: writes all frames that the events name below a folder.
-        left_out: plain sentences on what did not become an event, and why.
+        write_frames: writes all frames that the events name to a folder.
+        left_out: sentences about data that did not become an event, with the reason.
         rig: the endoscope's calibration, where the recording has it.
-        source: what it was, for the record.
+        source: description of the recording.
     """
 
     drafts: list[Draft]
@@ -46,5 +46,5 @@ class Imported:
 
 
 def rows(matrix: FloatArray) -> list[list[float]]:
-    """A matrix as the lists that a document holds."""
+    """A matrix as nested lists for a document."""
     return [[float(value) for value in row] for row in matrix]

@@ -1,12 +1,12 @@
 """Results as files that other programs read: PLUS, ROS 2, 3D Slicer, and JSON.
 
 The transform is always ``trus_T_camera``, which maps camera coordinates to TRUS coordinates; each program has its own
-way to say so:
+convention:
 
 - PLUS: ``<Transform From="Camera" To="Trus" Matrix=...>``, millimetres, rows one after another.
 - ROS 2: a ``TransformStamped`` with the target as ``header.frame_id`` and the source as ``child_frame_id``, metres.
-- Slicer: a node ``CameraToTrus`` whose matrix *to its parent* is ``trus_T_camera`` in Slicer's RAS numbers, as it comes
-  by OpenIGTLink. An ITK transform file holds the *resampling* direction, parent to node, in LPS: ``F inverse(M) F``
+- Slicer: a node ``CameraToTrus`` whose matrix *to its parent* is ``trus_T_camera`` in RAS coordinates, as sent by
+  OpenIGTLink. An ITK transform file holds the *resampling* direction, parent to node, in LPS: ``F inverse(M) F``
   with ``F = diag(-1, -1, 1)``.
 - JSON: with the covariance, the verdict and its reasons.
 """
@@ -35,7 +35,7 @@ _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exported:
-    """One epoch of a result, to be exported.
+    """One epoch of a result for export.
 
     Attributes:
         session: its name.
@@ -59,29 +59,29 @@ class Exported:
 
     @property
     def refused(self) -> bool:
-        """Whether this must not be used."""
+        """Whether the verdict is refused, so that the registration must not be used."""
         return self.verdict is Verdict.REFUSED
 
     @property
     def warning_lines(self) -> list[str]:
-        """What a reader of the file has to know first: nothing where the verdict is ``ok``."""
+        """Warning at the top of the file: verdict and reasons; empty where the verdict is ``ok``."""
         if self.verdict is Verdict.OK:
             return []
         forced = "REFUSED by fgreg, exported with --force: DO NOT USE for navigation"
-        say = forced if self.refused else "verdict: warning"
-        return [say, *(one_line(reason, 300) for reason in self.reasons)]
+        heading = forced if self.refused else "verdict: warning"
+        return [heading, *(one_line(reason, 300) for reason in self.reasons)]
 
 
 def registration_of(
     estimate: SessionEstimate, path: Path, *, epoch: int | None = None, force: bool = False
 ) -> Exported:
-    """The epoch of a result that is to be exported: the last one unless told.
+    """The epoch of a result for export.
 
     Args:
-        estimate: the result that ``path`` holds.
-        path: the result's file; its time is the registration's.
-        epoch: index.
-        force: also where the verdict is ``refused``.
+        estimate: the result in ``path``.
+        path: the result's file; its time of change becomes ``solved``.
+        epoch: index; None: the last one.
+        force: export also where the verdict is ``refused``.
 
     Raises:
         InputError: no such epoch, no transform in it, or refused without ``force``.
@@ -97,7 +97,7 @@ def registration_of(
     where = f"{path.name}: epoch {chosen.index}"
     if verdict is Verdict.REFUSED and not force:
         why = f" ({one_line(estimate.reasons[0], 160)})" if estimate.reasons else ""
-        raise InputError(where, f"the verdict refused{why}", "ok or warning, or --force to export it nevertheless")
+        raise InputError(where, f"the verdict refused{why}", "ok or warning, or --force to export it")
     if chosen.trus_T_camera is None:
         raise InputError(where, "no transform", "one that could be computed")
     tre = chosen.predicted_tre
@@ -167,7 +167,7 @@ def slicer_tfm(found: Exported) -> str:
 
 
 def as_json(found: Exported) -> str:
-    """Everything about the registration, with units in the names."""
+    """The registration with covariance, verdict and predicted error as JSON, units in the names."""
     document: dict[str, Any] = {
         "format": JSON_FORMAT,
         "fgreg": __version__,
@@ -194,7 +194,7 @@ WRITERS: dict[str, Callable[[Exported], str]] = {
     ".txt": slicer_tfm,
     ".json": as_json,
 }
-"""What each ending of a file's name is written by."""
+"""The writer of each file suffix."""
 
 
 def _iso(moment: datetime) -> str:

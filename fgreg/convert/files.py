@@ -1,4 +1,4 @@
-"""Output files: whole or not at all, and nothing that is there is lost without being asked for."""
+"""Atomic output: a file or folder is written whole or not at all, and replaced only with ``overwrite``."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml",
 
 
 def write_whole(path: Path, text: str, *, overwrite: bool = False) -> None:
-    """A text file under its name only when all of it is on disk.
+    """Write a text file atomically: it gets its name when all of it is on disk.
 
     Raises:
-        InputError: the file is there and ``overwrite`` is not set, it is one of a session's own, or the disk refuses.
+        InputError: the file exists and ``overwrite`` is not set, it is a session's own file, or it cannot be written.
     """
     if path.name in _SESSION_FILES:
         raise InputError(str(path), "the name of a session's own file", "another name")
@@ -46,16 +46,16 @@ def write_whole(path: Path, text: str, *, overwrite: bool = False) -> None:
 
 @contextmanager
 def whole_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to fill, which takes its name when the block ends well, and is gone where it does not.
+    """A temporary folder that is renamed to ``folder`` at the end of the block, and removed after an exception.
 
     Args:
-        folder: new, or empty; with ``overwrite`` also one that holds a session, which goes only when the new one is
+        folder: new or empty; with ``overwrite`` also one with a session, which is replaced when the new one is
             complete.
 
     Raises:
-        InputError: something else is there, or the disk refuses.
+        InputError: ``folder`` has other contents, or cannot be written.
     """
-    folder = Path(os.path.abspath(folder))  # noqa: PTH100  (a link to a folder stays what the user named)
+    folder = Path(os.path.abspath(folder))  # noqa: PTH100  (keeps the link that the user named)
     if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
         if not overwrite:
             raise InputError(str(folder), "something that is no empty folder", "a new or empty one, or --overwrite")

@@ -1,4 +1,4 @@
-"""Mappings: which columns, topics or fields of a recording are what. One YAML file; all of it has defaults.
+"""Mappings: the columns, topics or fields of a recording and their roles. One YAML file; every key has a default.
 
 format: fgreg-mapping/1
 # CSV
@@ -33,7 +33,7 @@ from fgreg.session.yaml_loader import load_yaml
 MAPPING_FORMAT = "fgreg-mapping/1"
 
 LOOK = tuple(key for key in record(TrusRecord).fields if not isinstance(key.kind, Covariance))
-"""What a look can have in a table."""
+"""Keys of a look in a table."""
 
 COLUMNS = (
     *("t", "type", "pm", *(key.name for key in LOOK), "left", "right", "text"),
@@ -41,13 +41,13 @@ COLUMNS = (
     *("marker_qw", "marker_rx_rad", "marker_ry_rad", "marker_rz_rad", "spot_x_mm", "spot_y_mm", "spot_z_mm"),
     *("corner_column", "corner_row", "camera_new_T_camera_old"),
 )
-"""What a CSV table can have; each is looked for under its own name unless the mapping gives another."""
+"""Roles of CSV columns; a column has the name of its role unless the mapping names another."""
 
 TOPICS = ("left", "right", "left_info", "right_info", "marker", "scan", "look", "frame", "mark", "ecm")
-"""What a ROS 2 recording can have; images, their camera_info and the ECM are found by name."""
+"""Roles of ROS 2 topics; images, their camera_info and the ECM are also found by name."""
 
 FIELDS = ("marker", "scan", "type", "pm", "sweep", "amplitude", "x_mm", "range_mm", "text")
-"""What a PLUS sequence can have for each frame, besides its image and time."""
+"""Roles of the fields of a PLUS frame, besides its image and time."""
 
 
 def _by_name(name: str, known: tuple[str, ...], kind: Kind) -> Section:
@@ -57,7 +57,7 @@ def _by_name(name: str, known: tuple[str, ...], kind: Kind) -> Section:
 
 @dataclass(frozen=True, slots=True)
 class Constant(Kind):
-    """A number or a text; a text inside."""
+    """A number or a text, read as text."""
 
     takes_text = True
 
@@ -76,7 +76,7 @@ class Constant(Kind):
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Where a value comes from: ``scale * cell + offset`` of a column, or one value for all rows."""
+    """Source of a value: ``scale * cell + offset`` of a column, or one value for all rows."""
 
     column: Annotated[str, Key("its name", Text("the name of a column"))] = ""
     scale: Annotated[float, Key("factor to the unit of the format", Number())] = 1.0
@@ -90,7 +90,7 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class ColumnKind(Kind):
-    """A column's name, or a mapping with more on it."""
+    """A column's name, or a mapping of :class:`Column`."""
 
     takes_text = True
 
@@ -113,13 +113,13 @@ _LENGTH, _ANGLE = Number(0.0, 1e3, above=True), Number(0.0, 180.0, above=True)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMoves:
-    """What the endoscope's holder says of the camera's moves."""
+    """Detection of camera moves from the pose of the endoscope's holder."""
 
-    mm: Annotated[float, Key("the camera moved where it shifted by more", _LENGTH)] = 1.0
-    deg: Annotated[float, Key("or turned by more", _ANGLE)] = 0.5
-    sigma_mm: Annotated[float, Key("how well the holder knows the shift", _LENGTH)] = 1.0
-    sigma_deg: Annotated[float, Key("how well it knows the turn", _ANGLE)] = 0.5
-    tip_T_camera: Annotated[FloatArray, Key("where on the holder the camera is", Transform(), default="identity")] = (
+    mm: Annotated[float, Key("a shift above this is a camera move", _LENGTH)] = 1.0
+    deg: Annotated[float, Key("or a rotation above this", _ANGLE)] = 0.5
+    sigma_mm: Annotated[float, Key("standard deviation of the holder's shift", _LENGTH)] = 1.0
+    sigma_deg: Annotated[float, Key("standard deviation of its rotation", _ANGLE)] = 0.5
+    tip_T_camera: Annotated[FloatArray, Key("pose of the camera on the holder", Transform(), default="identity")] = (
         field(default_factory=lambda: as_float_array(np.eye(4)))
     )
 
@@ -135,7 +135,7 @@ _FRAMES = ListOf(Integer(0, 2**31 - 1), "a list of frame numbers from 0")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordingMapping:
-    """A mapping, read; empty where there is no file."""
+    """The contents of a mapping file; the defaults hold without a file."""
 
     columns: Annotated[
         Mapping[str, Column], Key("of CSV tables: where each value is", _by_name("Columns", COLUMNS, ColumnKind()))
@@ -151,11 +151,11 @@ class RecordingMapping:
         None
     )
     clock: Annotated[
-        str, Key("whose times count: those of headers, or of recording", Text(allowed=("header", "recorder")))
+        str, Key("clock of the times: message headers, or the recorder", Text(allowed=("header", "recorder")))
     ] = "header"
-    max_gap_s: Annotated[float, Key("most time between what is put together", _GAP)] = 0.1
+    max_gap_s: Annotated[float, Key("largest time between joined data", _GAP)] = 0.1
     same_pm_s: Annotated[
-        float | None, Key("looks that follow each other so soon are at one PM; absent: each is at its own", _GAP)
+        float | None, Key("looks within this time are of one PM; absent: each look has its own PM", _GAP)
     ] = None
     moves: Annotated[CameraMoves, Key("when the camera moved", name="camera_moved")] = field(
         default_factory=CameraMoves
@@ -170,7 +170,7 @@ class RecordingMapping:
 
     @property
     def by_header(self) -> bool:
-        """Times are those of the messages' headers, not those of recording."""
+        """Whether times are from the messages' headers, not from the recorder."""
         return self.clock == "header"
 
 
@@ -179,7 +179,7 @@ MAPPING = record(RecordingMapping, ("format", MAPPING_FORMAT))
 
 
 def read_mapping(path: Path) -> RecordingMapping:
-    """Reads a mapping file.
+    """Read a mapping file.
 
     Raises:
         InputError: the first problem, with key and line.

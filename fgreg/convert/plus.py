@@ -1,9 +1,9 @@
 """PLUS sequences: each frame is a look, with the marker's pose and the stage's angle from its transforms and fields.
 
 By default a frame has ``MarkerToCameraTransform`` (mm), and the stage's angle either as a field ``StageAngle`` (deg) or
-as a transform ``ProbeToStageTransform``, whose turn about x is taken (the probe's z axis along (0, sin t, cos t)).
-Optional fields say more: ``FgregType`` (pair, aim, track, note), ``FgregPm``, ``FgregSweep``, ``FgregAmplitude``,
-``FgregX`` and ``FgregRange`` (mm; instead of the image), ``FgregText``. A mapping names others.
+as a transform ``ProbeToStageTransform``, whose rotation about x is used (the probe's z axis along (0, sin t, cos t)).
+Optional fields: ``FgregType`` (pair, aim, track, note), ``FgregPm``, ``FgregSweep``, ``FgregAmplitude``,
+``FgregX`` and ``FgregRange`` (mm; instead of the image), ``FgregText``. A mapping can name others.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ _BAD_STATUS = ("INVALID", "MISSING", "OUT_OF_VIEW", "TRACKER_ERROR")
 
 
 def read_plus(path: Path, mapping: RecordingMapping) -> Imported:
-    """Reads a sequence as events.
+    """Read a sequence as events.
 
     Raises:
-        InputError: the file, or a field of a frame, is not what it should be.
+        InputError: the file or a field of a frame is invalid.
     """
     sequence = read_sequence(path)
     frames = _Frames(sequence, mapping)
@@ -71,7 +71,7 @@ def read_plus(path: Path, mapping: RecordingMapping) -> Imported:
 
 
 class _Frames:
-    """The frames of a sequence as documents of events."""
+    """Converts the frames of a sequence to event documents."""
 
     def __init__(self, sequence: SequenceFile, mapping: RecordingMapping) -> None:
         self._sequence = sequence
@@ -89,7 +89,7 @@ class _Frames:
         self._next_pm = 0
 
     def document(self, index: int) -> Document:
-        """One frame. Raises PairRefused where the tracker or the scanner had nothing at the time."""
+        """The event of one frame. Raises PairRefused where tracker or scanner have no valid data at its time."""
         fields = self._sequence.frames[index]
         place = f"{self._sequence.name}: Seq_Frame{index:04d}"
         t = self._number(fields, "Timestamp", place)
@@ -160,7 +160,7 @@ class _Frames:
         try:
             return math.degrees(turn_about_x(self._transform(fields, "scan", place)[:3, :3]))
         except ValueError as error:
-            raise InputError(f"{place}_{name}", str(error), "the probe's turn about its x axis") from None
+            raise InputError(f"{place}_{name}", str(error), "a rotation of the probe about its x axis") from None
 
     def _image(self, index: int, fields: Mapping[str, str]) -> str:
         if self._sequence.images is None or index >= len(self._sequence.images):
@@ -177,8 +177,9 @@ class _Frames:
 def oriented(image: npt.NDArray[Any], orientation: str, is_rf: bool, name: str) -> npt.NDArray[Any]:
     """A stored image as a session's frame: (elements, samples) of channel data, (depth, lateral) of an envelope.
 
-    PLUS's two first letters say where x and y of the stored image, (height, width), go: M or U to the probe's marked or
-    unmarked side, F or N far from the probe or near to it. The marked side becomes the higher column or element.
+    The first two letters of PLUS's orientation are the directions of x and y of the stored image (height, width): M or
+    U to the probe's marked or unmarked side, F or N away from the probe or towards it. The marked side becomes the
+    higher column or element.
 
     Raises:
         InputError: other letters.

@@ -45,10 +45,10 @@ class SequenceFile:
 
 
 def read_sequence(path: Path) -> SequenceFile:
-    """Reads a sequence whole.
+    """Read a whole sequence.
 
     Raises:
-        InputError: not a MetaImage of three dimensions, or cut off.
+        InputError: not a MetaImage of three dimensions, or truncated.
     """
     name = path.name
     data = read_bounded(path, name, _MAX_BYTES)

@@ -1,4 +1,4 @@
-"""CSV tables: one row, one event. Columns under their own names, or as a mapping says."""
+"""CSV tables: one event per row. Columns have the names of their roles, or those of a mapping."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _WITH_MARKER = ("aim", "pair", "track")
 
 
 def read_table(path: Path, mapping: RecordingMapping) -> Imported:
-    """Reads a table; frames that it names are files relative to its folder.
+    """Read a table; the frames it names are files relative to its folder.
 
     Raises:
-        InputError: the first cell that is not what its column should be, with its line.
+        InputError: the first invalid cell, with its line.
     """
     try:
         text = read_bounded(path, path.name, _MAX_BYTES).decode("utf-8-sig")
@@ -68,7 +68,7 @@ def read_table(path: Path, mapping: RecordingMapping) -> Imported:
 
 
 class _Table:
-    """The header of a table: where each value is."""
+    """The header of a table: the column of each role."""
 
     def __init__(self, path: Path, mapping: RecordingMapping) -> None:
         self.path, self._mapping = path, mapping
@@ -111,7 +111,7 @@ class _Row:
             raise InputError(self.where, f"{len(cells)} cells", f"{table.width}, as the header has")
 
     def draft(self) -> Draft:
-        """The row as an event; what it lacks is told when it is read as one."""
+        """The row as an event; missing values are reported when the event is read."""
         kind = self.text("type") or "pair"
         document: Document = {"type": kind, "t": self.need("t")}
         if kind == "pair":
@@ -121,8 +121,8 @@ class _Row:
         if kind == "pair":
             document["trus"] = self._trus()
         elif kind == "track":
-            heard = any(self.text(key) for key in ("x_mm", "range_mm", "frame"))
-            document |= {"trus": self._trus()} if heard else {"scan_deg": self.need("scan_deg")}
+            has_look = any(self.text(key) for key in ("x_mm", "range_mm", "frame"))
+            document |= {"trus": self._trus()} if has_look else {"scan_deg": self.need("scan_deg")}
         elif kind == "aim":
             spot = self.three(_SPOT)
             if spot is not None:
@@ -159,21 +159,21 @@ class _Row:
         return value * column.scale + column.offset
 
     def need(self, role: str) -> float:
-        """A number that has to be there."""
+        """A required number."""
         value = self.number(role)
         if value is None:
             raise InputError(f"{self.where}: {role}", "nothing", "a number")
         return value
 
     def whole(self, role: str) -> int:
-        """A whole number that has to be there."""
+        """A required whole number."""
         value = self.need(role)
         if value != round(value):
             raise InputError(f"{self.where}: {role}", f"{value:g}", "a whole number")
         return round(value)
 
     def three(self, roles: tuple[str, ...]) -> list[float] | None:
-        """Numbers that are all there, or none of them."""
+        """Numbers that are all given, or None where none is."""
         if not any(self.text(role) for role in roles):
             return None
         return [self.need(role) for role in roles]
@@ -233,7 +233,7 @@ class _Row:
         return trus
 
     def _frame(self, role: str, name: str, suffix: str) -> str:
-        """The name that a file gets in the session; the same file has one name."""
+        """The name of a file in the session; the same file always has the same name."""
         path = self._table.path.parent / name
         if not path.is_file():
             raise InputError(f"{self.where}: {role}", f"{shown(name)}: no such file", "a file relative to the table")
@@ -248,13 +248,13 @@ class _Row:
 
 
 def _copy_frames(frames: Mapping[Path, str], folder: Path) -> None:
-    """Copies files; pictures that are no PNG become one."""
+    """Copy files; images of other formats are converted to PNG."""
     for path, name in frames.items():
         data = read_bounded(path, str(path), _MAX_BYTES)
         if path.suffix.lower() not in (".npy", ".png"):
             picture = read_picture(path)
             if picture is None:
-                raise InputError(str(path), "something that is no picture", "a picture (PNG, JPEG, BMP, TIFF)")
+                raise InputError(str(path), "a file that is not an image", "a picture (PNG, JPEG, BMP, TIFF)")
             data = png_bytes(picture)
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)

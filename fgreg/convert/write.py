@@ -1,4 +1,4 @@
-"""Events and frames of a recording, written as a session that is whole and checked, or not at all."""
+"""Write events and frames of a recording as a checked session, whole or not at all."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_SETUP = 4_000_000
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What became of a recording: number of events by type, frames, and plain sentences on what did not."""
+    """Result of a conversion: number of events by type, of frames, and sentences about what was left out."""
 
     events: Mapping[str, int]
     frames: int
@@ -34,17 +34,17 @@ class Written:
 def write_session(
     imported: Imported, setup: Path, out: Path, *, rig: StereoRig | None = None, overwrite: bool = False
 ) -> Written:
-    """Writes a session folder.
+    """Write a session folder.
 
     Args:
         imported: the recording.
-        setup: a ``session.yaml``, or a folder with one: how things were set up. Copied as it is.
+        setup: a ``session.yaml``, or a folder with one. It is copied unchanged.
         out: the folder.
         rig: the endoscope's calibration, where the setup has none.
-        overwrite: replace a session that is there.
+        overwrite: replace an existing session.
 
     Raises:
-        InputError: an event that the format does not take, with its place in the recording; nothing is written then.
+        InputError: an event that the format does not allow, with its place in the recording; nothing is written.
     """
     if not imported.drafts:
         why = f"; {imported.left_out[0]}" if imported.left_out else ""
@@ -72,7 +72,7 @@ def write_session(
 
 
 def _summary(imported: Imported) -> str:
-    """For the record: what the session was made of."""
+    """Text of the first note: source of the session, and what was left out."""
     missing = "; ".join(one_line(reason, 200) for reason in imported.left_out[:20])
     more = len(imported.left_out) - 20
     tail = f" and {more} more" if more > 0 else ""
@@ -88,7 +88,7 @@ def _read_setup(path: Path, name: str, session: str) -> Setup:
 
 
 def _lines(drafts: list[Draft], folder: Path, setup: Setup) -> tuple[list[bytes], int]:
-    """The events' lines, each read back as a reader of the session will; number of frames."""
+    """The events' lines, each checked by reading it back, and the number of frames."""
     out: list[bytes] = []
     uses: dict[Path, FrameUse] = {}
     last: tuple[float, int] | None = None
@@ -110,7 +110,7 @@ def _lines(drafts: list[Draft], folder: Path, setup: Setup) -> tuple[list[bytes]
 
 
 def _place(draft: Draft, problem: InputError) -> str:
-    """The place in the recording instead of the line that was never written."""
+    """The place of a problem in the recording, in place of the line in events.jsonl."""
     inner = problem.where.split(": ", 2)
     return f"{draft.where}: {inner[2]}" if len(inner) == 3 else draft.where
 
