@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from fgreg.convert.drafts import Imported
     from fgreg.convert.mapping import RecordingMapping
 
-_HELP = """Recordings into sessions, and results into files that other programs read.
+_HELP = """Convert recordings to sessions, and results to files for other programs.
 
 \b
-A recording, with the session.yaml that says how things were set up:
+A recording, with the session.yaml of its set-up:
   fgreg convert shots.csv   OUT --setup session.yaml   CSV: one row, one event
   fgreg convert bag/        OUT --setup session.yaml   ROS 2: rosbag2 folder, .mcap, .db3
   fgreg convert scan.mha    OUT --setup session.yaml   PLUS sequence (.mha, .mhd)
@@ -27,7 +27,7 @@ A result (a session's folder, or its result.yaml), by the ending of OUT:
   fgreg convert SESSION registration.tfm    3D Slicer: linear transform CameraToTrus
   fgreg convert SESSION registration.json   all of it: covariance, verdict, reasons
 \b
-Where session.yaml has no camera, --calibration FILE brings it: ROS camera_info (left
+Where session.yaml has no camera, --calibration FILE provides it: ROS camera_info (left
 and right: give the option twice), OpenCV FileStorage, Kalibr camchain. A ROS 2
 recording with camera_info topics needs none.
 \b
@@ -40,7 +40,7 @@ Others are named in a mapping (--map):
   topics: {marker: /marker/pose, scan: /stage/joint_states, frame: /probe/channels}
   fields: {marker: NeedleToCameraTransform, scan: StageAngle}
 \b
-What lacks its marker or stage angle is left out and told. A result with the verdict
+What lacks its marker or stage angle is left out with a warning. A result with the verdict
 refused is exported with --force only, and the file says so.
 """
 
@@ -56,23 +56,23 @@ def add_convert(app: typer.Typer) -> None:
             Path | None, typer.Option("--setup", metavar="FILE", help="session.yaml of a new session (or its folder).")
         ] = None,
         mapping: Annotated[
-            Path | None, typer.Option("--map", metavar="FILE", help="What is what in the recording.")
+            Path | None, typer.Option("--map", metavar="FILE", help="Names of the columns, topics or fields.")
         ] = None,
         calibration: Annotated[
             list[Path] | None,
-            typer.Option("--calibration", metavar="FILE", help="The endoscope's, where session.yaml has no camera."),
+            typer.Option("--calibration", metavar="FILE", help="Of the endoscope, where session.yaml has no camera."),
         ] = None,
         unit: Annotated[
             str | None, typer.Option("--calibration-unit", metavar="m|mm", help="Of the calibration's lengths.")
         ] = None,
         rectified: Annotated[
-            bool, typer.Option("--rectified", help="The pictures were rectified with this calibration.")
+            bool, typer.Option("--rectified", help="The images were rectified with this calibration.")
         ] = False,
         epoch: Annotated[int | None, typer.Option("--epoch", help="Of a result; default: the last one.")] = None,
         force: Annotated[
             bool, typer.Option("--force", help="Export a result that is refused, marked as such.")
         ] = False,
-        overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there under OUT.")] = False,
+        overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing OUT.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
     ) -> None:
         result = _result_file(source)
@@ -85,7 +85,7 @@ def add_convert(app: typer.Typer) -> None:
             return
         _refuse({"--epoch": epoch, "--force": force or None}, "a recording", "a result")
         if setup is None:
-            raise InputError("--setup", "nothing", "the session.yaml that says how things were set up")
+            raise InputError("--setup", "nothing", "the session.yaml of the set-up")
         _import(source, out, setup, mapping, calibration or [], unit, rectified, overwrite, quiet)
 
 
@@ -96,10 +96,10 @@ def _refuse(options: Mapping[str, object], given: str, of: str) -> None:
 
 
 def _result_file(source: Path) -> Path | None:
-    """The result that a source is or has, or None where it is a recording.
+    """The result file of a source, or None where the source is a recording.
 
     Raises:
-        InputError: neither.
+        InputError: neither a result nor a recording.
     """
     from fgreg.drivers.ros_recordings import is_recording
 

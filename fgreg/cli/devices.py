@@ -24,10 +24,10 @@ def add_devices(app: typer.Typer) -> None:
         ] = None,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
     ) -> None:
-        """What devices are there, and which of them answer. No stage moves.
+        """List the devices and whether they answer. No stage moves.
 
         Without CONFIG: libraries, video devices, Thorlabs cubes. With CONFIG, each of its devices is opened for at most
-        2 s: what comes from it, how often, by whose clock, and whether that is what session.yaml says. Exit status 1
+        2 s: its data, their rate, their clock, and whether they agree with session.yaml. Exit status 1
         where one of them does not answer.
 
         \b
@@ -54,14 +54,14 @@ def add_devices(app: typer.Typer) -> None:
 
 
 class _Shown:
-    """Answers as they come, or as one document at the end."""
+    """Prints the answers one by one, or as one document at the end."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
         self.sections: dict[str, list[DeviceReport]] = {}
 
     def section(self, title: str, answers: Any, key: str = "") -> None:
-        """A heading and its answers."""
+        """Print a heading and its answers."""
         found = self.sections.setdefault(key or title.replace(" ", "_").lower(), [])
         if not self._as_json:
             typer.echo(title)
@@ -73,7 +73,7 @@ class _Shown:
             typer.echo("  none")
 
     def end(self) -> None:
-        """The document."""
+        """Print the document, if wanted."""
         if self._as_json:
             document = {key: [asdict(answer) for answer in answers] for key, answers in self.sections.items()}
             typer.echo(json.dumps(document, indent=2))

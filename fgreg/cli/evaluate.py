@@ -30,7 +30,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions.")],
         folds: Annotated[int, typer.Option("--folds", help="Folds of the cross-validation; 0: none.")] = 5,
         one_by_one: Annotated[
-            bool, typer.Option("--leave-one-out/--no-leave-one-out", help="Also leave out each PM by itself.")
+            bool, typer.Option("--leave-one-out/--no-leave-one-out", help="Also leave out each PM alone.")
         ] = True,
         subsets: Annotated[
             int, typer.Option("--subsets", help="Most subsets of each number of pairs; 0: no such curve.")
@@ -50,10 +50,10 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and no tables.")] = False,
     ) -> None:
-        """How good is it: errors against the truth, held-out pairs, number of pairs, influence of each.
+        """Evaluate sessions: errors against the truth, cross-validation, number of pairs, influence of each.
 
-        Solves each SESSION again and again from parts of its pairs. With a ground_truth.yaml: TRE, tracking and beam
-        errors. Without: what the pairs say about each other; the pair residual (the publication's Eq. 12) is not a
+        Solves each SESSION repeatedly from subsets of its pairs. With a ground_truth.yaml: TRE, tracking and beam
+        errors. Without: how well the pairs predict each other; the pair residual (the publication's Eq. 12) is not a
         TRE. Exit status 1 where a verdict is refused.
         """
         from fgreg.evaluation.case import EvaluationConfig
@@ -73,7 +73,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         if plot_format not in FORMATS:
             raise InputError("--plot-format", plot_format, "one of " + ", ".join(FORMATS))
         if plots is not None:
-            new_figure()  # a missing library is told before the work, not after
+            new_figure()  # reports a missing library before the work starts
         config = EvaluationConfig(
             folds=folds,
             leave_one_out=one_by_one,
@@ -100,15 +100,15 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
 
     @app.command()
     def advise(
-        session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session so far.")],
+        session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")],
         count: Annotated[int, typer.Option("--count", "-n", help="How many shots to list.")] = 5,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
     ) -> None:
         """Where the next shot helps most: spots and beam directions, ranked by the predicted TRE after them.
 
-        Reads what has been taken so far; at least 4 pairs. The last camera epoch counts. Exit status 1 where there is
-        no registration to advise on.
+        Uses all shots up to now; at least 4 pairs. The advice is for the last camera epoch. Exit status 1 where there
+        is no registration.
         """
         from fgreg.errors import EstimationError
         from fgreg.evaluation.advised import advice_dict, print_advice
@@ -152,7 +152,7 @@ def _cores() -> int:
 
 
 def named_apart(cases: "list[Case]", folders: list[Path]) -> "list[Case]":
-    """Sessions of the same name are called by their folders."""
+    """Rename sessions that share a name to their folders."""
     names = [case.name for case in cases]
     return [
         replace(case, name=str(folder)) if names.count(case.name) > 1 else case
@@ -173,7 +173,7 @@ def write_text(path: Path, text: str, option: str) -> None:
 
 
 def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]":
-    """A session with its frames recognised (once) and its truth, and what the frames say against it."""
+    """A session as a case, with detection in its frames done once, and the conditions from the detection."""
     from fgreg.detection.events_to_measurements import recognise
     from fgreg.evaluation.case import Case, Truth
     from fgreg.model.solve_config import SolveConfig

@@ -32,16 +32,16 @@ IN_CONFIG = {
     "width": "room.width",
     "limit_mm": "settings.limit_mm",
 }
-"""Parameters of the command, and where a CONFIG.yaml has them."""
+"""Parameters of the command, and their keys in CONFIG.yaml."""
 SHOW_S = 0.25
 SLOW_MS = 250.0
-"""From a frame to its angle: beyond this the stage lags behind the beam, and its watchdog may miss the heartbeat."""
+"""Latency from a frame to its angle above which the stage lags behind and its watchdog may miss the heartbeat."""
 MOST_REASONS, REASON_WIDTH = 2, 170
-"""Of the verdict, in the panel: it has to fit a small terminal."""
+"""Limits of the verdict's reasons in the panel, which must fit a small terminal."""
 
 
 def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
-    """Register the command; ``make_extras`` gives what a summary tells besides the estimate."""
+    """Register the command; ``make_extras`` gives what a summary has besides the estimate."""
 
     @app.command()
     def live(
@@ -59,7 +59,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             ),
         ] = None,
         duration: Annotated[
-            float | None, typer.Option("--duration", metavar="S", help="End after so many seconds. Default: at Ctrl-C.")
+            float | None, typer.Option("--duration", metavar="S", help="End after this time. Default: at Ctrl-C.")
         ] = None,
         no_viewer: Annotated[
             bool,
@@ -69,9 +69,9 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         ] = False,
         rrd: Annotated[
             Path | None,
-            typer.Option("--rrd", metavar="FILE", help="Record what a viewer would show."),
+            typer.Option("--rrd", metavar="FILE", help="Also write a Rerun recording."),
         ] = None,
-        seed: Annotated[int, typer.Option("--seed", help="Of all that is random in the simulated room.")] = 1,
+        seed: Annotated[int, typer.Option("--seed", help="Random seed of the simulated room.")] = 1,
         aims: Annotated[int, typer.Option("--aims", help="Calibration shots in the simulated room.")] = 8,
         bumps: Annotated[
             float,
@@ -90,14 +90,14 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document at the end.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")] = False,
     ) -> None:
-        """Register while it happens: devices in, registration and stage angle out, everything recorded.
+        """Run a live session: devices in, registration and stage angle out, everything recorded.
 
         Without CONFIG a simulated operating room runs: a surgeon calibrates the fibre at a board, points at tissue, the
-        stage searches the sound, the registration forms, and the stage follows the beam. Now and then somebody bumps
-        into the camera. With CONFIG your devices are used, each by the driver that it names.
+        stage searches for the PM, the registration improves, and the stage follows the beam. Now and then the camera
+        is moved. With CONFIG your devices are used, each with the driver that it names.
 
-        Devices that disappear are told within a second and used again when they are back. A stage that stopped for
-        trouble is latched: it says why, and moves again after `reset` and a new request.
+        Lost devices are reported within a second and used again after they reconnect. A stage that stopped on a fault
+        is latched: it reports the cause, and moves again after `reset` and a new request.
 
         \b
           fgreg live --aims 6 --duration 120 --no-viewer  the room, in the terminal
@@ -147,7 +147,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
 
 def _alone(context: typer.Context) -> None:
-    """With a CONFIG.yaml, options that it has keys for would go unheard. Raises InputError."""
+    """Refuse options whose keys are in the CONFIG.yaml: they would have no effect. Raises InputError."""
     for name, key in IN_CONFIG.items():
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
@@ -197,7 +197,7 @@ def _conduct(
     def end(_number: int, _frame: object) -> None:
         nonlocal ended
         ended = True
-        emergency_stop_all()  # the loop ends after its turn; the stage does not wait for that
+        emergency_stop_all()  # the stage stops now; the loop ends after its current turn
 
     with _display(silent) as (say, show), viewer_feed(rrd, folder.name, live=viewer, say=say) as feed:
         before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
@@ -226,7 +226,7 @@ def _conduct(
 
 
 def figures_dict(figures: "Figures") -> dict[str, Any]:
-    """What the loop measured of itself."""
+    """The loop's statistics as plain types."""
     import numpy as np
 
     latency = np.array(figures.latency_ms)
@@ -242,11 +242,11 @@ def figures_dict(figures: "Figures") -> dict[str, Any]:
 
 
 def figures_line(figures: "Figures") -> str:
-    """The same on one line."""
+    """The loop's statistics on one line."""
     found = figures_dict(figures)
     latency = found["latency_ms"]
     return (
-        f"Live: {found['frames']} frames looked into, {found['skipped']} skipped, {found['pulses']} pulses, "
+        f"Live: {found['frames']} frames used, {found['skipped']} skipped, {found['pulses']} pulses, "
         f"{found['stage_orders']} orders to the stage; from frame to angle: median {latency['p50']:.0f}, "
         f"99 % {latency['p99']:.0f}, longest {latency['max']:.0f} ms"
     )
@@ -258,7 +258,7 @@ Show = Callable[["Running", "Status"], None]
 
 @contextmanager
 def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
-    """A panel that changes on a terminal, else a line whenever something new is told."""
+    """A live panel on a terminal, else a line for every new message."""
     if silent:
         yield lambda _text: None, lambda _session, _status: None
         return
@@ -285,7 +285,7 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
 
 
 def status_line(status: "Status") -> str:
-    """One line: how far, the estimate, what was told last."""
+    """One line: phase, estimate, last message."""
     known = status.recorder.known
     lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
     verdict = status.verdict.value if known.registered else "no registration"
@@ -294,7 +294,7 @@ def status_line(status: "Status") -> str:
 
 
 def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> Any:
-    """The session as a panel: what has to be seen at a glance first, the same as in the viewer."""
+    """The session's status as a panel, with the most important rows first, as in the viewer."""
     from rich.panel import Panel
     from rich.table import Table
     from rich.text import Text
@@ -310,7 +310,7 @@ def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> A
     table.add_column(overflow="fold")
 
     def row(title: str, text: str, style: str = "") -> None:
-        table.add_row(title, Text(text, style=style))  # what devices say is no markup
+        table.add_row(title, Text(text, style=style))  # messages of devices are not markup
 
     if known.registered:
         row("registration", status.verdict.value.upper(), STYLES[status.verdict])
@@ -327,7 +327,7 @@ def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> A
     row("next", next_line(now), "bold")
     row("stage", stage_line(now, stage))
     if now.news != now.task:
-        row("told last", now.news)
+        row("last message", now.news)
     row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it")
     latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
     slow = bool(figures.latency_ms) and figures.latency_ms[-1] > SLOW_MS

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 GARBAGE_THRESHOLD = 50_000
-"""New objects between two looks for garbage: imports leave none, and 700 would cost a short command a twentieth."""
+"""New objects between garbage collections: imports leave no garbage, and the default 700 costs 5 % of a command."""
 
 app = typer.Typer(
     name="fgreg",
@@ -47,7 +47,7 @@ app = typer.Typer(
 )
 
 UsageError: type[Exception] = cast("type[Exception]", typer.BadParameter.__mro__[1])
-"""What typer raises for wrong words on the command line; it has no public name in all its versions."""
+"""The usage error of typer, which has no public name in all its versions."""
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")]
@@ -58,7 +58,7 @@ def main() -> None:
     """Entry point: known errors become one line and exit status 2."""
     gc.set_threshold(GARBAGE_THRESHOLD)
     try:
-        with one_thread_each():  # what is worked on at once is frames, solves or devices, never a matrix
+        with one_thread_each():  # parallel work is over frames, solves or devices, not in matrices
             status = app(standalone_mode=False)
     except FgregError as error:
         _fail(str(error))
@@ -69,7 +69,7 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
     except BrokenPipeError:
-        # The reader of our output left; say nothing more, not even at interpreter exit.
+        # The reader of our output has closed it: print nothing more, not even at interpreter exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_REFUSED)
     sys.exit(status if isinstance(status, int) else 0)
@@ -97,7 +97,7 @@ def _top(
 
 
 def _no_progress(_step: str, _done: int, _total: int) -> None:
-    """Says nothing."""
+    """Ignore progress."""
 
 
 @contextmanager
@@ -133,7 +133,7 @@ def solve(
     ] = None,
     limit_mm: LimitOption = 3.0,
     redetect: Annotated[
-        bool, typer.Option("--redetect", help="Detect in the frames even where events bring poses.")
+        bool, typer.Option("--redetect", help="Detect in the frames even where events have poses.")
     ] = False,
     estimate: EstimateOption = "",
     detect_moves: Annotated[
@@ -144,8 +144,8 @@ def solve(
 ) -> None:
     """Calibrate the fibre, register camera to TRUS, answer the session's tracking queries.
 
-    Reads SESSION, looks at its frames, writes result.yaml and prints a summary: verdict first, with what to do where it
-    is not ok. No initial guess is needed. Exit status 1 where the verdict is refused.
+    Reads SESSION, detects in its frames, writes result.yaml and prints a summary: verdict first, with the remedy where
+    it is not ok. No initial guess is needed. Exit status 1 where the verdict is refused.
     """
     from fgreg.model.estimate import Verdict
     from fgreg.pipeline.solve import SolveRequest, solve_session
@@ -160,7 +160,7 @@ def solve(
 
 
 def _show(report: "SolveReport", as_json: bool) -> None:
-    """The summary of a solve, with what the reader warned of."""
+    """Print the summary of a solve, with the reader's warnings."""
     from fgreg.cli.report import print_summary, summary_dict
 
     extras = _summary_extras(report)
@@ -173,7 +173,7 @@ def _show(report: "SolveReport", as_json: bool) -> None:
 
 
 def _summary_extras(report: "SolveReport") -> Any:
-    """What the summary tells besides the estimate."""
+    """The parts of the summary besides the estimate."""
     from fgreg.cli.report import DetectionFigures, SummaryExtras, TruthFigures
     from fgreg.detection.results import MarkerFit, PaFind
     from fgreg.model.events import PairEvent
@@ -210,7 +210,7 @@ def _summary_extras(report: "SolveReport") -> Any:
 def check(session: SessionArgument, as_json: JsonOption = False) -> None:
     """Check a session's files and report all problems at once.
 
-    Looks at session.yaml, events.jsonl, ground_truth.yaml and the headers of all frames. Exit status 2 where there are
+    Checks session.yaml, events.jsonl, ground_truth.yaml and the headers of all frames. Exit status 2 where there are
     problems; warnings alone are 0.
     """
     from fgreg.session.session_reader import check_session
@@ -237,7 +237,7 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same session, byte by byte.")] = 1,
     pairs: Annotated[int | None, typer.Option("--pairs", help="Number of photoacoustic markers.")] = None,
     aims: Annotated[int | None, typer.Option("--aims", help="Number of calibration shots.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a session that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     list_presets: Annotated[bool, typer.Option("--list", help="List the presets and end.")] = False,
     quiet: QuietOption = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""What several commands take: options, and the settings that they make."""
+"""Options that several commands share, and their settings."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,10 +33,10 @@ OnlineEstimateOption = Annotated[
 def solve_config(
     limit_mm: float, estimate: str, known: tuple[str, ...] = ("sound_speed", "probe_radius")
 ) -> "SolveConfig":
-    """The settings that the options ask for; ``known``: what this command can estimate besides.
+    """The settings from the options; ``known``: extra variables that this command can estimate.
 
     Raises:
-        InputError: an option that is not one of them, or a limit that is none.
+        InputError: an unknown variable, or an invalid limit.
     """
     from fgreg.model.solve_config import SolveConfig
 

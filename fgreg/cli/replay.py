@@ -28,7 +28,7 @@ HEADING = f"{'t, s':>9}  {'event':<30} {'epoch':>5} {'pairs':>5} {'NIS':>6} {'wo
 
 
 def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
-    """Register the command; ``make_extras`` gives what a summary tells besides the estimate."""
+    """Register the command; ``make_extras`` gives what a summary has besides the estimate."""
 
     @app.command()
     def replay(
@@ -38,7 +38,7 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
         ] = None,
         speed: Annotated[
             str,
-            typer.Option("--speed", metavar="N", help="1: as recorded; 10: ten times that; max: as fast as it goes."),
+            typer.Option("--speed", metavar="N", help="1: as recorded; 10: ten times that; max: as fast as possible."),
         ] = "max",
         rrd: Annotated[
             Path | None,
@@ -50,17 +50,17 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
         limit_mm: LimitOption = 3.0,
         estimate: OnlineEstimateOption = "",
         redetect: Annotated[
-            bool, typer.Option("--redetect", help="Detect in the frames even where events bring poses.")
+            bool, typer.Option("--redetect", help="Detect in the frames even where events have poses.")
         ] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no lines, no summary.")] = False,
     ) -> None:
-        """Run a recorded session through the online engine, as it would have gone in the operating room.
+        """Run a recorded session through the online engine, as in the operating room.
 
-        Each aim, pair and camera move is taken in at its turn, and a line says what is known after it: camera epoch,
+        Each aim, pair and camera move is added in order, and a line shows the estimate after it: camera epoch,
         pairs used in it, the new pair's NIS (squared misfit over its predicted covariance, by the estimate without it:
         above 6 is one in twenty), the predicted 95 % error at the worst target in mm, and the verdict. Tracking queries
-        are answered from what was known at their time. At the end all is judged as a whole: the registration is that of
+        are answered from the estimate at their time. At the end there is a full solve: the registration is that of
         fgreg solve. Writes result.yaml with timing_ms added. Exit status 1 where the verdict is refused.
 
         Watch it in real time: fgreg replay SESSION --speed 1 --live. Or record it: --rrd FILE.
@@ -129,7 +129,7 @@ def _display(quiet: bool) -> "Iterator[tuple[Progress | None, OnStep | None]]":
 
 
 def step_line(step: "ReplayStep") -> "Text":
-    """What is known after an event, on one line of at most 80 columns (reasons run on)."""
+    """The estimate after an event, on one line of at most 80 columns (reasons may be longer)."""
     from rich.text import Text
 
     from fgreg.cli.report import STYLES

@@ -1,7 +1,7 @@
-"""The summary of a solved session: for people in a terminal, and as plain data for programs.
+"""The summary of a solved session: text for a terminal, and plain data for programs.
 
-For people: verdict first, then reasons, registration, laser line, pairs, tracks, and where the files are. Everything is
-ASCII but the names that users chose, and fits 80 columns. For programs: the same names and units as ``result.yaml``.
+The text has the verdict first, then reasons, registration, laser line, pairs, tracks and files. It is ASCII except for
+names chosen by users, and fits 80 columns. The plain data have the names and units of ``result.yaml``.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ MEANINGS = {
     Verdict.REFUSED: "no transform below may be used",
 }
 MOST_ROWS = 40
-"""Longer tables are cut to the looks that are not used and those with the largest NIS."""
+"""Longer tables show only the unused looks and those with the largest NIS."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionFigures:
-    """How many of the frames that were looked at gave something."""
+    """Counts of detections, and of the frames in which they were attempted."""
 
     markers_found: int
     markers_total: int
@@ -53,11 +53,11 @@ class DetectionFigures:
 
 @dataclass(frozen=True, slots=True)
 class TruthFigures:
-    """Errors against a known truth, one entry per epoch (or track); None where there is no answer or no truth.
+    """Errors against a known truth, one entry per epoch (or track); None without a result or truth.
 
     Attributes:
         tre_mean_mm, tre_worst_mm: target registration error over the session's targets, per epoch.
-        track_error_rad: answer less truth, per track.
+        track_error_rad: result less truth, per track.
     """
 
     tre_mean_mm: tuple[float | None, ...] = ()
@@ -67,13 +67,13 @@ class TruthFigures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SummaryExtras:
-    """What a summary tells besides the estimate.
+    """The parts of a summary besides the estimate.
 
     Attributes:
         rrd, result: files written.
         elapsed_s: time the solve took.
-        detections: where frames were looked at.
-        looks: the measured look behind each of ``estimate.pairs`` (None: nothing was measured), for scan and range.
+        detections: None where no frames were used.
+        looks: the measured look of each of ``estimate.pairs`` (None: nothing was measured), for scan and range.
         truth: where it is known.
     """
 
@@ -93,7 +93,7 @@ def pm_rotation_sigma_rad(trus_p_pm_mm: FloatArray, covariance: FloatArray) -> f
 
 
 def laser_sigmas(laser: LaserEstimate) -> tuple[float, float]:
-    """Largest sigma of the beam's direction (rad) and of its place across itself, at the laser frame's origin (mm)."""
+    """Largest sigma of the beam's direction (rad) and of its position across it, at the laser frame's origin (mm)."""
     direction = np.linalg.eigvalsh(laser.covariance[:2, :2])[-1]
     place = np.linalg.eigvalsh(laser.covariance[3:5, 3:5])[-1]
     return math.sqrt(max(0.0, float(direction))), math.sqrt(max(0.0, float(place)))
@@ -110,7 +110,7 @@ def print_summary(
         return
     with console.capture() as capture:
         console.print(summary, crop=False)
-    # Tables pad their lines; what goes to a file or a pipe should not end in blanks.
+    # Tables pad their lines: strip trailing blanks for files and pipes.
     console.file.write("".join(line.rstrip() + "\n" for line in capture.get().splitlines()))
 
 
@@ -138,7 +138,7 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
 
 
 def _clean(text: str) -> str:
-    """Text from a file without what could steer a terminal."""
+    """Text from a file without control characters."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
@@ -345,7 +345,7 @@ def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:
         )
     if extra.elapsed_s is not None:
         yield f"Solved in {extra.elapsed_s:.1f} s"
-    # Paths are not wrapped: they are there to be copied.
+    # Paths are not wrapped, so that they can be copied.
     for title, path in (("Result", extra.result), ("Recording", extra.rrd)):
         if path is not None:
             yield Text(f"{title:<9}  {_clean(str(path))}", no_wrap=True, overflow="ignore")
@@ -353,11 +353,11 @@ def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:
         yield Text(f"           (open it with: rerun {_clean(str(extra.rrd))})", no_wrap=True, overflow="ignore")
 
 
-# ---- for programs ----
+# ---- plain data ----
 
 
 def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras) -> dict[str, Any]:
-    """The answer as plain types, with the names and units of ``result.yaml``; figures that are not finite are None.
+    """The result as plain types, with the names and units of ``result.yaml``; figures that are not finite are None.
 
     Besides those: ``aims``, ``targets``, each look's ``t``, ``scan_deg``, ``x_mm`` and ``range_mm``, and where there
     are any ``truth``, ``detections``, ``elapsed_s`` and ``files``.

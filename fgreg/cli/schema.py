@@ -11,7 +11,7 @@ import typer
 
 
 class Document(StrEnum):
-    """What has a JSON Schema."""
+    """Documents that have a JSON Schema."""
 
     SESSION = "session"
     EVENTS = "events"
@@ -22,10 +22,10 @@ class Document(StrEnum):
 DESCRIPTIONS = {
     Document.SESSION: ("fgreg.model.session_model:SESSION", "session.yaml: how a session was set up"),
     Document.EVENTS: ("fgreg.model.events:EVENTS", "a line of events.jsonl: what happened in a session"),
-    Document.RESULT: ("fgreg.model.estimate:RESULT", "result.yaml: the answer for a session"),
+    Document.RESULT: ("fgreg.model.estimate:RESULT", "result.yaml: the result of a session"),
     Document.LIVE: ("fgreg.live.config_keys:LIVE", "CONFIG.yaml: devices of a live session"),
 }
-"""Where each is described, and its title."""
+"""Module and name of each description, and its title."""
 
 
 def add_schema(app: typer.Typer) -> None:
