@@ -231,7 +231,7 @@ def test_a_pipe_instead_of_a_file_is_refused_without_waiting(tmp_path: Path) -> 
         (folder / name).unlink()
         os.mkfifo(folder / name)
     problems, _ = check_session(folder)
-    assert [problem.found for problem in problems] == ["something that is no regular file"] * 2
+    assert [problem.found for problem in problems] == ["something that is not a regular file"] * 2
 
 
 def test_files_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

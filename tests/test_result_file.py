@@ -286,7 +286,7 @@ def test_an_older_result_is_removed_and_nothing_else(tmp_path: Path) -> None:
     other = tmp_path / "thesis.tex"
     other.write_text("kept")
     for not_ours in (path, other):
-        with pytest.raises(InputError, match="a file that is no result"):
+        with pytest.raises(InputError, match="a file that is not a result"):
             remove_result(not_ours)
         assert not_ours.read_text() == "kept"
     named = tmp_path / "mine.yaml"

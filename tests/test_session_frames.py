@@ -103,7 +103,7 @@ def test_an_image_cut_anywhere_is_no_image(folder: Path, cut: int) -> None:
     path = folder / "frames" / "b.png"
     path.write_bytes(path.read_bytes()[:cut])
     assert checked(folder) == [
-        "events.jsonl: line 5: marker.right: found 'frames/b.png', which is no whole PNG image, expected a PNG image"
+        "events.jsonl: line 5: marker.right: found 'frames/b.png', which is not a complete PNG, expected a PNG image"
     ]
 
 
@@ -113,7 +113,7 @@ def test_an_image_of_another_size_or_kind(folder: Path) -> None:
     assert checked(folder) == [
         "events.jsonl: line 3: marker.left: found 'frames/a.png' with 480 x 640 px, "
         "expected camera.image_size, 640 x 480",
-        "events.jsonl: line 5: marker.right: found 'frames/b.png', which is no whole PNG image, expected a PNG image",
+        "events.jsonl: line 5: marker.right: found 'frames/b.png', which is not a complete PNG, expected a PNG image",
     ]
 
 

@@ -1,7 +1,7 @@
-"""A recorded session through the online engine, event by event, as it would have gone: the steps of ``fgreg replay``.
+"""Replays a recorded session through the online engine, event by event: the steps of ``fgreg replay``.
 
-read the session -> recognise its frames -> each event into the engine in its turn, tracking queries answered from what
-was known then -> judge all of it -> write the result, with how long things took (and the recording).
+read the session -> detect in its frames -> add each event to the engine in order, and answer tracking queries from the
+estimate at their time -> full solve -> write the result with timings (and the recording).
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequest:
-    """What to do.
+    """Options of a replay.
 
     Attributes:
-        folder: the session. out: where the result goes; ``result.yaml`` in the session's folder where None.
-        rrd: the recording to write, if any. live: show it in a viewer of its own while it grows.
-        speed: session seconds per second; None: as fast as it goes.
-        redetect: look at frames even where poses are recorded.
+        folder: the session. out: result file; None: ``result.yaml`` in the session's folder.
+        rrd: the recording to write, if any. live: show the replay in a new viewer.
+        speed: session seconds per second; None: as fast as possible.
+        redetect: detect in frames even where poses are recorded.
     """
 
     folder: Path
@@ -67,14 +67,14 @@ class ReplayRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReplayStep:
-    """One event that was replayed.
+    """One replayed event.
 
     Attributes:
-        event: as recorded. done, total: its number among those to replay, from 1, and how many there are.
-        estimate: known after it; None before anything is. answer: to a track.
-        refused: why it was not taken in; empty where it was.
-        elapsed_ms: what the engine took for it; None where it did not get that far.
-        noticed: whether the engine found out here by itself that the camera had moved.
+        event: as recorded. done, total: its number among the replayed events, from 1, and their count.
+        estimate: after it; None before the first one. answer: result of a track.
+        refused: why it was not added; empty where it was.
+        elapsed_ms: the engine's time for it; None where the engine did not receive it.
+        noticed: whether the engine detected an unreported camera move here.
     """
 
     event: Shown
@@ -92,7 +92,7 @@ OnStep = Callable[[ReplayStep], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReplayReport:
-    """All that came of a replay: what a solve reports, and what the engine said at its end."""
+    """Result of a replay: the report of the full solve, and the engine's last estimate."""
 
     solved: SolveReport
     settled: OnlineEstimate | None
@@ -108,15 +108,15 @@ def replay_session(
     """Replay a recorded session.
 
     Args:
-        request: what to do.
+        request: its options.
         config: of the estimate.
-        progress: called as frames are looked at.
+        progress: called after each frame.
         on_step: called after each event.
-        make_engine: the online engine where not the package's own.
+        make_engine: makes the online engine; None: the package's.
 
     Raises:
         InputError: bad input; no result is left behind, not even an older one.
-        ViewerError: there is no viewer to show it in.
+        ViewerError: the viewer cannot be started.
     """
     start = time.perf_counter()
     config = config or SolveConfig()
@@ -138,7 +138,7 @@ def replay_session(
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
         prior = sound_speed_prior(recognised, config)
-        # Moves that were detected when the session was recorded are events: they are taken as they were found then.
+        # Moves that were detected during recording are events: they are used as recorded, without a new search.
         recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
         engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config, prior)
         player = _Player(session, recognised, engine, viewer, request.speed)
@@ -164,7 +164,7 @@ def replay_session(
 
 
 class _Player:
-    """Gives a session's events to an engine in their turn."""
+    """Adds a session's events to an engine in order."""
 
     def __init__(
         self,
@@ -188,7 +188,7 @@ class _Player:
         self.estimate: OnlineEstimate | None = None
 
     def play(self, on_step: OnStep | None) -> None:
-        """All events, each at its time where there is a speed."""
+        """Replay all events, each at its time where there is a speed."""
         refused = refused_lines(self._session.events)
         shown = [
             (index, event)
@@ -253,7 +253,7 @@ class _Player:
         )
 
     def taken(self) -> Recognised:
-        """What the engine took in: its measurements, the events behind them, and why others are not among them."""
+        """The engine's measurements, the events they come from, and the reasons of unused events."""
         recognised, measurements = self._recognised, self._engine.measurements()
         epoch_of = recognised.epoch_of
         if self._engine.moves:
@@ -270,13 +270,13 @@ class _Player:
         )
 
     def found(self) -> EpochsFound:
-        """What the engine found out and the session does not tell."""
-        told = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
-        moves = tuple(move for move in self._engine.moves if move.since_t not in told)
+        """Camera moves detected by the engine that the session does not report, and loop closures."""
+        reported = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
+        moves = tuple(move for move in self._engine.moves if move.since_t not in reported)
         return EpochsFound(moves, self._engine.loop_closures)
 
     def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
-        """One per track event, in order; ``unanswered`` has the reasons of those that were not put to the engine."""
+        """One result per track event, in order; ``unanswered`` has those that the engine did not receive."""
         places = [i for i, event in enumerate(self._session.events) if isinstance(event, TrackEvent)]
         return tuple(
             self._answers.get(place, replace(none, causal=True)) for place, none in zip(places, unanswered, strict=True)
@@ -293,7 +293,7 @@ def _shot(measured: Aim | Pair | Track | None) -> Aim | Pair:
 
 
 def quantiles(elapsed_ms: Sequence[float]) -> Quantiles | None:
-    """Median, 99 % quantile and maximum; None of nothing."""
+    """Median, 99 % quantile and maximum; None where there are no values."""
     if not elapsed_ms:
         return None
     p50, p99 = (float(value) for value in np.quantile(elapsed_ms, (0.5, 0.99)))
@@ -301,12 +301,12 @@ def quantiles(elapsed_ms: Sequence[float]) -> Quantiles | None:
 
 
 def left_out(known: OnlineEstimate | None) -> bool:
-    """Whether the pair just added does not fit; before there is a registration none does or does not."""
+    """Whether the pair just added is an outlier; False before there is a registration."""
     return known is not None and known.trus_T_camera is not None and not known.used
 
 
 def describe(step: ReplayStep) -> str:
-    """What the event was, in a few words."""
+    """A short description of a step, for the log."""
     event = step.event
     match event:
         case AimEvent():

@@ -1,6 +1,6 @@
-"""A recorded session, from its folder to its result: the steps of ``fgreg solve`` on one page.
+"""Solves a recorded session, from its folder to its result: the steps of ``fgreg solve`` on one page.
 
-read the session -> recognise marker, board and PM in the frames -> calibrate and register in one graph -> judge
+read the session -> detect marker, board and PM in the frames -> calibrate and register in one graph -> verdict
 -> answer the tracking queries -> write the result (and the recording).
 """
 
@@ -40,22 +40,22 @@ if TYPE_CHECKING:
 
 RESULT_FILE = "result.yaml"
 SOUND_SPEED_TOLERANCE = 0.005
-"""Deviations of the sound speed ratio below this cost less than the noise does, however well they are known."""
+"""Smaller deviations of the sound speed ratio give no warning: their error is below that of the noise."""
 TOO_FEW_AIMS = 0.5
-"""Share of aims that have to be usable."""
+"""Share of unusable aims from which there is a warning."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with the step's name, items done and items in all."""
+"""Called with (name of the step, items done, total items)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SolveRequest:
-    """What to do.
+    """Options of a solve.
 
     Attributes:
-        folder: the session. out: where the result goes; ``result.yaml`` in the session's folder where None.
-        rrd: the recording to write, if any. redetect: look at frames even where poses are recorded.
-        detect_moves: look for unreported camera moves, and solve what lies between as epochs.
+        folder: the session. out: result file; None: ``result.yaml`` in the session's folder.
+        rrd: the recording to write, if any. redetect: detect in frames even where poses are recorded.
+        detect_moves: detect unreported camera moves, and split the session into epochs at them.
     """
 
     folder: Path
@@ -72,7 +72,7 @@ class TruthErrors:
     Attributes:
         tre_mm: per epoch, distances (n,) at the targets; None where there is no registration or no truth.
         beam_angle_rad, beam_offset_mm: angle between the beams; distance of the true beam's origin from the beam.
-        track_rad: per track, estimated less true stage angle, None where unanswered.
+        track_rad: per track, estimated less true stage angle, None where there is no result.
     """
 
     tre_mm: tuple[FloatArray | None, ...]
@@ -83,16 +83,16 @@ class TruthErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolveReport:
-    """All that came of a solve.
+    """Result of a solve.
 
     Attributes:
-        session: as it was read.
-        recognised: what was found in its frames; ``recognised.measurements`` is what was solved.
-        solution: the estimate with the registration, posterior and snapshot behind it.
-        estimate: what ``result.yaml`` holds: verdict, reasons, beam, epochs, pairs, tracks, aims.
+        session: as read.
+        recognised: detections in its frames; ``recognised.measurements`` were solved.
+        solution: the estimate with its registration, posterior and snapshot.
+        estimate: contents of ``result.yaml``: verdict, reasons, beam, epochs, pairs, tracks, aims.
         truth: of ``ground_truth.yaml``. errors: against it; None where there is none.
-        result_path, rrd_path: what was written; the latter None where no recording was asked for.
-        elapsed_s: from the files to the result.
+        result_path, rrd_path: written files; the latter None without a recording.
+        elapsed_s: time of the whole solve.
     """
 
     session: Session
@@ -155,10 +155,10 @@ def solve_session(
 
 
 def remove_older_result(folder: Path, result_path: Path) -> None:
-    """Remove an older result before work starts, so that a failure never leaves one that looks current.
+    """Remove an older result before work starts, so that it does not remain after a failure.
 
     Raises:
-        InputError: the session's folder is not there, or the result's place cannot be written to.
+        InputError: the session's folder does not exist, or the result cannot be written there.
     """
     if not folder.is_dir():
         raise InputError(str(folder), "a file" if folder.exists() else "nothing", "a session's folder")
@@ -166,7 +166,7 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
 
 
 def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
-    """The session's events with camera moves in place that were found out: epochs of pairs and tracks follow."""
+    """The session's measurements with detected camera moves: pairs and tracks get their new epochs."""
     from fgreg.online.recorded_moves import renumbered, split_epochs
 
     if not found.texts:
@@ -182,12 +182,12 @@ def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
 
 
 def move_conditions(found: EpochsFound) -> list[Condition]:
-    """What moves that were found out mean for the verdict."""
+    """Conditions of the verdict from detected camera moves."""
     return [Condition(Verdict.WARNING, text) for text in found.texts]
 
 
 def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:
-    """What the wavefronts say of the sound speed, weighed with the configuration's prior; None without wavefronts."""
+    """The sound speed from the wavefronts, combined with the configuration's prior; None without wavefronts."""
     pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
     if pooled is None:
         return None
@@ -198,15 +198,15 @@ def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeed
 
 
 def detection_conditions(recognised: Recognised, config: SolveConfig) -> list[Condition]:
-    """What the frames say against the session: wrong sound speed (unless estimated), calibration shots lost."""
+    """Conditions of the verdict from the frames: wrong sound speed (unless estimated), unusable calibration shots."""
     found = []
     pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
     if pooled is not None and not config.estimate_sound_speed:
         ratio, sigma = pooled
         if abs(ratio - 1.0) > max(3.0 * sigma, SOUND_SPEED_TOLERANCE):
             text = (
-                f"the wavefronts say that sound travels at {ratio:.4f} +- {sigma:.4f} of probe.sound_speed_m_s: "
-                "correct it in session.yaml (ranges given as numbers have to be computed anew)"
+                f"the wavefronts give a sound speed of {ratio:.4f} +- {sigma:.4f} times probe.sound_speed_m_s: "
+                "correct it in session.yaml (ranges given as numbers have to be computed again)"
             )
             found.append(Condition(Verdict.WARNING, text))
     lost_aims, used = recognised.unused_aims, len(recognised.measurements.aims)
@@ -220,7 +220,7 @@ def detection_conditions(recognised: Recognised, config: SolveConfig) -> list[Co
 
 
 def session_estimate(session: Session, recognised: Recognised, solution: Solution) -> SessionEstimate:
-    """The solution with every shot of the session in it, in event order: those left out carry their reason."""
+    """The solution with every shot of the session in it, in event order; unused ones have their reason."""
     pairs = dict(zip(recognised.pair_events, solution.pairs, strict=True))
     tracks = dict(zip(recognised.track_events, solution.tracks, strict=True))
     aims = dict(zip(recognised.aim_events, solution.aims, strict=True))
@@ -243,7 +243,7 @@ def session_estimate(session: Session, recognised: Recognised, solution: Solutio
 def errors_where_known(
     estimate: SessionEstimate, truth: GroundTruth | None, moves: Sequence[DetectedMove], targets_mm: FloatArray
 ) -> TruthErrors | None:
-    """:func:`truth_errors`; None without a truth, or where moves that were found make other epochs than it has."""
+    """:func:`truth_errors`; None without a truth, or where detected moves give other epochs than it has."""
     if truth is None or (moves and len(truth.trus_T_camera) != len(estimate.epochs)):
         return None
     return truth_errors(estimate, truth, targets_mm)
@@ -277,7 +277,7 @@ def show(
     estimate: SessionEstimate,
     truth: GroundTruth | None,
 ) -> None:
-    """Everything into the recording: frames with what was found in them, then the result."""
+    """Draw the frames with their detections, then the result."""
     if isinstance(viewer, NullViewer):
         return  # spares reading the frames again
     model = session.model
@@ -298,7 +298,7 @@ def show_frames(
     event: AimEvent | PairEvent | TrackEvent,
     shot: int,
 ) -> None:
-    """The frames of one event with what was found in them; ``shot`` is its number among aims, pairs and tracks."""
+    """Draw the frames of one event with their detections; ``shot``: its number among aims, pairs and tracks."""
     if isinstance(viewer, NullViewer):
         return  # spares reading the frames again
     from fgreg.detection.event_frames import load_trus_frame, marker_pictures
@@ -321,20 +321,20 @@ def show_frames(
             continue
         frame = load_trus_frame(look.frame, event.line, "trus.frame", model)
         find = recognised.finds.get((index, number), NoSignal(""))
-        heard = find if isinstance(find, PaFind) else None
+        source = find if isinstance(find, PaFind) else None
         viewer.pa_frame(
             event.t,
             shot,
             frame,
-            heard.x_mm if heard else look.x_mm,
-            heard.range_mm if heard else look.range_mm,
-            heard.covariance if heard else look.covariance,
+            source.x_mm if source else look.x_mm,
+            source.range_mm if source else look.range_mm,
+            source.covariance if source else look.covariance,
             model.probe,
         )
 
 
 def _outlines(recognised: Recognised, index: int, model: SessionModel) -> list[FloatArray] | None:
-    """The tags' outlines in the left image as the fitted pose has them."""
+    """The tags' outlines (4, 2) px in the left image, from the fitted pose; None without one."""
     fit = recognised.markers.get(index)
     if not isinstance(fit, MarkerFit) or model.marker is None or model.camera is None:
         return None
@@ -343,7 +343,7 @@ def _outlines(recognised: Recognised, index: int, model: SessionModel) -> list[F
 
 
 def _corner(recognised: Recognised, index: int, event: Event, model: SessionModel) -> FloatArray | None:
-    """The aimed-at spot in the left image."""
+    """The aimed-at spot (2,) px in the left image; None where unknown."""
     if not isinstance(event, AimEvent) or index not in recognised.aim_events or model.camera is None:
         return None
     aim = recognised.measurements.aims[recognised.aim_events.index(index)]

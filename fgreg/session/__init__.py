@@ -1,1 +1,1 @@
-"""Sessions and results on disk: read, checked, written. The contract is in sessions/README.md."""
+"""Read, check and write sessions and results on disk. The format is in sessions/README.md."""

@@ -1,7 +1,7 @@
-"""A file that only grows, line by line, each line on disk before :meth:`AppendFile.append` returns.
+"""An append-only file of lines; each line is on disk before :meth:`AppendFile.append` returns.
 
-Every line goes out with one ``write(2)``. Whatever fails, the file is cut back to its last whole line at once, or,
-where the system refuses even that, before the next line is written.
+Every line is written with one ``write(2)``. After a failure the file is truncated to its last whole line at once or, if
+that fails too, before the next line is written.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fgreg.errors import JournalError
 
 _MODE = 0o644
 
-# The system calls by names of their own, so that tests can make them fail as a disk does.
+# Module-level names for the system calls, so that tests can make them fail like a disk.
 _write = os.write
 _truncate = os.ftruncate
 
@@ -31,10 +31,10 @@ def _sync(handle: int) -> None:
 
 
 def sync_path(path: Path) -> None:
-    """Puts a file or folder on disk that is there already.
+    """Flush an existing file or folder to disk.
 
     Raises:
-        OSError: the system refuses.
+        OSError: it cannot be flushed.
     """
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -44,11 +44,11 @@ def sync_path(path: Path) -> None:
 
 
 class AppendFile:
-    """An open file with an exclusive lock; only one process (of those that lock) has it at a time.
+    """An open file with an exclusive advisory lock.
 
     Args:
         path: of the file.
-        name: how messages call it.
+        name: its name in messages.
         handle: open for reading and appending, locked.
         size: of the file's whole lines.
     """
@@ -59,7 +59,7 @@ class AppendFile:
 
     @classmethod
     def open(cls, path: Path, name: str) -> Self:
-        """Open and lock; made (and its folder put on disk) where it is not there.
+        """Open and lock; an absent file is created, and its folder flushed to disk.
 
         Raises:
             JournalError: locked by another process, no regular file, or the system refuses.
@@ -90,7 +90,7 @@ class AppendFile:
                 return cls(path, name, handle, os.fstat(handle).st_size)
             except OSError as error:
                 os.close(handle)
-                raise JournalError(name, f"it cannot be made ({error.strerror})", "make room for it") from None
+                raise JournalError(name, f"it cannot be created ({error.strerror})", "make room for it") from None
             except BaseException:
                 os.close(handle)
                 raise
@@ -102,7 +102,7 @@ class AppendFile:
         return self._size
 
     def tail(self) -> bytes:
-        """What follows the last line break: empty, or a line that was cut short."""
+        """The bytes after the last line break: empty, or a truncated line."""
         end, tail = self._size, b""
         while end > 0:
             start = max(0, end - 65536)
@@ -129,15 +129,15 @@ class AppendFile:
         self._size = size
 
     def append(self, line: bytes, *, durable: bool = True) -> int:
-        """Write one line; it is on disk when this returns, or, where not ``durable``, with the next one that is.
+        """Write one line; it is on disk when this returns or, if not ``durable``, with the next durable one.
 
-        What is not durable survives this program's end at any moment, though not the machine's.
+        A line that is not durable survives a crash of the program, but not of the machine.
 
         Returns:
             The offset at which the line starts.
 
         Raises:
-            JournalError: it is not written, and the file holds what it held before.
+            JournalError: it is not written, and the file is unchanged.
         """
         if self._handle < 0:
             raise JournalError(self._name, "it is closed", "open the session again")
@@ -153,14 +153,14 @@ class AppendFile:
             self._restore()
             found = f"an event could not be recorded ({error.strerror})"
             raise JournalError(self._name, found, "mend that and add the event again") from None
-        except BaseException:  # an interrupt between write and sync: nobody was told that the line is there
+        except BaseException:  # an interrupt between write and sync: the line is not acknowledged
             self._restore()
             raise
         self._size = start + len(line)
         return start
 
     def _check(self) -> None:
-        """The file is still the one that was opened, with what was written to it and nothing else."""
+        """Check that the file is the opened one and has only what was written through this object."""
         again = "add no more events; open the session again"
         if not _same_file(self._handle, self._path):
             raise JournalError(self._name, "it was removed or replaced while it was open", again)
@@ -185,7 +185,7 @@ class AppendFile:
             self._damaged = False
 
     def close(self) -> None:
-        """Unlock and close; twice does no harm."""
+        """Unlock and close; may be called twice."""
         handle, self._handle = self._handle, -1
         if handle >= 0:
             os.close(handle)

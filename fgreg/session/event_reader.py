@@ -1,4 +1,4 @@
-"""``events.jsonl``: what happened, one JSON object per line, described by fgreg.model.events."""
+"""Reads ``events.jsonl``: one JSON object per line, described by fgreg.model.events."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ _MAX_INTEGER_DIGITS = 30
 
 @dataclass(slots=True)
 class EventLog:
-    """What an ``events.jsonl`` holds: the events that are right, and warnings."""
+    """The valid events of an ``events.jsonl``, and warnings."""
 
     events: list[Event] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
 
 class _RefusedJsonError(ValueError):
-    """Well-formed, but not allowed here: a key twice, a number that is none."""
+    """Well-formed JSON that is not allowed here: a duplicate key, NaN or infinity."""
 
 
 class _CutShortError(ValueError):
-    """A last line without its line break that is no JSON."""
+    """A last line without line break that is not JSON."""
 
 
 def read_events(path: Path, file: str, folder: Path, setup: Setup | None, problems: list[InputError]) -> EventLog:
-    """Reads the events; appends to ``problems`` all that is wrong with them.
+    """Read the events; appends all problems to ``problems``.
 
     Args:
         path: the file.
         file: how messages name it.
         folder: the session's folder, resolved.
-        setup: what the session has; None where that could not be read, and is not checked against.
+        setup: of the session; None where it could not be read: then events are not checked against it.
     """
     log = EventLog()
     try:
@@ -70,7 +70,7 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
 
 @dataclass(frozen=True, slots=True)
 class LineRead:
-    """One line by itself: its event, its time where it has one, and what is wrong with it (then there is no event)."""
+    """One line: its event, its time where it has one, and its problems (then there is no event)."""
 
     event: Event | None
     t: float | None
@@ -80,7 +80,7 @@ class LineRead:
 def read_line(
     line: bytes, number: int, file: str, folder: Path, setup: Setup | None, last: tuple[float, int] | None
 ) -> LineRead:
-    """Reads one line.
+    """Read one line.
 
     Args:
         line: with its line break.
@@ -103,9 +103,9 @@ def read_line(
 
 
 def _time(document: Mapping[str, object], last: tuple[float, int] | None) -> tuple[float | None, list[Problem]]:
-    """The time of an event, None where it has none, and what is wrong with it."""
+    """The time of an event, None where it has none, and its problems."""
     if "t" not in document:
-        return None, []  # missed with the other keys
+        return None, []  # reported with the other missing keys
     try:
         t = SECONDS.read(document["t"])
     except FieldError as error:
@@ -141,7 +141,7 @@ def _records(event: Event) -> Iterator[tuple[tuple[str | int, ...], MarkerRecord
 
 
 def _misfits(event: Event, setup: Setup | None) -> Iterator[Problem]:
-    """What an event says that its session, or its place in the file, does not allow."""
+    """Problems of an event with respect to its session or its place in the file."""
     if isinstance(event, RefusedEvent):
         line = event.refused_line
         if line is not None and not 0 < line < event.line:
@@ -190,7 +190,7 @@ def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator
         if number == 1:
             line = line.removeprefix(b"\xef\xbb\xbf")
         if len(line) > MAX_LINE_BYTES:
-            # What follows cannot be told apart into lines any more.
+            # The rest cannot be split into lines.
             where = f"{file}: line {number}"
             problems.append(InputError(where, "a longer line", f"at most {MAX_LINE_BYTES} bytes"))
             return
@@ -198,7 +198,7 @@ def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator
 
 
 def _parse(line: bytes) -> Mapping[str, object]:
-    """The object on a line. Raises FieldError where it is bad, _CutShortError where a last line was cut short."""
+    """The object on a line. Raises FieldError where it is invalid, _CutShortError where a last line is truncated."""
     if len(line) > MAX_LINE_BYTES:
         raise FieldError.of(f"{len(line)} bytes", f"at most {MAX_LINE_BYTES}")
     expected = "one JSON object"
@@ -243,5 +243,5 @@ def _refuse_constant(name: str) -> float:
 
 
 def _integer(digits: str) -> int | float:
-    # Python refuses to convert thousands of digits; no field here needs more than a double holds.
+    # Python refuses to convert thousands of digits; no field needs more precision than a double.
     return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)

@@ -1,7 +1,7 @@
-"""Events as the objects that lines of ``events.jsonl`` hold: what fgreg.session.event_reader reads back.
+"""Writes events as lines of ``events.jsonl``, the inverse of fgreg.session.event_reader.
 
-Numbers keep all their digits: the shortest text that reads back as the same double. Numbers that are not finite are
-refused; JSON has none.
+Numbers are written as the shortest text that reads back as the same double. Numbers that are not finite are refused,
+since JSON has none.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Document = dict[str, Any]
 
 
 def type_of(event: Event) -> str:
-    """The event's ``type``, as the file has it."""
+    """The event's ``type`` in the file."""
     return EVENTS.names[type(event)]
 
 
 def event_document(event: Event, folder: Path) -> Document:
-    """An event as the mapping that its line holds; what is absent or has its default is left out.
+    """An event as the mapping of its line; absent values and defaults are left out.
 
     Args:
         event: ``line`` is not part of the document.
@@ -58,7 +58,7 @@ def event_line(document: Document, place: str) -> bytes:
 
 
 def writable(value: object) -> object:
-    """A value with all that JSON does not have as texts: for the record of an event that was refused for it."""
+    """A value with everything that JSON lacks converted to text, to record a refused event."""
     if isinstance(value, Mapping):
         return {str(key): writable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -69,7 +69,7 @@ def writable(value: object) -> object:
 
 
 def _not_finite(value: object, path: str = "") -> tuple[str, str] | None:
-    """Place and text of the first number that is not finite, or None."""
+    """Path and text of the first number that is not finite, or None."""
     if isinstance(value, float):
         return None if math.isfinite(value) else (path, str(value))
     entries: list[tuple[str, object]] = []

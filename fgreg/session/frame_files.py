@@ -1,4 +1,4 @@
-"""Raw frames that events name: whether they are what they should be, from headers alone."""
+"""Checks of the raw frames that events name, without decoding their pixels."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MAX_BYTES = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class FrameUse:
-    """A frame that an event names: resolved path, name in the folder, use, and the place of the name."""
+    """A frame that an event names: resolved path, name in the folder, kind, and the place of the name for messages."""
 
     path: Path
     name: str
@@ -35,11 +35,11 @@ class FrameUse:
 
 
 def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int, int] | None) -> None:
-    """Checks that a file is a whole PNG image of the camera's size, by its chunk headers.
+    """Check that a file is a complete PNG image of the camera's size, by its chunk headers.
 
     Args:
         path: the file.
-        name: as the event has it.
+        name: in the event.
         where: the place of the name, for messages.
         image_size: (width, height), or None where there is no camera to compare with.
 
@@ -49,14 +49,14 @@ def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int,
     with _open_frame(path, name, where) as file:
         size = _png_size(file)
         if size is None:
-            raise InputError(where, f"{shown(name)}, which is no whole PNG image", "a PNG image")
+            raise InputError(where, f"{shown(name)}, which is not a complete PNG", "a PNG image")
         if image_size is not None and size != image_size:
             expected = f"camera.image_size, {image_size[0]} x {image_size[1]}"
             raise InputError(where, f"{shown(name)} with {size[0]} x {size[1]} px", expected)
 
 
 def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
-    """(width, height) of a PNG file whose chunks are all there, else None. Pixel data are not decoded."""
+    """(width, height) of a complete PNG file, else None. Pixel data are not decoded."""
     header = file.read(33)
     if len(header) < 33 or header[:8] != _PNG_SIGNATURE or header[8:16] != b"\x00\x00\x00\x0dIHDR":
         return None
@@ -74,7 +74,7 @@ def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
         at += 12 + length
         if at > end:
             return None
-        # Checksums here, or a damaged file would be a complaint of the image library's own.
+        # Check the checksums here: for a damaged file the image library would print its own message.
         body = file.read(length + 4)
         if zlib.crc32(body[:-4], zlib.crc32(kind)) != int.from_bytes(body[-4:], "big"):
             return None
@@ -86,7 +86,7 @@ def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
 def trus_frame_problem(
     shape: tuple[int, ...], dtype: np.dtype[np.generic], probe: ProbeModel
 ) -> tuple[str, str] | None:
-    """What keeps an array from being a TRUS frame of this probe, and what was expected, or None."""
+    """Why an array is not a TRUS frame of this probe: (found, expected); None where it is one."""
     if len(shape) != 2 or min(shape) < 2 or dtype.kind not in "iuf":
         found = f"an array of {dtype} with shape {list(shape)}"
     elif probe.image is not None or probe.holds_channels(shape, dtype):
@@ -102,21 +102,21 @@ def trus_frame_problem(
 
 
 def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None) -> None:
-    """Checks that a file is an NPY array that this probe can have recorded, by its header and the file's length.
+    """Check that a file is an NPY array that fits this probe, by its header, length and finiteness.
 
     Args:
         path: the file.
-        name: as the event has it.
+        name: in the event.
         where: the place of the name, for messages.
         probe: to compare with, or None where it could not be read.
 
     Raises:
-        InputError: it is not. Arrays of Python objects (pickles) are refused unread.
+        InputError: it is not. Arrays of Python objects (pickles) are refused without being read.
     """
     with _open_frame(path, name, where) as file:
         header = _npy_header(file)
         if header is None:
-            raise InputError(where, f"{shown(name)}, which is no NPY array", "an NPY array")
+            raise InputError(where, f"{shown(name)}, which is not an NPY array", "an NPY array")
         shape, dtype = header
         if dtype.hasobject:
             raise InputError(where, f"{shown(name)} with Python objects", "an NPY array of numbers")
@@ -132,7 +132,7 @@ def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None
 
 
 def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[np.generic]] | None:
-    """Shape and type of an NPY file, read up to its data; None where it is none."""
+    """Shape and type of an NPY file, read up to its data; None where it is not one."""
     try:
         version = npy_format.read_magic(file)
         if version not in ((1, 0), (2, 0), (3, 0)):
@@ -157,7 +157,7 @@ def _open_frame(path: Path, name: str, where: str) -> IO[bytes]:
 def check_frames(
     uses: list[FrameUse], probe: ProbeModel | None, image_size: tuple[int, int] | None
 ) -> list[InputError]:
-    """Checks each named frame once for each use; returns all that is wrong, in the order of the uses."""
+    """Check each named frame once per kind; returns all problems in the order of the uses."""
     problems: list[InputError] = []
     seen: set[tuple[Path, FrameKind]] = set()
     for use in uses:

@@ -1,4 +1,4 @@
-"""The truth about a session, where it is known: simulation, or a phantom that was measured."""
+"""Ground truth of a session, from simulation or a measured phantom."""
 
 import re
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ class ByPm(Kind):
 
 @dataclass(frozen=True, slots=True)
 class TrackTruth:
-    """Where the stage has to be turned to at a time."""
+    """True stage angle of a track event."""
 
     t: Annotated[float, Key("of the track event, s", SECONDS)]
     stage_rad: Annotated[
@@ -63,7 +63,7 @@ class TrackTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundTruth:
-    """What ``ground_truth.yaml`` holds; what it does not say is empty or None."""
+    """Contents of ``ground_truth.yaml``; absent values are empty or None."""
 
     trus_T_camera: Annotated[
         tuple[FloatArray, ...],

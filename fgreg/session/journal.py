@@ -1,8 +1,8 @@
-"""The journal of a session while it is recorded: every event on disk before anybody is told that it is taken in.
+"""The journal of a session while it is recorded: every event is on disk before it is acknowledged.
 
-What is written is what :func:`fgreg.session.session_reader.read_session` reads back: each line is read by the same code
-before it goes out, and :meth:`Journal.append` hands back the event as it was read. Work on with that one, and a session
-that is opened again goes on from the very same numbers.
+:func:`fgreg.session.session_reader.read_session` reads back exactly what is written: each line is checked with the same
+code before it is written, and :meth:`Journal.append` returns the event as it was read. Use that event, so that a
+session that is opened again continues from the same numbers.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from fgreg.session.yaml_loader import load_yaml
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appended:
-    """An event that is on disk: the offset of its line, and the event as a reader of the file has it."""
+    """An event that is on disk: the offset of its line, and the event as read back."""
 
     offset: int
     event: Event
@@ -44,8 +44,8 @@ class Journal:
 
     Attributes:
         folder: the session's, resolved.
-        model: how things are set up.
-        warnings: of reading, and of a last line that had been cut short and was dropped.
+        model: of the session.
+        warnings: of reading, and about a truncated last line that was dropped.
     """
 
     def __init__(
@@ -59,14 +59,14 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path) -> Self:
-        """Open a session to record to it; its ``events.jsonl`` is made where there is none.
+        """Open a session to record to it; an absent ``events.jsonl`` is created.
 
-        A last line that was cut short (power was lost while it was written) is dropped with a warning: nobody was ever
-        told that it had been taken in. One that lacks nothing but its line break gets that.
+        A truncated last line (power was lost during the write) is dropped with a warning: it was never acknowledged.
+        A complete last line without line break gets one.
 
         Raises:
-            InputError: the session's files are not as they should be.
-            JournalError: another program records to it, or the disk refuses.
+            InputError: the session's files are invalid.
+            JournalError: another program records to it, or the disk fails.
         """
         resolved = _resolved(folder)
         setup = _setup(resolved)
@@ -98,7 +98,7 @@ class Journal:
         return 0 if self._last is None else self._last[1]
 
     def take_recorded(self) -> tuple[Event, ...]:
-        """The events that the file held when it was opened; the journal forgets them."""
+        """The events that were in the file at opening; the journal releases them."""
         events, self._recorded = self._recorded, ()
         return events
 
@@ -106,23 +106,23 @@ class Journal:
         """All events that are recorded, from the file; others may be appended meanwhile.
 
         Raises:
-            InputError: somebody else has changed the session's files.
+            InputError: another program has changed the session's files.
         """
         lines = self.lines
         return read_session(self.folder).events[:lines]
 
     def append(self, event: Event, *, durable: bool = True, late: bool = False) -> Appended:
-        """Put an event on disk, behind all others; its ``line`` is given to it here.
+        """Append an event to the file and flush it to disk; its ``line`` is set here.
 
-        Frames that it names have to be there: they are checked, and put on disk first.
+        The frames that it names must exist: they are checked and flushed to disk first.
 
         Args:
-            durable: on disk when this returns; False: with the next event that is (for what no estimate depends on).
-            late: one that happened before the last one was recorded gets that one's time, as the file wants it.
+            durable: on disk when this returns; False: with the next durable event (for events that no estimate uses).
+            late: an event older than the last one gets the last one's time, since times must not decrease.
 
         Raises:
-            InputError: it goes back in time, has a number that is not finite, or is otherwise not what a reader takes.
-            JournalError: the disk refuses; nothing is recorded, and the file is as it was.
+            InputError: its time decreases, a number is not finite, or it is otherwise invalid.
+            JournalError: the disk fails; nothing is recorded, and the file is unchanged.
         """
         with self._lock:
             if late and self._last is not None and event.t < self._last[0]:
@@ -144,7 +144,7 @@ class Journal:
             return Appended(offset, read.event)
 
     def write_frame(self, name: str, data: bytes) -> Path:
-        """Put a raw frame on disk; an event that names it comes after.
+        """Write a raw frame to disk, before the event that names it.
 
         Args:
             name: relative to the session's folder, such as ``frames/a.png``.
@@ -154,8 +154,8 @@ class Journal:
             Its path, for the event.
 
         Raises:
-            InputError: a name that leads out of the folder, or of a file that is there: frames are never written over.
-            JournalError: the disk refuses; no file is left.
+            InputError: a name outside the folder, or of an existing file: frames are never overwritten.
+            JournalError: the disk fails; no file is left.
         """
         try:
             path = FrameName(FrameKind.CAMERA).read(name, self.folder)
@@ -187,7 +187,7 @@ class Journal:
         return path
 
     def _sync_frames(self, frames: set[Path]) -> None:
-        """Frames (and their names in their folders) on disk: those that others wrote may still be on their way."""
+        """Flush frames and their folders to disk: other programs may have written them without a flush."""
         try:
             others = frames - self._fresh
             for path in [*sorted(others), *sorted({path.parent for path in others})]:
@@ -197,7 +197,7 @@ class Journal:
         self._fresh -= frames
 
     def close(self) -> None:
-        """Unlock the session; twice does no harm."""
+        """Unlock the session; may be called twice."""
         self._file.close()
 
 
@@ -212,7 +212,7 @@ def _resolved(folder: Path) -> Path:
 
 
 def _setup(folder: Path) -> Setup:
-    """What the session has, before anything is made in its folder."""
+    """The session's set-up, read before any file is created in its folder."""
     problems: list[InputError] = []
     setup = read_setup(load_yaml(folder / SETUP_FILE, SETUP_FILE), SETUP_FILE, folder.name or "session", problems)
     if problems:
@@ -221,14 +221,14 @@ def _setup(folder: Path) -> Setup:
 
 
 def _mend_tail(file: AppendFile, folder: Path, setup: Setup) -> list[str]:
-    """Drop a last line that was cut short, or give a whole one the line break it lacks; warnings."""
+    """Drop a truncated last line, or add a missing line break; returns warnings."""
     tail = file.tail()
     if not tail:
         return []
     # The number and time of the line do not matter here: all is read again afterwards.
     if read_line(tail + b"\n", 2**31, EVENTS_FILE, folder, setup, None).problems:
         if not _is_cut_short(tail):
-            return []  # a whole line that is wrong: the reader says so
+            return []  # a complete but invalid line: the reader reports it
         file.cut(file.size - len(tail))
         return [f"{EVENTS_FILE}: the last line was cut short ({len(tail)} bytes) and is dropped"]
     file.append(b"\n")
@@ -236,7 +236,7 @@ def _mend_tail(file: AppendFile, folder: Path, setup: Setup) -> list[str]:
 
 
 def _is_cut_short(tail: bytes) -> bool:
-    """Whether a line without its break is no whole JSON text, as the reader has it."""
+    """Whether a line without line break is not complete JSON, by the reader's rules."""
     try:
         json.loads(tail.decode("utf-8"))
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""``result.yaml``: written whole or not at all, and every field is checked on reading (see fgreg.model.estimate)."""
+"""``result.yaml``: written atomically; every field is checked on reading (see fgreg.model.estimate)."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _FORMAT_LINE = b"format: fgreg-result/"
 
 
 def remove_result(path: Path) -> None:
-    """Removes an older result before work starts, so that no failure leaves one behind.
+    """Remove an older result before work starts, so that it does not remain after a failure.
 
     Raises:
-        InputError: the folder is absent or cannot be written to, or the path is anything but an older result.
+        InputError: the folder is absent or cannot be written to, or the path is not an older result.
     """
     if path.name in _SESSION_FILES:
         raise InputError(str(path), "the name of a session's own file", "another name for the result")
@@ -41,7 +41,7 @@ def remove_result(path: Path) -> None:
         raise InputError(str(path.parent), "a folder that cannot be written to", f"one to write {path.name} to")
     try:
         if os.path.lexists(path) and not _is_result(path):
-            raise InputError(str(path), "a file that is no result", "a new name, or that of an older result")
+            raise InputError(str(path), "a file that is not a result", "a new name, or that of an older result")
         path.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
         raise InputError(str(path), f"a file that cannot be removed ({_reason(error)})", "an older result") from None
@@ -58,11 +58,11 @@ def _is_result(path: Path) -> bool:
 
 
 def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, version: str) -> None:
-    """Writes a result: to a temporary file beside it first, which then takes its name.
+    """Write a result to a temporary file in the same folder, which is then renamed.
 
     Args:
-        estimate: the answer.
-        model: of the session; gives it its name.
+        estimate: the result.
+        model: of the session; its name is written.
         path: the file, replaced where it exists.
         version: of this package.
 
@@ -71,7 +71,7 @@ def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, ver
         ValueError: a transform of the estimate is not rigid, or an array not finite (a defect of the estimate).
     """
     document = RESULT.write(replace(estimate, session=model.name, version=version))
-    # The format's line comes first, and as it is: an older result is known by it.
+    # The format line comes first and unquoted: _is_result recognises an older result by it.
     text = f"format: {document.pop('format')}\n" + yaml_text(document, _ONE_LINE)
     temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
     try:
@@ -91,7 +91,7 @@ def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, ver
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes a rename last through a loss of power; some file systems cannot, and that is no failure."""
+    """Flush a rename to disk; file systems that do not support it are ignored."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -105,7 +105,7 @@ def _reason(error: OSError | ValueError) -> str:
 
 
 def read_result(path: Path) -> SessionEstimate:
-    """Reads a result and checks every field.
+    """Read a result and check every field.
 
     Times of the looks are not in the file: ``t`` of each pair is NaN; nor are the calibration shots. A predicted error
     that is ``null`` reads as infinite.

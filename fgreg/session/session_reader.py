@@ -1,4 +1,4 @@
-"""A session's folder, read and checked: ``session.yaml``, ``events.jsonl``, ``ground_truth.yaml``, frames.
+"""Reads and checks a session's folder: ``session.yaml``, ``events.jsonl``, ``ground_truth.yaml``, frames.
 
 Every problem becomes an :class:`InputError` that names the file, the key or line, what was found and what was
 expected. :func:`read_session` raises the first, :func:`check_session` returns all of them.
@@ -35,9 +35,9 @@ class Session:
 
     Attributes:
         folder: as given.
-        model: how things were set up.
-        events: what happened, in order.
-        warnings: plain sentences on what is allowed but hardly meant, and on a last line that was cut short.
+        model: its set-up.
+        events: in order.
+        warnings: sentences about values that are allowed but implausible, and about a truncated last line.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class Session:
 
 
 def read_session(folder: str | Path) -> Session:
-    """Read a session's folder. Frames that events name lie inside it, but whether they exist shows when they are used.
+    """Read a session's folder. The paths of frames are checked to be inside it; that the files exist is not checked.
 
     Raises:
         InputError: the first problem of the folder, of ``session.yaml`` or of ``events.jsonl``.
@@ -63,10 +63,10 @@ def read_session(folder: str | Path) -> Session:
 
 
 def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
-    """Checks a session, its ground truth where there is one, and the headers of all frames that events name.
+    """Check a session, its ground truth where there is one, and the headers of all frames that events name.
 
     Returns:
-        All problems and all warnings; both empty where all is well.
+        All problems and all warnings.
     """
     problems: list[InputError] = []
     setup, log = _read(folder, problems)
@@ -82,7 +82,7 @@ def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
 
 
 def read_ground_truth(folder: Path) -> GroundTruth | None:
-    """The truth about a session, or None where there is no ``ground_truth.yaml``.
+    """The ground truth of a session, or None where there is no ``ground_truth.yaml``.
 
     Raises:
         InputError: the first problem of the file.
@@ -95,7 +95,7 @@ def read_ground_truth(folder: Path) -> GroundTruth | None:
 
 
 def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, EventLog]:
-    """Both files of a session; what is wrong is appended to ``problems``, and the rest still read."""
+    """Read both files of a session; appends problems to ``problems`` and reads the rest."""
     try:
         resolved = folder.resolve(strict=True)
         if not resolved.is_dir():
@@ -116,7 +116,7 @@ def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, Event
 
 
 def _warnings(setup: Setup | None, log: EventLog) -> list[str]:
-    """What is allowed but hardly meant, of both files together."""
+    """Warnings about implausible values in both files."""
     if setup is None:
         return log.warnings
     beyond = []

@@ -1,4 +1,4 @@
-"""``session.yaml``: how a session was set up, described by fgreg.model.session_model."""
+"""Reads ``session.yaml``, the set-up of a session, described by fgreg.model.session_model."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Part = TypeVar("Part")
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What could be read of ``session.yaml``: the model where all of it was right, else the parts that were.
+    """Contents of ``session.yaml``: the model where all of it is valid, else the valid parts.
 
-    ``present`` holds the dotted names of the sections that are there, right or wrong, so that events which need one
-    are not reported as well where it is only misspelt inside.
+    ``present`` holds the dotted names of all sections in the file, valid or not, so that an error inside a section is
+    not reported again for every event that needs it.
     """
 
     model: SessionModel | None
@@ -30,7 +30,7 @@ class Setup:
 
 
 def read_setup(data: Mapping[str, object], file: str, default_name: str, problems: list[InputError]) -> Setup:
-    """Checks a ``session.yaml``; appends to ``problems`` all that is wrong with it.
+    """Check a ``session.yaml``; appends all problems to ``problems``.
 
     Args:
         data: its content.
@@ -67,7 +67,7 @@ def _present(data: Mapping[str, object]) -> frozenset[str]:
         inner = data.get(section)
         if isinstance(inner, Mapping):
             names |= {f"{section}.{key}" for key in inner}
-    # A section that is not there or no section is one problem, not one more for each event that needs a part of it.
+    # An absent or invalid section is one problem, not another one for each event that needs a part of it.
     if not isinstance(data.get("probe"), Mapping):
         names.add("probe.channels")
     if not isinstance(data.get("camera"), Mapping):
@@ -82,7 +82,7 @@ def _warnings(
     marker: MarkerModel | None,
     board: BoardModel | None,
 ) -> list[str]:
-    """What is allowed but hardly meant."""
+    """Warnings about values that are allowed but implausible."""
     out = []
     if probe is not None and not 1300.0 <= probe.sound_speed_m_s <= 1700.0:
         out.append(

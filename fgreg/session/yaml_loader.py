@@ -1,10 +1,10 @@
-"""YAML from files that nobody vouches for: plain data only, bounded in size, depth and nodes, keys with their lines.
+"""YAML from untrusted files: plain data only, bounded in size, depth and nodes, keys with their lines.
 
-Built on the parser's events, so nothing of PyYAML's constructors runs. What differs from ``yaml.safe_load``:
+It uses the parser's events, so no constructor of PyYAML runs. Differences from ``yaml.safe_load``:
 
-- a key may come once; keys are texts; merge keys and tags are refused;
-- aliases count as often as they are used, and an alias inside its own anchor is refused, so that a few lines cannot
-  stand for billions of nodes;
+- a key may occur once; keys are texts; merge keys and tags are refused;
+- every use of an alias counts as new nodes, and an alias inside its own anchor is refused, so that a few lines cannot
+  expand to billions of nodes;
 - numbers are those of YAML 1.2 (``1e-3`` is one; ``010``, ``1_000`` and ``1:30``, on which versions disagree, are
   texts and fail where a number is expected), truth values are ``true`` and ``false``, dates are texts.
 """
@@ -22,7 +22,7 @@ import yaml
 from fgreg.errors import InputError, one_line
 
 MAX_DEPTH = 32
-"""Nesting beyond which a file is refused; the formats here need seven levels."""
+"""Largest nesting of a file; the formats here need seven levels."""
 
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
@@ -33,15 +33,15 @@ _TRUTH = {"true": True, "True": True, "TRUE": True, "false": False, "False": Fal
 _NULLS = frozenset({"", "~", "null", "Null", "NULL"})
 _MAX_INTEGER_DIGITS = 30
 
-# libyaml's parser where the wheel brings it (ten times faster); the pure one raises the same errors.
+# libyaml's parser where the wheel includes it (ten times faster); the pure one raises the same errors.
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class YamlMapping(dict[str, object]):
-    """A mapping that knows the 1-based line of each key.
+    """A mapping with the 1-based line of each key.
 
-    ``texts`` has the written form of numbers that YAML 1.1 takes for texts (``1e5``), so that a text is not lost where
-    one is expected: writers of 1.1 leave such texts without quotes.
+    ``texts`` has the written form of numbers that YAML 1.1 reads as texts (``1e5``), for keys that expect a text:
+    writers of 1.1 leave such texts without quotes.
     """
 
     __slots__ = ("lines", "texts")
@@ -53,7 +53,7 @@ class YamlMapping(dict[str, object]):
 
 
 class YamlSequence(list[object]):
-    """A list that knows the 1-based line of each item."""
+    """A list with the 1-based line of each item."""
 
     __slots__ = ("lines",)
 
@@ -66,12 +66,12 @@ def open_file(path: Path, label: str) -> IO[bytes]:
     """A regular file, opened for reading; pipes and devices are refused before they can block.
 
     Raises:
-        InputError: absent, no regular file, or not readable. ``label`` is how messages name the file.
+        InputError: absent, not a regular file, or not readable. ``label`` is its name in messages.
     """
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
-            kind = "a folder" if stat.S_ISDIR(mode) else "something that is no regular file"
+            kind = "a folder" if stat.S_ISDIR(mode) else "something that is not a regular file"
             raise InputError(label, kind, "a file")
         return path.open("rb")
     except FileNotFoundError:
@@ -98,11 +98,11 @@ def read_bounded(path: Path, label: str, max_bytes: int) -> bytes:
 
 
 def load_yaml(path: Path, label: str, *, max_bytes: int = 4_000_000, max_nodes: int = 200_000) -> YamlMapping:
-    """The mapping that a YAML file holds.
+    """Read the top mapping of a YAML file.
 
     Args:
         path: the file.
-        label: how messages name it.
+        label: its name in messages.
         max_bytes, max_nodes: bounds on size and on nodes after expansion of aliases.
 
     Raises:
@@ -118,14 +118,14 @@ def load_yaml(path: Path, label: str, *, max_bytes: int = 4_000_000, max_nodes: 
 
 
 def parse_yaml(text: str, label: str, *, max_nodes: int = 200_000) -> YamlMapping:
-    """As :func:`load_yaml`, of a text."""
+    """As :func:`load_yaml`, from a text."""
     builder = _Builder(label, max_nodes)
     try:
         for event in yaml.parse(text, Loader=_LOADER):
             builder.take(event)
     except yaml.MarkedYAMLError as error:
         where = f"{label}: line {error.problem_mark.line + 1}" if error.problem_mark else label
-        if "nesting" in (error.problem or ""):  # libyaml may look ahead as far as its own limit
+        if "nesting" in (error.problem or ""):  # libyaml may reach its own nesting limit first
             raise InputError(where, "nesting too deep", f"at most {MAX_DEPTH} levels") from None
         raise InputError(where, f"bad YAML ({_problem(error.problem)})", "YAML") from None
     except (yaml.YAMLError, ValueError) as error:
@@ -153,7 +153,7 @@ class _Open:
 
 
 class _Builder:
-    """Turns parser events into plain data, counting every node as often as it is reached."""
+    """Turns parser events into plain data, and counts the nodes, those of aliases at each use."""
 
     def __init__(self, label: str, max_nodes: int) -> None:
         self.root: object = None
