@@ -1,4 +1,4 @@
-"""Values of a document that name files: frames inside the session's folder, and files of any place."""
+"""Kinds of values that name files: frames inside the session's folder, and files anywhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FRAME_NAME = "a relative name of a file inside the session's folder"
 
 
 class FrameKind(Enum):
-    """What a frame is used for."""
+    """Use of a frame: camera image or TRUS frame."""
 
     CAMERA = "camera"
     TRUS = "trus"
@@ -23,10 +23,10 @@ class FrameKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameName(Kind):
-    """The name of a raw frame, relative to the session's folder; its resolved path inside.
+    """The name of a raw frame, relative to the session's folder; read as its resolved path.
 
-    The file need not exist, but has to lie inside the folder: names that are absolute, have ``..`` or control
-    characters, or lead out by a symbolic link are refused. The folder that is passed has to be resolved.
+    The file need not exist, but must be inside the folder: names that are absolute, have ``..`` or control characters,
+    or leave it by a symbolic link are refused. The folder passed must be resolved.
     """
 
     use: FrameKind
@@ -66,7 +66,7 @@ class FrameName(Kind):
 
 @dataclass(frozen=True, slots=True)
 class ExistingPath(Kind):
-    """A file or folder that is there, relative to the document's folder."""
+    """An existing file or folder, relative to the document's folder."""
 
     takes_text = True
 
@@ -91,7 +91,7 @@ class ExistingPath(Kind):
 
 
 def exists(path: Path) -> bool:
-    """Whether something is at a path; False for names that no file system takes."""
+    """Whether a path exists; False for names that are invalid on the file system."""
     try:
         return path.exists()
     except (OSError, ValueError):

@@ -1,6 +1,6 @@
-"""What a value of a document may be: each kind reads, writes, and says itself what it takes.
+"""Kinds of values in a document: each reads, writes and describes its values.
 
-Files hold degrees where a name ends with ``_deg``; inside they are radians.
+Files hold degrees where a name ends with ``_deg``; in memory they are radians.
 """
 
 from __future__ import annotations
@@ -31,39 +31,39 @@ _SYMMETRY_TOLERANCE = 1e-6
 _MIN_CORRELATION_EIGENVALUE = 1e-9
 _SIGMA_RANGE = (1e-9, 1e6)
 _UNBOUNDED, _FINITE = 1e12, 1e100
-"""Bounds that only keep out what is no measured number; of parts of a matrix, the second."""
+"""Bounds that exclude only impossible numbers; the second is for entries of a matrix."""
 
 JsonSchema = dict[str, Any]
 
 
 class Kind:
-    """What a value may be."""
+    """A kind of value: how it is read, written and described."""
 
     __slots__ = ()
 
     takes_text = False
-    """Whether a number that other readers of YAML take for a text (``1e5``) is read as one."""
+    """Whether a number that other YAML readers treat as text (``1e5``) is read as text."""
 
     def read(self, value: object, folder: Path | None = None, /) -> Any:
-        """The value inside, of one in a document.
+        """Convert a value of a document to its form in memory.
 
         Args:
             value: as parsed.
-            folder: that names of files are relative to.
+            folder: to which names of files are relative.
 
         Raises:
-            FieldError: it is not what it should be.
+            FieldError: the value is invalid.
         """
         raise NotImplementedError
 
     def write(self, value: Any, folder: Path | None = None, /) -> Any:
-        """The value in a document, as plain data, of one inside: what :meth:`read` takes."""
+        """Convert a value in memory to plain data for a document, the inverse of :meth:`read`."""
         del folder
         return value
 
     @property
     def expected(self) -> str:
-        """What messages and tables say is expected."""
+        """Description of valid values for messages and tables."""
         raise NotImplementedError
 
     def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
@@ -91,7 +91,7 @@ class Number(Kind):
     decimals: int | None = None
 
     def has(self, value: object) -> bool:
-        """Whether a value is a number inside the interval; a truth value is none."""
+        """Whether a value is a number inside the interval; booleans are not numbers."""
         if type(value) is not float and type(value) is not int:
             return False
         return (self.low < value if self.above else self.low <= value) and value <= self.high
@@ -103,7 +103,7 @@ class Number(Kind):
         return math.radians(number) if self.degrees else number
 
     def write(self, value: Any, _folder: Path | None = None, /) -> float | int | None:
-        """Where figures are rounded, one that is not finite is written as null."""
+        """With ``decimals``, a number that is not finite is written as null."""
         if self.degrees:
             value = math.degrees(value)
         if self.decimals is not None:
@@ -138,7 +138,7 @@ class Figure(Number):
 
 @dataclass(frozen=True, slots=True)
 class Integer(Kind):
-    """An integer (3.0 is none) in [low, high]."""
+    """An integer in [low, high]; 3.0 is not one."""
 
     low: int
     high: int
@@ -206,8 +206,8 @@ class Text(Kind):
     """A text that is not empty.
 
     Attributes:
-        what: what messages call it.
-        allowed: the only ones, where given.
+        what: its description in messages.
+        allowed: the only valid texts, where given.
         check: raises InputError or FieldError for a text that cannot be one.
         enum: what the allowed ones become.
     """
@@ -252,7 +252,7 @@ class Text(Kind):
 
 @dataclass(frozen=True, slots=True)
 class Numbers(Kind):
-    """A list of numbers, each in an interval: ``count`` of them, or any number from one. Inside an array (n,)."""
+    """A list of numbers, each in an interval: ``count`` of them, or at least one where None; read as an array (n,)."""
 
     count: int | None
     each: Number = Number()
@@ -284,7 +284,7 @@ class Numbers(Kind):
 
 @dataclass(frozen=True, slots=True)
 class NumberTuple(Numbers):
-    """As :class:`Numbers`; a tuple inside."""
+    """As :class:`Numbers`, read as a tuple."""
 
     def read(self, value: object, _folder: Path | None = None, /) -> tuple[float, ...]:
         return tuple(Numbers.read(self, value).tolist())
@@ -292,7 +292,7 @@ class NumberTuple(Numbers):
 
 @dataclass(frozen=True, slots=True)
 class IntegerPair(Kind):
-    """A list of two integers in [low, high], a tuple inside."""
+    """A list of two integers in [low, high], read as a tuple."""
 
     low: int
     high: int
@@ -317,7 +317,7 @@ class IntegerPair(Kind):
 
 @dataclass(frozen=True, slots=True)
 class Matrix(Kind):
-    """A square matrix of finite numbers, row by row; an array (size, size) inside."""
+    """A square matrix of finite numbers, row by row; read as an array (size, size)."""
 
     size: int
 
@@ -379,7 +379,7 @@ class Transform(Matrix):
 
 @dataclass(frozen=True, slots=True)
 class Covariance(Matrix):
-    """A symmetric, positive definite (or semidefinite) matrix; symmetric to the last digit inside.
+    """A symmetric, positive definite (or semidefinite) matrix; made exactly symmetric on reading.
 
     Attributes:
         semidefinite: variances may be zero.
@@ -411,7 +411,7 @@ class Covariance(Matrix):
 
 @dataclass(frozen=True, slots=True)
 class ListOf(Kind):
-    """A list of one kind, a tuple inside; not empty unless ``empty``. ``what`` is for messages."""
+    """A list of one kind, read as a tuple; not empty unless ``empty``. ``what`` is for messages."""
 
     each: Kind
     what: str = ""
@@ -444,7 +444,7 @@ class ListOf(Kind):
 
 @dataclass(frozen=True, slots=True)
 class Points(Kind):
-    """A list of points [x, y, z]; an array (n, 3) inside."""
+    """A list of points [x, y, z], read as an array (n, 3)."""
 
     each: Numbers
 
@@ -464,7 +464,7 @@ class Points(Kind):
 
 @dataclass(frozen=True, slots=True)
 class Anything(Kind):
-    """Whatever a document can hold; ``what`` is for messages."""
+    """Any value of a document; ``what`` is for messages."""
 
     what: str
 
@@ -481,7 +481,7 @@ class Anything(Kind):
 
 @dataclass(frozen=True, slots=True)
 class Converted(Kind):
-    """Another kind, where what is inside is laid out otherwise than the file: ``inside`` and ``outside`` convert."""
+    """Another kind with a different form in memory: ``inside`` and ``outside`` convert to it and back."""
 
     stored: Kind
     inside: Callable[[Any], Any]
@@ -512,7 +512,7 @@ POINT_MM = Numbers(3, COORDINATE_MM)
 
 
 def in_radians(degrees: Number) -> Number:
-    """The same interval of degrees in the file, radians inside."""
+    """The same interval in degrees in the file, read as radians."""
     return replace(degrees, degrees=True)
 
 
@@ -544,7 +544,7 @@ def _require_finite(array: FloatArray) -> None:
 
 
 def transform_problem(matrix: FloatArray, max_translation_mm: float = math.inf) -> tuple[str, str] | None:
-    """What keeps a (4, 4) matrix of bounded entries from being a rigid transform, and what was expected, or None."""
+    """Why a (4, 4) matrix is not a rigid transform: (found, expected); None where it is one."""
     if not is_rigid(matrix):
         rotation = matrix[:3, :3]
         off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
@@ -565,7 +565,7 @@ def as_rigid(matrix: FloatArray) -> FloatArray:
 
 
 def covariance_problem(matrix: FloatArray, *, semidefinite: bool = False) -> str | None:
-    """What keeps a finite (n, n) matrix from being a covariance, or None.
+    """Why a finite (n, n) matrix is not a covariance; None where it is one.
 
     Checked on the correlations, so that units do not matter: symmetric to 1e-6, smallest eigenvalue above 1e-9. With
     ``semidefinite``, variances may be zero and the eigenvalue only must not be negative beyond rounding.

@@ -1,4 +1,4 @@
-"""What is wrong with a document: each problem with its path in it, and the words for it."""
+"""Problems of a document, each with its path, and their messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Path = tuple[str | int, ...]
 
 
 class Problem(NamedTuple):
-    """One problem; ``meant`` is the known key that an unknown one was probably meant to be."""
+    """One problem; ``meant`` is the known key that an unknown key probably stands for."""
 
     path: Path
     found: str
@@ -28,10 +28,10 @@ class Problem(NamedTuple):
 
 
 class FieldError(ValueError):
-    """A value, or a mapping, is not what its description says.
+    """A value or mapping does not fit its description.
 
     Attributes:
-        problems: all that is wrong; at least one. Paths are relative to the value.
+        problems: all of them, at least one. Paths are relative to the value.
         values: of a mapping, what could be read, by attribute.
     """
 
@@ -48,12 +48,12 @@ class FieldError(ValueError):
         return cls([Problem(path, found, expected)])
 
     def below(self, *path: str | int) -> list[Problem]:
-        """The problems, as those of what holds this value at ``path``."""
+        """The problems with ``path``, the place of this value in its parent, put before their paths."""
         return [problem._replace(path=path + problem.path) for problem in self.problems]
 
 
 def path_text(path: Path) -> str:
-    """As messages have it: ``marker.tags[1].id``."""
+    """A path as text for messages: ``marker.tags[1].id``."""
     text = ""
     for step in path:
         if isinstance(step, int):
@@ -64,7 +64,7 @@ def path_text(path: Path) -> str:
 
 
 def place_text(path: Path, file: str, root: object = None, line: int | None = None) -> str:
-    """A place as messages have it: ``session.yaml: probe.pitch_mm (line 7)``.
+    """A place as text for messages: ``session.yaml: probe.pitch_mm (line 7)``.
 
     Args:
         path: from the top of the document.
@@ -121,7 +121,7 @@ def shown(value: object) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """The known word that a misspelt one was probably meant to be."""
+    """The known word most similar to a misspelt one; None where none is similar."""
     by_lower = {name.lower(): name for name in known}
     matches = difflib.get_close_matches(word[:80].lower(), list(by_lower), n=1, cutoff=0.7)
     return by_lower[matches[0]] if matches else None

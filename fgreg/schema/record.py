@@ -29,7 +29,7 @@ from fgreg.schema.problems import FieldError, Problem, nearest, shown
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """How a field of a dataclass stands in a file.
+    """Description of a dataclass field in a file.
 
     Attributes:
         help: one line for tables and examples.
@@ -60,13 +60,13 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class NotStored:
-    """Of a field that is not in the file: what it reads as."""
+    """Marks a field that is not in the file, with the value it gets on reading."""
 
     value: object
 
 
 class Inline:
-    """Of a field whose own keys stand in the same mapping: an object made of some of the mapping's keys."""
+    """Marks a field whose own keys are in the same mapping: an object made of some of the mapping's keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ class Record(Kind):
             raise FieldError.of(f"values that do not fit together ({error})", "values that do") from None
 
     def values(self, value: object, folder: Path | None = None, /) -> dict[str, Any]:
-        """The values of the keys that are there, by attribute. Raises FieldError with all that is wrong."""
+        """The values of the present keys, by attribute. Raises FieldError with all problems."""
         if not isinstance(value, Mapping):
             raise FieldError.of(shown(value), self.expected)
         problems = [] if self._known >= value.keys() else list(self._unknown(value))
@@ -173,7 +173,7 @@ class Record(Kind):
         return out
 
     def _unknown(self, value: Mapping[str, object]) -> Iterator[Problem]:
-        """Keys that are not known; one that resembles a known one that is absent is probably that."""
+        """Problems of unknown keys, each with the most similar absent key."""
         for key in value:
             if key in self._known or key.startswith("x_"):
                 continue
@@ -217,7 +217,7 @@ class Record(Kind):
 
     @property
     def name(self) -> str:
-        """Of its JSON Schema."""
+        """Name of its JSON Schema."""
         tags = [value for key, value in self.constants.items() if key != "format"]
         return ".".join([self.cls.__name__.removeprefix("_"), *tags])
 

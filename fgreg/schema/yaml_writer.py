@@ -1,4 +1,4 @@
-"""Plain data as YAML text that people read: one line for what is one thing, every float with a dot."""
+"""Plain data as readable YAML: matrices row by row, small mappings on one line, every float with a dot."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _item(entry: object, one_line: bool, flow: Collection[str]) -> Iterator[str]
 
 
 def _float(value: float) -> str:
-    """As every YAML reader takes for a float: with a dot, and a sign in the exponent."""
+    """A float that every YAML reader reads as one: with a dot, and a sign in the exponent."""
     mantissa, exponent, power = repr(value).partition("e")
     if "." not in mantissa:
         mantissa += ".0"
