@@ -43,7 +43,7 @@ from fgreg.registration.register import SoundSpeedPrior, pack_session
 from fgreg.smoother.shared_variables import Quadratic
 
 MIN_KNOWN = 6
-"""PMs needed for a registration: with fewer on one side of a split point a move cannot be tested."""
+"""PMs needed for a registration: with fewer on both sides of a split point a move cannot be tested there."""
 MARGIN, MOST_SPLITS = 6.0, 24
 """The full test uses split points whose log Bayes factor is this close to the best one's; largest number of them."""
 
