@@ -92,6 +92,11 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
             f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}, but no peak inside the image"
         )
     row, column, amplitude, covariance = fit
+    if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0):
+        return NoSignal(
+            f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}, but the image is too small, or cut "
+            "off at a level, to say how well the position is known"
+        )
     noise = math.sqrt(0.5 * float(level[peak.row]))
     return PaFind(
         x_mm=probe.image.origin_mm[1] + column * probe.image.pixel_mm[1],

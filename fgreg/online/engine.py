@@ -54,6 +54,8 @@ LATER_PAIRS = (12, 15, 20, 25, 30, 40, 60, 80)
 """Numbers of pairs at which the full solve runs later; after the last one it runs whenever the pairs have doubled."""
 LOOP_PMS = (MOST_LOOKS, 18, 10)
 """Numbers of PMs at which a loop closure of the recorded session is looked for when it is opened again."""
+MOST_LOSSES = 3
+"""Times that a case is submitted again after its worker process has ended, until the next event."""
 MOST_ROUNDS = 4
 """Largest number of full solves at one event: after each camera move that one finds another follows."""
 
@@ -108,6 +110,8 @@ class OnlineRegistration:
         self._surface: TissueSurface | None = None
         self._find_moves, self._verdicts = find_moves, verdicts
         self._move_failure = ""  # of the camera-move test
+        self._failures = ("", "")  # as reported in the estimate
+        self._losses = 0  # cases lost in a row
         self._tags = TagMonitor()
         self._moves: list[DetectedMove] = []
         self._loop_closures: list[DetectedLoopClosure] = []
@@ -180,7 +184,7 @@ class OnlineRegistration:
             start = EpochStart(event.t, event.camera_new_T_camera_old, event.covariance)
             if event.since_t is not None:
                 return with_move(state, replace(start, t=event.since_t), setting, self._pairs_since(event.since_t))
-            if self._noticed.get(state.epoch) and (state.active_window is None or not state.epoch_pairs):
+            if self._noticed.get(state.epoch) and state.epoch_pms < LEAST_PMS:
                 # This may be the move that was detected, or another one, so the measured motion cannot be used.
                 start = EpochStart(event.t)
             return with_move(state, start, setting)
@@ -210,7 +214,7 @@ class OnlineRegistration:
 
     def _want(self, event: OnlineEvent, found: TagsMoved | TagsAtRest | None, misplaced: frozenset[int]) -> None:
         """Decide what the full solve has to do after an event."""
-        state = self._state
+        state, self._losses = self._state, 0
         if self._solver.failure and state.epoch_pairs:  # the last full solve gave no result
             self._solve_wanted = True
         if isinstance(event, Pair):
@@ -221,7 +225,8 @@ class OnlineRegistration:
             if no_estimate or rejected or due or not misplaced <= self._misplaced:
                 self._solve_wanted = True
         elif isinstance(event, Aim):
-            if state.epoch_pairs and (state.active_window is None or state.epoch_pairs <= FIRST_PAIRS):
+            first = state.active_window is None or state.epoch_pairs <= FIRST_PAIRS
+            if state.epoch_pairs and (first or not misplaced <= self._misplaced):
                 self._solve_wanted = True
         elif (found is not None or isinstance(event, CameraMoved)) and state.epoch_pairs:
             self._solve_wanted = True
@@ -234,7 +239,7 @@ class OnlineRegistration:
             if not self._solver.busy:
                 case = self._case()
                 if case is None:
-                    return
+                    break
                 self._asked, self._solve_wanted, self._move_wanted = self._division, False, False
                 self._move_untested = case.move is not None and case.move.known is None
                 self._solver.submit(case)
@@ -243,16 +248,21 @@ class OnlineRegistration:
                     self._estimate = self._estimated(self._state, self._estimate.t)
             if not self._fetch(t):
                 break
-        if self._solver.failure or self._move_failure:
+        failures = (self._solver.failure, self._move_failure)
+        if failures != self._failures:
+            self._failures = failures
             self._estimate = self._estimated(self._state, self._estimate.t)
 
     def _fetch(self, t: float | None = None) -> bool:
         """Take over a result; whether there was one."""
         found = self._solver.fetch()
         if found is None:
-            if self._solver.lost:  # the worker process ended: the case is submitted again
-                self._solver.lost, self._solve_wanted = False, True
+            if self._solver.lost:  # with its process: submitted again, at most so often until the next event
+                self._solver.lost, self._losses = False, self._losses + 1
+                if self._losses <= MOST_LOSSES:
+                    self._solve_wanted, self._move_wanted = True, self._find_moves
             return False
+        self._losses = 0
         if self._asked != self._division or found.epoch != self._state.epoch:
             self._solve_wanted = True
             return True
@@ -329,6 +339,8 @@ class OnlineRegistration:
 
     def _take_over(self, found: FullSolveResult) -> None:
         """Take over optimum, inliers and report of a full solve; where that fails the incremental estimate stays."""
+        if self._report is not None and found.serial < self._report.serial:
+            return  # a later one has been taken over
         before = self._state, self._misplaced, self._report, self._surface
         try:
             if found.report is not None:
@@ -359,12 +371,14 @@ class OnlineRegistration:
 
     def _close_loop(self, found: LoopClosure, t: float) -> None:
         """Close a loop: the earlier epoch's registration becomes a prior of the current epoch."""
-        before = self._state
+        before, report = self._state, self._report
+        self._report = None  # it was of another registration
         try:
             state = with_motion(before, back_to(before.now.start, found.to), self._setting)
             state = replace(state, nis=before.nis, used=before.used)
             estimate = self._estimated(state, self._estimate.t)
         except Exception:  # the epoch stays as it was, only its registration is less certain
+            self._report = report
             return
         self._loop_closures.append(DetectedLoopClosure(before.epoch, found.to, t, found.log_bayes))
         self._state, self._estimate = state, estimate

@@ -83,7 +83,8 @@ class WorkerSolver:
     @property
     def failure(self) -> str:
         """Why the last case failed; empty where it did not."""
-        return self._worker.failure
+        waits = self._worker.busy and self._worker.trouble  # the process does not take the case
+        return f"the full solve's process: {self._worker.trouble}" if waits else self._worker.failure
 
     @failure.setter
     def failure(self, text: str) -> None:

@@ -142,8 +142,9 @@ def _beams(found: Optimum) -> list[FloatArray]:
 
 def _is_clean(problem: PackedProblem, found: Optimum) -> bool:
     """Whether each shot fits, and all of them together, at the best least squares optimum."""
-    best = int(np.argmin(found.evaluation.cost))
-    if found.evaluation.cost[best] > plausible_cost(problem):
+    cost = np.where(np.isfinite(found.evaluation.cost), found.evaluation.cost, np.inf)
+    best = int(np.argmin(cost))
+    if cost[best] > plausible_cost(problem):
         return False
     state, private = found.state.take([best]), found.evaluation.private.take([best])
     pm, aim = np.ones(len(problem.pms), dtype=bool), np.ones(len(problem.aims.rotation), dtype=bool)

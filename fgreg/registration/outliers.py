@@ -285,9 +285,10 @@ def innovations(parts: Parts, pm_inlier: BoolArray, aim_inlier: BoolArray) -> In
 def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
     sign = np.where(kept, -1.0, 1.0)
     cost, gradient, own = part.cost[0], part.gradient[0], part.hessian[0]
-    seen = (
-        np.diag(hessian + own.sum(axis=0)) > UNKNOWN
-    )  # variables that no shot observes (the pose, of aims) do not matter
+    # Variables that no shot observes (the pose, of aims) do not matter.
+    seen = np.diag(hessian + own.sum(axis=0)) > UNKNOWN
+    if not seen.any():
+        return np.full(len(cost), np.inf)
     gradient = gradient[:, seen]
     rest = (hessian + sign[:, None, None] * own)[:, seen][:, :, seen]
     scale = np.sqrt(np.maximum(np.diagonal(rest, axis1=1, axis2=2), 0.0))

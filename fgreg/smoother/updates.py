@@ -45,8 +45,8 @@ def with_pair(state: State, pair: Pair, setting: Setting) -> State:
 
 def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setting) -> State:
     """:func:`with_pair` where there is a registration; the pair is the state's last shot, an outlier up to now."""
-    place, shot = len(state.shots) - 1, state.shots[-1]
-    label = shot.label
+    before, place = state, len(state.shots) - 1
+    label = state.shots[-1].label
     places = [state.now.first + i for i, other in enumerate(state.current) if other.label == label]
     if label in state.marginalised:  # a new look at a marginalised PM: all its looks return to the active window
         state = replace(state, marginalised=state.marginalised - {label})
@@ -62,10 +62,11 @@ def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setti
     nis = innovation(prepared, active.covariance, known)
     inliers, count = state.counts()
     fits = nis <= limit_of(len(prepared.rows), inliers + (same is None), count)
-    state = replace(state, nis=nis, used=fits)
     if not fits:
         # The full solve decides which of several looks at a PM is the outlier; until then it is the last one.
-        return _split_off(state, place) if same is not None else state
+        rejected = _split_off(before, place) if any(before.shots[p].inlier for p in places) else before
+        return replace(rejected, nis=nis, used=False)
+    state = replace(state, nis=nis, used=True)
     shots = list(state.shots)
     for p in places:
         shots[p] = replace(shots[p], inlier=True)
@@ -95,11 +96,9 @@ def _marginalised(state: State, active: ActiveWindow, change: Change, setting: S
     if len(stay) < MOST:
         return state, change
     oldest = frozenset(group.label for group in stay[:LEAVE])
-    more = own_prior(state, oldest, active.state, setting)
-    if more is None:
-        return state, change
-    older = more if state.older is None else state.older.at(active.state, setting.columns).plus(more)
-    state = replace(state, older=older, marginalised=state.marginalised | oldest)
+    marginalised = state.marginalised | oldest
+    older = own_prior(state, marginalised, active.state, setting)
+    state = replace(state, older=older, marginalised=marginalised)
     prior = total_prior(state, active.state, setting)
     return state, replace(change, remove=(*change.remove, *oldest), prior=prior)
 
@@ -161,13 +160,14 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
     first = len(state.shots) - last
     if not 0 <= last <= state.epoch_pairs:
         raise ValueError(f"the last {last} pairs are not all of the current epoch")
+    ended = state.now if state.active_window is not None else replace(state.now, state=None, covariance=None)
     shots = list(state.shots)
     for place in range(first, len(shots)):
         pair = replace(shots[place].pair, epoch=state.epoch + 1)
         shots[place] = Shot(pair, pair.pm, inlier=False)
     moved = replace(
         state,
-        epochs=(*state.epochs, Epoch(start, first)),
+        epochs=(*state.epochs[:-1], ended, Epoch(start, first)),
         shots=tuple(shots),
         active_window=None,
         carried=None,
@@ -184,15 +184,19 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
 def with_motion_prior(state: State, setting: Setting) -> State:
     """The state whose current epoch, which has no pairs yet, is registered by the measured motion at its start.
 
-    It is unchanged where there is no such motion, or where the epoch before the motion has no registration.
+    It is unchanged where there is no such motion, or where the epoch before the motion has no registration, or one that
+    the motion does not determine.
     """
     start, layout = state.now.start, state.layout
     before = state.epochs[start.old(state.epoch)].state if start.motion_known and state.epoch else None
     if before is None or layout is None:
         return state
     at = carried_over(before, start)
-    state, carried = carried_prior(state, at, setting)
-    active = open_active_window((), carried, layout, state.epoch)
+    try:
+        state, carried = carried_prior(state, at, setting)
+        active = open_active_window((), carried, layout, state.epoch)
+    except ArithmeticError:  # the move is taken in all the same
+        return state
     now = replace(state.now, state=active.state, covariance=active.covariance)
     return replace(
         state, carried=carried, active_window=active, epochs=(*state.epochs[:-1], now), why_none="", is_open=False
