@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fgreg.geometry.transforms import as_float_array, exp_so3
 from fgreg.graph.packing import pack
-from fgreg.graph.reduced_graph import log_posterior
+from fgreg.graph.reduced_graph import log_posterior, refine
 from fgreg.graph.reduced_solver import optimize
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Aim, MarkerObservation, Measurements, Pair
@@ -17,10 +19,13 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.minimal_set_consensus import consensus_starts
 from fgreg.registration.outliers import innovations_at, plausible_cost, pm_degrees_of_freedom
+from fgreg.registration.posterior import moved_private
 from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register, targets_moved
 from fgreg.registration.solve import distance_to_explicit, solve
 from tests.forward import Truth, make_measurements
+
+STUDY = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "study_junk.py"))
 
 
 def _flipped(marker: MarkerObservation) -> MarkerObservation:
@@ -249,3 +254,38 @@ def test_junk_that_bends_the_estimate_until_it_fits_widens_the_posterior() -> No
             squares.append(targets_moved(truth.trus_T_camera[0], there, model.targets_mm) ** 2)
     optimum, mean = np.mean(squares[::2]), np.mean(squares[1::2])
     assert mean < 0.7 * optimum
+
+
+def _with_outliers_of_all_kinds(seed: int, *, first_hit: bool) -> tuple[SessionModel, Measurements, list[int]]:
+    """A session of 25 pairs with ten outliers of the kinds that tools/study_junk.py makes, and which they are."""
+    model, clean, _ = make_measurements(np.random.default_rng(seed), pairs=25, first_hit=first_hit)
+    where = np.random.default_rng([seed, 1])
+    outliers = [int(index) for index in where.permutation(25)[:10]]
+    pairs = list(clean.pairs)
+    for number, index in enumerate(outliers):
+        pairs[index] = STUDY["spoil"](pairs[index], STUDY["KINDS"][number % len(STUDY["KINDS"])], where)
+    return model, replace(clean, pairs=tuple(pairs)), outliers
+
+
+def test_a_pm_that_does_not_converge_is_no_inlier_of_a_search() -> None:
+    # Its chi square passes below the limit on the way, once in a while.
+    model, spoiled, outliers = _with_outliers_of_all_kinds(18, first_hit=True)
+    left_out = np.flatnonzero(~register(spoiled, model, SolveConfig()).shots.pm_inlier)
+    assert set(outliers) <= set(left_out.tolist())
+    assert len(left_out) <= len(outliers) + 1
+
+
+def test_the_density_with_outliers_does_not_hang_on_how_often_their_pms_are_refined() -> None:
+    model, spoiled, _ = _with_outliers_of_all_kinds(51, first_hit=False)
+    config = SolveConfig()
+    (mode, *_) = posterior_mean(register(spoiled, model, config), config).modes
+    assert mode.mixture is not None
+    problem, root = mode.mixture.problem, np.linalg.cholesky(mode.covariance)
+    step = np.random.default_rng(0).standard_normal((200, len(root))) @ root.T
+    state = mode.optimum.state.take(np.zeros(200, dtype=np.int64)).retract(step, problem.columns)
+    private = moved_private(mode, step)
+    densities = []
+    for _ in range(6):
+        _, private = refine(problem, state, private)
+        densities.append(log_posterior(problem, state, private))
+    assert np.ptp(densities, axis=0).max() < 0.1

@@ -45,6 +45,9 @@ from fgreg.graph.reduced_blocks import (
 from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.graph.window_likelihood import log_shape_ratios
 
+DIVERGED_MM = 1.0
+"""A PM that moves by more in one step, after several, does not converge."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
@@ -109,6 +112,11 @@ class _System:
     aim_cost: FloatArray
     prior_cost: FloatArray
     private: PrivateState
+
+    @property
+    def moved_mm(self) -> FloatArray:
+        """(J, S) how far the PMs move from the linearisation point."""
+        return np.asarray(np.sqrt(np.einsum("nis,nis->ns", self.point_step, self.point_step)))
 
     @property
     def cost(self) -> FloatArray:
@@ -237,7 +245,8 @@ def log_posterior(problem: PackedProblem, state: SharedState, private: PrivateSt
     system = _system(problem, state, private)
     pms = _log_shapes(problem, state, system) - 0.5 * system.pm_cost.T
     if problem.log_outlier is not None:
-        pms = np.logaddexp(pms, problem.log_outlier)
+        # The chi square of a PM that does not converge is anything, also next to nothing.
+        pms = np.logaddexp(np.where(system.moved_mm.T > DIVERGED_MM, -np.inf, pms), problem.log_outlier)
     return np.asarray(pms.sum(axis=1) - 0.5 * (system.aim_cost.sum(axis=0) + system.prior_cost))
 
 
@@ -392,8 +401,7 @@ def evaluate(
     """
     system = _system(problem, state, private)
     by = _shared_derivatives(problem, state, system)
-    moved_mm = np.sqrt(np.einsum("nis,nis->ns", system.point_step, system.point_step))
-    weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(moved_mm)))
+    weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(system.moved_mm)))
     look, columns, pms = system.look, np.array(look_columns(problem)), len(problem.beam_pm)
     line, h_ps, look_t = by.line, by.h_ps, look[:, :, 4:]
     if loss is not least_squares:

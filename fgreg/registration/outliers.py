@@ -24,9 +24,9 @@ from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_graph import (
+    DIVERGED_MM,
     Contributions,
     Costs,
-    Evaluation,
     Loss,
     Parts,
     Weights,
@@ -52,8 +52,8 @@ MAX_STEPS = 30
 SETTLE_ROUNDS = 8
 TOLERANCE = 1e-4
 """Newton decrement (chi square) at which a descent ends."""
-DIVERGED_MM, DIVERGED_CHI2 = 1.0, 1e4
-"""A PM that moves by more (mm) in one step, after several, does not converge; its chi square is then at least this."""
+DIVERGED_CHI2 = 1e4
+"""Least chi square of a PM that does not converge."""
 UNKNOWN = 1e-9
 """Correlation eigenvalue below which the other shots do not determine a direction."""
 
@@ -170,14 +170,14 @@ def _fixed(costs: Costs, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Weights
     return Weights(pm, aim, costs.prior + (pm * costs.pm).sum(axis=1) + (aim * costs.aim).sum(axis=1))
 
 
-def _settled(problem: PackedProblem, state: SharedState, loss: Loss) -> Evaluation:
-    """The evaluation at the starts; a PM that does not converge gets a large cost, whatever its residual is."""
+def _converged_pms(loss: Loss) -> Loss:
+    """The loss, in which a PM that does not converge gets a large cost, whatever its residual is."""
 
-    def with_diverged(costs: Costs) -> Weights:
+    def of(costs: Costs) -> Weights:
         far = np.where(costs.moved_mm > DIVERGED_MM, np.maximum(costs.pm, DIVERGED_CHI2), costs.pm)
         return loss(replace(costs, pm=far))
 
-    return evaluate(problem, state, private_at(problem, state), with_diverged)
+    return of
 
 
 def _settled_parts(problem: PackedProblem, state: SharedState) -> Parts:
@@ -205,11 +205,12 @@ def graduated(
         robust_aims: aims may be outliers, too; else they have full weight.
         keep_within, wanted: of the truncated cost, as of :func:`fgreg.graph.reduced_solver.optimize`.
     """
-    start: Evaluation | None = None
     private: PrivateState | None = None
     for scale in CAUCHY_SCALES:
         loss = partial(_cauchy, scale=scale, aim_scale=scale if robust_aims else np.inf)
-        start = _settled(problem, state, loss) if private is None else None
+        start = None
+        if private is None:
+            start = evaluate(problem, state, private_at(problem, state), _converged_pms(loss))
         found = optimize(
             problem, state, private, max_iterations=STEPS_PER_SCALE, tolerance=TOLERANCE, loss=loss, start=start
         )
@@ -238,7 +239,7 @@ def _truncated_minima(
     wanted: float = np.inf,
 ) -> RobustOptimum:
     limit, aim_limit = pm_limits(problem, TYPICAL_P), AIM_LIMIT if robust_aims else np.inf
-    loss = partial(_truncated, limit=limit, aim_limit=aim_limit)
+    loss = _converged_pms(partial(_truncated, limit=limit, aim_limit=aim_limit))
     for _ in range(2):
         found = optimize(
             problem,
@@ -248,7 +249,6 @@ def _truncated_minima(
             keep_within=keep_within,
             wanted=wanted,
             loss=loss,
-            start=_settled(problem, state, loss),
         )
         state = found.state
     at, index = found.evaluation, distinct(problem, state, found.evaluation)

@@ -13,13 +13,12 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
-from fgreg.graph.reduced_graph import Parts, contributions, refine
+from fgreg.graph.reduced_graph import DIVERGED_MM, Parts, contributions, refine
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements
 from fgreg.registration.outliers import (
     AIM_LIMIT,
     DIVERGED_CHI2,
-    DIVERGED_MM,
     innovations_of,
     limits_among,
     outlier_p_of,
