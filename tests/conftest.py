@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from fgreg.workers.threads import NAMES
+
+# One thread for linear algebra, as commands have it: pytest's -n gives every core a process. Before they are loaded.
+os.environ.update({name: "1" for name in NAMES if name not in os.environ})
 
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
