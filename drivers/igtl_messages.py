@@ -33,7 +33,6 @@ MAX_BODY_BYTES = 32 << 20
 """Largest message taken: 128 elements of 60,000 samples in floats, a volume of 256 x 256 x 256 bytes."""
 HEADER = struct.Struct(">H12s20sIIQQ")
 STATUS = struct.Struct(">Hq20s")
-TYPES = ("IMAGE", "TRANSFORM", "STRING", "STATUS")
 
 STATUS_OK, STATUS_NOT_READY = 1, 13
 

@@ -13,7 +13,6 @@ import shutil
 import socket
 import tempfile
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -357,16 +356,6 @@ def ask_truth(path: Path, camera_s: Sequence[float], spots_s: Sequence[float]) -
 def open_stage(model: StageModel, path: str) -> RoomStage:
     """The stage of the room whose socket is at ``path``, for the watchdog."""
     return RoomStage(model, Path(path))
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = START_S) -> bool:
-    """Wait for a condition; whether it became true within ``seconds``."""
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True
 
 
 def open_camera(context: DriverContext, _options: NoOptions) -> StereoCamera:

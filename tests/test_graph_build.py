@@ -6,15 +6,23 @@ import math
 from collections import Counter
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
 from fgreg.errors import EstimationError
-from fgreg.graph.gtsam_graph import GraphOptions, Variable, build_graph, variable_name
-from fgreg.graph.gtsam_values import SharedValues, beam_of_chart, initial_values, laser_chart, read_estimate
+from fgreg.graph.gtsam_graph import GraphOptions, Variable, build_graph
+from fgreg.graph.gtsam_values import SharedValues, beam_of_chart, laser_chart
 from fgreg.model.session_model import NoiseModel
+from graph_optimum import initial_values, read_estimate
 from tests.forward import make_measurements, make_session, random_marker_T_laser, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal
+
+
+def variable_name(key: int) -> str:
+    """A key as docs/model.md writes it, such as ``theta[3]``."""
+    symbol = gtsam.Symbol(key)
+    return f"{Variable(chr(symbol.chr())).name}[{symbol.index()}]"
 
 
 def counts(explicit_keys: list[int]) -> Counter[str]:

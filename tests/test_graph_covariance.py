@@ -9,9 +9,9 @@ import pytest
 
 from fgreg.errors import EstimationError
 from fgreg.graph.gtsam_graph import GraphOptions, build_graph, make_ordering
-from fgreg.graph.gtsam_solver import optimize
-from fgreg.graph.gtsam_values import SharedValues, initial_values, read_estimate
+from fgreg.graph.gtsam_values import SharedValues
 from graph_covariance import GraphCovariance
+from graph_optimum import initial_values, optimize, read_estimate
 from tests.forward import make_measurements
 from tests.graph_cases import CASES, make_case, pose_error
 

@@ -12,9 +12,8 @@ import pytest
 
 from fgreg.factors import marker_pose, point_on_arc, point_on_line, sensitivity_prior
 from fgreg.factors.adapter import Residual, custom_factor
-from fgreg.graph.gtsam_solver import optimize
-from fgreg.graph.gtsam_values import initial_values
 from graph_covariance import GraphCovariance
+from graph_optimum import initial_values, optimize
 from tests.forward import make_session, with_noise
 from tests.graph_cases import make_case
 

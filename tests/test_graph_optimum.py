@@ -13,17 +13,9 @@ from scipy.linalg import logm
 from fgreg.factors.adapter import FactorError
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.gtsam_graph import ExplicitGraph
-from fgreg.graph.gtsam_solver import optimize
-from fgreg.graph.gtsam_values import (
-    GraphEstimate,
-    SharedValues,
-    beam_of_chart,
-    initial_values,
-    laser_chart,
-    made_consistent,
-    read_estimate,
-)
+from fgreg.graph.gtsam_values import SharedValues, beam_of_chart, laser_chart
 from fgreg.model.session_model import NoiseModel
+from graph_optimum import GraphEstimate, initial_values, made_consistent, optimize, read_estimate
 from tests.forward import hear, make_session, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal, perturbed, pose_error
 

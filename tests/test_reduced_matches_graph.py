@@ -10,16 +10,16 @@ import pytest
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import ExplicitGraph, GraphOptions, build_graph
-from fgreg.graph.gtsam_solver import GraphOptimum
-from fgreg.graph.gtsam_solver import optimize as optimize_graph
-from fgreg.graph.gtsam_values import SharedValues, initial_values, read_shared
+from fgreg.graph.gtsam_values import SharedValues
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import Costs, Weights, contributions, evaluate, log_posterior, private_at, refine
 from fgreg.graph.reduced_solver import Optimum, distinct, optimize
-from fgreg.graph.shared_state import SharedState, make_state, pose_difference, stack_states
+from fgreg.graph.shared_state import SharedState, make_state, stack_states, step_between
 from fgreg.model.session_model import NoiseModel
 from graph_covariance import GraphCovariance
+from graph_optimum import GraphOptimum, initial_values, read_shared
+from graph_optimum import optimize as optimize_graph
 from tests.forward import make_measurements, make_session
 
 CASES: dict[str, dict[str, Any]] = {
@@ -54,7 +54,7 @@ def test_optimum_is_that_of_the_explicit_graph(case: str) -> None:
     other = make_state(
         np.stack(there.trus_T_camera)[None], found.state.marker_T_nominal, problem.radius_mm, there.marker_laser[None]
     )
-    poses = np.concatenate([pose_difference(found.state, other, k)[0] for k in range(epochs)])
+    poses = step_between(found.state, other, problem.columns)[0, : 6 * epochs]
     step = np.concatenate([poses, there.marker_laser - found.state.beam[0]])
     size = len(step)
     covariance = np.linalg.inv(found.evaluation.hessian[0])[:size, :size]

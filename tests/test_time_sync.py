@@ -140,10 +140,12 @@ def test_nearly_half_a_turn_between_poses_takes_the_shorter_way() -> None:
 
 def test_history_is_bounded_and_takes_no_pose_from_the_past() -> None:
     history = PoseHistory(keep_s=1.0)
-    assert history.newest_s() is None
+    assert history.newest() is None
     assert all(history.add(_timed(0.03 * i, _steady(0.0))) for i in range(200))
     assert not history.add(_timed(0.5, _steady(0.0)))
-    assert history.newest_s() == pytest.approx(0.03 * 199)
+    newest = history.newest()
+    assert newest is not None
+    assert newest.t_s == pytest.approx(0.03 * 199)
     assert history.can_tell(5.0)
     assert not history.can_tell(6.0)
     with pytest.raises(PairRefused, match="before the pulse"):

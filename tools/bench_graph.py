@@ -29,9 +29,9 @@ from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
 from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.graph.gtsam_graph import GraphOptions, build_graph
-from fgreg.graph.gtsam_solver import optimize
-from fgreg.graph.gtsam_values import SharedValues, initial_values
+from fgreg.graph.gtsam_values import SharedValues
 from graph_covariance import GraphCovariance
+from graph_optimum import initial_values, optimize
 from tests.forward import make_measurements
 
 

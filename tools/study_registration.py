@@ -21,8 +21,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import inverse, transform_points
 from fgreg.graph.gtsam_graph import GraphOptions, build_graph
-from fgreg.graph.gtsam_solver import optimize
-from fgreg.graph.gtsam_values import SharedValues, initial_values, read_shared
+from fgreg.graph.gtsam_values import SharedValues
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig
@@ -31,6 +30,7 @@ from fgreg.simulation.config import Sweep
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
+from graph_optimum import initial_values, optimize, read_shared
 
 
 @dataclass

@@ -7,7 +7,7 @@ over the session before any covariance is computed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -287,20 +287,6 @@ class _Builder:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Recollection:
-    """State of an :class:`EventRecogniser` after the previous events, except for the markers' numbers.
-
-    Attributes:
-        markers, boards: cost and degrees of freedom of the detections, in order.
-        next_id: number of the next new marker.
-    """
-
-    markers: tuple[Misfit, ...] = ()
-    boards: tuple[Misfit, ...] = ()
-    next_id: int = 0
-
-
 class EventRecogniser:
     """Turns events into measurements one by one; corner noise is pooled over the frames up to now.
 
@@ -347,24 +333,6 @@ class EventRecogniser:
         if self._before != (len(self._markers), len(self._boards)):
             del self._markers[self._before[0] :], self._boards[self._before[1] :]
             self._pool()
-
-    def recollection(self) -> Recollection:
-        """The state that the next events depend on."""
-        return Recollection(tuple(self._markers), tuple(self._boards), self._builder.next_id)
-
-    def recollect(self, markers: Iterable[tuple[MarkerRecord, int]], recollection: Recollection) -> None:
-        """Restore the state of a recogniser, and its numbers of these markers.
-
-        Raises:
-            ValueError: a number that is not below ``next_id``.
-        """
-        for record, number in markers:
-            if not 0 <= number < recollection.next_id:
-                raise ValueError(f"marker {number} of {recollection.next_id}")
-            self._builder.ids[_marker_key(record, redetect=False)] = number
-        self._builder.next_id = recollection.next_id
-        self._markers, self._boards = list(recollection.markers), list(recollection.boards)
-        self._pool()
 
     def _pool(self) -> None:
         self._builder.marker_noise = pool_corner_noise(self._markers)

@@ -1,8 +1,7 @@
 """The explicit graph of a session: the variables and factors of docs/model.md, sections 3 and 4.
 
 This is the reference. The reduced problem, with the private variables eliminated in closed form, has to reach the same
-optimum; it is used where speed matters. Solving is in gtsam_solver.py, starting values and reading back in
-gtsam_values.py.
+optimum; it is used where speed matters. Values and the Gauss-Newton step are in gtsam_values.py.
 
 Shots: a *shot* is one marker observation of one spot. Aims come first, one shot each; then the pairs' shots, one per PM
 and marker observation. Looks at a PM that share an observation share the shot (its pose counts once); looks with
@@ -48,12 +47,6 @@ class Variable(Enum):
     def key(self, index: int = 0) -> int:
         """The GTSAM key of the variable with this index."""
         return int(gtsam.symbol(self.value, index))
-
-
-def variable_name(key: int) -> str:
-    """A key as docs/model.md writes it, e.g. ``theta[3]``."""
-    symbol = gtsam.Symbol(key)
-    return f"{Variable(chr(symbol.chr())).name}[{symbol.index()}]"
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ import numpy as np
 
 from fgreg.geometry.transforms import BoolArray, IntArray
 from fgreg.graph.packing import BeamArrays, LookArrays, PackedProblem, RotationShapes
-from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.model.sensitivity import WindowShapes
 
 
@@ -41,9 +40,3 @@ def _select_shapes(shapes: RotationShapes, index: IntArray, looks: BoolArray) ->
         shapes.amplitude_log[index],
         np.where(stands >= 0, look_place[stands], -1),
     )
-
-
-def private_of(problem: PackedProblem, private: PrivateState, pms: IntArray) -> PrivateState:
-    """The private variables of some PMs (increasing indices)."""
-    mine = np.isin(problem.beam_pm, pms)
-    return replace(private, trus_p_pm=private.trus_p_pm[:, pms], beam_error=private.beam_error[:, mine])

@@ -102,14 +102,6 @@ def make_state(
     )
 
 
-def pose_difference(first: SharedState, second: SharedState, epoch: int = 0) -> FloatArray:
-    """(S, 6) right-tangent difference of two states' registrations: ``first * retract = second``."""
-    first_R_trus = np.swapaxes(first.rotation[:, epoch], -1, -2)
-    omega = log_so3(first_R_trus @ second.rotation[:, epoch])
-    shift = first_R_trus @ (second.translation_mm[:, epoch] - first.translation_mm[:, epoch])[..., None]
-    return np.concatenate([omega, shift[..., 0]], axis=1)
-
-
 def step_between(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
     """(S, D) such that ``first.retract(step) = second``; both with the same beam chart."""
     out = np.zeros((second.count, columns.size))

@@ -218,10 +218,6 @@ class PoseHistory:
         """Remove all poses: their frame or their clock has changed."""
         self._poses.clear()
 
-    def newest_s(self) -> float | None:
-        """Time of the newest pose."""
-        return self._poses[-1].t_s if self._poses else None
-
     def newest(self) -> TimedPose | None:
         """The newest pose."""
         return self._poses[-1] if self._poses else None

@@ -76,25 +76,20 @@ def limits_among(problem: PackedProblem, pm_inlier: BoolArray, kept: int, count:
     A PM that is not in ``pm_inlier`` has the limit that it would have as an inlier. So a borderline PM is an inlier,
     whether it was one before or not.
     """
-    inside, outside = pm_limits(problem, outlier_p_of(kept, count)), pm_limits(problem, outlier_p_of(kept + 1, count))
+    inside, outside = pm_limits(problem, outlier_p(kept, count)), pm_limits(problem, outlier_p(kept + 1, count))
     return np.where(pm_inlier, inside, outside)
 
 
 AIM_LIMIT = float(chdtri(2, OUTLIER_P))
 
 
-def outlier_p(pm_inlier: BoolArray) -> float:
-    """Tail probability p of an inlier's deviation below which a shot is an outlier, given the inlier PMs (J,).
+def outlier_p(inliers: int, count: int) -> float:
+    """Tail probability p of an inlier's deviation below which a shot is an outlier, for ``inliers`` of ``count`` PMs.
 
     With two degrees of freedom an inlier's density falls as exp(-d / 2), and so does the share p that deviates by more
     than d. Inlier and outlier are equally likely where p is the outlier density times the odds of an outlier.
     """
-    return outlier_p_of(int(pm_inlier.sum()), len(pm_inlier))
-
-
-def outlier_p_of(kept: int, count: int) -> float:
-    """:func:`outlier_p` where ``kept`` of ``count`` PMs are inliers."""
-    return max(OUTLIER_P, OUTLIER_DENSITY * min((count - kept) / max(kept, 1), 1.0))
+    return max(OUTLIER_P, OUTLIER_DENSITY * min((count - inliers) / max(inliers, 1), 1.0))
 
 
 def log_outlier(problem: PackedProblem, pm_inlier: BoolArray) -> FloatArray:

@@ -11,8 +11,7 @@ import numpy as np
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import GraphOptions, build_graph
-from fgreg.graph.gtsam_solver import newton_step
-from fgreg.graph.gtsam_values import PrivateValues, SharedValues, values_at
+from fgreg.graph.gtsam_values import PrivateValues, SharedValues, newton_step, values_at
 from fgreg.graph.reduced_blocks import moved_markers
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.split_points import logsumexp, move_odds_in_epoch

@@ -21,7 +21,7 @@ from fgreg.registration.outliers import (
     DIVERGED_CHI2,
     innovations_of,
     limits_among,
-    outlier_p_of,
+    outlier_p,
 )
 from fgreg.smoother.isam_window import ActiveWindow, Prepared
 from fgreg.smoother.shared_variables import Quadratic, small_step
@@ -42,7 +42,7 @@ def sigma_distance(first: SharedState, second: SharedState, covariance: FloatArr
 
 def limit_of(degrees_of_freedom: int, inliers: int, count: int) -> float:
     """Chi square beyond which a PM is an outlier; ``inliers`` of ``count`` PMs, including this one, are inliers."""
-    return float(chdtri(max(degrees_of_freedom, 1), outlier_p_of(inliers, count)))
+    return float(chdtri(max(degrees_of_freedom, 1), outlier_p(inliers, count)))
 
 
 def innovation(prepared: Prepared, covariance: FloatArray, before: Quadratic | None = None) -> float:

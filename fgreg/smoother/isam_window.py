@@ -308,7 +308,7 @@ class ActiveWindow:
 
 
 def empty_isam() -> gtsam.ISAM2:
-    """iSAM2 that eliminates by QR (see fgreg.graph.gtsam_solver) and re-linearises by the thresholds above."""
+    """iSAM2 that eliminates by QR (see fgreg.graph.gtsam_values.newton_step); re-linearises by the thresholds above."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
     parameters.relinearizeSkip = 1
