@@ -4,8 +4,8 @@ Conventions for all of them:
 
 - **Time.** All incoming data carry a :class:`Stamp`: the device's time and the host's, seconds. Host times are
   ``time.monotonic()`` (:func:`host_now`). ``fgreg.model.time_sync.DeviceClock`` maps device times to the host's clock,
-  ``fgreg.model.time_sync.PoseHistory`` and ``scan_at`` interpolate marker poses and stage angles to a laser pulse. A
-  device without a clock stamps both with the host's time.
+  ``fgreg.model.time_sync.PoseHistory`` interpolates marker poses to a laser pulse. A device without a clock stamps both
+  with the host's time.
 - **Never wait.** ``poll`` returns at once with the waiting items, oldest first. The driver drops items that are not
   fetched in time, oldest first, and counts them in ``dropped``: queues do not grow.
 - **Loss.** A lost device raises :class:`DeviceLost` from ``poll`` or ``send``, once. After that the driver reconnects
@@ -33,31 +33,6 @@ import numpy.typing as npt
 from fgreg.errors import FgregError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.time_sync import Stamp
-from fgreg.stage.interface import RotationStage, StageError, StageLost, StageStatus
-
-__all__ = [
-    "BmodeFrame",
-    "BmodeSource",
-    "CommandKind",
-    "DeviceLost",
-    "DriverContext",
-    "MotionSample",
-    "MotionSource",
-    "Operator",
-    "OperatorCommand",
-    "PaFrame",
-    "PhotoacousticSource",
-    "Registration",
-    "RotationStage",
-    "StageError",
-    "StageLost",
-    "StageStatus",
-    "Stamp",
-    "StereoCamera",
-    "StereoFrame",
-    "TransformSink",
-    "host_now",
-]
 
 
 class DeviceLost(FgregError):  # noqa: N818

@@ -22,10 +22,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fgreg.drivers.base import BmodeFrame, Stamp
+from fgreg.drivers.base import BmodeFrame
 from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
 from fgreg.errors import InputError, one_line
+from fgreg.model.time_sync import Stamp
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import BmodeSource, DriverContext

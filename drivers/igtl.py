@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.drivers.base import BmodeFrame, MotionSample, PaFrame, Registration, Stamp, host_now
+from fgreg.drivers.base import BmodeFrame, MotionSample, PaFrame, Registration, host_now
 from fgreg.drivers.igtl_messages import (
     Image,
     Message,
@@ -31,6 +31,7 @@ from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import inverse, is_rigid, make_transform, nearest_rotation
+from fgreg.model.time_sync import Stamp
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import BmodeSource, DriverContext, MotionSource, PhotoacousticSource, TransformSink

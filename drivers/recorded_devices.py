@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgreg.drivers.base import DeviceLost, MotionSample, Stamp, StereoFrame, host_now
+from fgreg.drivers.base import DeviceLost, MotionSample, StereoFrame, host_now
 from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES, picture_of, pose_of, stamp_ns
 from fgreg.drivers.ros_recordings import ECM_POSE, Recorded, Recording
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import Grabbed
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, adjoint, as_float_array, inverse
+from fgreg.model.time_sync import Stamp
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext, MotionSource, StereoCamera

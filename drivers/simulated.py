@@ -45,14 +45,7 @@ from fgreg.stage.interface import MAX_CALL_S, StageLost, StageStatus
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 if TYPE_CHECKING:
-    from fgreg.drivers.base import (
-        BmodeSource,
-        DriverContext,
-        MotionSource,
-        Operator,
-        PhotoacousticSource,
-        StereoCamera,
-    )
+    from fgreg.drivers.base import BmodeSource, DriverContext, MotionSource, Operator, PhotoacousticSource, StereoCamera
     from fgreg.drivers.options import NoOptions, RoomStageOptions
 
 AGAIN_S = 0.2

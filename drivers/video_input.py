@@ -17,8 +17,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from fgreg.drivers.base import DeviceLost, Stamp, host_now
+from fgreg.drivers.base import DeviceLost, host_now
 from fgreg.drivers.interlacing import Picture
+from fgreg.model.time_sync import Stamp
 
 SILENCE_S = 0.7
 """A device without a frame for this long counts as lost, so that the loss is reported within a second."""

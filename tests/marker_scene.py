@@ -18,7 +18,9 @@ from fgreg.geometry.transforms import (
     transform_points,
 )
 from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig, TagModel
-from fgreg.simulation.render import Background, Optics, Surface, TagSurface, project_points, render_frame
+from fgreg.simulation.lens import project_points
+from fgreg.simulation.render import Optics, render_frame
+from fgreg.simulation.surfaces import Background, Surface, TagSurface
 
 SIZE = (1280, 720)
 Frame = npt.NDArray[np.uint8]

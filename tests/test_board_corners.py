@@ -12,7 +12,7 @@ from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner, board_covariance
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
 from fgreg.model.session_model import BoardModel, CharucoModel, StereoRig
-from fgreg.simulation.render import BoardSurface, PatchSurface
+from fgreg.simulation.surfaces import BoardSurface, PatchSurface
 from tests.marker_scene import LEFT, RIG, Frame, frames_of, left_pixels, pose_error, rotation_error_deg
 
 PLAIN = BoardModel(9, 6, 10.0)

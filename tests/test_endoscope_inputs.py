@@ -15,12 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fgreg.drivers.base import DeviceLost, Stamp, StereoCamera, StereoFrame
+from fgreg.drivers.base import DeviceLost, StereoCamera, StereoFrame
 from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout, video_devices
 from fgreg.drivers.interlacing import Fields
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Grabbed, Timing, VideoInput
 from fgreg.errors import InputError
+from fgreg.model.time_sync import Stamp
 
 Picture = npt.NDArray[np.uint8]
 

@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fgreg.drivers.base import DeviceLost, Registration, Stamp, host_now
+from fgreg.drivers.base import DeviceLost, Registration, host_now
 from fgreg.drivers.igtl import IgtlMotion, IgtlPhotoacoustic, IgtlReceiver, IgtlTransformSink
 from fgreg.drivers.igtl_messages import Status, Text
 from fgreg.drivers.tcp_link import Endpoint
 from fgreg.geometry.transforms import exp_so3, make_transform
+from fgreg.model.time_sync import Stamp
 from tests.network_peers import collect, free_port, wait_for
 
 pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")

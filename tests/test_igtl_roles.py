@@ -20,7 +20,6 @@ from fgreg.drivers.base import (
     MotionSource,
     PhotoacousticSource,
     Registration,
-    Stamp,
     TransformSink,
     host_now,
 )
@@ -30,6 +29,7 @@ from fgreg.drivers.igtl_registration import DeviceNames
 from fgreg.drivers.tcp_link import Endpoint
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import exp_so3, make_transform
+from fgreg.model.time_sync import Stamp
 from tests.igtl_bytes import Told, image_body, message, read_matrix, read_messages, transform_body
 from tests.network_peers import collect, hung_up, serve, wait_for
 

@@ -11,7 +11,8 @@ from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import dictionary_named, find_tags
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
 from fgreg.model.session_model import MarkerModel, StereoRig, TagModel
-from fgreg.simulation.render import Optics, TagSurface, render_frame
+from fgreg.simulation.render import Optics, render_frame
+from fgreg.simulation.surfaces import TagSurface
 from tests.marker_scene import (
     LEFT,
     ONE_TAG,

@@ -18,10 +18,11 @@ from fgreg.model.measurements import Aim, MarkerObservation, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.minimal_set_consensus import consensus_starts
+from fgreg.registration.multistart import targets_moved
 from fgreg.registration.outliers import innovations_at, plausible_cost, pm_degrees_of_freedom
 from fgreg.registration.posterior import moved_private
 from fgreg.registration.posterior_mean import posterior_mean
-from fgreg.registration.register import Registration, register, targets_moved
+from fgreg.registration.register import Registration, register
 from fgreg.registration.solve import distance_to_explicit, solve
 from tests.forward import Truth, make_measurements
 

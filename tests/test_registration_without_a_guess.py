@@ -12,7 +12,8 @@ from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import make_state
 from fgreg.model.estimate import Verdict
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.register import calibrate_beam, register, search_epoch, targets_moved
+from fgreg.registration.multistart import calibrate_beam, search_epoch, targets_moved
+from fgreg.registration.register import register
 from fgreg.registration.solve import solve
 from tests.forward import make_measurements
 

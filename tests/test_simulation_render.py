@@ -11,17 +11,9 @@ import pytest
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
 from fgreg.model.session_model import BoardModel, CameraModel, CharucoModel
 from fgreg.simulation.config import default_rig
-from fgreg.simulation.render import (
-    Background,
-    BoardSurface,
-    Optics,
-    PatchSurface,
-    Surface,
-    TagSurface,
-    project_points,
-    render_frame,
-    undistorted_rays,
-)
+from fgreg.simulation.lens import project_points, undistorted_rays
+from fgreg.simulation.render import Optics, render_frame
+from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Surface, TagSurface
 from fgreg.simulation.textures import board_texture
 
 LENS = default_rig().left

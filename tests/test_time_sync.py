@@ -19,7 +19,6 @@ from fgreg.model.time_sync import (
     TimedPose,
     interpolate,
     pose_at,
-    scan_at,
 )
 from tests.numerical import random_pose
 
@@ -115,20 +114,6 @@ def test_where_the_marker_was_not_seen_around_the_pulse_the_pair_is_refused(
 def test_poses_out_of_order_are_a_defect() -> None:
     with pytest.raises(ValueError, match="time order"):
         pose_at([_timed(1.0, _steady(0.0)), _timed(0.9, _steady(0.0))], 0.95)
-
-
-def test_stage_angle_is_interpolated_and_refused_alike() -> None:
-    readings = [(1.0, 0.1), (1.05, 0.2), (1.2, 0.2)]
-    assert scan_at(readings, 1.0) == 0.1
-    assert scan_at(readings, 1.02) == pytest.approx(0.14)
-    with pytest.raises(PairRefused, match="the stage readings around the pulse are 150 ms apart"):
-        scan_at(readings, 1.1)
-    with pytest.raises(PairRefused, match="no stage reading after the pulse: the nearest is 50 ms away"):
-        scan_at(readings, 1.25)
-    with pytest.raises(PairRefused, match="no stage reading at all"):
-        scan_at([], 1.25)
-    with pytest.raises(ValueError, match="time order"):
-        scan_at(readings[::-1], 1.1)
 
 
 def test_nearly_half_a_turn_between_poses_takes_the_shorter_way() -> None:

@@ -18,8 +18,9 @@ from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
+from fgreg.online.events import DetectedMove
 from fgreg.online.live_session import LiveSession
-from fgreg.online.recorded_moves import DetectedMove, find_moves, renumbered, split_epochs
+from fgreg.online.recorded_moves import find_moves, renumbered, split_epochs
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.registration.register import SoundSpeedPrior, register
 from fgreg.session.result_file import read_result

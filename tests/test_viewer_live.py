@@ -12,12 +12,13 @@ import pytest
 from rich.console import Console
 
 from fgreg.cli.live import status_panel
-from fgreg.drivers.base import BmodeFrame, Stamp
+from fgreg.drivers.base import BmodeFrame
 from fgreg.live.actions import RegistrationState, StageView
 from fgreg.live.recorder import RecorderState
 from fgreg.live.status import Figures, Status
 from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
 from fgreg.model.measurements import MarkerObservation, Track
+from fgreg.model.time_sync import Stamp
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.viewer.live import Moment
 from fgreg.viewer.recording import Viewer

@@ -27,11 +27,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from fgreg.drivers.base import DeviceLost, Registration, Stamp, host_now
+from fgreg.drivers.base import DeviceLost, Registration, host_now
 from fgreg.drivers.bk_oem import BkOemScanner
 from fgreg.drivers.igtl import IgtlPhotoacoustic, IgtlTransformSink
 from fgreg.drivers.igtl_messages import pack_image
 from fgreg.drivers.tcp_link import Endpoint
+from fgreg.model.time_sync import Stamp
 from tests.bk_emulator import frame, grabbed
 
 CHANNELS = (1, 128, 2048)

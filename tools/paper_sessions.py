@@ -29,9 +29,10 @@ from fgreg.model.sensitivity import rotation_of_arc
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.initialization import beam_starts
+from fgreg.registration.multistart import calibrate_beam
 from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.readout import read_laser
-from fgreg.registration.register import calibrate_beam, register
+from fgreg.registration.register import register
 from fgreg.registration.solve import track_snapshot
 from fgreg.session.session_reader import read_session
 from fgreg.simulation import sweeps

@@ -43,7 +43,9 @@ from fgreg.geometry.transforms import (
     transform_points,
 )
 from fgreg.model.session_model import BoardModel, CameraModel, CharucoModel, MarkerModel, StereoRig, TagModel
-from fgreg.simulation.render import Background, BoardSurface, Optics, TagSurface, project_points, render_frame
+from fgreg.simulation.lens import project_points
+from fgreg.simulation.render import Optics, render_frame
+from fgreg.simulation.surfaces import Background, BoardSurface, TagSurface
 
 SIZE = (1280, 720)
 BARD = Path(__file__).resolve().parents[2] / "shared" / "data" / "bard_aruco"

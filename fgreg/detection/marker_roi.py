@@ -52,6 +52,3 @@ def window_about(outlines_px: FloatArray, shape: tuple[int, int]) -> Window:
     left, top = (2 * int(max(0.0, value - margin) // 2) for value in low)
     right, bottom = (int(np.ceil(value + margin)) + 1 for value in high)
     return left, min(right, shape[1]), top, min(bottom, shape[0])
-
-
-__all__ = ["MarkerRoi", "window_about"]

@@ -376,6 +376,3 @@ def _open_to_all(devices: Mapping[Role, tuple[Chosen, ...]]) -> list[str]:
         if not (options.host.startswith("127.") or options.host in ("localhost", "::1")):
             out.append(f"{where}: listens at {options.host}: other machines can connect, and no password is asked")
     return out
-
-
-__all__ = ["Chosen", "LiveConfig", "read_config"]

@@ -9,12 +9,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
-from fgreg.drivers.base import BmodeFrame, DeviceLost, DriverContext, PaFrame, Stamp, StereoFrame
+from fgreg.drivers.base import BmodeFrame, DeviceLost, DriverContext, PaFrame, StereoFrame
 from fgreg.drivers.options import Connection, EndoscopeOptions
 from fgreg.drivers.registry import EXTRAS, Role, distribution, installed, load
 from fgreg.errors import FgregError, MissingExtraError, one_line
 from fgreg.live.config import Chosen, LiveConfig
 from fgreg.model.session_model import SessionModel
+from fgreg.model.time_sync import Stamp
 
 LISTEN_S = 2.0
 ENOUGH, ENOUGH_S = 20, 1.0

@@ -140,6 +140,3 @@ class Pictures:
         if self._came_s - self._showed_s > NOTHING_NEW_S:
             return f"its {self._side} picture shows nothing: is the light on, is the lens free?"
         return ""
-
-
-__all__ = ["Health", "Pictures", "Source"]

@@ -109,6 +109,3 @@ def _doing() -> Work[Any, Any]:
 def _do(task: tuple[Callable[..., Any], tuple[Any, ...]]) -> Any:
     work, arguments = task
     return work(*arguments)
-
-
-__all__ = ["Locator"]

@@ -92,6 +92,3 @@ def _looking(picture: Any, rig: StereoRig, marker: MarkerModel) -> Work[Shape, V
 def _look(picture: Any, roi: MarkerRoi, shape: Shape) -> ViewCorners:
     size, kind = shape
     return roi.see(np.frombuffer(picture, np.dtype(kind)).reshape(size))
-
-
-__all__ = ["RightViewWorker", "right_roi"]

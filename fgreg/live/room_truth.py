@@ -12,10 +12,10 @@ import numpy as np
 from fgreg.detection.events_to_measurements import recognise
 from fgreg.errors import FgregError, InputError
 from fgreg.model.measurements import Measurements
+from fgreg.schema.yaml_writer import yaml_text
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.session_reader import TRUTH_FILE, read_ground_truth, read_session
 from fgreg.simulation.documents import rows
-from fgreg.simulation.write import yaml_text
 
 TruthAt = Callable[[Sequence[float], Sequence[float]], dict[str, Any]]
 """As :meth:`fgreg.simulation.room.Room.truth_at`."""

@@ -123,6 +123,3 @@ class Steering:
             self.unwritten = str(error)
             return False
         return True
-
-
-__all__ = ["Steering"]

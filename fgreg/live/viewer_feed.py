@@ -22,8 +22,9 @@ from fgreg.model.events import AimEvent, NoteEvent, PairEvent
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
 from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.online.estimate import OnlineEstimate
+from fgreg.viewer.live import Moment
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
-from fgreg.viewer.recording import Moment, Viewer
+from fgreg.viewer.recording import Viewer
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.spawn import spawn_viewer
 from fgreg.viewer.status_line import Now

@@ -17,7 +17,6 @@ from fgreg.live.actions import (
     Follow,
     Halt,
     Inputs,
-    LocatedPulse,
     RegistrationState,
     Release,
     StageView,
@@ -356,6 +355,3 @@ class Workflow:
                 self._pms += 1
         if self._unheard == UNHEARD:
             out.append(Tell("the PM is not heard where the registration expects it: has the camera moved?"))
-
-
-__all__ = ["LocatedPulse", "Stage", "Workflow", "WorkflowSettings"]

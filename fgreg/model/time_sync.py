@@ -114,7 +114,7 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
         PairRefused: no pose on one side, or the two are farther apart than ``max_gap_s``.
         ValueError: poses out of order.
     """
-    before, after, share = _bracket([pose.t_s for pose in poses], t_s, max_gap_s, "marker pose")
+    before, after, share = _bracket([pose.t_s for pose in poses], t_s, max_gap_s)
     first, second = poses[before], poses[after]
     if before == after:
         return first
@@ -126,40 +126,24 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
     return TimedPose(t_s, transform, np.asarray(0.5 * (covariance + covariance.T)))
 
 
-def scan_at(readings: Sequence[tuple[float, float]], t_s: float, max_gap_s: float = MAX_GAP_S) -> float:
-    """Stage angle (rad) at a time, linear between the reading before and the reading after.
-
-    Args:
-        readings: (host time s, angle rad), in time order.
-        t_s: the moment, host time.
-        max_gap_s: longest time between the two readings used.
-
-    Raises:
-        PairRefused: no reading on one side, or the two are farther apart than ``max_gap_s``.
-        ValueError: readings out of order.
-    """
-    before, after, share = _bracket([t for t, _ in readings], t_s, max_gap_s, "stage reading")
-    return (1.0 - share) * readings[before][1] + share * readings[after][1]
-
-
-def _bracket(times: Sequence[float], t_s: float, max_gap_s: float, what: str) -> tuple[int, int, float]:
+def _bracket(times: Sequence[float], t_s: float, max_gap_s: float) -> tuple[int, int, float]:
     """Indices before and after a moment, and its share of the interval; the same index twice for an exact match."""
     if any(later < earlier for earlier, later in itertools.pairwise(times)):
-        raise ValueError(f"{what}s are not in time order")
+        raise ValueError("marker poses are not in time order")
     if not math.isfinite(t_s):
         raise PairRefused(f"the pulse's time is {t_s}")
     after = int(np.searchsorted(times, t_s, side="left"))
     if after < len(times) and times[after] == t_s:
         return after, after, 0.0
     if not times:
-        raise PairRefused(f"no {what} at all")
+        raise PairRefused("no marker pose at all")
     if after == 0 or after == len(times):
         side, nearest = ("before", times[0]) if after == 0 else ("after", times[-1])
-        raise PairRefused(f"no {what} {side} the pulse: the nearest is {1e3 * abs(nearest - t_s):.0f} ms away")
+        raise PairRefused(f"no marker pose {side} the pulse: the nearest is {1e3 * abs(nearest - t_s):.0f} ms away")
     gap = times[after] - times[after - 1]
     if gap > max_gap_s:
         raise PairRefused(
-            f"the {what}s around the pulse are {1e3 * gap:.0f} ms apart, at most {1e3 * max_gap_s:.0f} ms allowed"
+            f"the marker poses around the pulse are {1e3 * gap:.0f} ms apart, at most {1e3 * max_gap_s:.0f} ms allowed"
         )
     return after - 1, after, (t_s - times[after - 1]) / gap
 

@@ -36,7 +36,8 @@ from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
-from fgreg.registration.register import EpochSearch, Minimum, SoundSpeedPrior
+from fgreg.registration.multistart import EpochSearch, Minimum
+from fgreg.registration.register import SoundSpeedPrior
 from fgreg.registration.solve import Solution, solve
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms

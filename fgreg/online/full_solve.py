@@ -21,8 +21,9 @@ from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
+from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import pose_tangent
-from fgreg.registration.register import EpochSearch, Registration, SoundSpeedPrior, register
+from fgreg.registration.register import Registration, SoundSpeedPrior, register
 from fgreg.registration.solve import Solution, solve
 from fgreg.smoother.initialise import Initial, initial_of
 

@@ -116,6 +116,3 @@ def renumbered(epoch_of: Sequence[int], shots: Sequence[int], moves: Sequence[De
     """
     places = [(move.epoch, shots[move.since]) for move in moves]
     return tuple(_with_moves(epoch, index, places) for index, epoch in enumerate(epoch_of))
-
-
-__all__ = ["DetectedMove", "EpochsFound", "events_in_order", "find_epochs", "find_moves", "renumbered", "split_epochs"]

@@ -39,8 +39,9 @@ from fgreg.registration.solve import solve
 from fgreg.session.result_file import write_result
 from fgreg.session.session_reader import Session, read_ground_truth, read_session
 from fgreg.version import __version__
+from fgreg.viewer.live import Moment
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
-from fgreg.viewer.recording import Moment, Viewer
+from fgreg.viewer.recording import Viewer
 from fgreg.viewer.spawn import spawn_viewer
 
 Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent

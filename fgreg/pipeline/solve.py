@@ -34,7 +34,8 @@ from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:
-    from fgreg.online.recorded_moves import DetectedMove, EpochsFound
+    from fgreg.online.events import DetectedMove
+    from fgreg.online.recorded_moves import EpochsFound
     from fgreg.viewer.recording import Viewer
     from fgreg.viewer.scene import ShotKind
 

@@ -38,7 +38,8 @@ from fgreg.model.measurements import EpochStart, Look, MarkerObservation, Measur
 from fgreg.model.session_model import CameraModel, SessionModel
 from fgreg.model.tissue_surface import REACH_MM, TissueSurface, fit_surface
 from fgreg.registration.epochs import restrict_epochs
-from fgreg.registration.register import Minimum, Registration
+from fgreg.registration.multistart import Minimum
+from fgreg.registration.register import Registration
 
 TILT_RAD = math.radians(25.0)
 TILT_STEPS = 5

@@ -47,19 +47,6 @@ from fgreg.registration.outliers import (
     select_inliers,
 )
 
-__all__ = [
-    "EpochSearch",
-    "Minimum",
-    "Registration",
-    "Shots",
-    "calibrate_beam",
-    "choose_minimum",
-    "register",
-    "register_near",
-    "search_epoch",
-    "targets_moved",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class SoundSpeedPrior:

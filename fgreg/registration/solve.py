@@ -28,6 +28,7 @@ from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
+from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import Posterior, predicted_tre
 from fgreg.registration.posterior_mean import (
     estimated_radius,
@@ -36,7 +37,7 @@ from fgreg.registration.posterior_mean import (
     sound_speed_from_residuals,
 )
 from fgreg.registration.readout import read_aims, read_laser, read_pairs
-from fgreg.registration.register import EpochSearch, Registration, SoundSpeedPrior, register
+from fgreg.registration.register import Registration, SoundSpeedPrior, register
 from fgreg.registration.verdict import (
     SURE_OF_AIMS,
     SURE_OF_PAIRS,

@@ -14,8 +14,9 @@ from fgreg.graph.split_points import ALARM
 from fgreg.model.estimate import PredictedTre, Verdict, worst_verdict
 from fgreg.model.measurements import Pair
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.outliers import OUTLIER_P
-from fgreg.registration.register import EpochSearch, Registration
+from fgreg.registration.register import Registration
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9

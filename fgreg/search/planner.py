@@ -147,11 +147,6 @@ class SearchPlanner:
         self._queue = [prediction.scan_rad, *_around(prediction, model.reach_rad, self._low, self._high)]
 
     @property
-    def belief(self) -> Belief:
-        """The current distribution."""
-        return self._belief
-
-    @property
     def heard(self) -> bool:
         """Whether anything was detected up to now."""
         return any(amplitude is not None for _, amplitude in self._looks)

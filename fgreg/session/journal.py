@@ -7,10 +7,7 @@ session that is opened again continues from the same numbers.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import secrets
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -20,8 +17,6 @@ from typing import Self
 from fgreg.errors import InputError, JournalError
 from fgreg.model.events import Event
 from fgreg.model.session_model import SessionModel
-from fgreg.schema.files import FrameKind, FrameName
-from fgreg.schema.problems import FieldError, input_error
 from fgreg.session.append_only_file import AppendFile, sync_path
 from fgreg.session.event_reader import frames_of, read_line
 from fgreg.session.event_writer import event_document, event_line, type_of
@@ -54,7 +49,6 @@ class Journal:
         self.folder, self.model, self.warnings = folder, model, tuple(warnings)
         self._setup, self._file, self._recorded = setup, file, recorded.events
         self._last = (recorded.events[-1].t, recorded.events[-1].line) if recorded.events else None
-        self._fresh: set[Path] = set()
         self._lock = Lock()
 
     @classmethod
@@ -143,58 +137,13 @@ class Journal:
             self._last = (read.event.t, number)
             return Appended(offset, read.event)
 
-    def write_frame(self, name: str, data: bytes) -> Path:
-        """Write a raw frame to disk, before the event that names it.
-
-        Args:
-            name: relative to the session's folder, such as ``frames/a.png``.
-            data: the file's bytes (PNG, NPY).
-
-        Returns:
-            Its path, for the event.
-
-        Raises:
-            InputError: a name outside the folder, or of an existing file: frames are never overwritten.
-            JournalError: the disk fails; no file is left.
-        """
-        try:
-            path = FrameName(FrameKind.CAMERA).read(name, self.folder)
-        except FieldError as error:
-            raise input_error(error.problems[0], "frame") from None
-        if os.path.lexists(path):
-            name = path.relative_to(self.folder).as_posix()
-            raise InputError(f"frame {name}", "a file of this name", "a new name")
-        part = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
-        try:
-            made = not path.parent.is_dir()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                with part.open("xb") as file:
-                    file.write(data)
-                    file.flush()
-                    os.fsync(file.fileno())
-                part.rename(path)
-            except BaseException:
-                with contextlib.suppress(OSError):
-                    part.unlink(missing_ok=True)
-                raise
-            sync_path(path.parent)
-            if made:
-                sync_path(path.parent.parent)
-        except OSError as error:
-            raise JournalError(name, f"the frame could not be written ({error.strerror})", "mend that first") from None
-        self._fresh.add(path)
-        return path
-
     def _sync_frames(self, frames: set[Path]) -> None:
         """Flush frames and their folders to disk: other programs may have written them without a flush."""
         try:
-            others = frames - self._fresh
-            for path in [*sorted(others), *sorted({path.parent for path in others})]:
+            for path in [*sorted(frames), *sorted({path.parent for path in frames})]:
                 sync_path(path)
         except OSError as error:
             raise JournalError(path.name, f"the frame is not on disk ({error.strerror})", "mend that first") from None
-        self._fresh -= frames
 
     def close(self) -> None:
         """Unlock the session; may be called twice."""

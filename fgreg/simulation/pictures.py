@@ -11,15 +11,8 @@ from fgreg.geometry.transforms import FloatArray, make_transform, transform_poin
 from fgreg.model.session_model import CameraModel
 from fgreg.simulation.acoustics import Hearing, quantised, simulate_channels
 from fgreg.simulation.config import SimulationConfig
-from fgreg.simulation.render import (
-    Background,
-    BoardSurface,
-    PatchSurface,
-    Surface,
-    TagSurface,
-    UInt8Image,
-    render_frame,
-)
+from fgreg.simulation.render import UInt8Image, render_frame
+from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Surface, TagSurface
 
 DRAPE_MM = 45.0
 """Distance of the drape behind the calibration board."""

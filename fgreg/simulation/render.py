@@ -18,20 +18,8 @@ import numpy.typing as npt
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel
 from fgreg.simulation.lens import project_points, undistorted_rays
-from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Sheet, Surface, TagSurface
+from fgreg.simulation.surfaces import Background, Sheet, Surface
 from fgreg.simulation.textures import BLACK, WHITE, Float32Array
-
-__all__ = [
-    "Background",
-    "BoardSurface",
-    "Optics",
-    "PatchSurface",
-    "Surface",
-    "TagSurface",
-    "project_points",
-    "render_frame",
-    "undistorted_rays",
-]
 
 UInt8Image = npt.NDArray[np.uint8]
 

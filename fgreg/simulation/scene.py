@@ -19,7 +19,7 @@ from fgreg.geometry.transforms import (
 )
 from fgreg.model.session_model import CameraModel, StereoRig, TagModel
 from fgreg.simulation.config import SimulationConfig
-from fgreg.simulation.render import project_points
+from fgreg.simulation.lens import project_points
 
 CANDIDATES = 8
 """Number of candidates for a shot drawn at once; the first visible to the camera is taken."""

@@ -7,13 +7,12 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from fgreg.errors import InputError
+from fgreg.schema.yaml_writer import yaml_text
 from fgreg.simulation.simulate import Frame, SimulatedSession
 
 Progress = Callable[[int, int], None]
@@ -91,20 +90,3 @@ def encoded(name: str, frame: Frame) -> bytes:
         np.save(buffer, np.ascontiguousarray(frame), allow_pickle=False)
         return buffer.getvalue()
     raise ValueError(f"{name} is neither .png nor .npy")
-
-
-class _Dumper(yaml.SafeDumper):
-    """Mappings in blocks, lists of numbers on one line."""
-
-
-def _list(dumper: yaml.SafeDumper, values: list[Any]) -> yaml.nodes.Node:
-    flat = not any(isinstance(value, dict) for value in values)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", values, flow_style=flat)
-
-
-_Dumper.add_representer(list, _list)
-
-
-def yaml_text(document: dict[str, Any]) -> str:
-    """A document as text."""
-    return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=400))

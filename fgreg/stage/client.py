@@ -25,7 +25,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,8 +46,6 @@ SEND_S = 0.5
 """Longest time until the watchdog takes a message."""
 CLOSE_S = 5.0
 """Longest time that the watchdog may take to stop the stage when the link is closed."""
-READINGS = 100
-"""Number of stage angles kept, one every 50 ms."""
 SILENT_S = 0.7
 """A watchdog that is silent for this long is lost: it sends the stage's status every 50 ms."""
 
@@ -112,8 +109,6 @@ class StageLink:
 
     Attributes:
         view: the newest status, as of the last :meth:`poll`.
-        readings: (host time s, plane angle rad) of the last statuses of a homed stage, oldest first: for
-            ``fgreg.model.time_sync.scan_at``.
     """
 
     def __init__(
@@ -126,7 +121,6 @@ class StageLink:
     ) -> None:
         self.limits = limits
         self.view: StageView | None = None
-        self.readings: deque[tuple[float, float]] = deque(maxlen=READINGS)
         self._process, self._socket, self._emergency_fd, self._log = process, link, emergency_fd, log
         self._turn = threading.Lock()
         self._in = b""
@@ -329,11 +323,6 @@ class StageLink:
                 None if document[name] is None else MotionKind(document[name]) for name in ("moving", "requested")
             )
             latched = document["latched"]
-            if status is not None and status.homed:
-                if not self.readings or status.stamp.host_s > self.readings[-1][0]:
-                    self.readings.append((status.stamp.host_s, status.scan_rad))
-            else:
-                self.readings.clear()
             self.view = StageView(document["at_s"], document["connected"], status, moving, requested, latched)
             return None
         if what == "ready":

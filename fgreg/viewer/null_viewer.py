@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from fgreg.model.estimate import SessionEstimate
     from fgreg.model.measurements import Measurements, Track
     from fgreg.model.session_model import ProbeModel, SessionModel
-    from fgreg.viewer.recording import Moment, Truth, Viewer
+    from fgreg.viewer.live import Moment
+    from fgreg.viewer.recording import Viewer
+    from fgreg.viewer.result import Truth
     from fgreg.viewer.scene import ShotKind
     from fgreg.viewer.shapes import Image8
     from fgreg.viewer.status_line import BmodePicture

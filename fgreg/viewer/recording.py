@@ -368,6 +368,3 @@ class Viewer:
             for side, shape in self._shapes.items():
                 self._rec.log(f"world/camera/{side}", shapes.no_picture(shape))
         self._live.draw(moment, textured=moment.number in self._textured)
-
-
-__all__ = ["Moment", "Truth", "Viewer"]

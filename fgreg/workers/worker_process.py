@@ -309,6 +309,3 @@ def _answer(connection: Connection[Any, Any], work: Any) -> None:
         except Exception as error:  # a fault of one request; the next may be answered
             answer = ("failed", f"{type(error).__name__}: {error}")
         connection.send(answer)
-
-
-__all__ = ["Work", "WorkerProcess"]
