@@ -19,6 +19,24 @@ POSE_FLOOR = (FLOOR_RAD,) * 3 + (FLOOR_MM,) * 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraDependence:
+    """How an observation of the camera depends on the rig's constants, linearised, for c the constants of ``CAMERA``.
+
+    With constants off by c, what was observed has to be moved by ``gain @ c`` to be right: by a twist (rotation rad,
+    translation mm) along the camera's axes about the marker's origin, or by a shift of a spot (mm). The corners' misfit
+    tells something about the constants themselves: its chi square changes by ``c' information c - 2 pull' c``.
+
+    Attributes:
+        gain: (6, n) of a marker pose or (3, n) of a spot, n constants (fgreg.model.systematic.CAMERA).
+        information: (n, n). pull: (n,).
+    """
+
+    gain: FloatArray
+    information: FloatArray
+    pull: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MarkerObservation:
     """One detection of the marker.
 
@@ -26,11 +44,13 @@ class MarkerObservation:
         camera_T_marker: (4, 4).
         covariance: (6, 6) over the right tangent (rotation rad, translation mm).
         id: the same for identical observations (same frames, or same matrix), unique otherwise.
+        dependence: on the rig's constants, where it was detected in frames; None: that of a nominal detection.
     """
 
     camera_T_marker: FloatArray
     covariance: FloatArray
     id: int
+    dependence: CameraDependence | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,12 +78,16 @@ class Look:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aim:
-    """A calibration shot: marker and the spot (3,) in the camera frame with its (3, 3) covariance."""
+    """A calibration shot: marker and the spot (3,) in the camera frame with its (3, 3) covariance.
+
+    ``dependence``: of the spot on the rig's constants, where the board was detected in frames.
+    """
 
     t: float
     marker: MarkerObservation
     camera_p_spot_mm: FloatArray
     covariance: FloatArray
+    dependence: CameraDependence | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.systematic import SYSTEMATIC, Systematic
 from fgreg.schema.kinds import (
     COORDINATE_MM,
     NOISE_MM,
@@ -414,6 +415,12 @@ class NoiseModel:
     scan_rad: Annotated[float, Key("reading of the stage", Number(0.0, 180.0, unit="deg", degrees=True))] = (
         math.radians(0.1)
     )
+    beam_offset_mm: Annotated[
+        float, Key("per PM: of the sound's origin beside the beam, each axis", NOISE_MM, brief=True)
+    ] = 0.15
+    window_rad: Annotated[
+        float, Key("per PM: of the window's half width", Number(0.0, 45.0, unit="deg", degrees=True), brief=True)
+    ] = math.radians(0.4)
 
 
 def default_targets_mm(radius_mm: float) -> FloatArray:
@@ -464,10 +471,24 @@ class SessionModel:
             default="27 points: x -20, 0, 20; stage angle -30, 0, 30 deg; 22, 32, 42 mm beyond the probe's radius",
         ),
     ] = field(default_factory=lambda: as_float_array(np.zeros((0, 3))))
+    systematic: Annotated[
+        Systematic,
+        Key(
+            "standard deviations of the constants above, or `none`",
+            SYSTEMATIC,
+            default="those of a careful lab",
+            brief=True,
+        ),
+    ] = Systematic()
 
     def __post_init__(self) -> None:
         if not len(self.targets_mm):
             object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
+
+    @property
+    def constant_sigmas(self) -> FloatArray:
+        """(COUNT,) standard deviations of the rig's constants, in the order of :class:`Constant`."""
+        return self.systematic.sigmas(self.probe.sensitivity.edge_sigma_rad, self.noise.marker_bias_mm)
 
 
 SESSION = record(SessionModel, ("format", SESSION_FORMAT))
