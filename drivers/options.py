@@ -9,7 +9,8 @@ from typing import Annotated, Any
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.files import ExistingPath, exists
-from fgreg.schema.kinds import Integer, JsonSchema, Kind, Number, Text, Transform
+from fgreg.schema.kinds import Integer, JsonSchema, Kind, Number, Text
+from fgreg.schema.matrices import Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key
 from fgreg.stage.limits import LIMITS

@@ -25,7 +25,8 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.events import TrusRecord
-from fgreg.schema.kinds import Converted, Covariance, Integer, JsonSchema, Kind, ListOf, Number, Text, Transform
+from fgreg.schema.kinds import Converted, Integer, JsonSchema, Kind, ListOf, Number, Text
+from fgreg.schema.matrices import Covariance, Transform
 from fgreg.schema.problems import FieldError, input_error, shown
 from fgreg.schema.record import Field, Key, Section, record
 from fgreg.session.yaml_loader import load_yaml

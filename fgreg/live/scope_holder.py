@@ -24,7 +24,7 @@ FEWEST = 4
 SILENT_S = 2.0
 """A holder that was silent for longer may have been switched off and on, and may have a new origin."""
 SEEN_MM = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0], [40.0, 0.0, 100.0], [0.0, 40.0, 100.0]])
-"""Points in the camera frame, (4, 3), mm, about where tissue is; a move's size is their largest displacement."""
+"""points in the camera frame, (4, 3), mm, about where tissue is; a move's size is their largest displacement."""
 
 
 @dataclass(frozen=True, slots=True)

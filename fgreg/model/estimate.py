@@ -10,7 +10,8 @@ from enum import StrEnum
 from typing import Annotated
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.schema.kinds import ANY_SIZE, SECONDS, Covariance, Figure, Integer, ListOf, Number, Numbers, Text, Transform
+from fgreg.schema.kinds import ANY_SIZE, SECONDS, Figure, Integer, ListOf, Number, Numbers, Text
+from fgreg.schema.matrices import Covariance, Transform
 from fgreg.schema.record import Key, NotStored, record
 
 RESULT_FORMAT = "fgreg-result/1"

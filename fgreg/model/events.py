@@ -11,19 +11,8 @@ from typing import Annotated, ClassVar
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.files import FrameKind, FrameName
-from fgreg.schema.kinds import (
-    NOT_NEGATIVE,
-    POINT_MM,
-    SCAN_DEG,
-    SECONDS,
-    Anything,
-    Covariance,
-    Integer,
-    IntegerPair,
-    Number,
-    OneOf,
-    Transform,
-)
+from fgreg.schema.kinds import NOT_NEGATIVE, POINT_MM, SCAN_DEG, SECONDS, Anything, Integer, IntegerPair, Number, OneOf
+from fgreg.schema.matrices import Covariance, Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key, Tagged
 

@@ -25,16 +25,15 @@ from fgreg.schema.kinds import (
     Converted,
     Integer,
     IntegerPair,
-    Matrix,
     Number,
     Numbers,
     NumberTuple,
     OneOf,
-    Points,
     Text,
-    Transform,
     in_radians,
+    points,
 )
+from fgreg.schema.matrices import Matrix, Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key, record
 
@@ -467,7 +466,7 @@ class SessionModel:
         FloatArray,
         Key(
             "TRUS points at which the error matters",
-            Points(POINT_MM),
+            points(POINT_MM),
             default="27 points: x -20, 0, 20; stage angle -30, 0, 30 deg; 22, 32, 42 mm beyond the probe's radius",
         ),
     ] = field(default_factory=lambda: as_float_array(np.zeros((0, 3))))

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.schema.kinds import POINT_MM, SCAN_DEG, SECONDS, JsonSchema, Kind, ListOf, Transform, in_radians
+from fgreg.schema.kinds import POINT_MM, SCAN_DEG, SECONDS, JsonSchema, Kind, ListOf, in_radians
+from fgreg.schema.matrices import Transform
 from fgreg.schema.problems import FieldError, Problem, shown
 from fgreg.schema.record import Key, record
 
