@@ -18,14 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.drivers.base import BmodeFrame, MotionSample, PaFrame, Registration, host_now
-from fgreg.drivers.igtl_messages import (
-    Image,
-    Message,
-    MessageDecoder,
-    Transform,
-    check_name,
-    require_pyigtl,
-)
+from fgreg.drivers.igtl_messages import Image, Message, MessageDecoder, Transform, check_name, require_pyigtl
 from fgreg.drivers.igtl_registration import DeviceNames, registration_messages
 from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
@@ -230,12 +223,7 @@ class IgtlTransformSink(_IgtlDevice):
 
     _role = "transform sink"
 
-    def __init__(
-        self,
-        endpoint: Endpoint,
-        names: DeviceNames | None = None,
-        header_version: int = 2,
-    ) -> None:
+    def __init__(self, endpoint: Endpoint, names: DeviceNames | None = None, header_version: int = 2) -> None:
         if header_version not in (1, 2):
             raise InputError("OpenIGTLink header version", str(header_version), "1 or 2")
         self._names, self._version = names or DeviceNames(), header_version

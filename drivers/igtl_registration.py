@@ -110,11 +110,7 @@ def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -
 
 
 def _angles(registration: Registration) -> dict[str, float]:
-    given = {
-        "StageDeg": registration.stage_rad,
-        "PlaneDeg": registration.scan_rad,
-        "SigmaDeg": registration.sigma_rad,
-    }
+    given = {"StageDeg": registration.stage_rad, "PlaneDeg": registration.scan_rad, "SigmaDeg": registration.sigma_rad}
     return {key: math.degrees(value) for key, value in given.items() if value is not None and math.isfinite(value)}
 
 

@@ -58,7 +58,7 @@ class _Player:
         self.recording = recording
         self.dropped = 0
         self.ended = False
-        self._told = False
+        self._reported = False
         self._messages = recording.messages(topics)
         self._pace, self._room = pace, room
         self._next = next(self._messages, None)
@@ -80,18 +80,43 @@ class _Player:
         out = sorted((message for waiting in found.values() for message in waiting), key=lambda m: m[0].bag_ns)
         if self._next is None:
             self.ended = True
-            if not out and not self._told:
-                self._told = True
+            if not out and not self._reported:
+                self._reported = True
                 raise DeviceLost(f"recording {self.name}: played to its end")
         return out
 
     def close(self) -> None:
-        self.ended = self._told = True
+        self.ended = self._reported = True
         self._next = None
         self.recording.close()
 
 
-class RecordedMotion:
+class _RecordedDevice:
+    """A device of a recording that is played."""
+
+    _player: _Player
+
+    @property
+    def name(self) -> str:
+        """File and topics."""
+        return self._player.name
+
+    @property
+    def connected(self) -> bool:
+        """Whether the recording goes on."""
+        return not self._player.ended
+
+    @property
+    def dropped(self) -> int:
+        """Number of messages that were not fetched in time or cannot be used."""
+        return self._player.dropped
+
+    def close(self) -> None:
+        """Close the file."""
+        self._player.close()
+
+
+class RecordedMotion(_RecordedDevice):
     """A MotionSource: the endoscope's pose by its holder (CRTK ``measured_cp`` of the ECM; metres become mm).
 
     Args:
@@ -120,22 +145,6 @@ class RecordedMotion:
             recording.close()
             raise
         self._tip_T_camera = as_float_array(np.eye(4) if tip_T_camera is None else tip_T_camera, 4, 4)
-        self._bad = 0
-
-    @property
-    def name(self) -> str:
-        """File and topic."""
-        return self._player.name
-
-    @property
-    def connected(self) -> bool:
-        """Whether the recording goes on."""
-        return not self._player.ended
-
-    @property
-    def dropped(self) -> int:
-        """Number of samples that were not fetched in time or hold no valid pose."""
-        return self._player.dropped + self._bad
 
     def poll(self) -> list[MotionSample]:
         """Samples that became due since the last call. Raises DeviceLost once, at the end."""
@@ -146,7 +155,7 @@ class RecordedMotion:
             try:
                 transform, covariance = pose_of(message)
             except ValueError:
-                self._bad += 1  # a robot that is not ready sends invalid poses
+                self._player.dropped += 1  # a robot that is not ready sends invalid poses
                 continue
             if covariance is not None:
                 covariance = as_float_array(tip_from_camera @ covariance @ tip_from_camera.T)
@@ -154,12 +163,8 @@ class RecordedMotion:
             out.append(MotionSample(stamp, as_float_array(transform @ self._tip_T_camera), covariance))
         return out
 
-    def close(self) -> None:
-        """Close the file."""
-        self._player.close()
 
-
-class RecordedCamera:
+class RecordedCamera(_RecordedDevice):
     """A StereoCamera: recorded images, raw or compressed, matched by the times in their headers.
 
     Args:
@@ -194,22 +199,11 @@ class RecordedCamera:
             raise
         self._left, self._right = first, second
         self._matcher = StereoMatcher(max_gap_s, lambda g: g.stamp.device_s, 2 * room)
-        self._bad = 0
-
-    @property
-    def name(self) -> str:
-        """File and topics."""
-        return self._player.name
-
-    @property
-    def connected(self) -> bool:
-        """Whether the recording goes on."""
-        return not self._player.ended
 
     @property
     def dropped(self) -> int:
         """Images that were not fetched in time, have no partner, or cannot be decoded."""
-        return self._player.dropped + self._matcher.dropped + self._bad
+        return self._player.dropped + self._matcher.dropped
 
     def poll(self) -> list[StereoFrame]:
         """Frames that became due since the last call. Raises DeviceLost once, at the end."""
@@ -219,7 +213,7 @@ class RecordedCamera:
             try:
                 picture = picture_of(message)
             except ValueError:
-                self._bad += 1
+                self._player.dropped += 1
                 continue
             stamp = Stamp(stamp_ns(message, recorded.bag_ns) / 1e9, host_now())
             grabbed[recorded.topic].append(Grabbed(stamp, picture, index))
@@ -227,10 +221,6 @@ class RecordedCamera:
         expected = self._right is not None and not self._player.ended
         pairs = self._matcher.take(grabbed[self._left], rights, right_expected=expected)
         return [StereoFrame(a.stamp, a.picture, None if b is None else b.picture, a.index) for a, b in pairs]
-
-    def close(self) -> None:
-        """Close the file."""
-        self._player.close()
 
 
 def check_camera(options: RecordedCameraOptions) -> None:

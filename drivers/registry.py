@@ -133,12 +133,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         check="recorded_devices:check_camera",
     ),
     DriverEntry(
-        Role.CAMERA,
-        "simulated",
-        "of the simulated room",
-        options.NoOptions,
-        "simulated:open_camera",
-        room=True,
+        Role.CAMERA, "simulated", "of the simulated room", options.NoOptions, "simulated:open_camera", room=True
     ),
     DriverEntry(
         Role.PHOTOACOUSTIC,
@@ -149,12 +144,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         extra="igtl",
     ),
     DriverEntry(
-        Role.PHOTOACOUSTIC,
-        "simulated",
-        "of the simulated room",
-        options.NoOptions,
-        "simulated:open_probe",
-        room=True,
+        Role.PHOTOACOUSTIC, "simulated", "of the simulated room", options.NoOptions, "simulated:open_probe", room=True
     ),
     DriverEntry(
         Role.STAGE,
@@ -208,27 +198,11 @@ ENTRIES: tuple[DriverEntry, ...] = (
         room=True,
     ),
     DriverEntry(
-        Role.BMODE,
-        "igtl",
-        "B-mode images over OpenIGTLink",
-        options.IgtlBmodeOptions,
-        "igtl:open_bmode",
-        extra="igtl",
+        Role.BMODE, "igtl", "B-mode images over OpenIGTLink", options.IgtlBmodeOptions, "igtl:open_bmode", extra="igtl"
     ),
+    DriverEntry(Role.BMODE, "bk", "a BK scanner over its OEM interface", options.BkOptions, "bk_oem:open_scanner"),
     DriverEntry(
-        Role.BMODE,
-        "bk",
-        "a BK scanner over its OEM interface",
-        options.BkOptions,
-        "bk_oem:open_scanner",
-    ),
-    DriverEntry(
-        Role.BMODE,
-        "simulated",
-        "of the simulated room",
-        options.NoOptions,
-        "simulated:open_scanner",
-        room=True,
+        Role.BMODE, "simulated", "of the simulated room", options.NoOptions, "simulated:open_scanner", room=True
     ),
     DriverEntry(
         Role.SINKS,

@@ -435,11 +435,9 @@ def test_the_null_viewer_takes_every_call_and_writes_nothing(tmp_path: Path, mon
     monkeypatch.chdir(tmp_path)
     viewer = open_viewer(None, "phantom")
     assert isinstance(viewer, NullViewer)
-    real = {name: method for name, method in vars(Viewer).items() if inspect.isfunction(method)}
-    public = {name for name in real if not name.startswith("_")} | {"__enter__", "__exit__"}
-    assert public == {name for name, method in vars(NullViewer).items() if inspect.isfunction(method)}
-    for name in public:
-        assert inspect.signature(getattr(Viewer, name)) == inspect.signature(getattr(NullViewer, name))
+    for name, method in vars(Viewer).items():
+        if inspect.isfunction(method) and not name.startswith("_"):
+            getattr(viewer, name)()
     rng = np.random.default_rng(15)
     model, measurements, truth = make_measurements(rng, aims=1, pairs=2)
     with viewer:

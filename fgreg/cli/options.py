@@ -10,8 +10,7 @@ if TYPE_CHECKING:
     from fgreg.model.solve_config import SolveConfig
 
 LimitOption = Annotated[
-    float,
-    typer.Option("--limit-mm", help="Predicted error (95 %) at the worst target up to which the verdict is ok."),
+    float, typer.Option("--limit-mm", help="Predicted error (95 %) at the worst target up to which the verdict is ok.")
 ]
 EstimateOption = Annotated[
     str,
@@ -46,9 +45,7 @@ def solve_config(
         raise InputError("--estimate", estimate, expected)
     try:
         return SolveConfig(
-            limit_mm=limit_mm,
-            estimate_sound_speed="sound_speed" in wanted,
-            estimate_radius="probe_radius" in wanted,
+            limit_mm=limit_mm, estimate_sound_speed="sound_speed" in wanted, estimate_radius="probe_radius" in wanted
         )
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error

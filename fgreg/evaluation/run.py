@@ -11,14 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 
-from fgreg.evaluation.case import (
-    Case,
-    EvaluationConfig,
-    curve_sizes,
-    folds_of,
-    left_out_one_by_one,
-    subsets_of,
-)
+from fgreg.evaluation.case import Case, EvaluationConfig, curve_sizes, folds_of, left_out_one_by_one, subsets_of
 from fgreg.evaluation.influence import Influence, influences
 from fgreg.evaluation.resolve import Resolved, resolve
 from fgreg.geometry.target_error import beam_error, tre_mm

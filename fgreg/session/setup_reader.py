@@ -76,11 +76,7 @@ def _present(data: Mapping[str, object]) -> frozenset[str]:
 
 
 def _warnings(
-    file: str,
-    probe: ProbeModel | None,
-    camera: StereoRig | None,
-    marker: MarkerModel | None,
-    board: BoardModel | None,
+    file: str, probe: ProbeModel | None, camera: StereoRig | None, marker: MarkerModel | None, board: BoardModel | None
 ) -> list[str]:
     """Warnings about values that are allowed but implausible."""
     out = []

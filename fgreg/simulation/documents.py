@@ -44,10 +44,7 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
     model = SessionModel(
         name=config.name,
         probe=replace(
-            config.probe,
-            sensitivity=sensitivity,
-            channels=config.probe.channels if config.frames else None,
-            image=None,
+            config.probe, sensitivity=sensitivity, channels=config.probe.channels if config.frames else None, image=None
         ),
         stage=config.stage,
         camera=config.camera if config.frames else None,

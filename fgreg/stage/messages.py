@@ -80,13 +80,7 @@ class Reset:
 
 
 Message = Beat | Request | Command | Stop | Reset
-_KINDS: dict[str, type[Message]] = {
-    "beat": Beat,
-    "request": Request,
-    "command": Command,
-    "stop": Stop,
-    "reset": Reset,
-}
+_KINDS: dict[str, type[Message]] = {"beat": Beat, "request": Request, "command": Command, "stop": Stop, "reset": Reset}
 _NAMES = {kind: name for name, kind in _KINDS.items()}
 _OPTIONAL = {"marker_s", "registration", "scan_rad", "sigma_rad"}
 

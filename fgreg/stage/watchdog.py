@@ -58,12 +58,7 @@ class WatchdogSetup:
 
     def line(self) -> bytes:
         """As a line of JSON."""
-        document = {
-            "driver": self.driver,
-            "options": self.options,
-            "limits": self.limits.document(),
-            "log": self.log,
-        }
+        document = {"driver": self.driver, "options": self.options, "limits": self.limits.document(), "log": self.log}
         return json.dumps(document, allow_nan=False).encode() + b"\n"
 
     @staticmethod

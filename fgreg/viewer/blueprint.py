@@ -54,9 +54,7 @@ def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None)
     until_now = rrb.VisibleTimeRanges(
         [
             rrb.VisibleTimeRange(
-                timeline,
-                start=rrb.TimeRangeBoundary.infinite(),
-                end=rrb.TimeRangeBoundary.cursor_relative(),
+                timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
             )
             for timeline in ("shot", "time")
         ]
@@ -76,11 +74,7 @@ def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None)
     )
     images: list[rrb.View | rrb.Container] = []
     endoscope: list[rrb.View] = [
-        rrb.Spatial2DView(
-            origin=f"world/camera/{side}",
-            contents=["$origin/**"],
-            name=f"Endoscope, {side}",
-        )
+        rrb.Spatial2DView(origin=f"world/camera/{side}", contents=["$origin/**"], name=f"Endoscope, {side}")
         for side, there in (("left", contents.left), ("right", contents.right))
         if there
     ]

@@ -187,10 +187,7 @@ class Eye:
 
 
 def best_eye(
-    points_mm: FloatArray,
-    half_height: float = 0.45,
-    half_width: float = 0.42,
-    trus_view: FloatArray | None = None,
+    points_mm: FloatArray, half_height: float = 0.45, half_width: float = 0.42, trus_view: FloatArray | None = None
 ) -> Eye:
     """The eye from which points (n, 3) fill the view, from above and obliquely to the probe's axis.
 
