@@ -131,7 +131,7 @@ class _Feed(Generic[Item]):
         self._most, self._lock = most, threading.Lock()
         self._connection: socket.socket | None = None
         self._end, self._lost, self._dropped = threading.Event(), "", 0
-        self._heard_s = self._since_s = -np.inf
+        self._received_s = self._since_s = -np.inf
         self._index: int | None = None
         self._thread = threading.Thread(target=self._run, name=f"simulated {role}", daemon=True)
         self._thread.start()
@@ -146,7 +146,7 @@ class _Feed(Generic[Item]):
         """Whether the device is connected, and sends if it has to."""
         if self._connection is None:
             return False
-        return host_now() - self._heard_s < SILENT_S if self._sends else self._steady()
+        return host_now() - self._received_s < SILENT_S if self._sends else self._steady()
 
     def _steady(self) -> bool:
         """Whether the room has kept the connection; it closes one to a device with a fault at once."""
@@ -212,7 +212,7 @@ class _Feed(Generic[Item]):
                 self._dropped += max(0, index - self._index - 1)
             self._index = index
         item = self._made(header, payload)
-        self._heard_s = host_now()
+        self._received_s = host_now()
         with self._lock:
             self._waiting.append(item)
             while len(self._waiting) > self._most:

@@ -151,7 +151,7 @@ class TcpLink(Generic[Item]):
         # The rest is the thread's own.
         self._peers: list[_Peer[Item]] = []
         self._next_try_s = 0.0
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._server = self._listen() if endpoint.listen else None
         self._selector = selectors.DefaultSelector()
         self._wake, self._woken = socket.socketpair()
@@ -294,7 +294,7 @@ class TcpLink(Generic[Item]):
         with self._lock:
             latest = self._latest if self._offered is None else None  # else it is about to be sent to all
             self._state = "there"
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         first = self._greeting + (latest or b"")
         if first:
             peer.next_block = first
@@ -336,7 +336,7 @@ class TcpLink(Generic[Item]):
         elif items or peer.partial_since_s is None:
             peer.partial_since_s = now
         if items:
-            self._heard_s = now
+            self._received_s = now
             self._take_in(items)
 
     def _take_in(self, items: list[Item]) -> None:
@@ -388,7 +388,7 @@ class TcpLink(Generic[Item]):
                 self._hang_up(peer, f"a message was not complete after {MESSAGE_S:g} s")
             elif peer.block and now - peer.block_since_s > MESSAGE_S:
                 self._hang_up(peer, f"did not take what was sent for {MESSAGE_S:g} s")
-        if self._silent_s is not None and self._state == "there" and now - self._heard_s > self._silent_s:
+        if self._silent_s is not None and self._state == "there" and now - self._received_s > self._silent_s:
             self._lost("silent", f"{self._endpoint}: nothing heard for {self._silent_s:g} s")
 
     def _hang_up(self, peer: _Peer[Item], reason: str) -> None:

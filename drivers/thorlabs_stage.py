@@ -62,7 +62,7 @@ class ThorlabsStage:
         self._status: thorlabs_apt.CubeStatus | None = None
         self._home: thorlabs_apt.HomeSettings | None = None
         self._model_name = ""
-        self._heard_s = self._asked_s = -math.inf
+        self._received_s = self._asked_s = -math.inf
         self._before: tuple[float, int] | None = None
         self._velocity = 0.0
         self._told: int | None = None
@@ -101,9 +101,9 @@ class ThorlabsStage:
         """The newest status with its time of arrival; asks the cube for a newer one."""
         self._read()
         now = time.monotonic()
-        if now - self._heard_s > LOST_S:
+        if now - self._received_s > LOST_S:
             raise self._give_up(f"has said nothing for {LOST_S:.0f} s: is it switched on, is its cable in?")
-        if now - self._asked_s > ASK_AGAIN_S or self._heard_s >= self._asked_s:
+        if now - self._asked_s > ASK_AGAIN_S or self._received_s >= self._asked_s:
             self._asked_s = now
             self._write(thorlabs_apt.short(thorlabs_apt.REQ_STATUS, thorlabs_apt.CHANNEL))
         return self._as_status()
@@ -167,7 +167,7 @@ class ThorlabsStage:
                 if self._status is not None and (status.bits ^ self._status.bits) & thorlabs_apt.HOMED_BIT:
                     self._before, self._velocity = None, 0.0  # the zero was set: the position jumps, the stage does not
                 self._follow(now, status.position)
-                self._status, self._heard_s = status, now
+                self._status, self._received_s = status, now
             case thorlabs_apt.GET_HOME:
                 self._home = thorlabs_apt.read_home(message.data)
             case thorlabs_apt.GET_INFO:
@@ -207,7 +207,7 @@ class ThorlabsStage:
             fault = f"{self._name} has its motor switched off"
         moving, homing = bool(bits & thorlabs_apt.MOVING_BITS), bool(bits & thorlabs_apt.HOMING_BIT)
         return StageStatus(
-            Stamp(self._heard_s, self._heard_s),
+            Stamp(self._received_s, self._received_s),
             self._model.scan_from_device(self._status.position / COUNTS_PER_RAD),
             self._velocity if moving else 0.0,
             moving,

@@ -117,7 +117,7 @@ class VideoInput:
         self._told = False  # the present loss was told
         self._ended = False  # a file at its end
         self._why = "it could not be opened"
-        self._heard_s = host_now()
+        self._received_s = host_now()
         self._clock = _Clock(self._timing, origin or Origin())
         self._thread = threading.Thread(target=self._run, name=f"video {name}", daemon=True)
         self._thread.start()
@@ -168,7 +168,7 @@ class VideoInput:
     def _silent(self) -> bool:
         if self._timing.paced and self._count:
             return False  # it waits for its pace, and reports its end
-        return host_now() - self._heard_s > self._timing.silence_s
+        return host_now() - self._received_s > self._timing.silence_s
 
     def _silent_or_failed(self) -> bool:
         # A device that has not connected yet gets the same time as one that fell silent.
@@ -229,7 +229,7 @@ class VideoInput:
             if len(self._waiting) > self._room:
                 self._waiting.popleft()
                 self._dropped += 1
-            self._heard_s = host_now()
+            self._received_s = host_now()
             self._alive, self._told = True, False
 
     def _fail(self, why: str, *, waiting: bool = False) -> None:

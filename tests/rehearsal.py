@@ -200,7 +200,7 @@ class Rehearsal:
         amplitude = float(config.elevation.amplitude(room.plane_rad(t_s) - scan, width))
         amplitude *= math.exp(0.05 * rng.standard_normal())
         where = None if moving else scan + config.noise.scan_rad * rng.standard_normal()
-        if not self.workflow.listens:  # then nobody looks into it (fgreg.live.marker_tracker)
+        if not self.workflow.wants_pulses:  # then nobody looks into it (fgreg.live.marker_tracker)
             return LocatedPulse(t_s, None, marker, unpaired)
         if amplitude < self.threshold or t_s >= self.deaf_from_s:
             return LocatedPulse(t_s, where, marker, unpaired)

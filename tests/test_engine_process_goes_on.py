@@ -256,8 +256,8 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
                 if state.pairs and state.estimate is not None:
                     assert snapshots.read().snapshot.epochs
                 longest = max(longest, time.perf_counter() - start)
-                if ENGINE_ENDED in state.known.reasons:
-                    told.append(state.known.verdict)
+                if ENGINE_ENDED in state.registration.reasons:
+                    told.append(state.registration.verdict)
                 taken_in = not state.waiting and state.aims + state.pairs >= done
                 if taken_in and not state.trouble and len(engines.made) >= made:
                     return

@@ -163,12 +163,12 @@ def stand(pose_session: Path) -> Iterator[Stand]:
 
 
 def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stand) -> None:
-    epoch = stand.recorder.state.known.epoch
+    epoch = stand.recorder.state.registration.epoch
     stand.base_T_camera = MOVED
     stand.turn(0.1)
     assert stand.link.beats[-1] is None
     shown = stand.loop.status()
-    assert shown.answer is None
+    assert shown.tracking is None
     assert shown.verdict is Verdict.REFUSED
     assert "moving" in shown.reasons[0]
     assert "REFUSED" in status_line(shown).upper()
@@ -176,11 +176,11 @@ def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stan
     orders = len(stand.link.orders)
     stand.turn(0.25)
     assert len(stand.link.orders) == orders
-    stand.turn(5.0, lambda: stand.recorder.state.known.epoch > epoch and stand.link.beats[-1] is not None)
+    stand.turn(5.0, lambda: stand.recorder.state.registration.epoch > epoch and stand.link.beats[-1] is not None)
     (move,) = stand.moves()
     assert move.camera_new_T_camera_old is not None
     assert np.allclose(move.camera_new_T_camera_old, np.linalg.inv(MOVED), atol=1e-9)
-    assert stand.recorder.state.known.registered
+    assert stand.recorder.state.registration.registered
     assert not stand.recorder.state.camera_moving
 
 
@@ -260,7 +260,7 @@ def test_a_move_that_is_not_taken_in_holds_and_the_next_one_ties_nothing(
     stand.turn(10.0, lambda: bool(stand.moves()) and not stand.recorder.state.camera_moving)
     (move,) = stand.moves()
     assert move.camera_new_T_camera_old is None
-    assert stand.recorder.state.known.verdict is Verdict.REFUSED
+    assert stand.recorder.state.registration.verdict is Verdict.REFUSED
 
 
 def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
@@ -268,9 +268,9 @@ def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
     pulse_locator, marker_tracker = PulseLocator(model, latency_s=0.01), MarkerTracker(model, latency_s=0.08)
     now = host_now()
     try:
-        pulse_locator.listening = False
-        pulse_locator.hear([PaFrame(Stamp(now, now), np.zeros((1, 1), np.int16), 0)])
-        (pulse,) = pulse_locator.heard(now + 1.0, marker_tracker.poses)
+        pulse_locator.wanted = False
+        pulse_locator.add_frames([PaFrame(Stamp(now, now), np.zeros((1, 1), np.int16), 0)])
+        (pulse,) = pulse_locator.complete_pulses(now + 1.0, marker_tracker.poses)
         assert pulse.pulse_s == pytest.approx(now - 0.01)
     finally:
         pulse_locator.close()
@@ -286,9 +286,9 @@ def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
             return True
 
     marker_tracker.poses = History()  # type: ignore[assignment]
-    assert marker_tracker.see(StereoFrame(Stamp(now, now), blank, blank, 0)) is None
+    assert marker_tracker.detect(StereoFrame(Stamp(now, now), blank, blank, 0)) is None
     assert poses == []
     config = room_config(1)
     left, right = Room(config).pictures(0.0, 0)
-    assert marker_tracker.see(StereoFrame(Stamp(now, now), left, right, 1)) is not None
+    assert marker_tracker.detect(StereoFrame(Stamp(now, now), left, right, 1)) is not None
     assert poses == [pytest.approx(now - 0.08)]

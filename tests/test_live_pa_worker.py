@@ -42,7 +42,7 @@ def turn(pulse_locator: PulseLocator, until: Callable[[], object]) -> list[Locat
     while not until():
         assert time.monotonic() < end, pulse_locator.trouble
         pulse_locator.plane(time.monotonic(), 0.1, False)
-        heard += pulse_locator.heard(time.monotonic(), PoseHistory())
+        heard += pulse_locator.complete_pulses(time.monotonic(), PoseHistory())
         time.sleep(0.01)
     return heard
 
@@ -52,7 +52,7 @@ def pulse(pulse_locator: PulseLocator, data: np.ndarray | None = None) -> None:
     turn(pulse_locator, _after(0.02))
     now = time.monotonic()
     data = np.random.default_rng(1).integers(-20, 20, (128, 2000), dtype=np.int16) if data is None else data
-    pulse_locator.hear([PaFrame(Stamp(now, now), data, 0)])
+    pulse_locator.add_frames([PaFrame(Stamp(now, now), data, 0)])
 
 
 def _after(seconds: float) -> Callable[[], bool]:

@@ -63,11 +63,11 @@ def pulses(pulse_locator: PulseLocator, first: int, count: int) -> tuple[Located
     out: list[LocatedPulse] = []
     for k in range(first, first + count):
         t = 100.0 + k * PERIOD_S
-        pulse_locator.hear([PaFrame(Stamp(t, t), np.zeros((2, 2), dtype=np.int16), k)])
+        pulse_locator.add_frames([PaFrame(Stamp(t, t), np.zeros((2, 2), dtype=np.int16), k)])
         for at in (t - 0.02, t + 0.02):
             pulse_locator.plane(at, 0.1, moving=False)
             poses.add(TimedPose(at, np.eye(4), np.eye(6)))
-        out += pulse_locator.heard(t + 0.03, poses)
+        out += pulse_locator.complete_pulses(t + 0.03, poses)
     return tuple(out)
 
 
@@ -104,7 +104,7 @@ def test_pulses_that_nobody_listens_to_say_nothing_and_are_not_looked_into(
     pulse_locator: tuple[PulseLocator, SlowLocator],
 ) -> None:
     found, locator = pulse_locator
-    found.listening = False
+    found.wanted = False
     handed = pulses(found, 0, 20)
     assert len(handed) == 20
     assert not locator.under_way

@@ -49,7 +49,7 @@ def worker(room: tuple[SessionModel, list[Pictures]]) -> Iterator[RightViewWorke
 def ready(worker: RightViewWorker, image: UInt8Image) -> None:
     """Until it has looked at a picture."""
     end = time.monotonic() + 60.0
-    while not worker.look(image):
+    while not worker.submit(image):
         assert time.monotonic() < end
         time.sleep(0.02)
 
@@ -93,7 +93,7 @@ def test_another_size_of_pictures_begins_anew(
     right = room[1][0][1]
     ready(worker, right)
     assert seen_of(worker) is not None
-    assert not worker.look(np.ascontiguousarray(right[::2, ::2]))
+    assert not worker.submit(np.ascontiguousarray(right[::2, ::2]))
     ready(worker, right)
     assert seen_of(worker) is not None
 
@@ -112,7 +112,7 @@ def test_where_it_ends_or_hangs_frames_are_looked_into_here_and_another_takes_ov
         nonlocal frames
         left, right = pictures[frames % len(pictures)]
         frames += 1
-        pose = marker_tracker.see(StereoFrame(Stamp(frames / 30.0, frames / 30.0), left, right, frames))
+        pose = marker_tracker.detect(StereoFrame(Stamp(frames / 30.0, frames / 30.0), left, right, frames))
         expected = detect_marker(left, right, model.camera, model.marker)  # type: ignore[arg-type]
         assert isinstance(expected, MarkerFit)
         assert pose is not None

@@ -105,7 +105,7 @@ def test_a_pm_that_is_not_heard_is_given_up_and_said_so() -> None:
     session = rehearsal(aims=0, deaf_from_s=0.0)
     session.run(45.0)
     assert not any(isinstance(a, TakePairs) for _, a in session.asked)
-    assert any("nothing heard between" in tell.text and tell.done for _, tell in session.told)
+    assert any("nothing detected between" in tell.text and tell.done for _, tell in session.told)
 
 
 def test_without_the_marker_nothing_is_searched() -> None:

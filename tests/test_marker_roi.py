@@ -55,7 +55,7 @@ def test_a_moving_marker_has_the_corners_of_the_whole_picture(width_px: int, mon
     room.proceed(0.2)
     for k in range(EVERYWHERE + 4):
         image = room.pictures(k / 15.0, k)[0]
-        found, expected = watch.see(image), whole(model, image)
+        found, expected = watch.detect(image), whole(model, image)
         assert np.abs(corners(found) - corners(expected)).max() < SAME_PX
     assert len(looks) < EVERYWHERE + 8, "most are found where they were"
     assert sum(near is not None for near in looks) > EVERYWHERE
@@ -65,25 +65,25 @@ def test_a_marker_that_has_leapt_is_found_all_the_same() -> None:
     model, room = of_room(640)
     watch = watching(model)
     image = room.pictures(0.0, 0)[0]
-    watch.see(image)
+    watch.detect(image)
     leapt = np.ascontiguousarray(image[:, ::-1][::-1])  # half a turn about the middle
-    assert np.abs(corners(watch.see(leapt)) - corners(whole(model, leapt))).max() < SAME_PX
+    assert np.abs(corners(watch.detect(leapt)) - corners(whole(model, leapt))).max() < SAME_PX
 
 
 def test_a_picture_without_a_marker_is_empty_and_the_next_one_is_looked_into_as_a_whole() -> None:
     model, room = of_room(640)
     watch = watching(model)
     image = room.pictures(0.0, 0)[0]
-    watch.see(image)
-    assert watch.see(np.full_like(image, 90)).corners is None
-    assert np.abs(corners(watch.see(image)) - corners(whole(model, image))).max() < SAME_PX
+    watch.detect(image)
+    assert watch.detect(np.full_like(image, 90)).corners is None
+    assert np.abs(corners(watch.detect(image)) - corners(whole(model, image))).max() < SAME_PX
 
 
 def test_a_second_tag_of_the_same_id_is_noticed_within_some_pictures() -> None:
     model, room = of_room(640)
     watch = watching(model)
     image = room.pictures(0.0, 0)[0]
-    first = watch.see(image)
+    first = watch.detect(image)
     low, high = first.outlines_px.min(axis=0).astype(int) - 12, first.outlines_px.max(axis=0).astype(int) + 12
     tag = image[max(low[1], 0) : high[1], max(low[0], 0) : high[0]]
     double = image.copy()
@@ -92,7 +92,7 @@ def test_a_second_tag_of_the_same_id_is_noticed_within_some_pictures() -> None:
     y = 0 if low[1] > height else image.shape[0] - height
     double[y : y + height, x : x + width] = tag
     assert whole(model, double).corners is None
-    seen = [watch.see(double).corners for _ in range(EVERYWHERE + 1)]
+    seen = [watch.detect(double).corners for _ in range(EVERYWHERE + 1)]
     assert seen[-1] is None
 
 

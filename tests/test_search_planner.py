@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgreg.search.belief import Belief
-from fgreg.search.hearing import HearingModel
+from fgreg.search.detection_model import DetectionModel
 from fgreg.search.planner import (
     Found,
     NotFound,
@@ -28,8 +28,8 @@ LOW, HIGH = math.radians(-35.0), math.radians(35.0)
 THRESHOLD = 1.0
 
 
-def _model() -> HearingModel:
-    return HearingModel.of_session(make_session(curve=True).probe.sensitivity, THRESHOLD)
+def _model() -> DetectionModel:
+    return DetectionModel.of_session(make_session(curve=True).probe.sensitivity, THRESHOLD)
 
 
 def _amplitude(pm_deg: float, peak: float, scan_rad: float, rng: np.random.Generator | None = None) -> float | None:
@@ -45,13 +45,13 @@ def _search(
     rng: np.random.Generator,
     prediction: Prediction | None = None,
     settings: SearchSettings | None = None,
-    model: HearingModel | None = None,
+    model: DetectionModel | None = None,
 ) -> tuple[Step, list[Turn]]:
     planner = SearchPlanner(model or _model(), LOW, HIGH, 0.0, prediction, settings)
     turns = []
     while isinstance(step := planner.next(), Turn):
         turns.append(step)
-        planner.listened(step.scan_rad, _amplitude(pm_deg, peak, step.scan_rad, rng))
+        planner.add_look(step.scan_rad, _amplitude(pm_deg, peak, step.scan_rad, rng))
     return step, turns
 
 
@@ -156,7 +156,7 @@ def test_field_without_a_pm_is_given_up_after_two_sweeps() -> None:
     assert isinstance(step, NotFound)
     assert step.positions == len(turns) == 7 + 8
     assert {turn.phase for turn in turns} == {Phase.SWEEP}
-    assert "nothing heard between -35.0 and 35.0 deg in 2 sweeps" in step.reason
+    assert "nothing detected between -35.0 and 35.0 deg in 2 sweeps" in step.reason
 
 
 def test_weaker_pm_than_the_session_promises_is_found_by_the_second_sweep() -> None:
@@ -190,7 +190,7 @@ def test_single_false_hearing_does_not_end_in_an_answer_there() -> None:
     turns = 0
     while isinstance(step := planner.next(), Turn):
         amplitude = 1.8 if turns == 0 else _amplitude(15.0, 4.0, step.scan_rad, rng)
-        planner.listened(step.scan_rad, amplitude)
+        planner.add_look(step.scan_rad, amplitude)
         turns += 1
     assert isinstance(step, Found)
     assert math.degrees(step.scan_rad) == pytest.approx(15.0, abs=1.0)
@@ -199,7 +199,7 @@ def test_single_false_hearing_does_not_end_in_an_answer_there() -> None:
 def test_asking_twice_changes_nothing() -> None:
     planner = SearchPlanner(_model(), LOW, HIGH, 0.0)
     assert planner.next() == planner.next()
-    planner.listened(math.radians(-30.0), 2.0)
+    planner.add_look(math.radians(-30.0), 2.0)
     assert planner.next() == planner.next()
 
 
@@ -208,13 +208,13 @@ def test_stage_that_stops_elsewhere_is_taken_where_it_stopped() -> None:
     planner = SearchPlanner(_model(), LOW, HIGH, 0.0)
     while isinstance(step := planner.next(), Turn):
         stopped = step.scan_rad + math.radians(float(rng.uniform(-1.0, 1.0)))
-        planner.listened(stopped, _amplitude(8.0, 4.0, stopped, rng))
+        planner.add_look(stopped, _amplitude(8.0, 4.0, stopped, rng))
     assert isinstance(step, Found)
     assert math.degrees(step.scan_rad) == pytest.approx(8.0, abs=1.0)
 
 
 def test_session_without_a_curve_is_searched_with_a_bell_and_more_noise() -> None:
-    model = HearingModel.of_session(make_session().probe.sensitivity, THRESHOLD)
+    model = DetectionModel.of_session(make_session().probe.sensitivity, THRESHOLD)
     assert model.amplitude_sigma > _model().amplitude_sigma
     step, _ = _search(3.0, 4.0, np.random.default_rng(3), model=model)
     assert isinstance(step, Found)
@@ -232,7 +232,7 @@ def test_gain_goes_on_falling_beyond_the_curve() -> None:
 def test_amplitude_that_is_none_is_refused(amplitude: float) -> None:
     planner = SearchPlanner(_model(), LOW, HIGH, 0.0)
     with pytest.raises(ValueError, match="amplitude"):
-        planner.listened(0.0, amplitude)
+        planner.add_look(0.0, amplitude)
 
 
 def test_searches_that_make_no_sense_are_refused() -> None:
@@ -243,8 +243,8 @@ def test_searches_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ValueError, match="sigma > 0"):
         Prediction(0.0, 0.0)
     with pytest.raises(ValueError, match="threshold"):
-        HearingModel.of_session(make_session().probe.sensitivity, 0.0)
+        DetectionModel.of_session(make_session().probe.sensitivity, 0.0)
     with pytest.raises(ValueError, match="most_positions"):
         SearchSettings(most_positions=0)
     with pytest.raises(ValueError, match="angle"):
-        SearchPlanner(_model(), LOW, HIGH, 0.0).listened(math.nan, None)
+        SearchPlanner(_model(), LOW, HIGH, 0.0).add_look(math.nan, None)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fgreg.drivers.simulated_stage import SimulatedStage
 from fgreg.model.session_model import StageModel
 from fgreg.model.time_sync import Stamp
-from fgreg.search.hearing import HearingModel
+from fgreg.search.detection_model import DetectionModel
 from fgreg.search.planner import Found, SearchPlanner, Turn
 from fgreg.stage.interface import StageStatus
 from fgreg.stage.limits import MotionKind, MotionLimits
@@ -451,7 +451,7 @@ def test_whole_search_passes_the_gate(pm_deg: float) -> None:
     room = _room()
     low, high = LIMITS.sweep_rad
     planner = SearchPlanner(
-        HearingModel.of_session(make_session(curve=True).probe.sensitivity, 1.0),
+        DetectionModel.of_session(make_session(curve=True).probe.sensitivity, 1.0),
         low,
         high,
         room.stage.status().scan_rad,
@@ -462,6 +462,6 @@ def test_whole_search_passes_the_gate(pm_deg: float) -> None:
         assert Arrived(room.number) in room.run(8.0)
         stands = room.stage.status().scan_rad
         amplitude = 4.0 * 2.0 ** (-(((math.degrees(stands) - pm_deg) / 6.0) ** 2))
-        planner.listened(stands, amplitude if amplitude >= 1.0 else None)
+        planner.add_look(stands, amplitude if amplitude >= 1.0 else None)
     assert isinstance(step, Found)
     assert math.degrees(step.scan_rad) == pytest.approx(pm_deg, abs=0.5)

@@ -149,7 +149,7 @@ def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[s
     [
         (status(Verdict.OK), ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8°", "news [red]"]),
         (
-            replace(status(Verdict.OK), answer=None, invalid="the camera is moving"),
+            replace(status(Verdict.OK), tracking=None, invalid="the camera is moving"),
             ["REFUSED", "not known yet", "the camera is moving"],
         ),
         (status(None, ("camera", "stage")), ["none yet", "camera, stage", "get the camera and the stage back", "LOST"]),

@@ -150,10 +150,11 @@ class Watch:
         self._last: Status | None = None
         self._end: dict[str, int] = {}
         loop, recorder = session.loop, session.recorder
-        loop.pulse_locator.heard = _counted(loop.pulse_locator.heard, self._heard)  # type: ignore[method-assign]
-        loop.pulse_locator.hear = _counted(loop.pulse_locator.hear, self._hear)  # type: ignore[method-assign]
+        locator = loop.pulse_locator
+        locator.complete_pulses = _counted(locator.complete_pulses, self._heard)  # type: ignore[method-assign]
+        locator.add_frames = _counted(locator.add_frames, self._hear)  # type: ignore[method-assign]
         recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
-        loop.marker_tracker.see = self._timed(loop.marker_tracker.see, "look")  # type: ignore[method-assign]
+        loop.marker_tracker.detect = self._timed(loop.marker_tracker.detect, "look")  # type: ignore[method-assign]
         loop.turn = self._timed(loop.turn, "turn")  # type: ignore[method-assign]
         loop._steering.order = self._timed(loop._steering.order, "order")  # type: ignore[method-assign]
 
@@ -241,7 +242,7 @@ class Watch:
         pulses_sent, pulses_skipped = _until(made.pulses_s, self._last_pulse_s)
         frames = sum(counts[f"frames_{name}"] for name in ("looked_into", "dropped_loop", "dropped_driver", "waiting"))
         pulses = counts["pulses_handed_on"] + counts["pulses_waiting"] + counts["pulses_dropped"]
-        known, estimate = last.recorder.known, last.recorder.estimate
+        known, estimate = last.recorder.registration, last.recorder.estimate
         return {
             "counts": {
                 "frames_sent": frames_sent,

@@ -35,7 +35,7 @@ import numpy as np
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.session_model import SensitivityModel
-from fgreg.search.hearing import HearingModel
+from fgreg.search.detection_model import DetectionModel
 from fgreg.search.planner import Found, Prediction, SearchPlanner, SearchSettings, Turn
 from fgreg.simulation.acoustics import Elevation
 
@@ -83,7 +83,7 @@ def session_sensitivity() -> SensitivityModel:
 
 
 def planned(
-    room: Room, model: HearingModel, settings: SearchSettings, prediction_deg: tuple[float, float] | None
+    room: Room, model: DetectionModel, settings: SearchSettings, prediction_deg: tuple[float, float] | None
 ) -> float:
     """The planner's answer (deg), NaN where it found nothing."""
     prediction = None if prediction_deg is None else Prediction(*(math.radians(v) for v in prediction_deg))
@@ -91,7 +91,7 @@ def planned(
     planner = SearchPlanner(model, low, high, math.radians(room.stands_deg), prediction, settings)
     while isinstance(step := planner.next(), Turn):
         amplitude = room.listen(math.degrees(step.scan_rad))
-        planner.listened(step.scan_rad, amplitude or None)
+        planner.add_look(step.scan_rad, amplitude or None)
     return math.degrees(step.scan_rad) if isinstance(step, Found) else math.nan
 
 
@@ -212,7 +212,7 @@ def main() -> int:
     parser.add_argument("--stop-deg", type=float, default=None, help="sigma at which a search ends")
     arguments = parser.parse_args()
     settings = SearchSettings() if arguments.stop_deg is None else SearchSettings(math.radians(arguments.stop_deg))
-    model = HearingModel.of_session(session_sensitivity(), THRESHOLD, amplitude_sigma=NOISE)
+    model = DetectionModel.of_session(session_sensitivity(), THRESHOLD, amplitude_sigma=NOISE)
     count, seed, strong = arguments.pms, arguments.seed, (2.0, 8.0)
 
     def cold(room: Room, _rng: np.random.Generator) -> float:

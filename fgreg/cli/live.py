@@ -286,7 +286,7 @@ def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
 
 def status_line(status: "Status") -> str:
     """One line: phase, estimate, last message."""
-    known = status.recorder.known
+    known = status.recorder.registration
     lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
     verdict = status.verdict.value if known.registered else "no registration"
     state = f"epoch {known.epoch}, {known.pairs} looks, {verdict}"
@@ -304,7 +304,7 @@ def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> A
     from fgreg.viewer.status_line import error_line, next_line, stage_line
 
     state, now = status.recorder, now_of(status, stage)
-    known, estimate = state.known, state.estimate
+    known, estimate = state.registration, state.estimate
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")

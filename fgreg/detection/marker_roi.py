@@ -27,7 +27,7 @@ class MarkerRoi:
         self._last: ViewCorners | None = None
         self._since = 0
 
-    def see(self, image: npt.NDArray[np.generic]) -> ViewCorners:
+    def detect(self, image: npt.NDArray[np.generic]) -> ViewCorners:
         """The body's corners in the next image. If the search window loses a tag, the whole image is searched."""
         last, found = self._last, None
         if last is not None and self._since < EVERYWHERE:

@@ -77,10 +77,10 @@ class Inputs:
         now_s: host time.
         poses: recent camera_T_marker.
         stage: None if there is no stage or it is lost.
-        heard: pulses since the last step, oldest first.
+        pulses: those since the last step, oldest first.
         commands: the operator's commands since the last step.
-        known: state of the registration.
-        answer: tracking result for the newest pose: the angle that the plane should turn to; None if there is none.
+        registration: state of the registration.
+        tracking: tracking result for the newest pose: the angle that the plane should turn to; None if there is none.
         aims: number of recorded calibration shots.
         camera_moving_s: host time since which the camera has been moving, or since which a move has been missing in
             the estimate: the registration is invalid. None while it is valid.
@@ -89,10 +89,10 @@ class Inputs:
     now_s: float
     poses: PoseHistory
     stage: StageView | None
-    heard: tuple[LocatedPulse, ...]
+    pulses: tuple[LocatedPulse, ...]
     commands: tuple[OperatorCommand, ...]
-    known: RegistrationState
-    answer: TrackEstimate | None
+    registration: RegistrationState
+    tracking: TrackEstimate | None
     aims: int
     camera_moving_s: float | None = None
 

@@ -117,7 +117,7 @@ class LiveLoop:
         self._unshown = 0
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
-        self._answer: TrackEstimate | None = None
+        self._tracking: TrackEstimate | None = None
         self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
 
     def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
@@ -135,23 +135,23 @@ class LiveLoop:
         if not frames and now - self._stepped_s < STEP_S:
             return False
         before = self.marker_tracker.newest
-        pose = self._look(frames)
-        self._listen()
+        pose = self._track_marker(frames)
+        self._take_pulses()
         self._show()
         self._follow_camera()
-        if (plane := self._steering.listen()) is not None:
+        if (plane := self._steering.poll()) is not None:
             self.pulse_locator.plane(plane.at_s, plane.scan_rad, plane.moving)
-        self._answer = self._where_to(pose)
+        self._tracking = self._track_beam(pose)
         self._stepped_s = now
         newest, verdict = self.marker_tracker.poses.newest(), self._verdict()
         self._steering.beat(None if newest is None else newest.t_s, None if verdict is None else verdict.value)
-        for action in self._workflow.step(self._view(now)):
+        for action in self._workflow.step(self._inputs(now)):
             self._do(action)
         self._take_aim()
         if self.marker_tracker.newest is not before:  # the frame was processed
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
-        self._look_after(host_now())
+        self._check_devices(host_now())
         return True
 
     @property
@@ -168,7 +168,7 @@ class LiveLoop:
             self._text,
             self._task,
             self._recorder.state,
-            self._answer,
+            self._tracking,
             self._steering.view,
             self._steering.latched,
             tuple(self._health.lost),
@@ -185,7 +185,7 @@ class LiveLoop:
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
-    def _look(self, frames: Sequence[StereoFrame]) -> TimedPose | None:
+    def _track_marker(self, frames: Sequence[StereoFrame]) -> TimedPose | None:
         if not frames:
             return None
         new = self._pictures.is_new(frames[-1], host_now())
@@ -193,15 +193,15 @@ class LiveLoop:
         self.figures.skipped += len(frames) - new
         if not new:
             return None
-        pose = self.marker_tracker.see(frames[-1])
+        pose = self.marker_tracker.detect(frames[-1])
         self.figures.found += pose is not None
         return pose
 
-    def _listen(self) -> None:
-        self.pulse_locator.listening = self._workflow.listens
+    def _take_pulses(self) -> None:
+        self.pulse_locator.wanted = self._workflow.wants_pulses
         pulses = self._sources["probe"].poll()
         self.figures.pulses += len(pulses)
-        self.pulse_locator.hear(pulses)
+        self.pulse_locator.add_frames(pulses)
         self._commands += self._sources["operator"].poll()
 
     def _show(self) -> None:
@@ -234,7 +234,7 @@ class LiveLoop:
             self._tell(Tell("the camera moves: the registration is invalid until it rests and is registered again"))
         self._camera_moving_s = since_s
 
-    def _where_to(self, pose: TimedPose | None) -> TrackEstimate | None:
+    def _track_beam(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Tracking result for the new pose; without one the last result, as long as its pose is recent."""
         try:
             received = self._reader.read()
@@ -247,7 +247,7 @@ class LiveLoop:
             return None
         if pose is None:
             newest = self.marker_tracker.poses.newest()
-            return self._answer if newest is not None and host_now() - newest.t_s < 0.2 else None
+            return self._tracking if newest is not None and host_now() - newest.t_s < 0.2 else None
         if self._snapshot is None or not self._snapshot.epochs:
             return None
         self._number += 1
@@ -261,17 +261,17 @@ class LiveLoop:
         )
         return track(query, self._snapshot)
 
-    def _view(self, now: float) -> Inputs:
+    def _inputs(self, now: float) -> Inputs:
         commands, self._commands = tuple(self._commands), []
         state = self._recorder.state
         return Inputs(
             now,
             self.marker_tracker.poses,
             self._steering.view,
-            self.pulse_locator.heard(now, self.marker_tracker.poses),
+            self.pulse_locator.complete_pulses(now, self.marker_tracker.poses),
             commands,
-            state.known,
-            self._answer,
+            state.registration,
+            self._tracking,
             state.aims,
             self._camera_moving_s,
         )
@@ -284,8 +284,8 @@ class LiveLoop:
 
     def _verdict(self) -> Verdict | None:
         """Verdict of the registration; None if there is no valid one."""
-        known = self._recorder.state.known
-        return known.verdict if known.registered and not self._invalid() else None
+        registration = self._recorder.state.registration
+        return registration.verdict if registration.registered and not self._invalid() else None
 
     def _invalid(self) -> str:
         """Why the registration is invalid; empty if it is valid."""
@@ -378,15 +378,15 @@ class LiveLoop:
             return
         invalid = self._invalid()
         refused = estimate.verdict is Verdict.REFUSED or bool(invalid)
-        answer = None if refused else self._answer
-        stage_rad = None if answer is None else answer.stage_rad
+        tracking = None if refused else self._tracking
+        stage_rad = None if tracking is None else tracking.stage_rad
         registration = Registration(
             stamp,
             (Verdict.REFUSED if refused else estimate.verdict).value,
             None if refused else estimate.trus_T_camera,
             None if refused else estimate.covariance,
             None if stage_rad is None else self._model.stage.scan_from_device(stage_rad),
-            None if answer is None else answer.sigma_rad,
+            None if tracking is None else tracking.sigma_rad,
             (invalid,) if invalid else estimate.reasons,
             stage_rad,
         )
@@ -396,7 +396,7 @@ class LiveLoop:
             except DeviceLost as error:
                 self._sources[f"sink {number + 1}"].failed(str(error))
 
-    def _look_after(self, now: float) -> None:
+    def _check_devices(self, now: float) -> None:
         """Update which devices are lost; report and note each change."""
         health, state, steering = self._health, self._recorder.state, self._steering
         for role, source in self._sources.items():

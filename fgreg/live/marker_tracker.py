@@ -47,7 +47,7 @@ class MarkerTracker:
         self.missing = ""
         self.newest: StereoFrame | None = None
 
-    def see(self, frame: StereoFrame) -> TimedPose | None:
+    def detect(self, frame: StereoFrame) -> TimedPose | None:
         """The marker's pose at the frame's exposure; None if it is not found, and ``missing`` gives the reason."""
         t_s = self._clock.host_time(frame.stamp)
         fit = self._detect(frame)
@@ -66,10 +66,10 @@ class MarkerTracker:
     def _detect(self, frame: StereoFrame) -> MarkerFit | NotFound:
         """As :func:`fgreg.detection.marker.detect_marker`, with both views in parallel if the worker is ready."""
         right: ViewCorners | None = None
-        in_worker = frame.right is not None and self._right is not None and self._right_worker.look(frame.right)
-        left = self._left.see(frame.left)
+        in_worker = frame.right is not None and self._right is not None and self._right_worker.submit(frame.right)
+        left = self._left.detect(frame.left)
         if frame.right is not None and self._right is not None:
-            right = (self._right_worker.seen() if in_worker else None) or self._right.see(frame.right)
+            right = (self._right_worker.result() if in_worker else None) or self._right.detect(frame.right)
         return marker_from_views(left, right, self._marker)
 
     def close(self) -> None:

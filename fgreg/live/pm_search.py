@@ -32,7 +32,7 @@ class PmSearch:
         threshold: least amplitude of a detection.
         started_s: host time of the beginning.
         looks: pulses with a detection.
-        listens: whether the next pulse counts, because the stage stands at its goal.
+        wants_pulses: whether the next pulse counts, because the stage stands at its goal.
     """
 
     planner: SearchPlanner
@@ -41,33 +41,33 @@ class PmSearch:
     threshold: float
     started_s: float
     looks: list[LocatedPulse]
-    listens: bool = False
+    wants_pulses: bool = False
     _goal: Turn | None = None
     _waits_s: float = 0.0
     _stood_s: float | None = None
 
-    def step(self, now_s: float, stage: StageView, heard: tuple[LocatedPulse, ...]) -> Turn | Found | NotFound | None:
+    def step(self, now_s: float, stage: StageView, pulses: tuple[LocatedPulse, ...]) -> Turn | Found | NotFound | None:
         """The next position to turn to, or how the search has ended; None to wait."""
         if self._goal is not None:
             there = not stage.moving and abs(stage.scan_rad - self._goal.scan_rad) < ARRIVED_RAD
             if stage.moving or (there and self._stood_s is None):
                 self._waits_s = now_s
             self._stood_s = (self._stood_s or stage.at_s) if there else None
-            self.listens = self._stood_s is not None and now_s > self._stood_s + QUIET_S
-            pulse = None if self._stood_s is None else _first_after(self._stood_s + QUIET_S, heard)
+            self.wants_pulses = self._stood_s is not None and now_s > self._stood_s + QUIET_S
+            pulse = None if self._stood_s is None else _first_after(self._stood_s + QUIET_S, pulses)
             if pulse is None or pulse.scan_rad is None:
                 if now_s - self._waits_s < PATIENCE_S:
                     return None
                 what = "no laser pulse" if there else "the stage has not arrived"
                 return NotFound(f"{what} within {PATIENCE_S:.0f} s", len(self.looks))
             loud = pulse.amplitude is not None and pulse.amplitude >= self.threshold
-            self.planner.listened(pulse.scan_rad, pulse.amplitude if loud else None)
+            self.planner.add_look(pulse.scan_rad, pulse.amplitude if loud else None)
             if loud:
                 self.looks.append(pulse)
             self._goal = None
         step = self.planner.next()
         if isinstance(step, Turn):
-            self._goal, self._waits_s, self._stood_s, self.listens = step, now_s, None, False
+            self._goal, self._waits_s, self._stood_s, self.wants_pulses = step, now_s, None, False
         return step
 
     def best_looks(self, found: Found, model: SessionModel) -> tuple[LocatedPulse, ...]:
@@ -90,5 +90,5 @@ class PmSearch:
         return tuple(sorted(chosen, key=lambda look: look.pulse_s))
 
 
-def _first_after(t_s: float, heard: tuple[LocatedPulse, ...]) -> LocatedPulse | None:
-    return next((pulse for pulse in heard if pulse.scan_rad is not None and pulse.pulse_s > t_s), None)
+def _first_after(t_s: float, pulses: tuple[LocatedPulse, ...]) -> LocatedPulse | None:
+    return next((pulse for pulse in pulses if pulse.scan_rad is not None and pulse.pulse_s > t_s), None)

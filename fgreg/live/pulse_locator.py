@@ -52,9 +52,9 @@ class PulseLocator:
     """Turns the probe's frames into pulses with source, plane angle and marker pose.
 
     Attributes:
-        listening: whether sources should be located, which takes processor time.
+        wanted: whether sources should be located, which takes processor time.
         passed_over: number of pulses that were not located for want of time.
-        locator: the worker that locates sources; it is free for other jobs while ``listening`` is False.
+        locator: the worker that locates sources; it is free for other jobs while ``wanted`` is False.
     """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
@@ -62,7 +62,7 @@ class PulseLocator:
         self._clock = DeviceClock(latency_s)
         self._waiting: deque[_Waiting] = deque()
         self._planes: deque[tuple[float, float, bool]] = deque(maxlen=256)
-        self.listening, self.passed_over = True, 0
+        self.wanted, self.passed_over = True, 0
         self._unread, self._unread_s = "", -np.inf
 
     @property
@@ -82,13 +82,13 @@ class PulseLocator:
         if not self._planes or at_s > self._planes[-1][0]:
             self._planes.append((at_s, scan_rad, moving))
 
-    def hear(self, frames: Sequence[PaFrame]) -> None:
+    def add_frames(self, frames: Sequence[PaFrame]) -> None:
         """Take in pulses. One is processed at a time: the next is of use only once its result is known."""
         for frame in frames:
-            wanted = self.listening and not any(pulse.under_way for pulse in self._waiting)
+            wanted = self.wanted and not any(pulse.under_way for pulse in self._waiting)
             self._waiting.append(_Waiting(self._clock.host_time(frame.stamp), frame.data if wanted else None))
 
-    def heard(self, now_s: float, poses: PoseHistory) -> tuple[LocatedPulse, ...]:
+    def complete_pulses(self, now_s: float, poses: PoseHistory) -> tuple[LocatedPulse, ...]:
         """The pulses that are complete, oldest first."""
         out = []
         self.locator.check()
@@ -131,23 +131,23 @@ class PulseLocator:
         self.passed_over += 1
 
     def _complete(self, pulse: _Waiting, poses: PoseHistory) -> LocatedPulse:
-        heard = LocatedPulse(pulse.pulse_s, pulse.scan_rad)
+        complete = LocatedPulse(pulse.pulse_s, pulse.scan_rad)
         try:
-            heard = replace(heard, marker=poses.at(pulse.pulse_s))
+            complete = replace(complete, marker=poses.at(pulse.pulse_s))
         except PairRefused as error:
-            heard = replace(heard, unpaired=str(error))
+            complete = replace(complete, unpaired=str(error))
         if pulse.located is None:
-            return heard
+            return complete
         try:
             found = pulse.located.result()
         except Exception as error:  # a fault of one frame; the next may be good
             self._unread_s = host_now()
             self._unread = f"a frame of the probe could not be processed: {error}"
-            return replace(heard, scan_rad=None)  # unknown whether there was a signal
+            return replace(complete, scan_rad=None)  # unknown whether there was a signal
         if isinstance(found, NoSignal):
-            return heard
+            return complete
         return replace(
-            heard, x_mm=found.x_mm, range_mm=found.range_mm, covariance=found.covariance, amplitude=found.amplitude
+            complete, x_mm=found.x_mm, range_mm=found.range_mm, covariance=found.covariance, amplitude=found.amplitude
         )
 
     def _stood(self, t_s: float) -> float | None:

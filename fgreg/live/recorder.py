@@ -38,14 +38,14 @@ class RecorderState:
     """State of recording and estimate.
 
     Attributes:
-        known: summary of the estimate. estimate: the estimate itself.
+        registration: summary of the estimate. estimate: the estimate itself.
         aims, pairs: counts on disk and taken in. refused: on disk, not taken in. waiting: handed over, not on disk yet.
         trouble: the last error; empty if there is none.
         camera_moving: a reported camera move is not in the estimate yet, so the registration is invalid.
         blocked: why nothing can be recorded now; waiting events are recorded later. Empty if recording works.
     """
 
-    known: RegistrationState
+    registration: RegistrationState
     estimate: OnlineEstimate | None = None
     aims: int = 0
     pairs: int = 0
@@ -133,7 +133,7 @@ class Recorder:
         with self._lock:
             standing = _without_engine(self._state.estimate)
             self._state = replace(
-                self._state, known=registration_state(standing), estimate=standing, trouble=ENGINE_ENDED
+                self._state, registration=registration_state(standing), estimate=standing, trouble=ENGINE_ENDED
             )
         if time.monotonic() < self._revived_s + AGAIN_S:
             return
@@ -212,7 +212,8 @@ class Recorder:
             return
         with self._lock:
             blocked = self._state.blocked if holding else ""
-            self._state = replace(self._state, known=registration_state(estimate), estimate=estimate, blocked=blocked)
+            registration = registration_state(estimate)
+            self._state = replace(self._state, registration=registration, estimate=estimate, blocked=blocked)
 
 
 def _without_engine(estimate: OnlineEstimate | None) -> OnlineEstimate | None:

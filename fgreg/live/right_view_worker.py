@@ -38,7 +38,7 @@ class RightViewWorker:
         self._worker: WorkerProcess[Shape, ViewCorners] | None = None
         self._picture: Any = None
 
-    def look(self, image: npt.NDArray[np.generic]) -> bool:
+    def submit(self, image: npt.NDArray[np.generic]) -> bool:
         """Hand over a right picture; False if no process is ready for it."""
         if self._worker is None or len(self._picture) != image.nbytes:
             self._start(image.nbytes)
@@ -50,7 +50,7 @@ class RightViewWorker:
         self._worker.send((image.shape, image.dtype.str))
         return True
 
-    def seen(self) -> ViewCorners | None:
+    def result(self) -> ViewCorners | None:
         """Corners in the picture that was handed over; None if there is no result in time or the process failed."""
         reply = None if self._worker is None else self._worker.fetch(ANSWER_S)
         return None if reply is None else reply[0]
@@ -91,4 +91,4 @@ def _looking(picture: Any, rig: StereoRig, marker: MarkerModel) -> Work[Shape, V
 
 def _look(picture: Any, roi: MarkerRoi, shape: Shape) -> ViewCorners:
     size, kind = shape
-    return roi.see(np.frombuffer(picture, np.dtype(kind)).reshape(size))
+    return roi.detect(np.frombuffer(picture, np.dtype(kind)).reshape(size))

@@ -56,7 +56,7 @@ class Steering:
         view = None if self._stage is None else self._stage.view
         return "" if view is None else view.latched or ""
 
-    def listen(self) -> StageView | None:
+    def poll(self) -> StageView | None:
         """Take in the stage's reports; returns the newest status."""
         if self._stage is None:
             return None

@@ -86,7 +86,7 @@ class Status:
     Attributes:
         now_s: host time. t: session time. stage: current stage of the workflow.
         text: last message to the operator. task: last message that was not about devices: what to do next.
-        answer: tracking result for the newest pose. plane: status of the stage. lost: roles of the lost devices.
+        tracking: tracking result for the newest pose. plane: status of the stage. lost: roles of the lost devices.
         latched: why the stage may not move until a reset; empty if it may.
         pose, frame: newest. bmode: newest, None if its scanner is lost.
         invalid: why the registration is invalid, whatever its verdict was; empty if it is valid.
@@ -98,7 +98,7 @@ class Status:
     text: str
     task: str
     recorder: RecorderState
-    answer: TrackEstimate | None
+    tracking: TrackEstimate | None
     plane: StageView | None
     latched: str
     lost: tuple[str, ...]
@@ -110,9 +110,9 @@ class Status:
     @property
     def verdict(self) -> Verdict:
         """Current verdict; REFUSED if the registration is invalid."""
-        return Verdict.REFUSED if self.invalid else self.recorder.known.verdict
+        return Verdict.REFUSED if self.invalid else self.recorder.registration.verdict
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """Reasons for the verdict."""
-        return tuple(filter(None, (self.invalid, *self.recorder.known.reasons)))
+        return tuple(filter(None, (self.invalid, *self.recorder.registration.reasons)))

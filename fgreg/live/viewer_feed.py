@@ -131,7 +131,7 @@ class RerunFeed:
         track, pose = None, status.pose
         if pose is not None and status.now_s - pose.t_s < FRESH_S:
             marker = self._observation(pose.parent_T_child, pose.covariance)
-            track = Track(status.t, status.recorder.known.epoch, marker, ())
+            track = Track(status.t, status.recorder.registration.epoch, marker, ())
         return _Drawing(status.t, track, "", status.recorder.estimate, _frame(status), status, ended)
 
     def close(self) -> None:
@@ -176,7 +176,7 @@ class RerunFeed:
                 self.left_out += 1
 
     def _draw(self, drawing: _Drawing) -> None:
-        known, number, status, model = drawing.estimate, self._number, drawing.status, self._model
+        estimate, number, status, model = drawing.estimate, self._number, drawing.status, self._model
         invalid = "" if status is None else status.invalid
         if model is None:
             raise AssertionError("the session comes first")
@@ -194,26 +194,26 @@ class RerunFeed:
                 number=number,
                 shot=drawing.shot,
                 note=drawing.note,
-                trus_T_camera=None if known is None else known.trus_T_camera,
-                covariance=None if known is None else known.covariance,
+                trus_T_camera=None if estimate is None else estimate.trus_T_camera,
+                covariance=None if estimate is None else estimate.covariance,
                 marker_T_laser=self._beam,
-                tre=None if known is None or invalid else known.predicted_tre,
-                verdict=Verdict.REFUSED if known is None or invalid else known.verdict,
-                reasons=() if known is None else tuple(filter(None, (invalid, *known.reasons))),
-                pairs=0 if known is None else known.pairs,
-                nis=known.nis if known is not None and isinstance(drawing.shot, Pair) else None,
-                used=known is not None and known.used,
-                answer=None if status is None or not isinstance(drawing.shot, Track) else status.answer,
+                tre=None if estimate is None or invalid else estimate.predicted_tre,
+                verdict=Verdict.REFUSED if estimate is None or invalid else estimate.verdict,
+                reasons=() if estimate is None else tuple(filter(None, (invalid, *estimate.reasons))),
+                pairs=0 if estimate is None else estimate.pairs,
+                nis=estimate.nis if estimate is not None and isinstance(drawing.shot, Pair) else None,
+                used=estimate is not None and estimate.used,
+                answer=None if status is None or not isinstance(drawing.shot, Track) else status.tracking,
                 now=None if status is None else now_of(status, model.stage, ended=drawing.ended),
-                epoch=0 if known is None else known.epoch,
+                epoch=0 if estimate is None else estimate.epoch,
             )
         )
 
 
 def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
     """Content of the viewer's status line."""
-    plane, answer = status.plane, status.answer
-    goal = None if answer is None else answer.stage_rad
+    plane, tracking = status.plane, status.tracking
+    goal = None if tracking is None else tracking.stage_rad
     return Now(
         status.stage,
         status.task,
@@ -224,8 +224,8 @@ def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:
         plane is not None and plane.moving,
         status.latched,
         None if goal is None else stage.scan_from_device(goal),
-        None if answer is None else answer.sigma_rad,
-        "" if answer is None or status.verdict is Verdict.REFUSED else answer.reason,
+        None if tracking is None else tracking.sigma_rad,
+        "" if tracking is None or status.verdict is Verdict.REFUSED else tracking.reason,
         ended,
     )
 

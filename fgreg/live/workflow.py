@@ -33,7 +33,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.schema.kinds import Integer, Number
 from fgreg.schema.problems import FieldError
 from fgreg.schema.record import Key
-from fgreg.search.hearing import HearingModel
+from fgreg.search.detection_model import DetectionModel
 from fgreg.search.planner import Found, NotFound, Prediction, SearchPlanner, Turn
 from fgreg.stage.limits import MotionKind
 
@@ -50,13 +50,13 @@ CHECK_S = 0.3
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
 """The operator is told what is missing after a wait of this long."""
-UNHEARD = 8
+MISSED = 8
 """The operator is told after this many pulses in a row without a PM where the registration expects one."""
 
 
-def _why(known: RegistrationState) -> str:
+def _why(registration: RegistrationState) -> str:
     """The first reason for refusing the registration."""
-    return known.reasons[0] if known.reasons else "no registration"
+    return registration.reasons[0] if registration.reasons else "no registration"
 
 
 class Stage(StrEnum):
@@ -77,7 +77,7 @@ class WorkflowSettings:
     hearing_threshold: Annotated[
         float,
         Key(
-            "least amplitude that counts as heard, in the source's unit",
+            "least amplitude of a detection, in the source's unit",
             Number(0.0, 1e12, above=True),
             default="required, but in the simulated room",
             example="20.0",
@@ -107,7 +107,7 @@ class Workflow:
 
     def __init__(self, model: SessionModel, settings: WorkflowSettings, next_pm: int = 0) -> None:
         self._model, self._settings, self._next_pm = model, settings, next_pm
-        self._hearing = HearingModel.of_session(
+        self._detection_model = DetectionModel.of_session(
             model.probe.sensitivity, settings.hearing_threshold, scan_sigma_rad=model.noise.scan_rad
         )
         low, high = (model.stage.scan_from_device(angle) for angle in model.stage.limits_device_rad)
@@ -117,7 +117,7 @@ class Workflow:
         self._done_at: FloatArray | None = None
         self._pms, self._epoch = 0, 0
         self._refused_pms = 0
-        self._unheard = 0
+        self._missed = 0
         self._wanted: CommandKind | None = None
         self._latched = ""
         self._wanted_s = -math.inf
@@ -126,36 +126,36 @@ class Workflow:
         self._not_before_s = -math.inf  # earlier pulses belong to another epoch
 
     @property
-    def listens(self) -> bool:
+    def wants_pulses(self) -> bool:
         """Whether pulses should be located now; locating a source takes processor time."""
-        return self._checks if self._search is None else self._search.listens
+        return self._checks if self._search is None else self._search.wants_pulses
 
-    def step(self, view: Inputs) -> tuple[Action, ...]:
+    def step(self, inputs: Inputs) -> tuple[Action, ...]:
         """The actions for these inputs."""
         out: list[Action] = []
         self._checks = False
-        for command in view.commands:
-            out += self._obey(command, view)
-        latched = view.stage is not None and self._is_latched(view.stage, view.now_s, out)
-        if view.camera_moving_s is not None:
+        for command in inputs.commands:
+            out += self._obey(command, inputs)
+        latched = inputs.stage is not None and self._is_latched(inputs.stage, inputs.now_s, out)
+        if inputs.camera_moving_s is not None:
             # The registration is invalid. The motion request stays; the safety gate blocks the motion meanwhile.
-            self._search, self._not_before_s = None, max(self._not_before_s, view.now_s)
+            self._search, self._not_before_s = None, max(self._not_before_s, inputs.now_s)
             return tuple(out)
-        if view.known.epoch != self._epoch:
-            self._epoch, self._pms, self._done_at, self._unheard = view.known.epoch, 0, None, 0
+        if inputs.registration.epoch != self._epoch:
+            self._epoch, self._pms, self._done_at, self._missed = inputs.registration.epoch, 0, None, 0
             self._refused_pms = 0
             self._search = None
             out.append(Tell("the camera has moved: the registration starts again"))
-        self._advance(view, out)
+        self._advance(inputs, out)
         if any(isinstance(action, Ask | Halt | Release) for action in out):
             self._search = None
             return tuple(out)  # the next stage order depends on how the stage reacts
-        if view.stage is not None and not latched and self._may_turn(view, view.stage, out):
-            searches = view.stage.requested is MotionKind.SEARCH
+        if inputs.stage is not None and not latched and self._may_turn(inputs, inputs.stage, out):
+            searches = inputs.stage.requested is MotionKind.SEARCH
             if self.stage is Stage.COLLECTING or (self.stage is Stage.FOLLOWING and searches):
-                self._collect(view, view.stage, out)
+                self._collect(inputs, inputs.stage, out)
             elif self.stage is Stage.FOLLOWING:
-                self._follow(view, view.stage, out)
+                self._follow(inputs, inputs.stage, out)
         else:
             self._search = None
         return tuple(out)
@@ -171,20 +171,21 @@ class Workflow:
             self._want(CommandKind.RESET, text, now_s, out)
         return bool(stage.latched)
 
-    def _may_turn(self, view: Inputs, stage: StageView, out: list[Action]) -> bool:
+    def _may_turn(self, inputs: Inputs, stage: StageView, out: list[Action]) -> bool:
         """Whether the stage is homed and the operator has requested the next kind of motion; if not, ask for it."""
         if not stage.homed:
-            self._want(CommandKind.HOME, "the stage has to find its zero position", view.now_s, out)
+            self._want(CommandKind.HOME, "the stage has to find its zero position", inputs.now_s, out)
             return False
         if self.stage is Stage.COLLECTING and stage.requested is not MotionKind.SEARCH:
-            self._want(CommandKind.SEARCH, "the stage has to turn in search of PMs", view.now_s, out)
+            self._want(CommandKind.SEARCH, "the stage has to turn in search of PMs", inputs.now_s, out)
             return False
         if self.stage is Stage.FOLLOWING and self._settings.follow and self._search is None:
-            answered = view.answer is not None and view.answer.stage_rad is not None
+            tracking = inputs.tracking
+            answered = tracking is not None and tracking.stage_rad is not None
             if answered and stage.requested is not MotionKind.TRACK:
-                self._want(CommandKind.FOLLOW, "the stage is ready to follow the beam", view.now_s, out)
-            elif not answered and view.answer is not None and stage.requested is MotionKind.TRACK:
-                self._want(CommandKind.SEARCH, f"{view.answer.reason}: hold it still and search here", view.now_s, out)
+                self._want(CommandKind.FOLLOW, "the stage is ready to follow the beam", inputs.now_s, out)
+            elif not answered and tracking is not None and stage.requested is MotionKind.TRACK:
+                self._want(CommandKind.SEARCH, f"{tracking.reason}: hold it still and search here", inputs.now_s, out)
         return True
 
     def _want(self, wanted: CommandKind, text: str, now_s: float, out: list[Action]) -> None:
@@ -196,7 +197,7 @@ class Workflow:
 
     # --- the session's course ---------------------------------------------------------------------------------------
 
-    def _obey(self, command: OperatorCommand, view: Inputs) -> list[Action]:
+    def _obey(self, command: OperatorCommand, inputs: Inputs) -> list[Action]:
         match command.kind:
             case CommandKind.HOME:
                 return [Ask(MotionKind.HOME)]
@@ -217,76 +218,78 @@ class Workflow:
                 self._search = None
                 return [Halt("the operator has stopped the stage")]
             case CommandKind.RESET:
-                if view.stage is not None and view.stage.latched:
+                if inputs.stage is not None and inputs.stage.latched:
                     return [Release()]
-                return [Tell(f"no reset: the stage is not {'there' if view.stage is None else 'latched'}")]
+                return [Tell(f"no reset: the stage is not {'there' if inputs.stage is None else 'latched'}")]
         return []
 
-    def _advance(self, view: Inputs, out: list[Action]) -> None:
-        known = view.known
-        usable = known.registered and known.verdict is not Verdict.REFUSED
-        if self.stage is Stage.AIMING and view.aims >= self._settings.aims:
+    def _advance(self, inputs: Inputs, out: list[Action]) -> None:
+        registration = inputs.registration
+        usable = registration.registered and registration.verdict is not Verdict.REFUSED
+        if self.stage is Stage.AIMING and inputs.aims >= self._settings.aims:
             self.stage = Stage.COLLECTING
             out.append(Tell("calibrated: hold the fibre at the tissue", done=True))
         elif self.stage is Stage.COLLECTING and usable:
-            enough = self._settings.pms if known.verdict is Verdict.OK else self._settings.most_pms
+            enough = self._settings.pms if registration.verdict is Verdict.OK else self._settings.most_pms
             if self._pms >= enough and self._search is None:
                 self.stage = Stage.FOLLOWING
                 out.append(Tell("registered", done=True))
         elif self.stage is Stage.COLLECTING and self._pms >= self._refused_pms + self._settings.most_pms:
             self._refused_pms = self._pms
-            out.append(Tell(f"{self._pms} PMs, and refused: {_why(known)}; if the camera was moved, say so (moved)"))
+            why = _why(registration)
+            out.append(Tell(f"{self._pms} PMs, and refused: {why}; if the camera was moved, say so (moved)"))
         elif self.stage is Stage.FOLLOWING and not usable:
             self.stage, self._pms, self._refused_pms = Stage.COLLECTING, 0, 0
-            why = _why(known)
+            why = _why(registration)
             out += [Halt(f"the registration is refused: {why}"), Tell("hold the fibre at the tissue: registering")]
 
     # --- searching --------------------------------------------------------------------------------------------------
 
-    def _collect(self, view: Inputs, stage: StageView, out: list[Action]) -> None:
-        held = held_pose(view.poses, view.now_s)
+    def _collect(self, inputs: Inputs, stage: StageView, out: list[Action]) -> None:
+        held = held_pose(inputs.poses, inputs.now_s)
         if self._search is None:
             if held is None or not self._is_another(held):
-                self._wait(view, held, out)
+                self._wait(inputs, held, out)
                 return
-            self._waits_s = view.now_s
-            self._search = self._begin(view, stage, held, cold=False)
-        elif (slipped := self._slipped(view, self._search)) is not None:
+            self._waits_s = inputs.now_s
+            self._search = self._begin(inputs, stage, held, cold=False)
+        elif (slipped := self._slipped(inputs, self._search)) is not None:
             self._search = None
             if slipped:
                 out.append(Tell(f"{slipped}: hold it still"))
             return
-        step = self._search.step(view.now_s, stage, view.heard)
+        step = self._search.step(inputs.now_s, stage, inputs.pulses)
         if isinstance(step, Turn):
             out.append(Sweep(step.scan_rad, step.reason))
         elif isinstance(step, Found):
-            self._found(view.now_s, self._search, step, out)
+            self._found(inputs.now_s, self._search, step, out)
         elif isinstance(step, NotFound):
-            self._not_found(view, stage, self._search, step, out)
+            self._not_found(inputs, stage, self._search, step, out)
 
-    def _wait(self, view: Inputs, held: FloatArray | None, out: list[Action]) -> None:
+    def _wait(self, inputs: Inputs, held: FloatArray | None, out: list[Action]) -> None:
         """Tell the operator what is missing, once the wait is long."""
-        if view.now_s - self._waits_s < PATIENCE_S:
+        if inputs.now_s - self._waits_s < PATIENCE_S:
             return
-        self._waits_s = view.now_s
-        newest = view.poses.newest()
-        if newest is None or view.now_s - newest.t_s > 1.0:
+        self._waits_s = inputs.now_s
+        newest = inputs.poses.newest()
+        if newest is None or inputs.now_s - newest.t_s > 1.0:
             out.append(Tell("the marker is not seen: hold the fibre elsewhere", done=True))
         elif held is None:
             out.append(Tell("hold the fibre still", done=False))
         else:
             out.append(Tell("this spot is done: hold the fibre elsewhere", done=True))
 
-    def _begin(self, view: Inputs, stage: StageView, held: FloatArray, *, cold: bool) -> PmSearch:
+    def _begin(self, inputs: Inputs, stage: StageView, held: FloatArray, *, cold: bool) -> PmSearch:
         low, high = self._field
-        prediction, answer = None, view.answer
-        if not cold and answer is not None and answer.stage_rad is not None and answer.sigma_rad is not None:
-            at, sigma = self._model.stage.scan_from_device(answer.stage_rad), max(answer.sigma_rad, 1e-3)
-            if low <= at <= high and sigma <= WORTH_PREDICTING_RAD and view.known.verdict is not Verdict.REFUSED:
+        prediction, tracking = None, inputs.tracking
+        if not cold and tracking is not None and tracking.stage_rad is not None and tracking.sigma_rad is not None:
+            at, sigma = self._model.stage.scan_from_device(tracking.stage_rad), max(tracking.sigma_rad, 1e-3)
+            refused = inputs.registration.verdict is Verdict.REFUSED
+            if low <= at <= high and sigma <= WORTH_PREDICTING_RAD and not refused:
                 prediction = Prediction(at, sigma)
         stands = min(max(stage.scan_rad, low), high)
-        planner = SearchPlanner(self._hearing, low, high, stands, prediction)
-        return PmSearch(planner, held, prediction is None, self._settings.hearing_threshold, view.now_s, [])
+        planner = SearchPlanner(self._detection_model, low, high, stands, prediction)
+        return PmSearch(planner, held, prediction is None, self._settings.hearing_threshold, inputs.now_s, [])
 
     def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
         self._search, self._done_at, self._waits_s = None, search.held, now_s
@@ -294,27 +297,27 @@ class Workflow:
         if not looks:
             off_window = "the looks were outside the sensitivity window"
             why = next((look.unpaired for look in search.looks if look.unpaired), off_window)
-            out.append(Tell(f"the PM was heard, but cannot be paired ({why}): go on to the next spot", done=True))
+            out.append(Tell(f"the PM was detected, but cannot be paired ({why}): go on to the next spot", done=True))
             return
         out.append(TakePairs(self._next_pm, looks))
         self._next_pm += 1
         self._pms += 1
         turn, sigma = math.degrees(found.scan_rad), math.degrees(found.sigma_rad)
-        text = f"PM heard at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions: go on to the next spot"
+        text = f"PM detected at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions: go on to the next spot"
         out.append(Tell(text, done=True))
 
-    def _not_found(self, view: Inputs, stage: StageView, search: PmSearch, why: NotFound, out: list[Action]) -> None:
+    def _not_found(self, inputs: Inputs, stage: StageView, search: PmSearch, why: NotFound, out: list[Action]) -> None:
         if not search.cold:
-            self._search = self._begin(view, stage, search.held, cold=True)
+            self._search = self._begin(inputs, stage, search.held, cold=True)
             out.append(Tell(f"{why.reason}: searching the whole field"))
             return
-        self._search, self._done_at, self._waits_s = None, search.held, view.now_s
+        self._search, self._done_at, self._waits_s = None, search.held, inputs.now_s
         out.append(Tell(f"{why.reason}: go on to the next spot", done=True))
 
-    def _slipped(self, view: Inputs, search: PmSearch) -> str | None:
+    def _slipped(self, inputs: Inputs, search: PmSearch) -> str | None:
         """Why a search has to end; None if it goes on."""
-        newest = view.poses.newest()
-        if newest is None or view.now_s - newest.t_s > 1.0:
+        newest = inputs.poses.newest()
+        if newest is None or inputs.now_s - newest.t_s > 1.0:
             return "the marker is not seen"
         pose = newest.parent_T_child
         if moved_mm(pose, search.held) > SLIP_MM or turned_rad(pose, search.held) > SLIP_RAD:
@@ -329,29 +332,29 @@ class Workflow:
 
     # --- following --------------------------------------------------------------------------------------------------
 
-    def _follow(self, view: Inputs, stage: StageView, out: list[Action]) -> None:
-        answer, newest = view.answer, view.poses.newest()
-        if answer is None or answer.stage_rad is None or answer.sigma_rad is None or newest is None:
+    def _follow(self, inputs: Inputs, stage: StageView, out: list[Action]) -> None:
+        tracking, newest = inputs.tracking, inputs.poses.newest()
+        if tracking is None or tracking.stage_rad is None or tracking.sigma_rad is None or newest is None:
             return
-        plane = self._model.stage.scan_from_device(answer.stage_rad)
+        plane = self._model.stage.scan_from_device(tracking.stage_rad)
         if self._settings.follow and stage.requested is MotionKind.TRACK:
-            reason = f"following the beam, +- {math.degrees(answer.sigma_rad):.1f} deg"
-            out.append(Follow(plane, answer.sigma_rad, newest.t_s, reason))
-        held = held_pose(view.poses, view.now_s)
+            reason = f"following the beam, +- {math.degrees(tracking.sigma_rad):.1f} deg"
+            out.append(Follow(plane, tracking.sigma_rad, newest.t_s, reason))
+        held = held_pose(inputs.poses, inputs.now_s)
         if held is None or abs(stage.scan_rad - plane) > CHECK_RAD:
-            self._unheard = 0
+            self._missed = 0
             return
-        self._checks = view.now_s - self._checked_s > CHECK_S
-        for pulse in view.heard:
+        self._checks = inputs.now_s - self._checked_s > CHECK_S
+        for pulse in inputs.pulses:
             if pulse.scan_rad is None or abs(pulse.scan_rad - plane) > CHECK_RAD or pulse.pulse_s < self._not_before_s:
                 continue
-            self._checked_s = view.now_s
+            self._checked_s = inputs.now_s
             loud = pulse.amplitude is not None and pulse.amplitude >= self._settings.hearing_threshold
-            self._unheard = 0 if loud else self._unheard + 1
+            self._missed = 0 if loud else self._missed + 1
             if loud and pulse.marker is not None and self._is_another(held):
                 self._done_at = held
                 out.append(TakePairs(self._next_pm, (pulse,)))
                 self._next_pm += 1
                 self._pms += 1
-        if self._unheard == UNHEARD:
-            out.append(Tell("the PM is not heard where the registration expects it: has the camera moved?"))
+        if self._missed == MISSED:
+            out.append(Tell("the PM is not detected where the registration expects it: has the camera moved?"))

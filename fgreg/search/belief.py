@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.search.hearing import HearingModel
+from fgreg.search.detection_model import DetectionModel
 
 GRID_RAD = math.radians(0.1)
 """Spacing of angles."""
@@ -29,13 +29,13 @@ _NOISE_CLASSES = (1.0, 1.4, 2.0, 3.0, 6.0)
 class Belief:
     """Weights (J, K), summing to 1, over plane angles (J,) and log peaks (K,)."""
 
-    model: HearingModel
+    model: DetectionModel
     angle_rad: FloatArray
     log_peak: FloatArray
     weight: FloatArray
 
     @classmethod
-    def flat(cls, model: HearingModel, low_rad: float, high_rad: float) -> Self:
+    def flat(cls, model: DetectionModel, low_rad: float, high_rad: float) -> Self:
         """Uniform between two angles."""
         count = max(2, round((high_rad - low_rad) / GRID_RAD) + 1)
         angle = np.linspace(low_rad, high_rad, count)

@@ -19,7 +19,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.search.belief import Belief
-from fgreg.search.hearing import HearingModel
+from fgreg.search.detection_model import DetectionModel
 
 CANDIDATE_RAD = math.radians(0.5)
 """Spacing of the positions among which the next one is chosen."""
@@ -100,7 +100,7 @@ Step = Turn | Found | NotFound
 
 
 class SearchPlanner:
-    """One search: turn to the position of :meth:`next` and pass the look to :meth:`listened`, until ``next`` returns
+    """One search: turn to the position of :meth:`next` and pass the look to :meth:`add_look`, until ``next`` returns
     :class:`Found` or :class:`NotFound`.
 
     Args:
@@ -115,7 +115,7 @@ class SearchPlanner:
 
     def __init__(
         self,
-        model: HearingModel,
+        model: DetectionModel,
         low_rad: float,
         high_rad: float,
         stands_rad: float,
@@ -147,11 +147,11 @@ class SearchPlanner:
         self._queue = [prediction.scan_rad, *_around(prediction, model.reach_rad, self._low, self._high)]
 
     @property
-    def heard(self) -> bool:
+    def detected(self) -> bool:
         """Whether anything was detected up to now."""
         return any(amplitude is not None for _, amplitude in self._looks)
 
-    def listened(self, scan_rad: float, amplitude: float | None) -> None:
+    def add_look(self, scan_rad: float, amplitude: float | None) -> None:
         """Take in a look: the stage's reading (rad), and the amplitude or None if nothing was detected."""
         if not math.isfinite(scan_rad):
             raise ValueError(f"the stage's angle is {scan_rad}, expected a number")
@@ -164,19 +164,19 @@ class SearchPlanner:
         """The next step; the same as before if no look came in between."""
         count = len(self._looks)
         sigma = self._belief.sigma_rad()
-        if self.heard and sigma <= self.settings.stop_sigma_rad:
+        if self.detected and sigma <= self.settings.stop_sigma_rad:
             return Found(self._belief.best_rad(), sigma, count)
         if count >= self.settings.most_positions:
             return NotFound(f"still not known better than {math.degrees(sigma):.1f} deg after {count} positions", count)
-        if not self.heard or sigma > self._model.reach_rad:  # the PM may (still or again) be anywhere
+        if not self.detected or sigma > self._model.reach_rad:  # the PM may (still or again) be anywhere
             if self._queue:
-                return self._listen(self._queue[0])
-            if not self.heard:
-                return NotFound(self._silence(), count)
+                return self._queued(self._queue[0])
+            if not self.detected:
+                return NotFound(self._nothing_detected(), count)
         if self._beyond():
             at = math.degrees(self._belief.best_rad())
             return NotFound(
-                f"what is heard lies near {at:.1f} deg, too far from the prediction: search the field", count
+                f"the detected source lies near {at:.1f} deg, too far from the prediction: search the field", count
             )
         return self._refine(sigma)
 
@@ -184,18 +184,18 @@ class SearchPlanner:
         """Whether the PM lies outside the allowed positions, so that no look can come near it."""
         return self._belief.quantile(0.05) > self._high or self._belief.quantile(0.95) < self._low
 
-    def _listen(self, position: float) -> Turn:
+    def _queued(self, position: float) -> Turn:
         if self._prediction is not None:
             where = f"predicted {math.degrees(self._prediction.scan_rad):.1f} deg"
             reason = f"{where} +- {math.degrees(self._prediction.sigma_rad):.1f} deg"
             return Turn(position, Phase.PREDICTED, reason)
-        return Turn(position, Phase.SWEEP, f"sweep, position {len(self._looks) + 1}: nothing heard yet")
+        return Turn(position, Phase.SWEEP, f"sweep, position {len(self._looks) + 1}: nothing detected yet")
 
-    def _silence(self) -> str:
+    def _nothing_detected(self) -> str:
         low, high = math.degrees(self._low), math.degrees(self._high)
         if self._prediction is not None:
-            return f"nothing heard about the predicted angle, between {low:.1f} and {high:.1f} deg: search the field"
-        return f"nothing heard between {low:.1f} and {high:.1f} deg in {self.settings.passes} sweeps"
+            return f"nothing detected about the predicted angle, between {low:.1f} and {high:.1f} deg: search the field"
+        return f"nothing detected between {low:.1f} and {high:.1f} deg in {self.settings.passes} sweeps"
 
     def _refine(self, sigma: float) -> Turn:
         reach = 2.0 * self._model.reach_rad

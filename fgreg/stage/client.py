@@ -125,7 +125,7 @@ class StageLink:
         self._turn = threading.Lock()
         self._in = b""
         self._number = 0
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self._closed = False
         self._lost: str | None = None
         self._reports: list[Report] = []
@@ -295,7 +295,7 @@ class StageLink:
             self._log(StageRecord(time.monotonic(), "stop", None, self._unlogged[0].reason))
             self._unlogged.pop(0)
         reports, self._reports = self._reports, []
-        if time.monotonic() - self._heard_s > SILENT_S and not reports:
+        if time.monotonic() - self._received_s > SILENT_S and not reports:
             raise self._give_up(f"the stage's watchdog has been silent for {SILENT_S} s")
         return reports
 
@@ -310,7 +310,7 @@ class StageLink:
                 raise self._give_up(f"the stage's watchdog is gone: {error}") from error
             if not data:
                 raise self._give_up("the stage's watchdog is gone")
-            self._heard_s = time.monotonic()
+            self._received_s = time.monotonic()
             *lines, self._in = (self._in + data).split(b"\n")
             reports += [report for line in lines if (report := self._report(json.loads(line))) is not None]
 
@@ -344,7 +344,7 @@ class StageLink:
         first = json.loads(line)
         if first["report"] == "failed":
             raise StageError(f"the stage's driver did not start: {first['reason']}")
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
 
     # -- the end
 

@@ -83,7 +83,7 @@ class WorkerProcess(Generic[Request, Answer]):
         self.failure, self.lost, self.trouble = "", False, ""
         self._child: _Child | None = None
         self._awaited: Kind | None = None  # the one message that has not been answered, sent at _sent_s
-        self._sent_s = self._heard_s = self._started_s = 0.0
+        self._sent_s = self._received_s = self._started_s = 0.0
         self._waiting: tuple[Request] | None = None  # to be handed over
         self._reply: tuple[Answer | None] | None = None
         self._start()
@@ -136,7 +136,7 @@ class WorkerProcess(Generic[Request, Answer]):
     def check(self) -> None:
         """Check that the process is alive, also while it is idle. Call it often."""
         self._advance(0.0)
-        if self._child is not None and self._awaited is None and time.monotonic() - self._heard_s > PING_S:
+        if self._child is not None and self._awaited is None and time.monotonic() - self._received_s > PING_S:
             self._post(self._child, "ping", None)
 
     def close(self) -> None:
@@ -194,7 +194,7 @@ class WorkerProcess(Generic[Request, Answer]):
             failed = kind == "failed"
             self._reply = (None,) if failed else (value,)
             self.failure, self.lost = value if failed else "", False
-        self._awaited, self._heard_s, self.trouble = None, time.monotonic(), ""
+        self._awaited, self._received_s, self.trouble = None, time.monotonic(), ""
 
     def _post(self, child: _Child, kind: Kind, request: Request | None) -> None:
         """Send a message to an idle process."""

@@ -32,7 +32,7 @@ _LAPSE_LOG_SPAN = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HearingModel:
+class DetectionModel:
     """Gain against rotation, threshold, noise.
 
     Attributes:
@@ -54,7 +54,7 @@ class HearingModel:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.threshold) and self.threshold > 0):
-            raise ValueError(f"the hearing threshold is {self.threshold}, expected a number > 0")
+            raise ValueError(f"the detection threshold is {self.threshold}, expected a number > 0")
         if not (0 < self.amplitude_sigma <= 1 and min(self.scan_sigma_rad, self.width_sigma) >= 0 < self.reach_rad):
             raise ValueError("amplitude_sigma has to be in (0, 1], the other sigmas >= 0, reach_rad > 0")
 
@@ -114,10 +114,10 @@ class HearingModel:
             ValueError: an amplitude that is not a positive number.
         """
         if amplitude is None:
-            unheard = ndtr((math.log(self.threshold) - expected_log) / sigma)
-            return np.asarray((1.0 - LAPSE) * unheard + LAPSE)
+            missed = ndtr((math.log(self.threshold) - expected_log) / sigma)
+            return np.asarray((1.0 - LAPSE) * missed + LAPSE)
         if not (math.isfinite(amplitude) and amplitude > 0):
-            raise ValueError(f"the amplitude is {amplitude}, expected a number > 0, or None where nothing was heard")
+            raise ValueError(f"the amplitude is {amplitude}, expected a number > 0, or None where nothing was detected")
         z = (math.log(amplitude) - expected_log) / sigma
-        heard = np.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * sigma)
-        return np.asarray((1.0 - LAPSE) * heard + LAPSE / _LAPSE_LOG_SPAN)
+        detected = np.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * sigma)
+        return np.asarray((1.0 - LAPSE) * detected + LAPSE / _LAPSE_LOG_SPAN)
