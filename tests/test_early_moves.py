@@ -57,6 +57,20 @@ def test_a_move_after_few_pms_is_found_and_they_become_an_epoch_of_their_own(bef
     assert len(measurements.pairs) == before + 12
 
 
+def test_few_pairs_before_a_move_lead_no_registration_astray() -> None:
+    # Four pairs determine the old registration so weakly that full steps of its optimum diverge, to 1e22 mm.
+    model, measurements, truths = unreported_move(6, BUMP, 14, 4)
+    engine = OnlineRegistration(model, verdicts=False)
+    for _, event in events_in_order(measurements):
+        engine.add(event)
+    assert [move.since for move in engine.moves] == [4]
+    earlier, estimate = engine.state.epochs[0].state, engine.estimate
+    assert earlier is not None
+    assert np.linalg.norm(earlier.translation_mm) < 300.0
+    assert estimate.trus_T_camera is not None
+    assert tre_mm(estimate.trus_T_camera, truths[1].trus_T_camera[0], model.targets_mm).max() < 3.0
+
+
 def test_online_and_batch_find_the_same_early_move() -> None:
     model, measurements, _, engine = _ran(4)
     moves = find_moves(measurements, model, SolveConfig())

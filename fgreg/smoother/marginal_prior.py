@@ -19,11 +19,13 @@ from fgreg.model.measurements import EpochStart
 from fgreg.smoother.shared_variables import Quadratic, small_step
 
 PRIVATE_ROUNDS = 3
-EARLIER_ROUNDS = 5
+EARLIER_ROUNDS = 8
 EARLIER_SETTLED = 1e-4
 """Newton decrement (chi square) below which the earlier registrations are at their optimum."""
-UNSEEN = 1e-12
-"""Eigenvalue of a correlation matrix below which its pairs do not determine a direction of an earlier registration."""
+WEAK_RAD, WEAK_MM = 1.0, 100.0
+"""Sigmas of a weak prior on each earlier registration, about its estimate: few pairs do not determine it."""
+DAMPING = 10.0
+"""Factor on the weak prior's information after a step that does not lower the cost."""
 FAR_RAD, FAR_MM, FAR_EDGE_RAD, FAR_RATIO = 2e-3, 0.2, 1e-3, 1e-3
 """Steps of the estimate from the linearisation point beyond which a marginal prior is linearised again."""
 
@@ -45,17 +47,12 @@ def marginal_prior(problem: PackedProblem, state: SharedState) -> tuple[Quadrati
     earlier = 6 * (problem.columns.epochs - 1)
     private = _settled(problem, state, initial_private(problem, state), PRIVATE_ROUNDS)
     at = evaluate(problem, state, private)
-    back = np.zeros((0, 0))
-    for _ in range(EARLIER_ROUNDS if earlier else 0):
-        back = _pseudo_inverse(at.hessian[0, :earlier, :earlier])
-        step = np.zeros((1, problem.columns.size))
-        step[0, :earlier] = -back @ at.gradient[0, :earlier]
-        if float(-step[0, :earlier] @ at.gradient[0, :earlier]) < EARLIER_SETTLED:
-            break
-        state, at = _moved(problem, state, at, step)
+    if earlier:
+        state, at = _earlier_settled(problem, state, at, earlier)
     hessian, gradient = at.hessian[0], at.gradient[0]
     cost = float(at.cost[0])
     if earlier:
+        back = np.linalg.inv(hessian[:earlier, :earlier] + np.diag(_weak(earlier)))
         cross = hessian[:earlier, earlier:]
         hessian = hessian[earlier:, earlier:] - cross.T @ back @ cross
         cost -= float(gradient[:earlier] @ back @ gradient[:earlier])
@@ -73,6 +70,35 @@ def _settled(problem: PackedProblem, state: SharedState, private: PrivateState, 
     return private
 
 
+def _earlier_settled(
+    problem: PackedProblem, state: SharedState, at: Evaluation, earlier: int
+) -> tuple[SharedState, Evaluation]:
+    """The problem with its first ``earlier`` columns, the earlier registrations, at their optimum given all else.
+
+    Levenberg's steps: three or four pairs before an unreported camera move determine a registration so weakly that
+    full steps diverge.
+    """
+    damping = 1.0
+    for _ in range(EARLIER_ROUNDS):
+        gradient = at.gradient[0, :earlier]
+        damped = at.hessian[0, :earlier, :earlier] + np.diag(damping * _weak(earlier))
+        step = np.zeros((1, problem.columns.size))
+        step[0, :earlier] = -np.linalg.solve(damped, gradient)
+        if float(-step[0, :earlier] @ gradient) < EARLIER_SETTLED:
+            break
+        there, then = _moved(problem, state, at, step)
+        if then.cost[0] < at.cost[0]:
+            state, at, damping = there, then, 1.0
+        else:
+            damping *= DAMPING
+    return state, at
+
+
+def _weak(earlier: int) -> FloatArray:
+    """(earlier,) information of the weak prior."""
+    return np.tile(np.repeat([WEAK_RAD**-2, WEAK_MM**-2], 3), earlier // 6)
+
+
 def _moved(
     problem: PackedProblem, state: SharedState, at: Evaluation, step: FloatArray
 ) -> tuple[SharedState, Evaluation]:
@@ -81,13 +107,6 @@ def _moved(
     state = state.retract(step, problem.columns)
     private = _settled(problem, state, replace(at.private, trus_p_pm=points), 1)
     return state, evaluate(problem, state, private)
-
-
-def _pseudo_inverse(hessian: FloatArray) -> FloatArray:
-    """Inverse over the observed directions: one or two pairs do not determine the whole registration of an epoch."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    outer = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(hessian * outer, rcond=UNSEEN, hermitian=True) * outer)
 
 
 def has_moved(prior: Quadratic, state: SharedState, problem: PackedProblem) -> bool:
