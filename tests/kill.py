@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.detection.events_to_measurements import EventRecogniser
+from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.model.events import AimEvent, PairEvent
 from fgreg.model.measurements import Aim, Pair
 from fgreg.online.live_session import EpochFeed, LiveSession, online_engine
@@ -202,11 +202,11 @@ def difference_from_uninterrupted(folder: Path, source: Path) -> float:
     """Largest difference of registration and covariance: reopened, and the same events taken in without a break."""
     with LiveSession.open(folder) as live:
         reopened, model, config = live.estimate, live.journal.model, live.config
-    feed, recogniser = EpochFeed(online_engine(model, config, None)), EventRecogniser(model)
+    feed, extractor = EpochFeed(online_engine(model, config, None)), MeasurementExtractor(model)
     unbroken = None
     for event in read_session(folder).events:
         if isinstance(event, AimEvent | PairEvent):
-            shot = recogniser.add(event, feed.epoch)
+            shot = extractor.add(event, feed.epoch)
             if isinstance(shot, Aim | Pair):
                 unbroken = feed.add(shot) or unbroken
     if reopened is None or unbroken is None:

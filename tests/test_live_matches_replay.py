@@ -57,7 +57,7 @@ def test_settled_a_live_session_and_its_replay_have_the_same_epochs_verdict_and_
     assert there is not None
     assert (settled.verdict, settled.epoch, settled.pairs) == (there.verdict, there.epoch, there.pairs)
     assert settled.reasons == there.reasons
-    assert [p.epoch for p in replayed.solved.recognised.measurements.pairs] == [p.epoch for p in taken.pairs]
+    assert [p.epoch for p in replayed.solved.extracted.measurements.pairs] == [p.epoch for p in taken.pairs]
     assert settled.trus_T_camera is not None
     assert settled.covariance is not None
     assert there.trus_T_camera is not None

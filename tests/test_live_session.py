@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.detection.events_to_measurements import recognise
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.model.events import (
     AimEvent,
@@ -72,7 +72,7 @@ def test_reopened_at_any_moment_it_goes_on_with_the_estimate_of_before(pose_sess
             estimate = live.estimate
     again = read_session(folder).events
     assert [(type(e), e.t) for e in again] == [(type(e), e.t) for e in events]
-    whole = recognise(again, read_session(folder).model)
+    whole = extract_measurements(again, read_session(folder).model)
     with LiveSession.open(folder, make_engine=BatchEngine) as live:
         settled = live.settle()
         model = live.journal.model
@@ -141,7 +141,7 @@ def test_an_event_that_the_engine_refuses_is_recorded_as_refused_and_never_taken
     with LiveSession.open(folder, make_engine=BatchEngine) as live:
         same(live.estimate, after)
     # A solve of the recorded session leaves it out too, and says why.
-    solved = recognise(recorded.events, recorded.model)
+    solved = extract_measurements(recorded.events, recorded.model)
     assert [pair.t for pair in solved.measurements.pairs] == [pair.t for pair in [*pairs[:9], pairs[10]]]
     assert any("indeterminate" in reason for reason in solved.unused.values())
 
@@ -268,7 +268,7 @@ def test_told_and_noticed_moves_of_the_camera_are_epochs_for_every_reader(tmp_pa
             same(live.estimate, estimate)
             assert [pair.epoch for pair in live.measurements().pairs] == epochs
             assert len(read_session(folder).events) == len(recorded.events)
-    solved = recognise(recorded.events, recorded.model).measurements
+    solved = extract_measurements(recorded.events, recorded.model).measurements
     assert [pair.epoch for pair in solved.pairs] == epochs
     # A move that is told is an epoch as well.
     (folder / "events.jsonl").unlink()

@@ -76,8 +76,8 @@ def test_measurements_are_solved_as_in_their_session(pose_session: Path) -> None
     report = fgreg.solve(str(pose_session), fgreg.SolveConfig(limit_mm=3.0), out=pose_session / "own.yaml")
     assert (pose_session / "own.yaml").is_file()
     assert not (pose_session / "result.yaml").exists()
-    recognised = report.recognised
-    estimate = fgreg.solve_measurements(recognised.measurements, report.session.model, tracks=recognised.tracks)
+    extracted = report.extracted
+    estimate = fgreg.solve_measurements(extracted.measurements, report.session.model, tracks=extracted.tracks)
     assert estimate.verdict is report.estimate.verdict
     assert estimate.verdict is not fgreg.Verdict.REFUSED
     ours, theirs = estimate.epochs[0].predicted_tre, report.estimate.epochs[0].predicted_tre

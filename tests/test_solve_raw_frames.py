@@ -105,7 +105,7 @@ def test_a_recorded_pose_wins_unless_detection_is_asked_for(raw_session: Path, s
     _write(raw_session, events)
     posed = solve_session(SolveRequest(raw_session))
     again = solve_session(SolveRequest(raw_session, redetect=True))
-    posed_marker = posed.recognised.measurements.pairs[0].marker.camera_T_marker
+    posed_marker = posed.extracted.measurements.pairs[0].marker.camera_T_marker
     np.testing.assert_allclose(posed_marker[:3, 3], [0, 0, 100])
     first, redone = solved.report.estimate.epochs[0].trus_T_camera, again.estimate.epochs[0].trus_T_camera
     assert first is not None

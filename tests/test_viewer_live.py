@@ -20,7 +20,7 @@ from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.time_sync import Stamp
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.viewer.live import Moment
+from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.shapes import CANVAS, canvas
 from fgreg.viewer.status_line import Now
@@ -37,10 +37,10 @@ def bmode(placed: bool = True) -> BmodeFrame:
     return BmodeFrame(Stamp(0.0, 0.0), PICTURE, 0, (0.5, 0.25), (2.0, -3.0) if placed else None)
 
 
-def moment(number: int, now: Now, verdict: Verdict | None = Verdict.OK) -> Moment:
+def update(number: int, now: Now, verdict: Verdict | None = Verdict.OK) -> ViewerUpdate:
     """``verdict`` None: no registration."""
     track = Track(float(number), 0, MarkerObservation(np.eye(4), np.eye(6), number), ())
-    return Moment(
+    return ViewerUpdate(
         float(number),
         number,
         track,
@@ -59,12 +59,12 @@ def moment(number: int, now: Now, verdict: Verdict | None = Verdict.OK) -> Momen
     )
 
 
-def recorded(path: Path, shown: list[tuple[Moment, BmodeFrame | None]]) -> dict[str, list[Row]]:
+def recorded(path: Path, shown: list[tuple[ViewerUpdate, BmodeFrame | None]]) -> dict[str, list[Row]]:
     with Viewer(path, "live") as viewer:
         viewer.session(make_model())
         for one, picture in shown:
             viewer.bmode(one.t, one.number, picture)
-            viewer.moment(one)
+            viewer.update(one)
     return read_recording(path)
 
 
@@ -74,7 +74,7 @@ def page(rows: dict[str, list[Row]], number: int) -> str:
 
 
 def test_the_plane_stands_where_the_stage_is_and_the_goal_where_the_beam_will_be_heard(tmp_path: Path) -> None:
-    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), None)])
+    rows = recorded(tmp_path / "a.rrd", [(update(0, NOW), None)])
     for entity, scan_rad in (("/world/stage", SCAN_RAD), ("/world/goal", GOAL_RAD)):
         up = transform_of(rows[entity][-1])[:3, :3] @ [0.0, 0.0, 1.0]
         np.testing.assert_allclose(up, [0.0, math.sin(scan_rad), math.cos(scan_rad)], atol=1e-6)
@@ -92,7 +92,7 @@ def test_the_plane_stands_where_the_stage_is_and_the_goal_where_the_beam_will_be
 
 def test_a_bmode_picture_lies_in_the_plane_with_its_pixels_size_and_goes_when_its_scanner_goes(tmp_path: Path) -> None:
     lost = replace(NOW, lost=("bmode",))
-    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), bmode()), (moment(1, lost), None)])
+    rows = recorded(tmp_path / "a.rrd", [(update(0, NOW), bmode()), (update(1, lost), None)])
     with_it, without = rows["/world/stage/plane"]
     corners = with_it.array("Mesh3D:vertex_positions")
     radius = make_model().probe.radius_mm
@@ -107,7 +107,7 @@ def test_a_bmode_picture_lies_in_the_plane_with_its_pixels_size_and_goes_when_it
 
 
 def test_a_picture_whose_place_is_not_known_is_shown_beside_only_and_says_so(tmp_path: Path) -> None:
-    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), bmode(placed=False))])
+    rows = recorded(tmp_path / "a.rrd", [(update(0, NOW), bmode(placed=False))])
     assert "its position in the plane is not known" in rows["/bmode/caption"][-1].values["Points2D:labels"][0]
     (plane,) = rows["/world/stage/plane"]
     assert len(plane.values["Mesh3D:albedo_texture_buffer"][0]) == 3
@@ -115,7 +115,7 @@ def test_a_picture_whose_place_is_not_known_is_shown_beside_only_and_says_so(tmp
 
 def test_without_a_registration_no_camera_stands_anywhere_and_lost_devices_are_to_be_got_back(tmp_path: Path) -> None:
     gone = replace(NOW, lost=("camera", "stage", "sink 1"), scan_rad=None, goal_rad=None)
-    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW, None), bmode()), (moment(1, gone, None), None)])
+    rows = recorded(tmp_path / "a.rrd", [(update(0, NOW, None), bmode()), (update(1, gone, None), None)])
     for entity in ("/world/camera", "/world/stage", "/world/camera/marker"):
         assert rows[entity][-1].values["Transform3D:parent_frame"] == ["not known"]
     text = page(rows, 1)
@@ -126,7 +126,7 @@ def test_without_a_registration_no_camera_stands_anywhere_and_lost_devices_are_t
 
 
 def test_the_last_picture_says_that_the_session_is_over(tmp_path: Path) -> None:
-    rows = recorded(tmp_path / "a.rrd", [(moment(0, NOW), None), (moment(1, replace(NOW, ended=True)), None)])
+    rows = recorded(tmp_path / "a.rrd", [(update(0, NOW), None), (update(1, replace(NOW, ended=True)), None)])
     assert page(rows, 1).startswith("# THE SESSION HAS ENDED")
     assert "Next:" not in page(rows, 1)
     assert "Now" in views(tmp_path / "a.rrd").values()  # closing takes no view away

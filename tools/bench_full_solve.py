@@ -1,10 +1,10 @@
 """Processor time of one full solve (registration, posterior, verdict), against another checkout of the package.
 
-Cases: the first 3 to 15 pairs of sessions/paper, of sessions/phantom (its frames are recognised first, which does not
-count) and of simulated sessions; simulated sessions of 25 pairs of which a fifth are outliers. Both checkouts run in a
-process each, turn by turn, one solve at a time. Printed: the median processor time (user and system, ms) of each case
-and the ratio to the other checkout, the longest solve, and how far the two answers are apart: verdict, outliers, and
-the registration in standard deviations.
+Cases: the first 3 to 15 pairs of sessions/paper, of sessions/phantom (its frames are processed before) and of simulated
+sessions; simulated sessions of 25 pairs of which a fifth are outliers. Each checkout runs in a process of its own; they
+take turns, one solve at a time. Printed: the median processor time (user and system, ms) of each case and the ratio to
+the other checkout, the longest solve, and the differences of the two results: verdict, outliers, and the registration
+in standard deviations.
 
     python tools/bench_full_solve.py --against ../fgreg-before
 """
@@ -12,6 +12,7 @@ the registration in standard deviations.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
 import os
@@ -33,18 +34,20 @@ MODULES = {
     "solve": ("registration.solve", "batch"),
     "SolveConfig": ("model.solve_config", "config"),
     "read_session": ("session.session_reader", "session.reading"),
-    "recognise": ("detection.events_to_measurements", "recognition"),
+    "extract_measurements": (
+        "detection.events_to_measurements",
+        "detection.events_to_measurements:recognise",
+        "recognition:recognise",
+    ),
 }
-"""Where a name is, in this checkout or in an older one."""
+"""Where a name is, in this checkout or in an older one (with the name that it had there)."""
 
 
 def _named(name: str) -> Any:
-    for module in MODULES[name]:
-        try:
-            found = importlib.import_module(f"fgreg.{module}")
-        except ImportError:
-            continue
-        return getattr(found, name)
+    for place in MODULES[name]:
+        module, _, older_name = place.partition(":")
+        with contextlib.suppress(ImportError, AttributeError):
+            return getattr(importlib.import_module(f"fgreg.{module}"), older_name or name)
     raise SystemExit(f"{name} is in none of {MODULES[name]}")
 
 
@@ -58,7 +61,7 @@ def _cases(checkout: Path, sizes: list[int], seeds: int, *, phantom: bool) -> It
     forward, junk = importlib.import_module("tests.forward"), importlib.import_module("tools.study_junk")
     for name in ("paper", "phantom") if phantom else ("paper",):
         session = _named("read_session")(checkout / "sessions" / name)
-        measurements = _named("recognise")(session.events, session.model).measurements
+        measurements = _named("extract_measurements")(session.events, session.model).measurements
         for count in sizes:
             if count <= len(measurements.pairs):
                 yield f"{name} {count}", session.model, _first_pairs(measurements, count)
@@ -162,7 +165,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--seeds", type=int, default=6, help="simulated sessions of each kind")
     parser.add_argument("--pairs", type=int, nargs="*", default=list(PAIRS))
-    parser.add_argument("--phantom", action="store_true", help="sessions/phantom as well: some 20 s to recognise")
+    parser.add_argument("--phantom", action="store_true", help="sessions/phantom as well: some 20 s for its frames")
     parser.add_argument("--differences", action="store_true", help="print the cases whose answers differ")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from fgreg.detection.events_to_measurements import recognise
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -46,7 +46,7 @@ def session(folder: Path, name: str, pairs: int, seed: int) -> tuple[SessionMode
     path = folder / name
     write_session(simulate(replace(PRESETS["first-hit"], pairs=pairs), seed), path)
     read = read_session(path)
-    return read.model, recognise(read.events, read.model).measurements
+    return read.model, extract_measurements(read.events, read.model).measurements
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from baseline_alternating import LinesAndArcs, register_alternating
 from baseline_point_based import register_points
 from cramer_rao_bound import FullTruth, beam_covariance, truth_covariance
-from fgreg.detection.events_to_measurements import recognise
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import EstimationError
 from fgreg.evaluation.pair_residual import line_to_arc
 from fgreg.evaluation.resolve import pair_residuals, predict
@@ -75,7 +75,7 @@ def simulated(config: SimulationConfig, seed: int) -> Sim:
     with tempfile.TemporaryDirectory() as name:
         write_session(made, Path(name) / "s")
         session = read_session(Path(name) / "s")
-        read = recognise(session.events, session.model)
+        read = extract_measurements(session.events, session.model)
     truth = FullTruth(
         trus_T_camera=made.scene.trus_T_camera,
         marker_T_laser=made.scene.marker_T_laser,

@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.detection.events_to_measurements import recognise
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import EstimationError
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
@@ -166,7 +166,7 @@ def main() -> None:
             path = Path(folder) / str(index)
             write_session(simulated, path)
             session = read_session(path)
-            start = recognise(session.events, session.model).measurements
+            start = extract_measurements(session.events, session.model).measurements
             for place, (arm, sessions) in enumerate(arms.items()):
                 rng = np.random.default_rng([seed, place])
                 try:

@@ -58,7 +58,7 @@ def started_at_truth(report: SolveReport) -> float:
     if truth is None or truth.marker_T_laser is None:
         raise SystemExit("no truth in the session")
     options = GraphOptions(marker_T_nominal=truth.marker_T_laser)
-    explicit = build_graph(report.recognised.measurements, model, options)
+    explicit = build_graph(report.extracted.measurements, model, options)
     shared = SharedValues(truth.trus_T_camera, np.zeros(4))
     found = read_shared(explicit, optimize(explicit, initial_values(explicit, shared)).values, shared)
     camera_p = transform_points(inverse(truth.trus_T_camera[0]), model.targets_mm)
@@ -81,7 +81,7 @@ def collect(report: SolveReport, figures: Figures, limit_mm: float) -> None:
     epoch = estimate.epochs[0]
     if epoch.predicted_tre is not None:
         figures.predicted_mm.append(epoch.predicted_tre.mean_mm)
-    events = [report.session.events[i] for i in report.recognised.track_events]
+    events = [report.session.events[i] for i in report.extracted.track_events]
     if report.solution.snapshot is None:
         return
     for track, error, event in zip(estimate.tracks, errors.track_rad, events, strict=False):

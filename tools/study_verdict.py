@@ -37,7 +37,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.detection.events_to_measurements import recognise
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.geometry.transforms import (
     FloatArray,
     as_float_array,
@@ -219,7 +219,7 @@ def run(job: tuple[int, str, float]) -> Outcome:
         path = Path(folder) / "session"
         write_session(simulate(configuration(kind, rng), seed), path)
         session, truth = read_session(path), read_ground_truth(path)
-        measurements = recognise(session.events, session.model).measurements
+        measurements = extract_measurements(session.events, session.model).measurements
     if truth is None:
         raise SystemExit("no truth in the session")
     solution = solve(spoiled(kind, measurements, rng), [], session.model, config)

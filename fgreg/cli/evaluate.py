@@ -174,7 +174,7 @@ def write_text(path: Path, text: str, option: str) -> None:
 
 def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]":
     """A session as a case, with detection in its frames done once, and the conditions from the detection."""
-    from fgreg.detection.events_to_measurements import recognise
+    from fgreg.detection.events_to_measurements import extract_measurements
     from fgreg.evaluation.case import Case, Truth
     from fgreg.model.solve_config import SolveConfig
     from fgreg.pipeline.solve import detection_conditions
@@ -185,11 +185,13 @@ def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]
     for warning in session.warnings:
         sys.stderr.write(f"fgreg: warning: {warning}\n")
     step = f"looking at frames of {session.model.name}"
-    recognised = recognise(session.events, session.model, progress=lambda done, total: progress(step, done, total))
+    extracted = extract_measurements(
+        session.events, session.model, progress=lambda done, total: progress(step, done, total)
+    )
     truth = None
     if known is not None:
         stage = {round(track.t, 6): track.stage_rad for track in known.tracks}
-        answers = tuple(stage.get(round(track.t, 6)) for track in recognised.tracks)
+        answers = tuple(stage.get(round(track.t, 6)) for track in extracted.tracks)
         truth = Truth(known.trus_T_camera, known.marker_T_laser, answers)
-    case = Case(session.model.name, session.model, recognised.measurements, recognised.tracks, truth)
-    return case, detection_conditions(recognised, SolveConfig())
+    case = Case(session.model.name, session.model, extracted.measurements, extracted.tracks, truth)
+    return case, detection_conditions(extracted, SolveConfig())

@@ -178,16 +178,16 @@ def _summary_extras(report: "SolveReport") -> Any:
     from fgreg.detection.results import MarkerFit, PaFind
     from fgreg.model.events import PairEvent
 
-    recognised, errors = report.recognised, report.errors
-    looks = dict(zip(recognised.pair_events, (pair.look for pair in recognised.measurements.pairs), strict=True))
+    extracted, errors = report.extracted, report.errors
+    looks = dict(zip(extracted.pair_events, (pair.look for pair in extracted.measurements.pairs), strict=True))
     pair_events = [index for index, event in enumerate(report.session.events) if isinstance(event, PairEvent)]
     detections = None
-    if recognised.markers or recognised.finds:
+    if extracted.markers or extracted.finds:
         detections = DetectionFigures(
-            markers_found=sum(isinstance(fit, MarkerFit) for fit in recognised.markers.values()),
-            markers_total=len(recognised.markers),
-            sources_found=sum(isinstance(find, PaFind) for find in recognised.finds.values()),
-            sources_total=len(recognised.finds),
+            markers_found=sum(isinstance(fit, MarkerFit) for fit in extracted.markers.values()),
+            markers_total=len(extracted.markers),
+            sources_found=sum(isinstance(find, PaFind) for find in extracted.finds.values()),
+            sources_total=len(extracted.finds),
         )
     truth = None
     if errors is not None:

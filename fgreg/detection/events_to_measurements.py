@@ -54,7 +54,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recognised:
+class ExtractedMeasurements:
     """Measurements of a session, and the result for each event.
 
     Attributes:
@@ -91,9 +91,9 @@ def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
     return record.camera_T_marker.tobytes()
 
 
-def recognise(
+def extract_measurements(
     events: Sequence[Event], model: SessionModel, *, redetect: bool = False, progress: Progress | None = None
-) -> Recognised:
+) -> ExtractedMeasurements:
     """Turn a session's events into measurements.
 
     Args:
@@ -122,7 +122,7 @@ def recognise(
             builder.add(index, event, epoch_of[index])
         elif isinstance(event, AimEvent | PairEvent | TrackEvent):
             builder.unused[index] = f"it was refused when it was taken: {refused[event.line]}"
-    return Recognised(
+    return ExtractedMeasurements(
         measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts),
         tracks=tuple(builder.tracks),
         aim_events=tuple(builder.aim_events),
@@ -287,7 +287,7 @@ class _Builder:
         )
 
 
-class EventRecogniser:
+class MeasurementExtractor:
     """Turns events into measurements one by one; corner noise is pooled over the frames up to now.
 
     The measurement of an event depends only on the accepted aims and pairs before it. The same events therefore give

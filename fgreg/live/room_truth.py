@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.detection.events_to_measurements import recognise
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import FgregError, InputError
 from fgreg.model.measurements import Measurements
 from fgreg.schema.yaml_writer import yaml_text
@@ -40,7 +40,7 @@ def write_room_truth(truth_at: TruthAt, folder: Path, start_s: float, begin_t: f
         FgregError: the room does not answer, or the truth of the earlier epochs is unknown.
     """
     session = read_session(folder)
-    measured = recognise(session.events, session.model).measurements
+    measured = extract_measurements(session.events, session.model).measurements
     last_t = session.events[-1].t if session.events else 0.0
     at_t = _epoch_ends(measured, last_t)
     earlier = read_ground_truth(folder)

@@ -22,7 +22,7 @@ from fgreg.model.events import AimEvent, NoteEvent, PairEvent
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
 from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.viewer.live import Moment
+from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.scene import ShotKind
@@ -188,8 +188,8 @@ class RerunFeed:
             right = None if kind == "track" else drawing.frame.right  # one view is enough between events
             self._viewer.shot_images(drawing.t, kind, number, drawing.frame.left, right)
         self._viewer.bmode(drawing.t, number, None if status is None else status.bmode)
-        self._viewer.moment(
-            Moment(
+        self._viewer.update(
+            ViewerUpdate(
                 t=drawing.t,
                 number=number,
                 shot=drawing.shot,

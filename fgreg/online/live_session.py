@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from fgreg.detection.events_to_measurements import EventRecogniser
+from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import TrackEstimate
@@ -137,7 +137,7 @@ class LiveSession:
     def _begin_with(self, engine: Engine) -> None:
         """Start with an engine that has taken in nothing yet."""
         self._engine, self._feed = engine, EpochFeed(engine)
-        self._recogniser = EventRecogniser(self.journal.model)
+        self._extractor = MeasurementExtractor(self.journal.model)
 
     @classmethod
     def open(
@@ -256,7 +256,7 @@ class LiveSession:
             kept = self.journal.append(query).event
             if isinstance(kept, TrackEvent):
                 query = kept
-        found = self._recogniser.add(query, self._feed.epoch)
+        found = self._extractor.add(query, self._feed.epoch)
         if isinstance(found, Track):
             return replace(self._engine.track(found), causal=True)
         return TrackEstimate(query.t, None, None, None, causal=True, reason=str(found))
@@ -345,12 +345,12 @@ class LiveSession:
         estimate: OnlineEstimate | None = None
         try:
             if isinstance(event, AimEvent | PairEvent):
-                found = self._recogniser.add(event, self._feed.epoch)
+                found = self._extractor.add(event, self._feed.epoch)
                 if isinstance(found, Aim | Pair):
                     try:
                         estimate = self._feed.add(found)
                     except BaseException:  # nor may its frames count: the session opened again would lack them
-                        self._recogniser.take_back()
+                        self._extractor.take_back()
                         raise
             elif isinstance(event, CameraMovedEvent):
                 estimate = self._feed.add(event)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgreg.detection.events_to_measurements import Recognised, recognise
+from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.errors import EventRefused, InputError
 from fgreg.model.estimate import Quantiles, Timing, TrackEstimate, Verdict
 from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent, TrackEvent, refused_lines
@@ -39,7 +39,7 @@ from fgreg.registration.solve import solve
 from fgreg.session.result_file import write_result
 from fgreg.session.session_reader import Session, read_ground_truth, read_session
 from fgreg.version import __version__
-from fgreg.viewer.live import Moment
+from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.spawn import spawn_viewer
@@ -132,17 +132,17 @@ def replay_session(
     url = spawn_viewer() if request.live else None
     with open_viewer(request.rrd, session.model.name, url) as viewer:
         viewer.session(session.model)
-        recognised = recognise(
+        extracted = extract_measurements(
             session.events,
             session.model,
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        prior = sound_speed_prior(recognised, config)
+        prior = sound_speed_prior(extracted, config)
         # Moves that were detected during recording are events: they are used as recorded, without a new search.
         recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
         engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config, prior)
-        player = _Player(session, recognised, engine, viewer, request.speed)
+        player = _Player(session, extracted, engine, viewer, request.speed)
         player.play(on_step)
         taken, found = player.taken(), player.found()
         solution = solve(
@@ -150,14 +150,14 @@ def replay_session(
             (),
             session.model,
             config,
-            [*move_conditions(found), *detection_conditions(recognised, config)],
+            [*move_conditions(found), *detection_conditions(extracted, config)],
             prior,
         )
         settled = engine.settle() if player.estimate is not None else None
         estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())
         estimate = replace(estimate, tracks=player.answers(estimate.tracks))
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
-        viewer.result(session.model, taken.measurements, estimate, truth, recognised.tracks)
+        viewer.result(session.model, taken.measurements, estimate, truth, extracted.tracks)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
     solved = SolveReport(session, taken, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
@@ -170,19 +170,19 @@ class _Player:
     def __init__(
         self,
         session: Session,
-        recognised: Recognised,
+        extracted: ExtractedMeasurements,
         engine: Engine,
         viewer: Viewer | NullViewer,
         speed: float | None,
     ) -> None:
-        self._session, self._recognised, self._engine = session, recognised, engine
+        self._session, self._extracted, self._engine = session, extracted, engine
         self._viewer, self._speed, self._feed = viewer, speed, EpochFeed(engine)
         self._measured: dict[int, Aim | Pair | Track] = {
-            **dict(zip(recognised.aim_events, recognised.measurements.aims, strict=True)),
-            **dict(zip(recognised.pair_events, recognised.measurements.pairs, strict=True)),
-            **dict(zip(recognised.track_events, recognised.tracks, strict=True)),
+            **dict(zip(extracted.aim_events, extracted.measurements.aims, strict=True)),
+            **dict(zip(extracted.pair_events, extracted.measurements.pairs, strict=True)),
+            **dict(zip(extracted.track_events, extracted.tracks, strict=True)),
         }
-        self._unused = dict(recognised.unused)
+        self._unused = dict(extracted.unused)
         self._add_ms: list[float] = []
         self._track_ms: list[float] = []
         self._answers: dict[int, TrackEstimate] = {}
@@ -203,7 +203,7 @@ class _Player:
                 time.sleep(max(0.0, wait))
             step = replace(self._take(index, event), done=done, total=len(shown))
             if not isinstance(event, CameraMovedEvent):
-                show_frames(self._viewer, self._session, self._recognised, index, event, shot)
+                show_frames(self._viewer, self._session, self._extracted, index, event, shot)
             self._show(index, event, shot, step)
             shot += not isinstance(event, CameraMovedEvent)
             if on_step is not None:
@@ -234,8 +234,8 @@ class _Player:
         if isinstance(self._viewer, NullViewer):
             return
         known = self.estimate
-        self._viewer.moment(
-            Moment(
+        self._viewer.update(
+            ViewerUpdate(
                 t=event.t,
                 number=shot,
                 shot=self._measured.get(index) if not step.refused else None,
@@ -253,19 +253,19 @@ class _Player:
             )
         )
 
-    def taken(self) -> Recognised:
+    def taken(self) -> ExtractedMeasurements:
         """The engine's measurements, the events they come from, and the reasons of unused events."""
-        recognised, measurements = self._recognised, self._engine.measurements()
-        epoch_of = recognised.epoch_of
+        extracted, measurements = self._extracted, self._engine.measurements()
+        epoch_of = extracted.epoch_of
         if self._engine.moves:
             began = [start.t for start in measurements.epochs[1:]]
             epoch_of = tuple(sum(t <= event.t for t in began) for event in self._session.events)
         return replace(
-            recognised,
+            extracted,
             measurements=measurements,
             epoch_of=epoch_of,
-            aim_events=tuple(i for i in recognised.aim_events if i not in self._unused),
-            pair_events=tuple(i for i in recognised.pair_events if i not in self._unused),
+            aim_events=tuple(i for i in extracted.aim_events if i not in self._unused),
+            pair_events=tuple(i for i in extracted.pair_events if i not in self._unused),
             tracks=(),
             unused=self._unused,
         )

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fgreg.detection.camera import project
-from fgreg.detection.events_to_measurements import Recognised, recognise
+from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.detection.results import MarkerFit, NoSignal, PaFind, pool_sound_speed_ratio
 from fgreg.errors import InputError
 from fgreg.geometry.target_error import beam_error, tre_mm
@@ -88,7 +88,7 @@ class SolveReport:
 
     Attributes:
         session: as read.
-        recognised: detections in its frames; ``recognised.measurements`` were solved.
+        extracted: detections in its frames; ``extracted.measurements`` were solved.
         solution: the estimate with its registration, posterior and snapshot.
         estimate: contents of ``result.yaml``: verdict, reasons, beam, epochs, pairs, tracks, aims.
         truth: of ``ground_truth.yaml``. errors: against it; None where there is none.
@@ -97,7 +97,7 @@ class SolveReport:
     """
 
     session: Session
-    recognised: Recognised
+    extracted: ExtractedMeasurements
     solution: Solution
     estimate: SessionEstimate
     truth: GroundTruth | None
@@ -124,35 +124,35 @@ def solve_session(
     session = read_session(request.folder)
     truth = read_ground_truth(request.folder)
     with open_viewer(request.rrd, session.model.name) as viewer:
-        recognised = recognise(
+        extracted = extract_measurements(
             session.events,
             session.model,
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        prior = sound_speed_prior(recognised, config)
+        prior = sound_speed_prior(extracted, config)
         moves: tuple[DetectedMove, ...] = ()
-        conditions = detection_conditions(recognised, config)
+        conditions = detection_conditions(extracted, config)
         if request.detect_moves:
             from fgreg.online.recorded_moves import find_epochs  # loads the online engine
 
-            found = find_epochs(recognised.measurements, session.model, config, prior)
-            recognised, moves = with_moves(recognised, found), found.moves
+            found = find_epochs(extracted.measurements, session.model, config, prior)
+            extracted, moves = with_moves(extracted, found), found.moves
             conditions = [*move_conditions(found), *conditions]
         solution = solve(
-            recognised.measurements,
-            recognised.tracks,
+            extracted.measurements,
+            extracted.tracks,
             session.model,
             config,
             conditions,
             prior,
         )
-        estimate = session_estimate(session, recognised, solution)
+        estimate = session_estimate(session, extracted, solution)
         errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
-        show(viewer, session, recognised, estimate, truth)
+        show(viewer, session, extracted, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
-    return SolveReport(session, recognised, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
+    return SolveReport(session, extracted, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
 
 
 def remove_older_result(folder: Path, result_path: Path) -> None:
@@ -166,17 +166,17 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
     remove_result(result_path)
 
 
-def with_moves(recognised: Recognised, found: EpochsFound) -> Recognised:
+def with_moves(extracted: ExtractedMeasurements, found: EpochsFound) -> ExtractedMeasurements:
     """The session's measurements with detected camera moves: pairs and tracks get their new epochs."""
     from fgreg.online.recorded_moves import renumbered, split_epochs
 
     if not found.texts:
-        return recognised
-    epoch_of = renumbered(recognised.epoch_of, recognised.pair_events, found.moves)
-    tracks = zip(recognised.track_events, recognised.tracks, strict=True)
+        return extracted
+    epoch_of = renumbered(extracted.epoch_of, extracted.pair_events, found.moves)
+    tracks = zip(extracted.track_events, extracted.tracks, strict=True)
     return replace(
-        recognised,
-        measurements=split_epochs(recognised.measurements, found.moves, found.loop_closures),
+        extracted,
+        measurements=split_epochs(extracted.measurements, found.moves, found.loop_closures),
         tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
         epoch_of=epoch_of,
     )
@@ -187,9 +187,9 @@ def move_conditions(found: EpochsFound) -> list[Condition]:
     return [Condition(Verdict.WARNING, text) for text in found.texts]
 
 
-def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeedPrior | None:
+def sound_speed_prior(extracted: ExtractedMeasurements, config: SolveConfig) -> SoundSpeedPrior | None:
     """The sound speed from the wavefronts, combined with the configuration's prior; None without wavefronts."""
-    pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
+    pooled = pool_sound_speed_ratio(find for find in extracted.finds.values() if isinstance(find, PaFind))
     if pooled is None:
         return None
     ratio, sigma = pooled
@@ -198,10 +198,10 @@ def sound_speed_prior(recognised: Recognised, config: SolveConfig) -> SoundSpeed
     return SoundSpeedPrior(mean, (by_frames + by_prior) ** -0.5)
 
 
-def detection_conditions(recognised: Recognised, config: SolveConfig) -> list[Condition]:
+def detection_conditions(extracted: ExtractedMeasurements, config: SolveConfig) -> list[Condition]:
     """Conditions of the verdict from the frames: wrong sound speed (unless estimated), unusable calibration shots."""
     found = []
-    pooled = pool_sound_speed_ratio(find for find in recognised.finds.values() if isinstance(find, PaFind))
+    pooled = pool_sound_speed_ratio(find for find in extracted.finds.values() if isinstance(find, PaFind))
     if pooled is not None and not config.estimate_sound_speed:
         ratio, sigma = pooled
         if abs(ratio - 1.0) > max(3.0 * sigma, SOUND_SPEED_TOLERANCE):
@@ -210,25 +210,25 @@ def detection_conditions(recognised: Recognised, config: SolveConfig) -> list[Co
                 "correct it in session.yaml (ranges given as numbers have to be computed again)"
             )
             found.append(Condition(Verdict.WARNING, text))
-    lost_aims, used = recognised.unused_aims, len(recognised.measurements.aims)
+    lost_aims, used = extracted.unused_aims, len(extracted.measurements.aims)
     if lost_aims and len(lost_aims) >= TOO_FEW_AIMS * (used + len(lost_aims)):
         text = (
-            f"{len(lost_aims)} of {used + len(lost_aims)} aims could not be used ({recognised.unused[lost_aims[0]]}): "
+            f"{len(lost_aims)} of {used + len(lost_aims)} aims could not be used ({extracted.unused[lost_aims[0]]}): "
             "take them again with marker and board in both views"
         )
         found.append(Condition(Verdict.WARNING, text))
     return found
 
 
-def session_estimate(session: Session, recognised: Recognised, solution: Solution) -> SessionEstimate:
+def session_estimate(session: Session, extracted: ExtractedMeasurements, solution: Solution) -> SessionEstimate:
     """The solution with every shot of the session in it, in event order; unused ones have their reason."""
-    pairs = dict(zip(recognised.pair_events, solution.pairs, strict=True))
-    tracks = dict(zip(recognised.track_events, solution.tracks, strict=True))
-    aims = dict(zip(recognised.aim_events, solution.aims, strict=True))
+    pairs = dict(zip(extracted.pair_events, solution.pairs, strict=True))
+    tracks = dict(zip(extracted.track_events, solution.tracks, strict=True))
+    aims = dict(zip(extracted.aim_events, solution.aims, strict=True))
     for index, event in enumerate(session.events):
-        reason = recognised.unused.get(index, "")
+        reason = extracted.unused.get(index, "")
         if isinstance(event, PairEvent) and index not in pairs:
-            pairs[index] = PairEstimate(event.t, event.pm, recognised.epoch_of[index], used=False, reason=reason)
+            pairs[index] = PairEstimate(event.t, event.pm, extracted.epoch_of[index], used=False, reason=reason)
         elif isinstance(event, TrackEvent) and index not in tracks:
             tracks[index] = TrackEstimate(event.t, None, None, None, causal=False, reason=reason)
         elif isinstance(event, AimEvent) and index not in aims:
@@ -274,7 +274,7 @@ def truth_errors(estimate: SessionEstimate, truth: GroundTruth, targets_mm: Floa
 def show(
     viewer: Viewer | NullViewer,
     session: Session,
-    recognised: Recognised,
+    extracted: ExtractedMeasurements,
     estimate: SessionEstimate,
     truth: GroundTruth | None,
 ) -> None:
@@ -286,15 +286,15 @@ def show(
     shot = 0
     for index, event in enumerate(session.events):
         if isinstance(event, AimEvent | PairEvent | TrackEvent):
-            show_frames(viewer, session, recognised, index, event, shot)
+            show_frames(viewer, session, extracted, index, event, shot)
             shot += 1
-    viewer.result(model, recognised.measurements, estimate, truth, recognised.tracks)
+    viewer.result(model, extracted.measurements, estimate, truth, extracted.tracks)
 
 
 def show_frames(
     viewer: Viewer | NullViewer,
     session: Session,
-    recognised: Recognised,
+    extracted: ExtractedMeasurements,
     index: int,
     event: AimEvent | PairEvent | TrackEvent,
     shot: int,
@@ -314,14 +314,14 @@ def show_frames(
             shot,
             left,
             right,
-            _outlines(recognised, index, model),
-            _corner(recognised, index, event, model),
+            _outlines(extracted, index, model),
+            _corner(extracted, index, event, model),
         )
     for number, look in enumerate(looks_of(event)):
         if look.frame is None:
             continue
         frame = load_trus_frame(look.frame, event.line, "trus.frame", model)
-        find = recognised.finds.get((index, number), NoSignal(""))
+        find = extracted.finds.get((index, number), NoSignal(""))
         source = find if isinstance(find, PaFind) else None
         viewer.pa_frame(
             event.t,
@@ -334,18 +334,18 @@ def show_frames(
         )
 
 
-def _outlines(recognised: Recognised, index: int, model: SessionModel) -> list[FloatArray] | None:
+def _outlines(extracted: ExtractedMeasurements, index: int, model: SessionModel) -> list[FloatArray] | None:
     """The tags' outlines (4, 2) px in the left image, from the fitted pose; None without one."""
-    fit = recognised.markers.get(index)
+    fit = extracted.markers.get(index)
     if not isinstance(fit, MarkerFit) or model.marker is None or model.camera is None:
         return None
     left = model.camera.left
     return [project(left, transform_points(fit.camera_T_marker, tag.marker_p_corners_mm)) for tag in model.marker.tags]
 
 
-def _corner(recognised: Recognised, index: int, event: Event, model: SessionModel) -> FloatArray | None:
+def _corner(extracted: ExtractedMeasurements, index: int, event: Event, model: SessionModel) -> FloatArray | None:
     """The aimed-at spot (2,) px in the left image; None where unknown."""
-    if not isinstance(event, AimEvent) or index not in recognised.aim_events or model.camera is None:
+    if not isinstance(event, AimEvent) or index not in extracted.aim_events or model.camera is None:
         return None
-    aim = recognised.measurements.aims[recognised.aim_events.index(index)]
+    aim = extracted.measurements.aims[extracted.aim_events.index(index)]
     return np.asarray(project(model.camera.left, aim.camera_p_spot_mm[None])[0])

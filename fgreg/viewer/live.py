@@ -25,7 +25,7 @@ Reach = Callable[[FloatArray, FloatArray], float | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moment:
+class ViewerUpdate:
     """One shot, and the estimate right after it.
 
     Attributes:
@@ -58,8 +58,8 @@ class Moment:
     epoch: int = 0
 
 
-class LivePainter:
-    """Draws moments in order into a recording that :meth:`fgreg.viewer.recording.Viewer.session` started."""
+class LiveDrawing:
+    """Draws updates in order into a recording that :meth:`fgreg.viewer.recording.Viewer.session` started."""
 
     def __init__(self, rec: shapes.Recorder, model: SessionModel) -> None:
         self._rec, self._model = rec, model
@@ -68,13 +68,13 @@ class LivePainter:
         beyond = float(np.linalg.norm(model.targets_mm[:, 1:], axis=1).max()) - model.probe.radius_mm
         self._depth_mm = beyond + 5.0
 
-    def draw(self, moment: Moment, *, textured: bool) -> None:
-        """Draw one moment; ``textured``: its frame is already on the image plane."""
-        self._last = (moment.t, moment.number)
+    def draw(self, update: ViewerUpdate, *, textured: bool) -> None:
+        """Draw one update; ``textured``: its frame is already on the image plane."""
+        self._last = (update.t, update.number)
         self._rec.at(*self._last)
-        self._registration(moment)
-        shot = moment.shot
-        if moment.now is not None and "camera" in moment.now.lost:
+        self._registration(update)
+        shot = update.shot
+        if update.now is not None and "camera" in update.now.lost:
             self._rec.log("world/camera/marker", shapes.transform(None))
         elif shot is not None:
             self._rec.log("world/camera/marker", shapes.transform(shot.marker.camera_T_marker))
@@ -84,16 +84,16 @@ class LivePainter:
             self._plane(textured)
         match shot:
             case Pair():
-                self._pair(moment, shot)
+                self._pair(update, shot)
             case Track():
-                self._track(moment, shot)
+                self._track(update, shot)
             case _:
                 self._rec.clear("world/shot/pm", "world/shot/beam")
-        if moment.now is not None:
-            self._now(moment, moment.now)
-        self._figures(moment)
+        if update.now is not None:
+            self._now(update, update.now)
+        self._figures(update)
 
-    def _now(self, moment: Moment, now: Now) -> None:
+    def _now(self, update: ViewerUpdate, now: Now) -> None:
         """Draw the current and the desired stage angle, and the verdict as a colour."""
         import rerun as rr
 
@@ -114,14 +114,14 @@ class LivePainter:
             label = f"beam at {goal_line(now, stage)}"
             rec.log("world/goal/label", shapes.point(corners[3], shapes.GOAL, 1.0, label))
             rec.log("online/stage_deg/beam", rr.Scalars(goal_deg))
-        word, color = banner(moment)
+        word, color = banner(update)
         rec.log("verdict", shapes.flat(color))
         rec.log("verdict/word", shapes.points_2d(np.array([[shapes.BANNER[1] / 2.0, 0.0]]), shapes.MARKER, 0.5, [word]))
 
-    def _registration(self, moment: Moment) -> None:
-        transform, covariance = moment.trus_T_camera, moment.covariance
+    def _registration(self, update: ViewerUpdate) -> None:
+        transform, covariance = update.trus_T_camera, update.covariance
         self._rec.log("world/camera", shapes.transform(transform))
-        if transform is None or covariance is None or moment.verdict is Verdict.REFUSED:
+        if transform is None or covariance is None or update.verdict is Verdict.REFUSED:
             self._rec.clear("world/targets")
             return
         targets = self._model.targets_mm
@@ -138,10 +138,10 @@ class LivePainter:
             self._rec.log("world/stage/outline", shapes.plane_outline(corners))
             self._plane_is_plain = True
 
-    def _pair(self, moment: Moment, pair: Pair) -> None:
+    def _pair(self, update: ViewerUpdate, pair: Pair) -> None:
         strip = self._arc(pair.look, keep=True)
-        used = moment.used
-        spot = self._beam(moment, pair, nearest_on(strip), keep=used)
+        used = update.used
+        spot = self._beam(update, pair, nearest_on(strip), keep=used)
         if spot is None:
             self._rec.clear("world/shot/pm")
             return
@@ -151,17 +151,17 @@ class LivePainter:
             "world/shot/pm", shapes.point(spot, color, 5.0, f"PM {pair.pm}" + ("" if used else " (not used)"))
         )
 
-    def _track(self, moment: Moment, query: Track) -> None:
-        answer = moment.answer
+    def _track(self, update: ViewerUpdate, query: Track) -> None:
+        answer = update.answer
         if query.looks:
             self._arc(query.looks[-1], keep=False)
         lambda_mm = None if answer is None else answer.lambda_mm
-        spot = self._beam(moment, query, lambda _origin, _direction: lambda_mm, keep=False)
+        spot = self._beam(update, query, lambda _origin, _direction: lambda_mm, keep=False)
         if spot is None:
             self._rec.clear("world/shot/pm")
         else:
             self._rec.log("world/shot/pm", shapes.point(spot, shapes.PM, 5.0, "predicted spot"))
-        if moment.now is None and answer is not None and answer.stage_rad is not None:
+        if update.now is None and answer is not None and answer.stage_rad is not None:
             label = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°"
             self._stage(self._model.stage.scan_from_device(answer.stage_rad), label)
 
@@ -179,9 +179,9 @@ class LivePainter:
         corner = scene.plane_corners_mm(self._model.probe, self._depth_mm)[2]
         self._rec.log("world/stage/label", shapes.point(corner, shapes.SOUND, 1.0, label))
 
-    def _beam(self, moment: Moment, shot: Pair | Track, reach: Reach, *, keep: bool) -> FloatArray | None:
+    def _beam(self, update: ViewerUpdate, shot: Pair | Track, reach: Reach, *, keep: bool) -> FloatArray | None:
         """Draw the shot's beam; returns its end (3,), TRUS mm. ``reach`` gives its length, ``keep`` keeps it drawn."""
-        transform, laser = moment.trus_T_camera, moment.marker_T_laser
+        transform, laser = update.trus_T_camera, update.marker_T_laser
         if transform is None or laser is None:
             self._rec.clear("world/shot/beam")
             return None
@@ -196,56 +196,56 @@ class LivePainter:
         self._rec.log("world/shot/beam", shapes.arrow(origin, tip, shapes.BEAM, 2.5, "laser beam"))
         return tip
 
-    def _figures(self, moment: Moment) -> None:
+    def _figures(self, update: ViewerUpdate) -> None:
         import rerun as rr
 
         rec = self._rec
-        if moment.tre is not None and math.isfinite(moment.tre.worst_mm):
-            rec.log("online/predicted_worst_mm/worst", rr.Scalars(min(moment.tre.worst_mm, LARGEST_PLOTTED_MM)))
-        rec.log("online/pairs/used", rr.Scalars(float(moment.pairs)))
-        if moment.nis is not None and math.isfinite(moment.nis):
-            rec.log("online/nis/pair", rr.Scalars(moment.nis))
-        if moment.note:
-            level = {Verdict.OK: "INFO", Verdict.WARNING: "WARN", Verdict.REFUSED: "ERROR"}[moment.verdict]
-            state = moment.verdict.value
-            if moment.trus_T_camera is None:
+        if update.tre is not None and math.isfinite(update.tre.worst_mm):
+            rec.log("online/predicted_worst_mm/worst", rr.Scalars(min(update.tre.worst_mm, LARGEST_PLOTTED_MM)))
+        rec.log("online/pairs/used", rr.Scalars(float(update.pairs)))
+        if update.nis is not None and math.isfinite(update.nis):
+            rec.log("online/nis/pair", rr.Scalars(update.nis))
+        if update.note:
+            level = {Verdict.OK: "INFO", Verdict.WARNING: "WARN", Verdict.REFUSED: "ERROR"}[update.verdict]
+            state = update.verdict.value
+            if update.trus_T_camera is None:
                 level, state = "INFO", "no registration yet"
-            rec.log("log", rr.TextLog(f"{moment.note} [{state}]", level=level))
-        rec.log("summary", rr.TextDocument(self._page(moment), media_type="text/markdown"))
+            rec.log("log", rr.TextLog(f"{update.note} [{state}]", level=level))
+        rec.log("summary", rr.TextDocument(self._page(update), media_type="text/markdown"))
 
-    def _page(self, moment: Moment) -> str:
-        if moment.now is None:
-            return moment_markdown(moment)
-        verdict = None if moment.trus_T_camera is None else moment.verdict
+    def _page(self, update: ViewerUpdate) -> str:
+        if update.now is None:
+            return update_markdown(update)
+        verdict = None if update.trus_T_camera is None else update.verdict
         return now_markdown(
-            moment.now, self._model.stage, verdict, moment.tre, moment.pairs, moment.epoch, moment.reasons
+            update.now, self._model.stage, verdict, update.tre, update.pairs, update.epoch, update.reasons
         )
 
     def to_end(self) -> None:
-        """Set the time to that of the last moment for what is logged next."""
+        """Set the time to that of the last update for what is logged next."""
         self._rec.at(*self._last)
 
 
-def banner(moment: Moment) -> tuple[str, shapes.Color]:
+def banner(update: ViewerUpdate) -> tuple[str, shapes.Color]:
     """The verdict as a word and a colour; a lost device overrides the colour of a good registration."""
-    lost = () if moment.now is None else moment.now.lost
+    lost = () if update.now is None else update.now.lost
     gone = f"; LOST: {', '.join(lost)}" if lost else ""
-    if moment.trus_T_camera is None:
+    if update.trus_T_camera is None:
         return f"no registration yet{gone}", shapes.WARNING if lost else shapes.UNUSED
-    word = f"{moment.verdict.value.upper()}{gone}"
-    if moment.verdict is Verdict.REFUSED:
+    word = f"{update.verdict.value.upper()}{gone}"
+    if update.verdict is Verdict.REFUSED:
         return word, shapes.REFUSED
-    return word, shapes.WARNING if lost or moment.verdict is Verdict.WARNING else shapes.BEAM
+    return word, shapes.WARNING if lost or update.verdict is Verdict.WARNING else shapes.BEAM
 
 
-def moment_markdown(moment: Moment) -> str:
-    """The summary page of a moment, with the estimate at that time."""
-    tre = moment.tre
+def update_markdown(update: ViewerUpdate) -> str:
+    """The summary page of an update, with the estimate at that time."""
+    tre = update.tre
     worst = "not known" if tre is None else f"{tre.worst_mm:.2f} mm"
-    state = "No registration yet" if moment.trus_T_camera is None else f"At {moment.t:.1f} s: {moment.verdict.value}"
-    lines = [f"# {state}", "", f"After {moment.note}.", "", f"Pairs used in this camera epoch: {moment.pairs}.", ""]
+    state = "No registration yet" if update.trus_T_camera is None else f"At {update.t:.1f} s: {update.verdict.value}"
+    lines = [f"# {state}", "", f"After {update.note}.", "", f"Pairs used in this camera epoch: {update.pairs}.", ""]
     lines += [f"Predicted 95 % error at the worst target: {worst}.", ""]
-    return "\n".join([*lines, *(f"- {reason}" for reason in moment.reasons)])
+    return "\n".join([*lines, *(f"- {reason}" for reason in update.reasons)])
 
 
 def nearest_on(strip_mm: FloatArray) -> Reach:

@@ -34,9 +34,9 @@ from fgreg.model.session_model import ProbeModel, SessionModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
-from fgreg.viewer.live import LivePainter, Moment
+from fgreg.viewer.live import LiveDrawing, ViewerUpdate
 from fgreg.viewer.pa_frame import pa_picture, texture
-from fgreg.viewer.result import ResultPainter, Truth
+from fgreg.viewer.result import ResultDrawing, Truth
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.shapes import Image8
 from fgreg.viewer.status_line import BmodePicture
@@ -95,7 +95,7 @@ class Viewer:
         except BaseException:
             self._drop_part()
             raise
-        self._live: LivePainter | None = None
+        self._live: LiveDrawing | None = None
         self._model: SessionModel | None = None
         self._shown: set[str] = set()
         self._shapes: dict[str, tuple[int, ...]] = {}
@@ -261,7 +261,7 @@ class Viewer:
 
         Args:
             t: seconds.
-            index: number of the moment that is drawn next.
+            index: number of the update that is drawn next.
             picture: None where the scanner is lost: then the last one is removed.
         """
         if self._model is None:
@@ -300,7 +300,7 @@ class Viewer:
     ) -> None:
         """Draw the result: registration, beams, arcs, PMs, targets, tracks, plots and text.
 
-        Where moments were drawn before, the shots stay unchanged, and only plots and text are added.
+        Where updates were drawn before, the shots stay unchanged, and only plots and text are added.
 
         Args:
             model: the session's set-up.
@@ -309,7 +309,7 @@ class Viewer:
             truth: where it is known.
             tracks: the queries of ``estimate.tracks``, matched by time; without one only the plane is shown.
         """
-        painter = ResultPainter(
+        drawing = ResultDrawing(
             rec=self._rec,
             model=model,
             measurements=measurements,
@@ -319,11 +319,11 @@ class Viewer:
             textured=frozenset(self._textured),
         )
         if self._live is None:
-            painter.paint()
+            drawing.draw()
         else:
             self._live.to_end()
-            painter.paint_end(judged_last=True)
-        eye = scene.best_eye(painter.eye_points(), trus_view=painter.trus_view())
+            drawing.draw_end(from_now=True)
+        eye = scene.best_eye(drawing.eye_points(), trus_view=drawing.trus_view())
         self._rec.blueprint(make_blueprint(self._contents(result=True), estimate.verdict, eye))
         self._finished = True
 
@@ -340,7 +340,7 @@ class Viewer:
             "registered" in shown,
         )
 
-    def moment(self, moment: Moment) -> None:
+    def update(self, update: ViewerUpdate) -> None:
         """Draw a shot with the estimate at its time, so that the recording shows how the registration changes.
 
         Call it after :meth:`session` and after drawing the shot's images.
@@ -348,23 +348,23 @@ class Viewer:
         if self._model is None:
             raise AssertionError("the session comes first")
         if self._live is None:
-            self._live = LivePainter(self._rec, self._model)
-        if moment.now is not None:
+            self._live = LiveDrawing(self._rec, self._model)
+        if update.now is not None:
             self._shown.add("now")
-            if moment.trus_T_camera is not None and moment.verdict is not Verdict.REFUSED:
+            if update.trus_T_camera is not None and update.verdict is not Verdict.REFUSED:
                 self._shown.add("registered")
         contents = self._contents(result=True)
         if contents != self._arranged:  # rare, because it resets a view that the user may have rotated
             self._arranged = contents
             eye = None
-            if moment.now is not None:
+            if update.now is not None:
                 points = scene.live_points_mm(self._model.probe, self._model.targets_mm)
-                if moment.trus_T_camera is not None and contents.registered:
-                    points = np.vstack([points, moment.trus_T_camera[:3, 3]])
+                if update.trus_T_camera is not None and contents.registered:
+                    points = np.vstack([points, update.trus_T_camera[:3, 3]])
                 eye = scene.best_eye(points)
             self._rec.blueprint(make_blueprint(contents, None, eye))
-        if moment.now is not None and "camera" in moment.now.lost:  # an old image would look like a new one
-            self._rec.at(moment.t, moment.number)
+        if update.now is not None and "camera" in update.now.lost:  # an old image would look like a new one
+            self._rec.at(update.t, update.number)
             for side, shape in self._shapes.items():
                 self._rec.log(f"world/camera/{side}", shapes.no_picture(shape))
-        self._live.draw(moment, textured=moment.number in self._textured)
+        self._live.draw(update, textured=update.number in self._textured)

@@ -31,7 +31,7 @@ class Truth(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ResultPainter:
+class ResultDrawing:
     """Draws one result into one recording.
 
     Attributes:
@@ -49,7 +49,7 @@ class ResultPainter:
     tracks: tuple[Track, ...]
     textured: frozenset[int]
 
-    def paint(self) -> None:
+    def draw(self) -> None:
         """Draw everything."""
         looks = measured_pairs(self.estimate.pairs, self.measurements)
         markers_of_aims = {aim.t: aim.marker for aim in self.measurements.aims}
@@ -74,17 +74,17 @@ class ResultPainter:
                 self._pair(self.estimate.pairs[shot.position], looks[shot.position])
             else:
                 self._track(shot.position, epoch)
-        self.paint_end()
+        self.draw_end()
 
-    def paint_end(self, *, judged_last: bool = False) -> None:
+    def draw_end(self, *, from_now: bool = False) -> None:
         """Draw what does not belong to a shot: plots, summary, the true PMs.
 
-        ``judged_last``: the verdict holds from the present moment on, not for all times.
+        ``from_now``: the verdict holds from the present moment on, not for all times.
         """
         if self.estimate.verdict is Verdict.REFUSED:
             shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
         self._plots()
-        self._static(self.rec.log if judged_last else self.rec.static)
+        self._static(self.rec.log if from_now else self.rec.static)
 
     def eye_points(self) -> FloatArray:
         """(n, 3) points that the initial view must contain: probe, planes, cameras and markers."""
