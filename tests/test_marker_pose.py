@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -101,7 +103,10 @@ def corner_set(camera_T_body: FloatArray, noise_px: float = 0.0) -> CornerSet:
     ideal = 1000.0 * p[:, :2] / p[:, 2:] + noise_px * np.random.default_rng(0).normal(size=(8, 2))
     view = np.repeat([0, 1], 4).astype(np.int64)
     focal = np.full((8, 2), 1000.0)
-    return CornerSet(body, ideal, view, view, 0.01 * np.eye(16), np.full(8, 0.1), np.zeros((8, 2)), focal, views)
+    by_lens = np.concatenate([ideal[..., None], np.broadcast_to(np.eye(2), (8, 2, 2))], axis=-1)
+    return CornerSet(
+        body, ideal, view, view, 0.01 * np.eye(16), np.full(8, 0.1), np.zeros((8, 2)), focal, views, by_lens
+    )
 
 
 def test_residual_jacobian_against_differences() -> None:
@@ -122,17 +127,7 @@ def test_common_error_of_both_views_is_not_averaged_away() -> None:
     corners = corner_set(pose)
     outward = corners.ideal_px - corners.ideal_px.reshape(2, 4, 2).mean(axis=1).repeat(4, axis=0)
     outward *= 0.1 / np.abs(outward)  # 0.1 px along x and along y
-    corners = CornerSet(
-        corners.body_p_mm,
-        corners.ideal_px,
-        corners.view,
-        corners.group,
-        corners.covariance,
-        np.zeros(8),
-        outward,
-        corners.focal_px,
-        corners.view_T_camera,
-    )
+    corners = replace(corners, common_px=np.zeros(8), outward_px=outward)
     fit = fit_pose(corners, pose)
     assert fit is not None
     sigma_depth = np.sqrt(common_covariance(corners, fit)[5, 5])

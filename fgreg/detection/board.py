@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, robust_pose
-from fgreg.detection.camera import focal_px, ideal_from_pixels, pixel_by_ideal_jacobian
+from fgreg.detection.camera import focal_px, ideal_by_lens, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.corners import grey, refine_subpixel
 from fgreg.detection.edges import MIN_CONTRAST, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
@@ -23,6 +23,7 @@ from fgreg.detection.results import BoardFit, NotFound
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.session_model import BoardModel, CameraModel, StereoRig
+from fgreg.model.systematic import Constant
 
 CORNER_SIGMA_PX = 0.03
 """Sigma of a refined inner corner. Four squares meet there: the image is symmetric, so blur does not bias it."""
@@ -178,6 +179,7 @@ def _view_corners(
         outward_px=np.zeros((n, 2)),
         focal_px=np.tile(focal_px(camera), (n, 1)),
         view_T_camera=np.tile(view_T_camera, (n, 1, 1)),
+        by_lens=ideal_by_lens(camera, ideal),
     )
 
 
@@ -225,5 +227,5 @@ def detect_board(
     left_out = [f"{int(stray.sum())} corners off the board"] if stray.any() else []
     if 3 * int(stray.sum()) > len(stray):
         return NotFound(f"board: {int(stray.sum())} of {len(stray)} corners do not fit the board")
-    pose = choose_pose(everything.subset(~stray), "board", left_out)
+    pose = choose_pose(everything.subset(~stray), "board", left_out, Constant.BOARD_SIZE)
     return pose if isinstance(pose, NotFound) else BoardFit(pose, board)

@@ -19,6 +19,9 @@ from fgreg.detection.pose_least_squares import (
 )
 from fgreg.detection.results import NotFound, RigidFit
 from fgreg.geometry.transforms import FloatArray
+from fgreg.model.camera_dependence import corner_derivatives, fitted_dependence
+from fgreg.model.measurements import CameraDependence
+from fgreg.model.systematic import Constant
 
 VIEW_NAMES = ("left", "right")
 MAX_RMS_PX = 4.0
@@ -144,12 +147,13 @@ def _agreement(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArra
     return rms, float(np.minimum(rms, STRAY_START_PX).sum()) if in_front else np.inf
 
 
-def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit | NotFound:
+def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Constant) -> RigidFit | NotFound:
     """The pose of a body from the better planar hypothesis, if the other one fits significantly worse.
 
     Args:
         what: the body's name in messages, e.g. ``marker``.
         left_out: messages about dropped corners, copied to the result.
+        size: the constant that scales the body.
     """
     if len(corners.view) < 4:
         return NotFound(f"{what}: only {len(corners.view)} corners seen, at least 4 are needed")
@@ -158,6 +162,7 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit 
     chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
     if chosen is None:
         return NotFound(f"{what}: no pose fits the corners seen")
+    stated = corners.covariance
     corners, best = chosen
     rms = rms_px(best.residual_px)
     views = tuple(VIEW_NAMES[v] for v in np.unique(corners.view))
@@ -185,4 +190,19 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str]) -> RigidFit 
         residual_sum_px2=float(np.sum(best.residual_px**2)),
         second_ratio=float(ratio),
         left_out=tuple(left_out),
+        dependence=_dependence(corners, stated, best, size),
     )
+
+
+def _dependence(corners: CornerSet, stated: FloatArray, fit: PoseFit, size: Constant) -> CameraDependence:
+    """Of the pose on the rig's constants; ``stated``: the corners' covariance before any excess."""
+    derivatives = corner_derivatives(
+        fit.camera_T_body,
+        corners.body_p_mm,
+        corners.view,
+        corners.focal_px,
+        corners.view_T_camera,
+        size,
+        corners.by_lens,
+    )
+    return fitted_dependence(fit.camera_T_body, derivatives, corners.covariance, stated, -fit.residual_px, size)

@@ -96,6 +96,16 @@ def ideal_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArray:
     return normalized_from_pixels(camera, pixels) * focal_px(camera)
 
 
+def ideal_by_lens(camera: CameraModel, ideal: FloatArray) -> FloatArray:
+    """(..., 2, 3) derivative of :func:`ideal_from_pixels` by relative focal length and principal point, times -1.
+
+    It is how much farther along x and y an ideal pixel (..., 2) would be predicted with these larger.
+    """
+    by_pixel = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal))
+    from_centre = pixels_from_ideal(camera, ideal) - _principal_px(camera)
+    return np.concatenate([by_pixel @ from_centre[..., None], by_pixel], axis=-1)
+
+
 def pixels_from_ideal(camera: CameraModel, ideal: FloatArray) -> FloatArray:
     """Pixels (..., 2) of ideal pixels (..., 2)."""
     return pixels_from_normalized(camera, ideal / focal_px(camera))

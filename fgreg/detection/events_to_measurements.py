@@ -21,6 +21,7 @@ from fgreg.detection.results import (
     NotFound,
     PaFind,
     board_corner,
+    board_corner_dependence,
     marker_covariance,
 )
 from fgreg.geometry.transforms import FloatArray, as_float_array
@@ -39,6 +40,7 @@ from fgreg.model.events import (
 )
 from fgreg.model.measurements import (
     Aim,
+    CameraDependence,
     EpochStart,
     Look,
     MarkerObservation,
@@ -228,11 +230,13 @@ class _Builder:
 
     def _marker(self, index: int, event: AimEvent | PairEvent | TrackEvent) -> MarkerObservation | str:
         record = event.marker
+        dependence = None
         if needs_marker_frames(record, redetect=self.redetect):
             fit = self.found.markers[index]
             if isinstance(fit, NotFound):
                 return fit.reason
             transform, covariance = fit.camera_T_marker, marker_covariance(fit, self.marker_noise)
+            dependence = fit.pose.dependence
         else:
             if record.camera_T_marker is None:
                 raise AssertionError("a marker is a pose or frames")
@@ -247,13 +251,14 @@ class _Builder:
             self.ids[key] = self.next_id
             self.next_id += 1
         number = self.ids[key]
-        return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number)
+        return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number, dependence)
 
-    def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray] | str:
-        """The aimed-at spot (3,) mm, camera frame, and its covariance (3, 3): errors of the corner and of the laser."""
+    def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray, CameraDependence | None] | str:
+        """The aimed-at spot (3,) mm, camera frame, with its covariance (3, 3), which includes the laser's error, and how
+        it depends on the rig's constants."""
         laser = np.diag(np.square(self.model.noise.aim_mm))
         if event.camera_p_spot_mm is not None:
-            return event.camera_p_spot_mm, laser if event.covariance is None else event.covariance
+            return event.camera_p_spot_mm, laser if event.covariance is None else event.covariance, None
         fit = self.found.boards[index]
         if isinstance(fit, NotFound):
             return fit.reason
@@ -261,7 +266,8 @@ class _Builder:
             raise AssertionError("an aim has a spot or a corner")
         spot, covariance = board_corner(fit, event.corner[0], event.corner[1], self.board_noise)
         camera_R_board = fit.camera_T_board[:3, :3]
-        return spot, covariance + camera_R_board @ laser @ camera_R_board.T
+        dependence = board_corner_dependence(fit, event.corner[0], event.corner[1])
+        return spot, covariance + camera_R_board @ laser @ camera_R_board.T, dependence
 
     def _look(self, index: int, number: int, record: TrusRecord) -> Look | str:
         noise, stage = self.model.noise, self.model.stage

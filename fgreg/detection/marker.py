@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, without_strays
-from fgreg.detection.camera import focal_px
+from fgreg.detection.camera import focal_px, ideal_by_lens
 from fgreg.detection.corners import grey, square_corners
 from fgreg.detection.edges import Image
 from fgreg.detection.pose_least_squares import CornerSet, join
@@ -21,6 +21,7 @@ from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import FoundTag, find_tags, tag_cells
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig
+from fgreg.model.systematic import Constant
 
 LARGE_WIDTH_PX = 1000
 """In images of at least this width a single tag is first searched at half resolution."""
@@ -122,6 +123,7 @@ def view_corners(
                 squares.outward_px[k][keep],
                 np.tile(focal_px(camera), (count, 1)),
                 np.tile(view_T_camera, (count, 1, 1)),
+                ideal_by_lens(camera, squares.ideal_px[k][keep]),
             )
         )
         ids.append(tag.id)
@@ -178,7 +180,7 @@ def marker_from_views(left: ViewCorners | None, right: ViewCorners | None, marke
     ids = [i for _, view in seen if view.corners is not None for i in view.ids]
     names = [f"tag {i} in {name} view" for name, view in seen if view.corners is not None for i in view.ids]
     kept, strays = without_strays(join(parts), names)
-    pose = choose_pose(kept, "marker", left_out + strays)
+    pose = choose_pose(kept, "marker", left_out + strays, Constant.TAG_SIZE)
     if isinstance(pose, NotFound):
         return pose
     return MarkerFit(pose, tuple(sorted({ids[int(g)] for g in np.unique(kept.group)})))

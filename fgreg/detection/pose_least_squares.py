@@ -42,6 +42,7 @@ class CornerSet:
         outward_px: (n, 2) one sigma of a single error common to all corners: the bias of the corner method.
         focal_px: (n, 2) of the corner's camera.
         view_T_camera: (n, 4, 4) of the corner's camera from the left.
+        by_lens: (n, 2, 3) derivative of the predicted corner by its camera's relative focal length and centre.
     """
 
     body_p_mm: FloatArray
@@ -53,6 +54,7 @@ class CornerSet:
     outward_px: FloatArray
     focal_px: FloatArray
     view_T_camera: FloatArray
+    by_lens: FloatArray
 
     def subset(self, keep: BoolArray) -> CornerSet:
         """The corners for which ``keep`` (n,) holds."""
@@ -67,6 +69,7 @@ class CornerSet:
             self.outward_px[keep],
             self.focal_px[keep],
             self.view_T_camera[keep],
+            self.by_lens[keep],
         )
 
     def with_excess(self, variance_px2: float) -> CornerSet:
@@ -96,6 +99,7 @@ def join(parts: list[CornerSet]) -> CornerSet:
         np.concatenate([part.outward_px for part in parts]),
         np.concatenate([part.focal_px for part in parts]),
         np.concatenate([part.view_T_camera for part in parts]),
+        np.concatenate([part.by_lens for part in parts]),
     )
 
 

@@ -13,6 +13,8 @@ import numpy as np
 
 from fgreg.detection.corner_noise import CornerNoise, fit_covariance
 from fgreg.geometry.transforms import FloatArray, hat
+from fgreg.model.camera_dependence import corner_dependence
+from fgreg.model.measurements import CameraDependence
 from fgreg.model.session_model import BoardModel
 
 
@@ -39,6 +41,7 @@ class RigidFit:
         residual_sum_px2: sum of those squared distances.
         second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
         left_out: tags or corners that were seen but not used, with the reason.
+        dependence: of the pose on the rig's constants.
     """
 
     camera_T_body: FloatArray
@@ -52,6 +55,7 @@ class RigidFit:
     residual_sum_px2: float
     second_ratio: float
     left_out: tuple[str, ...]
+    dependence: CameraDependence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +110,12 @@ def board_corner(fit: BoardFit, column: int, row: int, noise: CornerNoise) -> tu
     jacobian = rotation @ np.hstack([-hat(board_p), np.eye(3)])
     covariance = jacobian @ board_covariance(fit, noise) @ jacobian.T
     return rotation @ board_p + fit.camera_T_board[:3, 3], covariance
+
+
+def board_corner_dependence(fit: BoardFit, column: int, row: int) -> CameraDependence:
+    """How the position of a board corner (:func:`board_corner`) depends on the rig's constants."""
+    board_p = np.array([column, row, 0.0]) * fit.board.square_mm
+    return corner_dependence(fit.camera_T_board, board_p, fit.pose.dependence)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,11 +29,15 @@ class CameraDependence:
     Attributes:
         gain: (6, n) of a marker pose or (3, n) of a spot, n constants (fgreg.model.systematic.CAMERA).
         information: (n, n). pull: (n,).
+        chi_square, degrees_of_freedom: of the corners' misfit, before ``information`` and ``pull`` were weighed down
+            where it is not plausible (fgreg.model.camera_dependence). Zero where there were no corners.
     """
 
     gain: FloatArray
     information: FloatArray
     pull: FloatArray
+    chi_square: float = 0.0
+    degrees_of_freedom: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
