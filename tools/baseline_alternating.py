@@ -6,11 +6,11 @@ a the point at arc angle theta' on arc i. In turn, until it no longer falls:
 1. gradient steps on lambda and the registration (F_reg) with theta' fixed;
 2. gradient steps on theta' with lambda and the registration fixed.
 
-There is no noise model and no prior on theta': the cost hardly sees rolls about the probe's axis, which theta' takes
-up. Where the out-of-plane angle is known to be bounded, theta' may be kept within the bound (projected gradient steps).
-It needs a first guess. Steps along the negative gradient of each block (rotation about the TRUS origin, translation,
-lambda, theta') with a step length each, kept the longest that lowers the cost (doubled after a success, halved until
-it does). The calibration of the fibre enters as a fixed beam.
+There is no noise model and no prior on theta': the cost hardly depends on rolls about the probe's axis, which theta'
+absorbs. Where the out-of-plane angle is known to be bounded, theta' can be kept within the bound (projected gradient
+steps). The method needs a first guess. Each block (rotation about the TRUS origin, translation, lambda, theta') has its
+own step length along the negative gradient: doubled after a success, halved until the cost falls. The calibration of
+the fibre enters as a fixed beam.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray, exp_so3
 
 INNER_STEPS = 10
-"""Gradient steps on one set of variables before it is the other's turn."""
+"""Gradient steps on one set of variables before the other set."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,12 +52,12 @@ class LinesAndArcs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlternatingResult:
-    """What the descent came to.
+    """Result of the descent.
 
     Attributes:
         trus_T_camera: (4, 4). lambda_mm, theta_rad: (n,).
         cost_mm2: mean squared distance.
-        rounds: of the alternation. converged: whether it ended by itself.
+        rounds: of the alternation. converged: whether it ended before the limit.
     """
 
     trus_T_camera: FloatArray
@@ -140,9 +140,9 @@ def register_alternating(
     Args:
         data: lines and arcs.
         trus_T_camera: the guess.
-        limit_rad: farthest that theta' may be off the image plane, as an arc angle; pi: free.
+        limit_rad: farthest that theta' may be off the image plane, as an arc angle; pi: no limit.
         tolerance: it has converged when a round lowers the cost by less than this share of it.
-        max_rounds: at most so many.
+        max_rounds: largest number of rounds.
     """
     descent = _Descent(data, trus_T_camera, limit_rad)
     rounds, quiet = 0, 0

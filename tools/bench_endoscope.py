@@ -1,8 +1,8 @@
 """What the endoscope's driver costs: two inputs of 1280 x 720 px at 30 frames/s, played from motion JPEG files.
 
 Prints, beside its target: pairs delivered, frames dropped, the time from a frame's arrival to the moment a polling
-loop has the pair, how long a lost device takes to be told, processor time for each pair, and what rectifying and taking
-fields cost by themselves. The waiting of the polling loop (2 ms) is part of the latency.
+loop has the pair, the time until a lost device is reported, processor time for each pair, and the cost of rectification
+and field separation alone. The wait of the polling loop (2 ms) is part of the latency.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _loss() -> None:
             endoscope.poll()
             time.sleep(0.033)
     except DeviceLost:
-        print(f"a device that is not there is told after {host_now() - began:.2f} s (target: 1 s)")
+        print(f"a device that is not there is reported after {host_now() - began:.2f} s (target: 1 s)")
     finally:
         endoscope.close()
 

@@ -84,7 +84,7 @@ def _cases(checkout: Path, sizes: list[int], seeds: int, *, phantom: bool) -> It
 
 
 def _answer(solution: Any) -> dict[str, Any]:
-    """What of a solution is compared."""
+    """The part of a solution that is compared."""
     epoch, registration = solution.epochs[-1], solution.registration
     search = None if registration is None else registration.searches[-1]
     return {
@@ -166,7 +166,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=6, help="simulated sessions of each kind")
     parser.add_argument("--pairs", type=int, nargs="*", default=list(PAIRS))
     parser.add_argument("--phantom", action="store_true", help="sessions/phantom as well: some 20 s for its frames")
-    parser.add_argument("--differences", action="store_true", help="print the cases whose answers differ")
+    parser.add_argument("--differences", action="store_true", help="print the cases whose results differ")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.serve is not None:

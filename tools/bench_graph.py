@@ -1,7 +1,7 @@
 """Times the factors and the explicit graph: microseconds per callback, and solve time against the number of pairs.
 
-Prints medians of CPU time; passes or fails nothing. The explicit graph is the reference, so what matters is that a
-factor stays cheap (some 10 us a linearisation) and that everything grows linearly.
+Prints medians of CPU time; there is no limit to pass. The explicit graph is the reference. A factor should stay cheap
+(some 10 us per linearisation), and everything should grow linearly.
 
     python tools/bench_graph.py
     python tools/bench_graph.py --pairs 100 1000 --repeats 9
@@ -70,7 +70,7 @@ def bench_factors(repeats: int) -> None:
     }
     print(f"{'factor':<24}{'error us':>10}{'linearize us':>14}")
     for name, factor in factors.items():
-        # A thousand in one graph, so that the call from Python counts for nothing.
+        # A thousand in one graph, so that the call from Python is negligible.
         graph = gtsam.NonlinearFactorGraph()
         for _ in range(1000):
             graph.add(factor)

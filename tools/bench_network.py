@@ -5,8 +5,8 @@
 Three rows: OpenIGTLink channel data (128 x 2048, 16 bit) as PhotoacousticSource, BK pictures (892 x 728) over OEM, and
 the registration out to a plain receiver. Given are the time from sending to poll (or from send to reception), the share
 of one core that the receiving process takes, messages lost, and growth of its memory. Targets: none lost, p99 at most
-10 ms (a quarter of the 40 ms from frame to angle), at most a tenth of a core, no growth. Then how long it takes until a
-device that is gone is said to be: target 1 s.
+10 ms (a quarter of the 40 ms from frame to angle), at most a tenth of a core, no growth. Then the time until a lost
+device is reported: target 1 s.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def send_pictures(server: socket.socket, seconds: float, rate_hz: float) -> None
 def send_on(
     server: socket.socket, seconds: float, rate_hz: float, block: Callable[[], bytes], first: bytes = b""
 ) -> None:
-    """Blocks at a steady rate to whoever connects."""
+    """Blocks at a steady rate to every client."""
     peer, _ = server.accept()
     with peer:
         peer.sendall(first)
@@ -115,7 +115,7 @@ def receive(what: str, sender: Callable[..., None], options: Any, make: Callable
 
 
 def registrations(options: argparse.Namespace) -> None:
-    """The other way; this loop is the receiver, too."""
+    """The other direction; this loop is the receiver, too."""
     sink = IgtlTransformSink(Endpoint.listening(0))
     delays, cpu, began = [], time.process_time(), time.monotonic()
     count = int(options.seconds * options.rate)
@@ -134,7 +134,7 @@ def registrations(options: argparse.Namespace) -> None:
 
 
 def losses() -> None:
-    """From hanging up, and from falling silent, until poll raises; and from being there again until connected."""
+    """Time from a closed or silent connection until poll raises, and from the return of the device until connected."""
     for what, silent in (("hangs up", False), ("falls silent", True)):
         said, back = [], []
         for _ in range(5):
@@ -160,7 +160,7 @@ def losses() -> None:
             for thing in (source, peer, server):
                 thing.close()
         again = "" if silent else f", connected again after {max(back):.3f} s"
-        print(f"device {what}: said after {max(said):.3f} s at most{again}")
+        print(f"device {what}: reported after {max(said):.3f} s at most{again}")
 
 
 def main() -> None:

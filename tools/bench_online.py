@@ -3,12 +3,12 @@
     python tools/bench_online.py                       # 2,000 pairs in 7 epochs
     python tools/bench_online.py --pairs 300 --epochs 1
 
-One run in one process, the full solve in it and timed apart: ``add`` without it is what an event takes where the full
-solve has a worker process, the taking over of its results included; ``add`` with it, over the first 10 pairs of each
-epoch, is what replay and tests take. Also ``track``, and the time to open the session's first 1,000 pairs again.
+The run is in one process; the full solve is timed separately. ``add`` without it is the time of an event where the full
+solve has a worker process, with the update by its results. ``add`` with it, over the first 10 pairs of each epoch, is
+the time in replay and tests. Also ``track``, and the time to open the session's first 1,000 pairs again.
 
-Wall time and processor time of the thread: on a machine that does other work as well the second is the engine's own,
-and the limits are held against it. The exit status is 1 where one is missed.
+Printed are wall time and processor time of the thread. On a machine that does other work as well, only the processor
+time is the engine's own, so the limits apply to it. The exit status is 1 where one is missed.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def now() -> Times:
 
 
 def since(start: Times) -> Times:
-    """What has passed on both."""
+    """Time since ``start`` on both."""
     end = now()
     return end[0] - start[0], end[1] - start[1]
 
 
 class TimedSolver(InProcessSolver):
-    """The full solve in this process. ``spent``: what it has taken since that was set to nothing."""
+    """The full solve in this process. ``spent``: its time since the last reset."""
 
     spent: Times = (0.0, 0.0)
 
@@ -115,7 +115,7 @@ def bench(model: SessionModel, measurements: Measurements) -> bool:
 
 
 def bench_opening(model: SessionModel, measurements: Measurements, *, worker: bool) -> bool:
-    """Take the events in at once; whether that is fast enough."""
+    """Take in all events at once; whether that is within the limit."""
     with OnlineRegistration(model, full_solve="worker" if worker else "in_process") as engine:
         start = now()
         restored(engine, measurements)

@@ -1,7 +1,7 @@
 """Times tracking queries: alone, and under a continuous stream of updates.
 
-Alone: one look at the PM, several with amplitudes, none (from the tissue surface): percentiles of wall time, and of CPU
-time, which a busy machine does not inflate.
+Alone: one look at the PM, several with amplitudes, none (from the tissue surface): percentiles of wall time and of CPU
+time. A busy machine does not inflate the CPU time.
 
 Under updates: this process adds pair after pair to an OnlineRegistration, without a pause, and publishes a snapshot
 after each. Meanwhile queries come at camera rate from
@@ -9,9 +9,9 @@ after each. Meanwhile queries come at camera rate from
   - a client in another process, by a round trip to the query process;
   - a thread of the updating process, by a round trip to the query process;
   - a thread of the updating process, which answers its queries itself.
-Given are the time from call to answer, and that from the moment at which the query was due (a frame's arrival): a
-thread may have to wait before it can even call. Each client also times a fixed piece of arithmetic: how much longer
-that takes than in isolation is what the machine's other work costs, whoever waits.
+Printed are the time from the call to the result, and from when the query was due (a frame's arrival): a thread may
+have to wait before it can call. Each client also times a fixed piece of arithmetic: its excess over the time in
+isolation is the cost of the machine's other work.
 
     python tools/bench_queries.py
     python tools/bench_queries.py --seconds 10 --full-solve worker
@@ -115,7 +115,7 @@ def _kinds() -> list[tuple[str, list[Track], Snapshot]]:
 
 @dataclass(frozen=True, slots=True)
 class Client:
-    """How a client asks, how long and how often; plain values that go to another process."""
+    """How a client sends queries, how long and how often; plain values for another process."""
 
     memory: str
     address: QueryAddress
@@ -205,22 +205,22 @@ class Updates:
                     start = time.perf_counter()
                     engine.add(pair)
                     between = time.perf_counter()
-                    if k > 8:  # those before are a registration from scratch each: updates are what this is about
+                    if k > 8:  # each of the pairs before is a registration from scratch, not an update
                         shared.publish(engine.snapshot())
                         self.add_s.append(between - start)
                         self.publish_s.append(time.perf_counter() - between)
 
 
 def under_updates(options: argparse.Namespace) -> None:
-    """Each kind of client beside the stream."""
+    """Each kind of client during the stream."""
     model, used, queries = _session(options.pairs)
     where = None if options.full_solve == "none" else options.full_solve
     print(f"under a stream of updates, {options.seconds:g} s each, a query every {options.period_ms:g} ms (ms)")
     for name, in_process, round_trip in (
         ("own process, shared snapshot", False, False),
         ("own process, round trip", False, True),
-        ("thread beside the updates, round trip", True, True),
-        ("thread beside the updates, answers itself", True, False),
+        ("thread of the updating process, round trip", True, True),
+        ("thread of the updating process, answers itself", True, False),
     ):
         with SharedSnapshot(Layout.of(model)) as shared, QueryServer(shared.name) as server:
             client = Client(shared.name, server.address, round_trip, queries, options.seconds, 1e-3 * options.period_ms)

@@ -1,13 +1,13 @@
-"""How long it takes to open a recorded session again, and how near its estimate is to what it was.
+"""Time to open a recorded session again, and the difference of its estimate to the one before.
 
     python tools/bench_reopen.py                     # 40, 200 and 1,000 pairs
-    python tools/bench_reopen.py --outliers 0.1      # a tenth of the PMs are something else
+    python tools/bench_reopen.py --outliers 0.1      # a tenth of the PMs are outliers
     python tools/bench_reopen.py --process           # the registration in a process of its own, as in `fgreg live`
 
-All but the last 20 events of a simulated session are opened, these are recorded, and the session is opened again: the
-estimate of before is compared with that of after. Limits: 2 s of processor time at 1,000 pairs, 0.05 standard
-deviations, the same inliers. The exit status is 1 where one is missed. Recording is timed as well: what an event takes
-with the disk, and how much of that is the disk's.
+A simulated session without its last 20 events is opened, these events are recorded, and the session is opened again.
+The estimates before and after are compared. Limits: 2 s of processor time at 1,000 pairs, 0.05 standard
+deviations, the same inliers. The exit status is 1 where one is missed. Recording is timed as well: the time of an
+event, and the part of it that the disk takes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SIGMAS = 0.05
 
 
 def spoil(path: Path, share: float, seed: int) -> None:
-    """In a share of the recorded pairs something else was heard than the PM."""
+    """Replace a share of the recorded pairs by outliers: the detected source is not the PM."""
     rng, lines = np.random.default_rng(seed), []
     for line in path.read_text().splitlines():
         event = json.loads(line)
@@ -92,7 +92,7 @@ def bench(folder: Path, pairs: int, outliers: float, seed: int, make_engine: Eng
     print(f"{pairs} pairs, {before.epoch + 1} epochs")
     print(f"  opened again in {open_s:.2f} s, of that reading {read_s:.2f} s; processor time {cpu_s:.2f} s{limit}")
     same = "the same inliers" if again == kept else f"{sum(np.not_equal(again, kept))} inliers differ"
-    print(f"  registration {sigmas:.4f} sigma from what it was (limit {SIGMAS:g}); {same}")
+    print(f"  registration {sigmas:.4f} sigma from the one before (limit {SIGMAS:g}); {same}")
     for name, values in (("recorded and taken in", add_ms), ("of which checked and on disk", disk_ms)):
         p50, p99 = np.quantile(values, [0.5, 0.99])
         print(f"  {name:<28} {p50:7.2f} ms   99 % {p99:.2f}, longest {max(values):.1f}")

@@ -1,8 +1,8 @@
-"""How long the stage goes on after the main program has failed: killed, stalled, or gone with a child left behind.
+"""Time until the stage stops after the main program has failed: killed, stalled, or ended with a child left behind.
 
 Each trial starts a main program with its watchdog and a simulated stage, lets the stage turn, and ends the main
-program. Printed: time from its end to the watchdog's order to stop, as the stage's side has it, beside the deadline: at
-once where the end of the connection shows it, else one heartbeat (0.5 s here) and what the watchdog's loop takes.
+program. Printed: time from its end to the watchdog's stop order, recorded at the stage, beside the deadline: immediate
+where the connection ends, else one heartbeat (0.5 s here) and one cycle of the watchdog's loop.
 ``--live``: the same for signals to ``fgreg live`` in its simulated room (heartbeat 0.25 s), while its stage homes and
 while it searches, by the watchdog's own log.
 

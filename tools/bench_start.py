@@ -1,13 +1,13 @@
-"""What commands cost to start: processor time and wall time of whole processes, alternating on one machine.
+"""Start-up cost of commands: processor time and wall time of whole processes, alternating on one machine.
 
     python tools/bench_start.py                              # this checkout against its limits
     python tools/bench_start.py --before ../older --runs 15  # against another checkout
 
-One round runs every command once, so that what else the machine does falls on all alike; medians over the rounds.
+One round runs every command once, so that the machine's other load affects all alike; medians over the rounds.
 Limits (exit status 1 where one is missed): ``fgreg --help`` at most 1.3 times ``import typer``; ``fgreg solve`` on
 poses at most twice the import of the libraries that it uses, and at most 0.55 of the older checkout's processor time;
-on raw frames at most 0.6 of its wall time. Byte code is kept in a folder of its own, written in the first round, which
-does not count.
+on raw frames at most 0.6 of its wall time. Byte code has a folder of its own; it is written in the first round, which
+is not counted.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ LIBRARIES = ("gtsam", "numpy", "poselib", "pydantic", "rich.console", "rich.tabl
 
 
 def environment(checkout: Path, byte_code: Path) -> dict[str, str]:
-    """That of a process which imports ``fgreg`` from a checkout, as a user has it: no word on numbers of threads."""
+    """Environment of a process that imports ``fgreg`` from a checkout, as a user has it: number of threads not set."""
     kept = {key: value for key, value in os.environ.items() if key not in ("PYTHONDONTWRITEBYTECODE", *NAMES)}
     return {**kept, "PYTHONPATH": os.fspath(checkout), "PYTHONPYCACHEPREFIX": os.fspath(byte_code)}
 

@@ -1,8 +1,8 @@
 """The posterior Cramer-Rao bound: the least covariance that any estimate can have on average, evaluated at the truth.
 
 The information of the reduced problem (Gauss-Newton Hessian: marker noise, PMs, lambda and theta' eliminated, priors of
-window and edge included) at noise-free measurements and the true state; its inverse, carried to the targets, is what
-the mean squared error can come down to (van Trees, 1968, with the Gaussian window as the prior of theta').
+window and edge included) at noise-free measurements and the true state. Its inverse, propagated to the targets, is the
+least mean squared error (van Trees, 1968, with the Gaussian window as the prior of theta').
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fgreg.model.session_model import SessionModel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FullTruth:
-    """Everything that was simulated.
+    """The complete simulated truth.
 
     Attributes:
         trus_T_camera: (4, 4) of each epoch. marker_T_laser: (4, 4).
@@ -71,7 +71,7 @@ def beam_covariance(measurements: Measurements, model: SessionModel, truth: Full
     """(4, 4) bound of the beam chart (x, y, a, b) about the true beam, from the aims alone."""
     alone = replace(measurements, pairs=(), epochs=measurements.epochs[:1])
     information, at = _truth_information(alone, model, replace(truth, pair_camera_T_marker=()))
-    # Without pairs the registration is not determined, and nothing but the aims and the bias's prior bears on the beam.
+    # Without pairs the registration is undetermined; only the aims and the prior of the bias determine the beam.
     return _inverse(information[at:, at:])[:4, :4]
 
 

@@ -1,7 +1,7 @@
-"""The 95 % region of a registration: all poses that are likelier than those that hold the last 5 % of the posterior.
+"""The 95 % region of highest density of a registration's posterior.
 
-At few pairs the posterior has arms that no ellipsoid follows. So a pose is judged by its density, with the other shared
-variables (beam, window edge, ...) at the values that suit it best, against the same figure of the posterior's samples.
+With few pairs the posterior has tails that no ellipsoid covers. So a pose is tested by its profile density (the other
+shared variables, such as beam and window edge, at their conditional optimum) against that of the posterior's samples.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Region:
 def credible_region(modes: tuple[Mode, ...], posterior: Posterior, probability: float = 0.95) -> Region:
     """The region that holds ``probability`` of the posterior sampled from these modes."""
     lighter = tuple(light(mode) for mode in modes)
-    # Equal steps through the cumulated weights: a sample of the posterior with the least noise of its own.
+    # Systematic resampling: equal steps through the cumulated weights.
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     pick = np.minimum(np.searchsorted(np.cumsum(posterior.weight), at), len(posterior.weight) - 1)
     state = posterior.mean.take(np.zeros(SAMPLES, dtype=np.int64)).retract(posterior.step[pick], posterior.columns)
@@ -61,8 +61,8 @@ def credible_region(modes: tuple[Mode, ...], posterior: Posterior, probability: 
 def ellipsoid_contains(posterior: Posterior, trus_T_camera: FloatArray, epoch: int = 0) -> bool:
     """Whether a registration (4, 4) lies in the posterior's 95 % ellipsoid of that epoch.
 
-    It has the axes of the posterior's covariance in GTSAM's tangent about the estimate, and is as large as it takes to
-    hold 95 % of the posterior (which is not Gaussian at few pairs).
+    It has the axes of the posterior's covariance in GTSAM's tangent about the estimate, and a size such that it contains
+    95 % of the posterior (which is not Gaussian with few pairs).
     """
     at = slice(6 * epoch, 6 * epoch + 6)
     information = np.linalg.inv(posterior.covariance[at, at])
@@ -82,14 +82,14 @@ def _from_mode(mode: Mode, state: SharedState) -> FloatArray:
     columns, count = problem.columns, state.count
     step = step_between(mode.optimum.state, state, columns)
     poses = 6 * columns.epochs
-    # The others start where the mode's Gaussian has them for these poses.
+    # The others start at their conditional mean under the mode's Gaussian.
     inverse = np.linalg.inv(at.hessian[0][poses:, poses:])
     step[:, poses:] = -step[:, :poses] @ at.hessian[0][:poses, poses:] @ inverse
     start = mode.optimum.state.take(np.zeros(count, dtype=np.int64))
     private = at.private.take(np.zeros(count, dtype=np.int64))
     private = replace(private, trus_p_pm=private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
     moved = start.retract(step, columns)
-    # Gauss-Newton is held to the mode's own spread: far out its steps may be anything.
+    # Gauss-Newton steps are limited to the mode's spread: far from the mode they are unreliable.
     hold = 0.01 * np.diag(np.diag(at.hessian[0]))[poses:, poses:]
     with np.errstate(all="ignore"):
         for _ in range(ROUNDS):

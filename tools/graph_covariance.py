@@ -47,7 +47,7 @@ class GraphCovariance:
         diagonal = np.diag(information)
         if not (np.isfinite(information).all() and (diagonal > 0.0).all()):
             raise EstimationError("these measurements do not determine all shared variables")
-        # Units differ by orders of magnitude; what is undetermined shows once they are taken out.
+        # Units differ by orders of magnitude, so the rank is tested on the correlation matrix.
         sigma = 1.0 / np.sqrt(diagonal)
         correlation = information * np.outer(sigma, sigma)
         if np.linalg.eigvalsh(correlation)[0] < _LEAST_EIGENVALUE:
@@ -64,8 +64,8 @@ class GraphCovariance:
     def of(self, key: int) -> FloatArray:
         """Marginal covariance of one variable, private or shared: a PM (3, 3), a distance or angle (1, 1), ...
 
-        What is private to one PM or aim meets the rest at shared variables only. So those factors alone, with all
-        else that is private eliminated, give ``R x + S s = d``, and the covariance is R^-1 (I + S C S') R^-T with C
+        The private variables of one PM or aim are connected to the rest by shared variables only. So those factors alone,
+        with their other private variables eliminated, give ``R x + S s = d``, and the covariance is R^-1 (I + S C S') R^-T with C
         of the shared variables s.
         """
         if key in self._columns:

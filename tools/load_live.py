@@ -1,9 +1,9 @@
-"""A live session under the load of an operating room: is every frame answered in time, and does nothing grow?
+"""A live session under the load of an operating room: latency of every frame, and growth of memory and queues.
 
 A room is played by another process (tools/load_player.py): 30 stereo frames of 1280 x 720 px a second that were made
-beforehand, 10 laser pulses a second, a surgeon who goes on as he is told, a camera that somebody bumps into. What
-``fgreg live`` does with it is measured: from a frame's arrival at its driver to the order to the stage or the knowledge
-that there is none; frames and pulses on their way; memory, processor time and queues; the end.
+beforehand, 10 laser pulses a second, a surgeon who follows the messages, a camera that is bumped. Measured are: the
+time from a frame's arrival at its driver to the stage order, or to the decision that there is none; counts of frames and
+pulses; memory, processor time and queues; the end.
 
     python tools/load_live.py --cache /var/tmp/fgreg           # ten minutes; the pictures (4.5 GB) are kept there
     python tools/load_live.py --cache /var/tmp/fgreg --seconds 60
@@ -40,16 +40,16 @@ from load_watch import GROWS_FROM_MIN, Made, Processes, Watch
 from played_room import FRAME_RATE, Making, make_pictures
 
 STAY_S = 12.0
-"""The surgeon stays at a spot for so long, while the stage follows."""
+"""Time that the surgeon stays at a spot while the stage follows."""
 P50_MS, P99_MS = 40.0, 100.0
 RECORDER_WAITS, PULSES_WAIT = 12, 30
-"""Events of some spots; pulses of the time that one is waited for (fgreg.live.marker_tracker)."""
+"""Events of some spots; pulses that come while one is waited for (fgreg.live.pulse_locator)."""
 GROWTH_MB = 20.0
 """More than this from minute 4 to the end is growth: a process's memory wanders by some MB."""
 
 
 def measure(options: argparse.Namespace, making: Making, folder: Path) -> dict[str, Any]:
-    """One session; what was seen."""
+    """Run one session; its figures."""
     figures_file = folder / "player.json"
     play = partial(playing, making=making, frame_rate=options.frame_rate, stay_s=STAY_S, figures=figures_file)
     session_folder = folder / "session"
@@ -96,7 +96,7 @@ def _player(player: dict[str, Any]) -> dict[str, Any]:
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
-    """What is on disk, and what ``fgreg check`` says of it."""
+    """Content on disk, and the result of ``fgreg check``."""
     program = "import sys; from fgreg.cli.main import main; sys.exit(main())"
     check = subprocess.run([sys.executable, "-c", program, "check", str(folder)], capture_output=True, text=True)
     counted = Counter(type(event) for event in read_session(folder).events)
@@ -109,7 +109,7 @@ def _recorded(folder: Path) -> dict[str, Any]:
 
 
 def verdicts(found: dict[str, Any]) -> dict[str, bool]:
-    """What was asked for, and whether it is so."""
+    """Each requirement, and whether it is met."""
     latency, counts, end = found["latency_ms"]["all"], found["counts"], found["end"]
     return {
         f"median latency at most {P50_MS:g} ms": latency["p50"] <= P50_MS,
@@ -123,7 +123,7 @@ def verdicts(found: dict[str, Any]) -> dict[str, bool]:
             queues["recorder"] <= RECORDER_WAITS and queues["pulses"] <= PULSES_WAIT
             for queues in found["queues"].values()
         ),
-        "every frame is answered or counted": counts["frames_unaccounted"] == 0,
+        "every frame is processed or counted": counts["frames_unaccounted"] == 0,
         "no pulse is lost": counts["pulses_dropped"] == 0 == counts["pulses_unaccounted"],
         "every pair handed over is on disk": counts["pairs_handed_over"] == end["pairs_on_disk"],
         "a clean end": end["check"] == 0 and not end["left_behind"] and end["seconds"] < 15.0,

@@ -1,4 +1,4 @@
-"""What plays a simulated room for tools/load_live.py: pictures from a file, all else as in the room."""
+"""Plays a simulated room for tools/load_live.py: pictures from a file, all else as in the room."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from played_room import Making, PlayedRoom
 
 
 class Player(RoomServer):
-    """The room's server, which writes down what it made for somebody: (the room's time, how late it was), s."""
+    """The room's server; it records the frames and pulses that it sent: (the room's time, delay), s."""
 
     def __init__(self, room: PlayedRoom, path: Path, frame_rate: float, stay_s: float) -> None:
         super().__init__(room, path, frame_rate=frame_rate, roam_s=stay_s)
@@ -37,12 +37,12 @@ class Player(RoomServer):
 def playing(
     path: Path, making: Making, frame_rate: float, stay_s: float, figures: Path
 ) -> Iterator[Work[tuple[str, str], None]]:
-    """Play a room whose devices are reached by the socket at ``path``; at the end, write what it did to ``figures``.
+    """Play a room whose devices are reached by the socket at ``path``; at the end, write its record to ``figures``.
 
     Args:
         making: of the room, its pictures made before.
-        frame_rate: a whole part of that of the pictures.
-        stay_s: at a spot, while the stage follows.
+        frame_rate: that of the pictures, or an integer fraction of it.
+        stay_s: time at a spot while the stage follows.
     """
     room = making.room()
     room.show(making.file(room, "r"))

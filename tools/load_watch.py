@@ -1,4 +1,4 @@
-"""What tools/load_live.py looks at while a session runs: latencies, queues, counts, and the processes' memory."""
+"""Measurements of tools/load_live.py during a session: latencies, queues, counts, and the processes' memory."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from fgreg.model.events import PairEvent
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 BUSY_S = 1.0
-"""After an event was handed over, something else happens for so long."""
+"""Time after an event in which the engine is at work on it."""
 GROWS_FROM_MIN = 4
-"""By then the stage follows: all that a session uses has been loaded."""
+"""By then the stage follows, and everything that a session uses has been loaded."""
 TINY_S = 1e-4
 TRACKER = "resource tracker"
 
 
 def percentiles(values: list[float]) -> dict[str, float]:
-    """Of latencies, rounded; how many there are."""
+    """Percentiles of latencies, rounded, and their number."""
     out: dict[str, float] = {"count": len(values)}
     if values:
         names = ("p50", "p90", "p99", "p99.9", "max")
@@ -42,7 +42,7 @@ def percentiles(values: list[float]) -> dict[str, float]:
 
 
 class _Answered(NamedTuple):
-    """One frame: when it was answered, its latency, the device's time of its exposure, what else was going on."""
+    """One frame: when it was processed, its latency, the device's time of its exposure, stage and load meanwhile."""
 
     done_s: float
     latency_ms: float
@@ -52,7 +52,7 @@ class _Answered(NamedTuple):
 
 
 class _Answers:
-    """Frames one after another, in few bytes each: the process's own memory is what is measured."""
+    """Frames in few bytes each, since the memory of this very process is measured."""
 
     def __init__(self) -> None:
         self._numbers, self._stages = array("d"), [""]
@@ -72,7 +72,7 @@ class _Answers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
-    """What the devices sent: times by their own clocks, and the host's time at 0 of the camera's."""
+    """Data sent by the devices: times by their own clocks, and the host's time at 0 of the camera's."""
 
     frames_s: FloatArray
     pulses_s: FloatArray
@@ -80,7 +80,7 @@ class Made:
 
 
 class Spent:
-    """What became of the wall time of calls on one thread: at work, waiting for a processor, waiting for something."""
+    """Wall time of calls on one thread, split into work, waiting for a processor, and other waiting."""
 
     def __init__(self) -> None:
         self._rows = array("d")
@@ -96,7 +96,7 @@ class Spent:
         self._rows.extend(1e3 * (b - a) for a, b in zip(before, self.now(), strict=True))
 
     def figures(self) -> dict[str, Any]:
-        """Percentiles, ms; of the slowest hundredth the means."""
+        """Percentiles, ms; means of the slowest hundredth."""
         rows = np.array(self._rows).reshape(-1, 3)
         rows = np.column_stack([rows, rows[:, 0] - rows[:, 1] - rows[:, 2]])
         names = ("wall", "at work", "waits for a processor", "waits for locks and disk")
@@ -108,7 +108,7 @@ class Spent:
 
 
 def _until(times_s: FloatArray, last_s: float) -> tuple[int, int]:
-    """How many there were up to one, and how many were left out between them by a player that could not keep up."""
+    """Number sent up to ``last_s``, and number that a slow player left out in between."""
     sent = times_s[times_s <= last_s + TINY_S]
     rate = round(1.0 / float(np.diff(times_s).min()))
     return len(sent), round(float(np.ptp(sent)) * rate) + 1 - len(sent)
@@ -124,7 +124,7 @@ def _counted(call: Callable[..., Any], note: Callable[[Any, Any], None]) -> Call
 
 
 def _rest(camera: StereoCamera) -> tuple[list[StereoFrame], int]:
-    """What waits at the driver, and how many it has dropped before that: of the same moment."""
+    """Frames that wait at the driver, and the number dropped before, both at one time."""
     left: list[StereoFrame] = []
     until = time.monotonic() + 1.0
     while True:
@@ -135,7 +135,7 @@ def _rest(camera: StereoCamera) -> tuple[list[StereoFrame], int]:
 
 
 class Watch:
-    """Looks at a session after each turn of its loop."""
+    """Measures a session after each step of its loop."""
 
     def __init__(self, session: Running) -> None:
         self._session = session
@@ -183,7 +183,7 @@ class Watch:
         self._pairs += isinstance(arguments[0], PairEvent)
 
     def see(self, status: Status) -> None:
-        """After a turn."""
+        """Take in the status after a step."""
         self._last = status
         figures = self._session.loop.figures
         if figures.frames > self._frames and status.frame is not None and figures.latency_ms:
@@ -206,7 +206,7 @@ class Watch:
         return int((at_s - self._began_s) / 60.0) + 1
 
     def end(self) -> None:
-        """The devices are about to go."""
+        """Read the counts before the devices are closed."""
         loop = self._session.loop
         devices, figures = loop._devices, loop.figures
         left, dropped = _rest(devices.camera)
@@ -227,7 +227,7 @@ class Watch:
         }
 
     def figures(self, made: Made) -> dict[str, Any]:
-        """What was seen, beside what was sent: up to the last that was received, as more was on its way at the end."""
+        """Received against sent, up to the last item received: more was on its way at the end."""
         answered, counts, last = self._answered.all(), self._end, self._last
         assert last is not None
         kinds: dict[str, list[float]] = {"all": [a.latency_ms for a in answered]}
@@ -288,7 +288,7 @@ class _Process:
 
 
 class Processes:
-    """This process and all that it has started, looked at once a minute."""
+    """This process and all its children, sampled once a minute."""
 
     def __init__(self) -> None:
         self._began_s = time.monotonic()
@@ -300,13 +300,13 @@ class Processes:
             self._first_used[pid] = _used_s(pid)
 
     def see(self, now_s: float) -> None:
-        """Where a minute has passed, look."""
+        """Sample if a minute has passed."""
         if now_s >= self._next_s:
             self._next_s += 60.0
             self.sample(now_s)
 
     def sample(self, _now_s: float) -> None:
-        """Look at all."""
+        """Sample all processes."""
         self._look()
         for pid, process in self._found.items():
             if _started(pid) == process.started:
@@ -323,7 +323,7 @@ class Processes:
             self._found.setdefault(pid, _Process(name, _started(pid))).name = name
 
     def figures(self) -> dict[str, Any]:
-        """By process: memory at each minute and at the end, its growth since all is in use, share of a processor."""
+        """By process: memory at each minute and at the end, its growth after start-up, share of a processor."""
         lasted = time.monotonic() - self._began_s
         out: dict[str, Any] = {}
         for pid, process in self._found.items():
@@ -336,7 +336,7 @@ class Processes:
         return out
 
     def left(self) -> list[str]:
-        """Those that are still there, but for this one and the one that Python has for as long as it runs."""
+        """Processes that still run, without this one and Python's resource tracker."""
         own = os.getpid()
         mine = {pid for pid, parent in _parents().items() if parent == own}
         return [
@@ -347,7 +347,7 @@ class Processes:
 
 
 def _stat(pid: int) -> list[str]:
-    """Fields after the name, from the state on; none where the process is gone."""
+    """Fields after the name, from the state on; none where the process has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     except OSError:
@@ -360,7 +360,7 @@ def _parents() -> dict[int, int]:
 
 
 def _started(pid: int) -> str:
-    """When it began, in the kernel's ticks; empty where it is gone (a zombie is)."""
+    """Start time in the kernel's ticks; empty where the process has ended (or is a zombie)."""
     fields = _stat(pid)
     return fields[19] if fields and fields[0] != "Z" else ""
 
@@ -376,7 +376,7 @@ def _rss_mb(pid: int) -> float:
 
 
 def _name(pid: int) -> str:
-    """Workers have theirs; the others are known by the module that they run."""
+    """Name of a worker process, or of the module that a process runs."""
     try:
         words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8")
         shown = Path(f"/proc/{pid}/comm").read_text(encoding="utf-8").strip()

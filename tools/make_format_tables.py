@@ -1,4 +1,4 @@
-"""Write the tables of README.md and sessions/README.md from what they describe; to be run when that changes.
+"""Write the tables of README.md and sessions/README.md from the described classes. Run it when these change.
 
     python tools/make_format_tables.py
 

@@ -1,10 +1,10 @@
-"""Make the example sessions in sessions/ anew: phantom (raw frames) and paper (poses).
+"""Make the example sessions in sessions/ again: phantom (raw frames) and paper (poses).
 
     python tools/make_sessions.py                 both, into sessions/
     python tools/make_sessions.py --check         make both in a temporary folder and compare with sessions/
     python tools/make_sessions.py --out DIR paper one of them, elsewhere
 
-Seeds are fixed, so the same versions of numpy and OpenCV give the same bytes; --check tells whether yours do.
+Seeds are fixed, so the same versions of numpy and OpenCV give the same bytes; --check compares.
 The sizes are printed against the 45 MB that sessions/phantom may take.
 """
 
@@ -26,7 +26,7 @@ HOME = Path(__file__).resolve().parent.parent / "sessions"
 
 
 def make(name: str, folder: Path) -> None:
-    """Writes one session and prints what it holds."""
+    """Write one session and print its content."""
 
     def progress(done: int, total: int) -> None:
         print(f"\r{name}: frame {done} of {total}", end="", file=sys.stderr, flush=True)
@@ -43,7 +43,7 @@ def make(name: str, folder: Path) -> None:
 
 
 def differences(one: Path, other: Path) -> list[str]:
-    """Names of files that are in one folder only, or not the same in both."""
+    """Names of files that are in one folder only, or differ."""
     names = {str(p.relative_to(root)) for root in (one, other) for p in root.rglob("*") if p.is_file()}
     names -= {"result.yaml"}
     _, differing, absent = filecmp.cmpfiles(one, other, sorted(names), shallow=False)

@@ -1,4 +1,4 @@
-"""Simulated streams with a camera move in them, and what an ideal estimator could know of them.
+"""Simulated streams with a camera move, and the covariance of an ideal estimator.
 
 For tools/study_moves.py, study_early_moves.py and study_returns.py. Poses with the documented noise (tests.forward).
 """
@@ -40,7 +40,7 @@ def random_direction(rng: np.random.Generator) -> FloatArray:
 
 
 def shift_of(rng: np.random.Generator, mm: float, degrees: float) -> FloatArray:
-    """camera_new_T_camera_old: by so many mm or turned by so many degrees, each half the time."""
+    """camera_new_T_camera_old: a shift by ``mm`` or a rotation by ``degrees``, each half the time."""
     if rng.uniform() < 0.5:
         return make_transform(np.eye(3), mm * random_direction(rng))
     return make_transform(exp_so3(math.radians(degrees) * random_direction(rng)), np.zeros(3))
@@ -60,7 +60,7 @@ def bump_of(seed: int, sigma_mm: float, sigma_rad: float) -> FloatArray:
 def two_epochs(
     seed: int, motion: FloatArray, before: int, after: int, *, first_hit: bool, reported: bool = False, looks: int = 1
 ) -> tuple[SessionModel, Measurements, tuple[Truth, Truth]]:
-    """PMs before and after a motion; same beam and window edge. ``reported``: as epochs 0 and 1, else all as epoch 0.
+    """PMs before and after a motion; same beam and window edge. ``reported``: in epochs 0 and 1, else all in epoch 0.
 
     With several ``looks`` at each PM they are 2 deg apart, with amplitudes, and share a marker observation.
     """
@@ -74,7 +74,7 @@ def two_epochs(
         np.random.default_rng([seed, 1]), aims=12, pairs=before, first_hit=first_hit, marker_T_laser=beam,
         trus_T_camera=trus_T_camera,
     )  # fmt: skip
-    # The same seed draws the same window edge; without aims all that follows is drawn again.
+    # The same seed draws the same window edge; without aims everything after it differs.
     _, second, moved = make(
         np.random.default_rng([seed, 1]), aims=0, pairs=after, first_hit=first_hit, marker_T_laser=beam,
         trus_T_camera=trus_T_camera @ inverse(motion),
@@ -92,7 +92,7 @@ def two_epochs(
 
 
 def many_aims(seed: int, truth: Truth) -> tuple[Aim, ...]:
-    """So many calibration shots that the beam counts as known."""
+    """Calibration shots in a number that makes the beam known."""
     rng = np.random.default_rng([seed, 9])
     return make_measurements(rng, aims=MANY_AIMS, pairs=0, marker_T_laser=truth.marker_T_laser)[1].aims
 
@@ -100,9 +100,9 @@ def many_aims(seed: int, truth: Truth) -> tuple[Aim, ...]:
 def ideal_covariance(
     model: SessionModel, measurements: Measurements, truths: tuple[Truth, ...]
 ) -> tuple[FloatArray, SharedState]:
-    """Covariance of all shared variables by the information at the truth: the least that any estimator can have.
+    """Covariance of all shared variables by the information at the truth: the least of any estimator.
 
-    Gaussian: windows count as such, and the geometry as linear. One truth per epoch of the measurements.
+    Windows are taken as Gaussians and the geometry as linear. One truth per epoch of the measurements.
     """
     problem = pack_session(measurements, model, replace(CONFIG, window_shape=False))
     poses = np.stack([truth.trus_T_camera[0] for truth in truths])

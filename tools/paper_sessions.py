@@ -1,4 +1,4 @@
-"""One simulated session of each table of the publication: what tools/reproduce_paper.py runs and puts together."""
+"""One simulated session of each table of the publication: run and combined by tools/reproduce_paper.py."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from fgreg.simulation.write import write_session
 from fgreg.tracking.query import track
 
 HELD = 10
-"""PMs of every session that no registration sees: pair residuals are theirs."""
+"""PMs of every session that no registration uses: pair residuals are computed on them."""
 SETTINGS = SolveConfig()
 GAUSSIAN = replace(SETTINGS, window_shape=False)
-"""Windows as Gaussians of the same mean and variance: the model that the bound is of."""
+"""Windows as Gaussians of the same mean and variance, as the bound assumes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class Sim:
     truth: FullTruth
 
     def first(self, pairs: int) -> Sim:
-        """With the first so many pairs only."""
+        """The session with its first ``pairs`` pairs only."""
         kept = replace(self.measurements, pairs=self.measurements.pairs[:pairs])
         truth = replace(self.truth, pair_camera_T_marker=self.truth.pair_camera_T_marker[:pairs])
         return replace(self, measurements=kept, truth=truth)
@@ -90,16 +90,16 @@ def simulated(config: SimulationConfig, seed: int) -> Sim:
 
 
 def deviating(degrees: float) -> SimulationConfig:
-    """PMs off the image plane by arc angles up to so many degrees, uniformly; the window says just that."""
+    """PMs off the image plane by arc angles up to ``degrees``, uniform; the window is the same."""
     table = PRESETS["paper"].probe.sensitivity
-    # The window bounds stage rotation; an arc angle of a PM at range r comes to less of it.
+    # The window bounds stage rotation, which is less than the arc angle of a PM at range r.
     rotation = rotation_of_arc(math.radians(max(degrees, 0.05)), table.depth_mm, PRESETS["paper"].probe.radius_mm)
     window = replace(table, half_width_rad=as_float_array(rotation), edge_sigma_rad=1e-4)
     return replace(PRESETS["paper"], probe=replace(PRESETS["paper"].probe, sensitivity=window))
 
 
 def first_guess(sim: Sim, rng: np.random.Generator, degrees: float, mm: float) -> FloatArray:
-    """The true registration, turned about the middle of the field and shifted by so much, any way."""
+    """The true registration, rotated about the middle of the field and shifted, in random directions."""
     axis, shift = rng.standard_normal((2, 3))
     turn = exp_so3(axis / np.linalg.norm(axis) * math.radians(degrees))
     centre = np.array([0.0, 0.0, sim.model.probe.radius_mm + 32.0])
@@ -108,12 +108,12 @@ def first_guess(sim: Sim, rng: np.random.Generator, degrees: float, mm: float) -
 
 
 def calibrated(measurements: Measurements) -> tuple[FloatArray, FloatArray]:
-    """The fibre's line (origin, direction) in the marker frame as the baselines have it: fitted to the spots as is."""
+    """The fibre's line (origin, direction) in the marker frame of the baselines: an unweighted fit to the spots."""
     return beam_starts(measurements.aims)[0]
 
 
 def lines_and_arcs(sim: Sim) -> LinesAndArcs:
-    """What the published method sees."""
+    """Input of the published method."""
     origin, direction = calibrated(sim.measurements)
     pairs = sim.measurements.pairs
     marker = np.stack([pair.marker.camera_T_marker for pair in pairs])
@@ -136,7 +136,7 @@ def baseline_residuals(sim: Sim, trus_T_camera: FloatArray) -> FloatArray:
 
 
 def by_points(sim: Sim, pms: Sequence[int], rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Baseline (b): registration from PMs seen in both frames; and the points (camera, TRUS) it was made from."""
+    """Baseline (b): registration from PMs seen in both frames; and its points (camera, TRUS)."""
     trus_p = np.stack([sim.truth.trus_p_pm_mm[pm] for pm in pms])
     camera_p = transform_points(inverse(np.asarray(sim.truth.trus_T_camera[0])), trus_p)
     camera_p = camera_p + rng.standard_normal(camera_p.shape) * [0.1, 0.1, 0.8]
@@ -173,7 +173,7 @@ def run_job(job: Job) -> dict[Any, Row]:
 
 
 def calibration(job: Job) -> dict[Any, Row]:
-    """Error of the fibre's line from so many aims."""
+    """Error of the fibre's line against the number of aims."""
     sim = simulated(replace(job.config, aims=max(job.sizes) + HELD, pairs=0, tracks_heard=0, tracks_silent=0), job.seed)
     out: dict[Any, Row] = {}
     true = sim.truth.marker_T_laser
@@ -200,7 +200,7 @@ def calibration(job: Job) -> dict[Any, Row]:
 
 
 def registration(job: Job) -> dict[Any, Row]:
-    """Errors from the first so many pairs; the last ``HELD`` are never used."""
+    """Errors against the number of pairs; the last ``HELD`` are never used."""
     count = max(job.sizes) + HELD
     sim = simulated(replace(job.config, pairs=count, tracks_heard=0, tracks_silent=0), job.seed)
     rng = np.random.default_rng([job.seed, 7])
@@ -267,7 +267,7 @@ def one_out(job: Job) -> dict[Any, Row]:
 
 
 def tracking(job: Job) -> dict[Any, Row]:
-    """Answers to queries whose PM is heard, with 10 pairs."""
+    """Results of queries whose PM is detected, with 10 pairs."""
     sim = simulated(replace(job.config, pairs=10, tracks_heard=6, tracks_silent=0), job.seed)
     found = register(sim.measurements, sim.model, SETTINGS)
     centred = posterior_mean(found, SETTINGS)
@@ -304,8 +304,8 @@ def same_cost(sim: Sim, direction: FloatArray, origin: FloatArray) -> tuple[Pack
 def timing(job: Job) -> dict[Any, Row]:
     """Processor seconds of (a), theta' free, and of fgreg from the same guess, 10 pairs.
 
-    fgreg twice: on its own cost (chi square with the priors), and on (a)'s, with the beam fixed and theta' free, down
-    to where (a) got.
+    fgreg twice: on its own cost (chi square with the priors), and on that of (a), with the beam fixed and theta' free,
+    down to the cost that (a) reached.
     """
     sim = simulated(replace(job.config, pairs=10, tracks_heard=0, tracks_silent=0), job.seed)
     rng = np.random.default_rng([job.seed, 9])
@@ -323,7 +323,7 @@ def timing(job: Job) -> dict[Any, Row]:
         row["same_cost"] = float(found.evaluation.cost[0]) / len(data.x_mm)
         if row["same_cost"] <= a.cost_mm2 * (1.0 + 1e-9):
             break
-    # fgreg's own cost, from the same guess; and what it says of (a)'s registration, everything else at its best.
+    # fgreg's own cost, from the same guess; and that cost at (a)'s registration, all else at its conditional optimum.
     own = pack(sim.measurements, sim.model)
     start = time.process_time()
     found = optimize(own, make_state(guess[None, None], frame, data.radius_mm))
@@ -340,7 +340,7 @@ def timing(job: Job) -> dict[Any, Row]:
 
 
 def positions(job: Job) -> dict[Any, Row]:
-    """Stage positions visited until a PM is heard, stepping from a limit of the field, at one step width."""
+    """Stage positions visited until a PM is detected, stepping from a limit of the field, at one step width."""
     sim = simulated(replace(job.config, pairs=20, tracks_heard=0, tracks_silent=0), job.seed)
     config = replace(job.config, stage=replace(job.config.stage, step_rad=math.radians(job.key)))
     field = math.radians(42.0)  # the PMs' field and the window beyond it

@@ -1,10 +1,10 @@
-"""A simulated room whose pictures are made beforehand, so that they cost next to nothing while the room goes on.
+"""A simulated room whose pictures are rendered beforehand, so that they cost almost nothing while it runs.
 
-The surgeon goes through a fixed list: aims, then spots at tissue in laps, some with the camera here and, after a bump,
-as many with it there, then back again. He is as interactive as in fgreg.simulation.room, but begins to move only where
-the hand's tremor begins anew, and travels for a whole number of its periods: so a place is one short clip of pictures
-that repeats while he stays, and a way from place to place another. Where things are is computed at any moment as in
-that room, with the same function of time that the clips were made from.
+The surgeon follows a fixed list: aims, then spots at tissue in laps, with the camera at one place and, after a bump, at
+another, then back again. He is as interactive as in fgreg.simulation.room, but starts to move only where a period of the
+hand's tremor starts, and travels for an integer number of periods. So each place is one short clip of pictures that
+repeats while he stays, and each way between places is another. Poses are computed at any time as in that room, with the
+same function of time as the clips.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from fgreg.simulation.room import BUMP_S, Place, Room, RoomConfig, Travel, trave
 FRAME_RATE = 30.0
 LOOP_FRAMES = 24
 LOOP_S = LOOP_FRAMES / FRAME_RATE
-"""Period of the tremor, and of what is repeated while the fibre is held."""
+"""Period of the tremor, and of the clip that repeats while the fibre is held."""
 PLAYED_TREMOR_HZ = (1.25, 2.5, 5.0, 8.75)
 """Whole numbers of periods in a loop."""
 EARLY = 1e-6
-"""Share of a frame by which a time may come short of it."""
+"""Tolerance of a frame's time, as a share of the frame interval."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +36,7 @@ class Clip:
     """Pictures that are shown one after the other.
 
     Attributes:
-        place: where the fibre is, or goes to. travel, camera: the motions, from the clip's begin at 0 s.
+        place: where the fibre is, or goes to. travel, camera: the motions; the clip begins at 0 s.
         first, frames: its pictures among all.
     """
 
@@ -49,7 +49,7 @@ class Clip:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Station:
-    """A place as it comes in the list: the clip that repeats there, and those on the way to the next."""
+    """A place of the list: the clip that repeats there, and those on the way to the next."""
 
     held: Clip
     leaving: tuple[Clip, ...]
@@ -60,9 +60,9 @@ class PlayedRoom(Room):
     """A room that goes through a fixed list of places.
 
     Args:
-        config: of the room; bumps come where the list has them, whatever it says of them.
+        config: of the room; bumps come from the list, not from it.
         spots: at tissue, for either place of the camera.
-        laps: through the spots before somebody bumps into the camera.
+        laps: through the spots before the camera is bumped.
 
     Attributes:
         stations: the list; each names the one after it.
@@ -116,7 +116,7 @@ class PlayedRoom(Room):
     # --- what happens -----------------------------------------------------------------------------------------------
 
     def proceed(self, t_s: float) -> Place:
-        """The surgeon goes on to the next place, once the tremor begins anew."""
+        """The surgeon goes on to the next place, once a period of the tremor starts."""
         station = self.stations[self._station]
         begin = LOOP_S * math.ceil(t_s / LOOP_S - EARLY)
         for clip in station.leaving:
@@ -136,19 +136,19 @@ class PlayedRoom(Room):
     # --- pictures ---------------------------------------------------------------------------------------------------
 
     def shown(self, t_s: float) -> tuple[Clip, int]:
-        """What is seen at a time: the clip, and which of its pictures."""
+        """The clip shown at a time, and the index of its picture."""
         begin, clip = next(entry for entry in reversed(self._shown) if entry[0] <= t_s + EARLY)
         return clip, math.floor((t_s - begin) * FRAME_RATE + EARLY) % clip.frames
 
     def show(self, pictures: UInt8Image) -> None:
-        """Have these pictures (n, 2, h, w) shown from now on."""
+        """Show these pictures (n, 2, h, w) from now on."""
         width, height = self.config.scene.camera.left.image_size
         if pictures.shape != (self.frames, 2, height, width):
             raise ValueError(f"pictures of shape {pictures.shape}, expected {(self.frames, 2, height, width)}")
         self._pictures = pictures
 
     def pictures(self, t_s: float, index: int) -> tuple[UInt8Image, UInt8Image]:  # noqa: ARG002
-        """Left and right image (h, w) at a time, as they were made."""
+        """Left and right image (h, w) at a time, as rendered."""
         clip, at = self.shown(t_s)
         if self._pictures is None:
             return self.made(clip, at)
@@ -156,7 +156,7 @@ class PlayedRoom(Room):
         return left, right
 
     def made(self, clip: Clip, at: int) -> tuple[UInt8Image, UInt8Image]:
-        """One picture of a clip, anew."""
+        """Render one picture of a clip."""
         now = self._place, self._travels, self._cameras
         self._place, self._travels, self._cameras = clip.place, [clip.travel], [clip.camera]
         try:
@@ -170,7 +170,7 @@ class PlayedRoom(Room):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Making:
-    """What a process needs to make pictures: plain values."""
+    """Input of a process that renders pictures: plain values."""
 
     config: RoomConfig
     spots: int
@@ -204,7 +204,7 @@ def _make(making: Making, number: int) -> int:
 def make_pictures(making: Making, processes: int) -> bool:
     """Make all pictures of a room and write them to the file; False where they are there already.
 
-    A file that is there is taken for this room's if the last picture of each clip is what is made now.
+    An existing file belongs to this room if the last picture of each clip equals the one rendered now.
     """
     room = making.room()
     if making.path.is_file() and _holds(making, room):

@@ -22,11 +22,11 @@ _FINE = b"."
 
 
 class QueryError(Exception):
-    """A query that could not be worked on; the text says why."""
+    """A query that cannot be processed; the text says why."""
 
 
 def encode_query(query: Track) -> bytes:
-    """A query as bytes. Of the markers' ids only which are equal is kept."""
+    """A query as bytes. The markers' ids are reduced to which of them are equal."""
     numbers: dict[int, int] = {}
     markers = (query.marker, *query.look_markers)
     parts = [_HEAD.pack(
@@ -66,7 +66,7 @@ def decode_query(data: bytes) -> Track:
     """A query from bytes.
 
     Raises:
-        QueryError: not such bytes, or a number in them that cannot be.
+        QueryError: the bytes are no query, or hold an invalid number.
     """
     if len(data) < _HEAD.size:
         raise QueryError(f"a query of {len(data)} bytes, expected at least {_HEAD.size}")
@@ -102,7 +102,7 @@ def encode_answer(answer: TrackEstimate, age_s: float) -> bytes:
 
 
 def encode_error(text: str) -> bytes:
-    """What went wrong with a query, as bytes."""
+    """An error message as bytes."""
     return _ERROR + text.encode()
 
 
@@ -110,7 +110,7 @@ def decode_answer(data: bytes) -> tuple[TrackEstimate, float]:
     """An answer, and the age (s) of the snapshot it is from.
 
     Raises:
-        QueryError: the query could not be worked on, or these are not such bytes.
+        QueryError: the query could not be processed, or the bytes are no result.
     """
     if data[:1] == _ERROR:
         raise QueryError(data[1:].decode(errors="replace"))

@@ -1,6 +1,6 @@
-"""A process that answers tracking queries from the shared snapshot, whatever the estimate's process is busy with.
+"""A process that answers tracking queries from the shared snapshot while the estimate's process is busy.
 
-Native calls of the estimate's updates hold their interpreter's lock, so a thread beside them waits. A client of this
+Native calls of the estimate's updates hold their interpreter's lock, so other threads of that process wait. A client of this
 server waits for one round trip over a local socket. A camera loop that is a process of its own needs no server: it
 holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.query.track` itself.
 """
@@ -30,13 +30,13 @@ from fgreg.workers.worker_process import Work, WorkerProcess
 from query_codec import QueryError, decode_answer, decode_query, encode_answer, encode_error, encode_query
 
 START_S = 30.0
-"""How long the process may take to start."""
+"""Longest time until the process has started."""
 _KEY_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True)
 class QueryAddress:
-    """Where a server listens, and the key that it asks for: hand it to processes that may ask."""
+    """Address and key of a server, for processes that may send queries."""
 
     path: str
     key: bytes
@@ -46,7 +46,7 @@ class QueryAddress:
 
 
 class QueryClient:
-    """Asks a server; safe to share between threads, which then take turns: faster with one client each.
+    """Sends queries to a server. Threads may share one and then take turns; one client each is faster.
 
     Raises:
         OSError: there is no such server. multiprocessing.AuthenticationError: the key is wrong.
@@ -66,7 +66,7 @@ class QueryClient:
         """The answer to a query, as of :func:`fgreg.tracking.query.track`.
 
         Raises:
-            QueryError: the server could not work on it. EOFError, OSError: the server is gone.
+            QueryError: the server could not process it. EOFError, OSError: the server has ended.
         """
         message = encode_query(query)
         with self._turn:
@@ -76,7 +76,7 @@ class QueryClient:
         return answer
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         self._connection.close()
 
     def __enter__(self) -> QueryClient:
@@ -149,7 +149,7 @@ class QueryServer:
 
 @contextlib.contextmanager
 def _serving(name: str, address: QueryAddress) -> Iterator[Work[None, None]]:
-    """In the process, one thread a client, which holds a reader of its own. Nothing is left to do for the worker."""
+    """Serve in the process: one thread per client, each with a reader of its own. The worker itself has no work."""
     reader = SnapshotReader(name)
     with Listener(address.path, family="AF_UNIX", backlog=16, authkey=address.key) as listener:
         threading.Thread(target=_accept, args=(listener, reader), daemon=True).start()
@@ -162,13 +162,13 @@ def _accept(listener: Listener, reader: SnapshotReader) -> None:
         try:
             connection = listener.accept()
         except (OSError, EOFError, AuthenticationError):
-            time.sleep(0.01)  # one that left in the middle of it, or has no key; or no more connections are to be had
+            time.sleep(0.01)  # a client that left meanwhile or has no key, or no more connections
             continue
         threading.Thread(target=_answer, args=(connection, reader.clone()), daemon=True).start()
 
 
 def _answer(connection: Connection[Any, Any], reader: SnapshotReader) -> None:
-    """Answer one client until it leaves."""
+    """Answer one client until it disconnects."""
     with connection, contextlib.suppress(OSError, EOFError):
         while True:
             connection.send_bytes(_reply(connection.recv_bytes(), reader))
@@ -180,5 +180,5 @@ def _reply(message: bytes, reader: SnapshotReader) -> bytes:
         return encode_answer(track(decode_query(message), received.snapshot), received.age_s)
     except (QueryError, NoSnapshotError) as error:
         return encode_error(str(error))
-    except Exception as error:  # a defect, or a query that nobody thought of: the next one is to be answered
+    except Exception as error:  # a defect, or an unforeseen query: the next one is still answered
         return encode_error(f"{type(error).__name__}: {error}")

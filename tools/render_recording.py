@@ -93,7 +93,7 @@ def headless_viewer(width: int, height: int, deadline: float) -> Iterator[Any]:
 
 
 def end(child: subprocess.Popen[bytes]) -> None:
-    """End a child and its process group: politely, then not."""
+    """End a child and its process group: by SIGTERM, then by SIGKILL."""
     for how in (signal.SIGTERM, signal.SIGKILL):
         if child.poll() is not None:
             return

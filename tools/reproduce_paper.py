@@ -1,4 +1,4 @@
-"""Every table of the publication side by side: published, its method and the conventional one run here, fgreg, bound.
+"""Every table of the publication: published, its method and the conventional one run here, fgreg, and the bound.
 
     python tools/reproduce_paper.py                          all tables, 100 sessions a row, about an hour on one core
     python tools/reproduce_paper.py --sessions 20 --slow 1   a first look
@@ -244,7 +244,7 @@ def bound_table(runner: Runner) -> Table:
         body.append([str(size), str(len(good)), cell(rms([r["gaussian_tre"] for r in good])), cell(bound), *figures])
     title = "Against the posterior Cramer-Rao bound, Gaussian window (target: ratio at most 1.07, standard error 0.02)"
     head = ["pairs", "sessions", "fgreg TRE rms, mm", "bound rms, mm", "ratio", "of the graph's optimum"]
-    head += ["of the answer, windows in their own shape"]
+    head += ["of the posterior mean, windows in their own shape"]
     return title, head, body
 
 
@@ -261,7 +261,7 @@ def tracking_table(runner: Runner) -> Table:
     jobs = [Job(tracking, c, s, key=k) for k, c in kinds.items() for s in runner.seeds(runner.args.sessions)]
     rows = runner.run("tracking", jobs)
     body = [[k, PUBLISHED_TRACKING, plus_minus([r["track"] for r in rows[k]])] for k in kinds]
-    return "Tracking error with 10 pairs, deg (PM heard once)", ["sweeps", "published", "fgreg"], body
+    return "Tracking error with 10 pairs, deg (PM detected once)", ["sweeps", "published", "fgreg"], body
 
 
 def timing_table(runner: Runner) -> Table:

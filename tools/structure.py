@@ -2,9 +2,8 @@
 
     python tools/structure.py ../before .
 
-Packages are what lies in ``fgreg/``: a folder, or a module that lies flat beside the folders. Imports count wherever
-they stand, in functions and under TYPE_CHECKING too. Layers are packages in the longest chain of imports; those in a
-circle share one. Public names are those of ``fgreg.__all__``.
+A package is a folder in ``fgreg/``, or a module directly in ``fgreg/``. All imports count, also those in functions and
+under TYPE_CHECKING. Layers are packages in the longest chain of imports; those in a circle share one. Public names are those of ``fgreg.__all__``.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ Arrows = dict[str, set[str]]
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What was counted in a checkout.
+    """Counts of a checkout.
 
     Attributes:
         files, lines: of each package.
-        flat: modules that lie flat in the package, ``__init__`` and ``__main__`` among them.
+        flat: modules directly in the package, ``__init__`` and ``__main__`` among them.
         arrows: each package, and the packages that it imports.
         package_circles, file_circles: packages, or files, that import each other in a loop.
         public: names of the public API.
@@ -59,7 +58,7 @@ class Structure:
 
 
 def circles(arrows: Arrows) -> tuple[tuple[str, ...], ...]:
-    """Groups of two or more that all reach each other."""
+    """Groups of two or more that import each other, directly or not."""
     names = sorted(arrows)
     reaches = np.array([[other in arrows[name] for other in names] for name in names])
     _, label = connected_components(reaches, connection="strong")
@@ -68,7 +67,7 @@ def circles(arrows: Arrows) -> tuple[tuple[str, ...], ...]:
 
 
 def public_names(package: Path) -> tuple[str, ...]:
-    """``__all__`` of the package, or of its module ``api``, as it is written there; none where there is no list."""
+    """``__all__`` of the package, or of its module ``api``, as written there; none where there is no list."""
     for path in (package / "__init__.py", package / "api.py"):
         for statement in ast.parse(path.read_text(encoding="utf-8")).body if path.is_file() else ():
             targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]

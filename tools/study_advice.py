@@ -1,10 +1,9 @@
-"""What following the advice is worth: simulated surgeons who take their next shots as advised, or at random.
+"""Benefit of the advice: simulated surgeons who take their next shots as advised, or at random.
 
 Every session starts with 4 random pairs. Two surgeons go on to 10: one takes the best of
-`fgreg.registration.next_shot`'s candidates, the other any one of the same candidates. Both miss alike: the beam passes
-the spot by --aim-mm and leans off the direction by --lean-deg. The tissue, the probe, the stage and all noise are the
-forward model's; where a beam ends is found by following it to the tissue. A shot that ends outside the probe's field is
-taken again.
+`fgreg.registration.next_shot`'s candidates, the other a random one of the same candidates. Both have the same errors: the beam passes
+the spot by --aim-mm and its direction is off by --lean-deg. Tissue, probe, stage and all noise are those of the forward
+model; the end of a beam is its intersection with the tissue. A shot that ends outside the probe's field is repeated.
 
 Printed: root mean square TRE over sessions and targets at every number of pairs, both arms, and the ratio at 10
 (target: at most 0.80).
@@ -99,7 +98,7 @@ def take_shot(
 def misplaced(
     camera_T_marker: FloatArray, camera_p_spot: FloatArray, rng: np.random.Generator, aim_mm: float, lean_rad: float
 ) -> FloatArray:
-    """The marker as a hand holds it that was asked for this one: turned about the spot, and the spot missed."""
+    """The marker as a hand holds it for a wanted pose: rotated about the spot, with the spot missed."""
     turn = exp_so3(rng.standard_normal(3) * lean_rad)
     about = make_transform(turn, camera_p_spot - turn @ camera_p_spot + aim_mm * rng.standard_normal(3))
     return np.asarray(about @ camera_T_marker)
@@ -127,7 +126,7 @@ def go_on(
         candidates = advice.candidates
         shot = None
         for attempt in range(TRIES):
-            # After a miss the surgeon looks farther down the list.
+            # After a miss the surgeon takes the next of the list.
             within = min(1 + attempt * attempt, len(advice.order)) if advised else len(advice.order)
             pick = advice.order[rng.integers(within)]
             held = misplaced(
@@ -176,7 +175,7 @@ def main() -> None:
                 except EstimationError as error:
                     raise SystemExit(f"session {seed}, {arm}: {error}") from error
             ratio = table(arms)[LAST]["ratio"]
-            print(f"\rsession {index + 1} of {args.sessions}, ratio so far {ratio:.3f}", end="", file=sys.stderr)
+            print(f"\rsession {index + 1} of {args.sessions}, ratio up to now {ratio:.3f}", end="", file=sys.stderr)
     print(file=sys.stderr)
     figures = table(arms)
     print("pairs  advised, rms mm   random, rms mm   ratio   medians of session rms, mm")

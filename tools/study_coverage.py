@@ -1,18 +1,19 @@
-"""Does the posterior mean what it says? Simulated sessions against their truth, per number of pairs and kind of look.
+"""Calibration of the posterior: simulated sessions against their truth, per number of pairs and kind of look.
 
 For each cell (pairs x window-only or first-hit): share of sessions with the truth inside the 95 % region of the
-registration; share of targets whose error is inside their own 95 % bound; NEES of the result's 6x6 (mean, median, 6 is
-right) and how often chi square of 6 degrees of freedom covers it; predicted against actual RMS target error, of the
-sessions that are not refused as ambiguous and of all (a rival minimum may be centimetres away, and a handful of such
-sessions make up the whole RMS); RMS roll (mean turn of the targets about the probe's axis); time per session of
-registration and posterior.
+registration; share of targets whose error is inside their own 95 % bound; NEES of the result's 6x6 (mean and median; 6
+expected) and its coverage by chi square of 6 degrees of freedom; predicted against actual RMS target error, of the
+sessions that are not refused as ambiguous and of all (another minimum may be centimetres away, and a few such sessions
+dominate the RMS); RMS roll (mean rotation of the targets about the probe's axis); time per session of registration and
+posterior.
 
     python tools/study_coverage.py --sessions 200                       all cells, the windows' own shape
-    python tools/study_coverage.py --pairs 25 --kind window --gaussian  Gaussian windows beside, to see what they lose
+    python tools/study_coverage.py --pairs 25 --kind window --gaussian  with Gaussian windows as well, to compare
     python tools/study_coverage.py --marker-noise 0.25 ...              marker noise scaled
 
-least_roll_ratio is what the windows' own shape can win at most in a cell of window-only looks: Fisher's information on
-a common turn, uniform window against Gaussian, at the noise with which beam and hearing tell each look's rotation.
+least_roll_ratio is the largest possible gain of the windows' own shape in a cell of window-only looks: Fisher's
+information on a common rotation, uniform window against Gaussian, at the noise of each look's rotation by beam and
+detection.
 
 Targets: region and per target 93 to 97 % (one cell may miss); mean NEES 5 to 7.5 and coverage of at least 93 % from 10
 pairs on; predicted within 7 % of actual; roll at 25 window-only pairs a third below that of Gaussian windows.
@@ -52,7 +53,7 @@ LIMIT = float(chi2.ppf(0.95, 6))
 
 
 def rotation_noise(found: PosteriorMean) -> FloatArray:
-    """(L,) rad: how well each look's rotation is known from its beam and its hearing alone, the window aside."""
+    """(L,) rad: standard deviation of each look's rotation by its beam and detection alone, without the window."""
     problem, optimum = found.modes[0].problem, found.modes[0].optimum
     at = optimum.evaluation
     look = look_block(problem, optimum.state, at.private.trus_p_pm[:, problem.look_pm])
@@ -62,12 +63,12 @@ def rotation_noise(found: PosteriorMean) -> FloatArray:
 
 
 def least_roll_ratio(sigma_rad: FloatArray, half_width_rad: float) -> float:
-    """Least ratio of roll errors, window as it is over Gaussian window, by Fisher's information on a common turn.
+    """Least ratio of roll errors, own shape over Gaussian window, by Fisher's information on a common turn.
 
-    A look whose rotation is uniform in the window and known to ``sigma_rad`` has the density of their sum, which says
-    of its place ``int f'^2 / f``; the Gaussian of the same variance says ``1 / (w^2 / 3 + sigma^2)``.
+    A look whose rotation is uniform in the window and known to ``sigma_rad`` has the density f of their sum, with the
+    location information ``int f'^2 / f``; the Gaussian of the same variance has ``1 / (w^2 / 3 + sigma^2)``.
     """
-    x = np.linspace(0.0, 1.0, 2001) * (half_width_rad + 6.0 * sigma_rad[:, None])  # and as much on the other side
+    x = np.linspace(0.0, 1.0, 2001) * (half_width_rad + 6.0 * sigma_rad[:, None])  # and the same on the other side
     low, high = (x - half_width_rad) / sigma_rad[:, None], (x + half_width_rad) / sigma_rad[:, None]
     density = norm.sf(low) - norm.sf(high)
     slope = (norm.pdf(high) - norm.pdf(low)) / sigma_rad[:, None]

@@ -1,14 +1,14 @@
 """Unreported camera moves before an epoch's seventh PM: the verdict on the mixed pairs, and when the move is found.
 
-Simulated streams as in tools/study_moves.py: so many PMs, an unreported move, up to 20 PMs more. The online
-engine takes them pair by pair; after each PM its full solve judges what there is (``settle``). Moves:
+Simulated streams as in tools/study_moves.py: some PMs, an unreported move, up to 20 PMs more. The online engine takes
+them pair by pair, with a full solve after each PM (``settle``). Moves:
 
-  room    2 deg and 2.5 mm a side and axis about the tissue's middle, as somebody bumps into the simulated room's camera
+  room    2 deg and 2.5 mm a side and axis about the tissue's middle, as a bump of the simulated room's camera
   small   2 mm or 1 deg about the camera, in a random direction
-  none    no move: how often the verdict is wrong anyway
+  none    no move: how often the verdict is wrong
 
-Printed, after so many PMs more: verdicts; how many of them are wrong; how often a move has been found; and how often
-the registration is usable (not refused) and right. Wrong is a registration whose largest error at the targets is
+Printed, by the number of PMs after the move: verdicts; how many are wrong; how often a move has been found; and how
+often the registration is usable (not refused) and right. Wrong is a registration whose largest error at the targets is
 beyond 1.5 times the predicted 95 % (three sigma), or beyond the limit where the prediction is within it.
 """
 
@@ -33,9 +33,9 @@ from move_streams import CONFIG, bump_of, shift_of, two_epochs
 
 AFTER = 20
 LOOKED_AT = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
-"""PMs after the move at which the verdict is asked for."""
+"""Numbers of PMs after the move at which the verdict is read."""
 SIGMAS = 1.5
-"""Beyond so many times the predicted 95 %, which are two sigma, an error is wrong."""
+"""An error beyond this multiple of the predicted 95 % (two sigma) is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Stood:
 
     @property
     def wrong(self) -> bool:
-        """Whether the predicted error is not true."""
+        """Whether the predicted error is too small."""
         limit = CONFIG.limit_mm
         return self.error_mm > SIGMAS * self.predicted_mm or self.predicted_mm <= limit < self.error_mm
 

@@ -1,17 +1,17 @@
-"""What junk among the shots costs: sessions with false PMs and flipped markers, against the same without them.
+"""Effect of outliers among the shots: sessions with false PMs and flipped markers, against the same without them.
 
-Each session has 12 aims and 25 pairs. A share of the pairs is then replaced by junk, of three kinds in turn:
+Each session has 12 aims and 25 pairs. A share of the pairs is then replaced by outliers, of three kinds in turn:
 
-  false PM      x and range of something else, anywhere in the image
+  false PM      x and range of another source, anywhere in the image
   marker flip   the other of the two planar poses: the tag's tilt mirrored about its line of sight
-  wrong marker  a pose of something else, anywhere within reach
+  wrong marker  a pose of another object, anywhere within reach
 
-and the session is solved with the junk and with the junk pairs taken out. Printed: the ratio of the RMS true target
-registration errors (mean over the targets), the share of junk left out, of gross junk (its squared misfit at the truth
-beyond 25, five standard deviations) and of good pairs, over all sessions.
+and the session is solved with the outliers and without them. Printed: the ratio of the RMS true target registration
+errors (mean over the targets), and the share rejected of the outliers, of the gross ones (squared misfit at the truth
+beyond 25, five standard deviations) and of the good pairs, over all sessions.
 
-Targets: a ratio of at most 1.08 at 20 % junk, 1.15 at 40 %; at least 95 % of the gross junk named; at most 2 % of the
-good pairs left out.
+Targets: a ratio of at most 1.08 at 20 % outliers, 1.15 at 40 %; at least 95 % of the gross outliers rejected; at most
+2 % of the good pairs rejected.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def flip(camera_T_marker: FloatArray) -> FloatArray:
 
 
 def spoil(pair: Pair, kind: str, rng: np.random.Generator) -> Pair:
-    """The pair with junk in its place."""
+    """The pair replaced by an outlier."""
     if kind == "false PM":
         look = replace(pair.look, x_mm=float(rng.uniform(-20, 20)), range_mm=float(rng.uniform(22, 42)))
         return replace(pair, look=look)
@@ -103,7 +103,7 @@ def tre_mm(found: Registration, truth: Truth, model: SessionModel) -> FloatArray
 
 @dataclass
 class Figures:
-    """What is collected over sessions; ``rms`` values are of the mean errors (mm) of each."""
+    """Figures collected over sessions; ``rms`` values are of the mean errors (mm) of each."""
 
     with_mm: list[float] = field(default_factory=list)
     without_mm: list[float] = field(default_factory=list)
@@ -116,7 +116,7 @@ class Figures:
     by_kind: dict[str, list[int]] = field(default_factory=lambda: {kind: [0, 0] for kind in KINDS})
 
     def add(self, other: Figures) -> None:
-        """Take in another's."""
+        """Add those of another session."""
         self.with_mm += other.with_mm
         self.without_mm += other.without_mm
         for name in ("junk", "junk_named", "gross", "gross_named", "good", "good_lost"):
@@ -174,13 +174,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=200)
     parser.add_argument("--pairs", type=int, default=25)
-    parser.add_argument("--share", type=float, nargs="*", default=[0.0, 0.2, 0.4], help="of the pairs that are junk")
+    parser.add_argument(
+        "--share", type=float, nargs="*", default=[0.0, 0.2, 0.4], help="of the pairs that are outliers"
+    )
     parser.add_argument("--aim-share", type=float, default=0.0, help="of the aims whose marker is flipped")
     parser.add_argument("--kind", choices=("all", *KINDS), default="all")
     parser.add_argument("--window", action="store_true", help="no first hits: only the window is known")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--verbose", action="store_true", help="a line for each session that junk made worse by 30 %%")
+    parser.add_argument(
+        "--verbose", action="store_true", help="a line for each session that outliers made worse by 30 %%"
+    )
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     out = {}
@@ -209,7 +213,7 @@ def main() -> None:
         }
         result |= {f"named, {kind}": named / n for kind, (named, n) in figures.by_kind.items() if n}
         out[str(share)] = result
-        print(f"{share:.0%} junk" + (f" (ratio at most {limit})" if limit else ""))
+        print(f"{share:.0%} outliers" + (f" (ratio at most {limit})" if limit else ""))
         for key, value in result.items():
             print(f"  {key:26s}{value:.4f}")
     if args.json:

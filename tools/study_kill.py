@@ -1,12 +1,12 @@
-"""Kill a recording process 200 times at random moments, and see whether anything that it acknowledged is lost.
+"""Kill a recording process 200 times at random moments, and check that no acknowledged event is lost.
 
     python tools/study_kill.py                 # events through the whole session: disk, then estimate
-    python tools/study_kill.py --journal-only  # the disk alone: more events in a life
+    python tools/study_kill.py --journal-only  # the disk alone: more events per run
     python tools/study_kill.py --kills 1000 --seed 2
 
-Each life opens the session again, goes on behind the last event, and is ended by SIGKILL. After each, every line but an
-unfinished last one has to be, byte by byte, what was given. At the end the sessions are opened once more; the estimate
-has to be that of the same events taken in without an interruption.
+Each run opens the session again, continues after the last event, and is ended by SIGKILL. After each, every line but an
+incomplete last one has to equal, byte by byte, the event given. At the end the sessions are opened once more; the
+estimate has to be that of the same events without an interruption.
 """
 
 from __future__ import annotations

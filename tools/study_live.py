@@ -1,15 +1,15 @@
-"""What `fgreg live` tells, against a replay and a solve of what it recorded, and against the truth.
+"""Reports of `fgreg live`, against a replay and a solve of its recording, and against the truth.
 
     python tools/study_live.py --seeds 1 2 --seconds 200            # rooms in real time, one after another
-    python tools/study_live.py --made-up --seeds 1 2 3 4 5          # in made-up time: observations without pictures
+    python tools/study_live.py --made-up --seeds 1 2 3 4 5          # in simulated time: observations without pictures
     python tools/study_live.py --recorded FOLDER ...                # sessions of earlier runs: replay and solve only
 
-Each room is conducted as `fgreg live` does it, but for the viewer. For every event: the estimate told right after it,
-and what replay tells there: verdict, epoch, pairs, and how far the registrations are apart, in sigma of the live one,
-in degrees and in mm. What differs by design: live judges, and looks for moves, in processes beside, whose answers
-come some events later than replay has them. So at the end both are settled, and then epochs, verdict and rejected pairs
-have to be the same and the registrations within 0.05 sigma. A solve with --detect-moves stands beside them, and the
-true error at the targets of each beside the one predicted. Every figure with a target is printed beside it.
+Each room is run as by `fgreg live`, without the viewer. For every event: the estimate reported right after it, and that of
+replay: verdict, epoch, pairs, and the difference of the registrations in sigma of the live one, in degrees and in mm.
+By design, live runs its full solves in worker processes, whose results come some events later than in replay. So both
+are settled at the end; then epochs, verdict and rejected pairs have to be the same and the registrations within 0.05
+sigma. A solve with --detect-moves is compared as well, and for each the true error at the targets with the predicted one.
+Every figure with a target is printed beside it.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ from tests.rehearsal import Rehearsal
 
 SAME_SIGMA = 0.05
 REFRESH_EVERY = 6
-"""Frames of a room in made-up time between looks at what was found out meanwhile."""
+"""Frames of a room in simulated time between two checks for results of the worker processes."""
 SETTLE_S = 3.0
-"""So long the processes beside the engine may take to answer after the last event."""
+"""Longest time of the worker processes after the last event."""
 
 
 @dataclass
 class Told:
-    """What was told of a session: after each event that was taken in, and at the end, settled."""
+    """Reports of a session: after each event that was taken in, and at the end, settled."""
 
     events: list[Recorded] = field(default_factory=list)
     estimates: list[OnlineEstimate | None] = field(default_factory=list)
@@ -67,7 +67,7 @@ class Told:
     measurements: Measurements | None = None
 
     def take(self, event: Recorded, estimate: OnlineEstimate | None, _beam: FloatArray | None) -> None:
-        """On the recorder's thread."""
+        """Take in an event and its estimate; called on the recorder's thread."""
         if not isinstance(event, AimEvent | PairEvent | CameraMovedEvent):
             return
         self.events.append(event)
@@ -90,7 +90,7 @@ def conduct(folder: Path, seed: int, width_px: int, aims: int, bump_every_s: flo
 
 
 class Recording:
-    """A live session in the place of a rehearsal's engine."""
+    """A live session in place of a rehearsal's engine."""
 
     def __init__(self, session: LiveSession, told: Told) -> None:
         self._session, self._told = session, told
@@ -99,7 +99,7 @@ class Recording:
 
     @property
     def estimate(self) -> OnlineEstimate:
-        """What was told last."""
+        """The last reported estimate."""
         self._queries += 1
         if self._queries % REFRESH_EVERY == 0:
             self._session.refresh()
@@ -125,7 +125,7 @@ class Recording:
 
 
 def rehearse(folder: Path, seed: int, aims: int, bump_every_s: float, seconds: float) -> Told:
-    """A session in a simulated room, in made-up time."""
+    """A session in a simulated room, in simulated time."""
     told = Told()
     room = Room(room_config(seed, aims=aims, bump_every_s=bump_every_s))
     rehearsal = Rehearsal(room)
@@ -163,7 +163,7 @@ def apart(a: OnlineEstimate | None, b: OnlineEstimate | EpochEstimate | None) ->
 
 
 class Stood:
-    """Where the camera truly stood, by the session's ground truth."""
+    """True poses of the camera, by the session's ground truth."""
 
     def __init__(self, folder: Path) -> None:
         raw = load_yaml(folder / "ground_truth.yaml", "ground_truth.yaml")
@@ -172,13 +172,13 @@ class Stood:
         self.targets_mm = read_session(folder).model.targets_mm
 
     def errors_mm(self, trus_T_camera: FloatArray, t: float) -> FloatArray:
-        """(n,) at the targets, of what is told at a time."""
+        """(n,) errors at the targets of a registration reported at a time."""
         true = self.poses[sum(moved <= t for moved in self.moved_s)]
         off = trus_T_camera @ np.linalg.inv(true)
         return np.asarray(np.linalg.norm(self.targets_mm @ off[:3, :3].T + off[:3, 3] - self.targets_mm, axis=1))
 
     def claim(self, known: OnlineEstimate | EpochEstimate | None, t: float) -> str:
-        """Error and prediction, worst target; WRONG where it is told to be ok and is not."""
+        """Error and prediction at the worst target; WRONG where the verdict is ok and the error is too large."""
         if known is None or known.trus_T_camera is None or known.predicted_tre is None:
             return ""
         error, predicted = float(self.errors_mm(known.trus_T_camera, t).max()), known.predicted_tre.worst_mm
@@ -192,7 +192,7 @@ def text(estimate: OnlineEstimate | None) -> str:
 
 
 def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
-    """Replay, solve and truth of one session; whether what has to be the same is."""
+    """Replay, solve and truth of one session; whether they agree where they have to."""
     steps: list[ReplayStep] = []
     engines: list[OnlineRegistration] = []
 
@@ -206,7 +206,7 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
     solved = solve_session(SolveRequest(folder, folder / "moves.yaml", detect_moves=True))
     met = True
     if told is not None:
-        # Moves that live found out are events of the record, not of what it was given.
+        # Moves that live detected are events of the recording, not of its input.
         found = [s for s in steps if not s.refused and not (isinstance(s.event, CameraMovedEvent) and s.event.detected)]
         print(f"  events taken in: live {len(told.events)}, replay {len(found)}    target the same")
         met = len(told.events) == len(found)
@@ -228,15 +228,15 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
                 print(f"  {step.event.t:7.1f}  {kind:<6} {text(estimate):<16} {text(step.estimate):<16} {gaps} {claim}")
         if worst:
             p50, p90 = np.quantile(worst, (0.5, 0.9))
-            print(f"  apart as told, sigma: median {p50:.3f}, 90 % {p90:.3f}, most {max(worst):.3f} ({len(worst)})")
-        print(f"  told ok where the worst target was off by more than twice what was predicted: {wrong}    target 0")
+            print(f"  apart as reported, sigma: median {p50:.3f}, 90 % {p90:.3f}, most {max(worst):.3f} ({len(worst)})")
+        print(f"  reported ok where the worst target was off by more than twice the prediction: {wrong}    target 0")
         met &= settled_same(told, replayed.settled, engines[-1])
     report_truth(folder, told, replayed.settled, solved.estimate.epochs)
     return met
 
 
 def settled_same(told: Told, replayed: OnlineEstimate | None, engine: OnlineRegistration) -> bool:
-    """Print how the two ends compare; whether they are the same."""
+    """Print the comparison of the two ends; whether they agree."""
     live = told.settled
     if live is None or replayed is None or told.measurements is None:
         print(f"  settled: live {text(live)}, replay {text(replayed)}    target the same")
@@ -257,14 +257,14 @@ def settled_same(told: Told, replayed: OnlineEstimate | None, engine: OnlineRegi
 def report_truth(
     folder: Path, told: Told | None, replayed: OnlineEstimate | None, epochs: tuple[EpochEstimate, ...]
 ) -> None:
-    """Errors of the epoch that lasts, at its last pair, beside what is predicted; true moves beside those noticed."""
+    """Errors of the current epoch at its last pair, beside the predicted ones; true moves beside the detected ones."""
     stood, events = Stood(folder), read_session(folder).events
     last = max((event.t for event in events if isinstance(event, PairEvent)), default=0.0)
     began = [round(e.t if e.since_t is None else e.since_t, 1) for e in events if isinstance(e, CameraMovedEvent)]
     print(f"  true moves at {stood.moved_s} s, the last pair at {last:.1f} s; epochs begin at {began} s")
     ends: list[tuple[str, OnlineEstimate | EpochEstimate | None]] = []
     if told is not None:
-        ends += [("live, as told last", told.estimates[-1] if told.estimates else None), ("live", told.settled)]
+        ends += [("live, as reported last", told.estimates[-1] if told.estimates else None), ("live", told.settled)]
     ends += [("replay", replayed), ("solve --detect-moves", epochs[-1])]
     for name, known in ends:
         claim = stood.claim(known, last)
@@ -281,12 +281,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--seconds", type=float, default=200.0)
-    parser.add_argument("--made-up", action="store_true", help="in made-up time, without pictures")
+    parser.add_argument("--made-up", action="store_true", help="in simulated time, without pictures")
     parser.add_argument("--width", type=int, default=480, help="of the camera's images, px")
     parser.add_argument("--aims", type=int, default=6)
     parser.add_argument("--bump-every", type=float, default=90.0, help="mean time between camera moves, s")
     parser.add_argument("--out", type=Path, default=Path("study-live"), help="folder of the sessions")
-    parser.add_argument("--recorded", type=Path, nargs="+", help="sessions to look at instead")
+    parser.add_argument("--recorded", type=Path, nargs="+", help="sessions to compare instead")
     parser.add_argument("--every", action="store_true", help="print every event")
     options = parser.parse_args()
     met = True

@@ -1,4 +1,4 @@
-"""What more information per shot is worth: several looks with amplitudes, tracking, an estimated sound speed.
+"""Benefit of more information per shot: several looks with amplitudes, tracking, an estimated sound speed.
 
 looks     sessions of first hits, and the same sessions with two more looks at each PM, 2 deg on each, and amplitudes
           (5 % noise, unknown peak): ratio of RMS target errors where each look has its own marker detection (target:
@@ -7,7 +7,7 @@ tracking  queries at PMs that the session does not have, answered from the sessi
           with amplitudes at each PM) and from the true registration and beam: RMS angle errors and their ratio (target:
           at most 1.10 after three looks); with three looks, amplitudes and marker detections at most 0.5 deg.
 speed     a sound speed 2 % off, with and without --estimate sound_speed, against sessions in which it is right (target:
-          at most 10 % worse where estimated, noticed where not), without and with wavefronts that say it to 0.3 %.
+          at most 10 % worse where estimated, detected where not), without and with wavefronts that give it to 0.3 %.
 
     python tools/study_looks.py looks tracking --sessions 200
 """
@@ -52,7 +52,7 @@ def solved(measurements: Measurements, model: SessionModel, config: SolveConfig 
 
 
 def errors(found: PosteriorMean, truth: Truth, model: SessionModel) -> tuple[float, float]:
-    """Mean squared target error, and the posterior's idea of it, mm^2."""
+    """Mean squared target error, and its posterior expectation, mm^2."""
     camera_p = transform_points(inverse(truth.trus_T_camera[0]), model.targets_mm)
     moved = transform_points(found.posterior.mean.trus_T_camera()[0], camera_p) - model.targets_mm
     expected = found.posterior.weight @ target_errors(found.posterior, 0, model.targets_mm) ** 2
@@ -60,7 +60,7 @@ def errors(found: PosteriorMean, truth: Truth, model: SessionModel) -> tuple[flo
 
 
 def first_looks(measurements: Measurements) -> Measurements:
-    """The session as it would have been with one look at each PM, amplitudes unread."""
+    """The session with one look at each PM and without amplitudes."""
     first: dict[int, Pair] = {}
     for pair in measurements.pairs:
         first.setdefault(pair.pm, replace(pair, look=replace(pair.look, amplitude=None)))
@@ -93,7 +93,7 @@ def tracking(pairs: int, seed: int) -> Row:
 
 
 def _tracked(pairs: int, seed: int, taken: dict[str, object]) -> Row:
-    """Squared angle errors (deg^2) of queries after a session ``taken`` in one way or the other."""
+    """Squared angle errors (deg^2) of queries after a session with the options ``taken``."""
     warnings.simplefilter("ignore")
     queries, out = 6, Row()
     model, measurements, truth = make_measurements(

@@ -1,10 +1,10 @@
-"""Devices of a live session that disappear and come back: how soon it is told, how soon they are used again.
+"""Devices of a live session that are lost and come back: time until it is reported, and until they are used again.
 
-A session is conducted in the simulated room (a process of its own) by the machinery of ``fgreg live``. Faults are made
-one after another, each for some seconds and several times. Printed for each: time from the fault until the operator is
-told, until it is told that the device is back, counted from when it was mended, and until the stage got its next order;
-and what the rest of the session did during the fault, per second: frames looked into, pulses taken in, orders given.
-Exit status 1 where something was told later than a second after it happened, or not at all.
+A session runs in the simulated room (a process of its own) with the code of ``fgreg live``. Faults are caused one after
+another, each for some seconds and several times. Printed for each: time from the fault until it is reported to the
+operator; time from its end until the return is reported, and until the next stage order; and the activity of the session
+during the fault, per second: frames processed, pulses taken in, orders given. Exit status 1 where a report came later
+than a second, or not at all.
 
     python tools/study_lost.py --repeat 10 --fault camera-frozen watchdog-killed
 """
@@ -30,7 +30,7 @@ TOLD_S = 1.0
 
 
 def show(name: str, trials: Sequence[Trial]) -> bool:
-    """One line; whether all was told in time."""
+    """One line; whether all was reported in time."""
 
     def column(values: Sequence[float]) -> str:
         known = [value for value in values if math.isfinite(value)]
@@ -52,7 +52,7 @@ def main() -> int:
     parser.add_argument("--lasts", type=float, default=3.0, help="seconds that a fault lasts (default: %(default)s)")
     parser.add_argument("--fault", nargs="+", choices=sorted(STUDIED), default=list(STUDIED))
     arguments = parser.parse_args()
-    print("                          told s         back s      next order s     frames pulses orders, per s meanwhile")
+    print("                      reported s         back s      next order s     frames pulses orders, per s meanwhile")
     print("fault          times  median    max   median    max   median    max")
     in_time = True
     for name in arguments.fault:
@@ -66,9 +66,9 @@ def main() -> int:
             own = [said for said in told if said.startswith(f"{fault.role} lost")]
             for said in told:
                 if said not in own:
-                    print(f"{name}: also told: {said}")
+                    print(f"{name}: also reported: {said}")
             if lost != len(own):
-                print(f"{name}: told {len(own)} times, recorded {lost} times")
+                print(f"{name}: reported {len(own)} times, recorded {lost} times")
                 in_time = False
         in_time &= show(name, trials)
     return 0 if in_time else 1

@@ -1,12 +1,12 @@
 """Accuracy, honesty and speed of marker and board detection, against rendered truth and on real frames.
 
 Renders a marker (one square tag) and a calibration board in front of a stereo endoscope with lens distortion, blur,
-uneven light and sensor noise, detects them, and prints what came out next to what is asked for:
+uneven light and sensor noise, detects them, and prints the figures beside their targets:
 
   views      30 mm tag at 80 to 180 mm, stereo and left view alone: errors of rotation, across and along the axis,
              depth bias, mean squared Mahalanobis error (6 expected), milliseconds per shot; the same with OpenCV's
              sub-pixel corners for comparison
-  border     tags whose nearest corner is so many pixels from the image's border (negative: cut off)
+  border     tags whose nearest corner is at a given distance in pixels from the image's border (negative: cut off)
   ambiguity  single tags of several sizes, distances and tilts in one view: share reported as ambiguous, share wrong
   board      plain and ChArUco board, stereo and left view alone: error and covariance of a corner
   bard       real webcam frames of two many-tag bodies (../shared/data/bard_aruco, left out where absent)
@@ -81,7 +81,7 @@ def margin_px(rig: StereoRig, camera_T_body: FloatArray, body_p: FloatArray) -> 
 
 
 def tilted(rng: np.random.Generator, tilt_rad: float, sight: FloatArray, *, facing: bool) -> FloatArray:
-    """A rotation whose z leans by ``tilt`` off the line of sight, any way round; ``facing``: z towards the camera."""
+    """A rotation whose z is tilted by ``tilt`` from the line of sight, in a random direction; ``facing``: z towards the camera."""
     around, roll = rng.uniform(-np.pi, np.pi, 2)
     lean = exp_so3(tilt_rad * np.array([np.cos(around), np.sin(around), 0.0]))
     turn = np.diag([1.0, -1.0, -1.0]) if facing else np.eye(3)
@@ -143,7 +143,7 @@ def summarise(errors: list[tuple[FloatArray, FloatArray]], squares: list[float])
 
 
 def study_views(views: int, rng: np.random.Generator) -> dict[str, Any]:
-    """The official figures."""
+    """Accuracy, NEES and time of the main section."""
     rig, marker = study_rig(), MarkerModel("DICT_4X4_50", (TagModel(0, 30.0),))
     kinds = ("stereo", "mono", "stereo subpixel", "mono subpixel")
     fits: dict[str, list[MarkerFit]] = {kind: [] for kind in kinds}
@@ -217,7 +217,7 @@ def study_border(views: int, rng: np.random.Generator) -> dict[str, Any]:
         for _ in range(tries):
             z, along = rng.uniform(80.0, 180.0), rng.uniform(-0.04, 0.04)
             axis, sign = int(rng.integers(2)), int(rng.choice([-1, 1]))
-            # Half of them square to the border, where a cut is hardest to notice.
+            # Half of them parallel to the border, where a cut is hardest to detect.
             rotation = tilted(rng, np.radians(rng.uniform(0.0, 40.0)), np.array([0.0, 0.0, 1.0]), facing=True)
             if rng.random() < 0.5:
                 rotation = np.diag([1.0, -1.0, -1.0]) @ exp_so3(rng.normal(size=3) * 0.02)
@@ -361,7 +361,7 @@ def read_bard(folder: Path) -> tuple[StereoRig, dict[str, MarkerModel], list[Any
         tags = []
         for line in np.loadtxt(folder / f"{name}.txt"):
             corners = line[4:].reshape(4, 3)
-            # The file's corners run from the top left, x right and y down; a tag's y is up and its z out of the page.
+            # The file's corners begin at the top left, with y down; a tag's y is up and its z points out of the page.
             right, down = corners[1] - corners[0], corners[3] - corners[0]
             size = float(np.linalg.norm(right))
             rotation = np.column_stack([right / size, -down / size, np.cross(right, -down) / size**2])

@@ -4,11 +4,11 @@ Poses with the documented noise, 12 aims, pair by pair through the engine, its f
 
   clean     streams of steady pairs: false alarms (target: at most 1 in 2,000 pairs)
   outliers  the same with a fifth of the pairs replaced by outliers
-  shifts    15 steady pairs, then a shift in a random direction about the camera: share found within so many pairs
+  shifts    15 steady pairs, then a shift in a random direction about the camera: share found within n pairs
             (targets: 5 mm or 3 deg, first-hit: 80 % within 2 and 93 % within 6; window only: 55 % and 85 %; 2 mm or
             1 deg, first-hit: 50 % within 6 and 80 % within 15)
 
-The ideal detector knows the old registration, the beam, the window's edge and the very shift, and sums up
+The ideal detector knows the old registration, the beam, the window's edge and the true shift, and accumulates
 likelihood ratios (Shiryaev and Roberts); its threshold is set to the same rate of false alarms on clean pairs.
 Results up to then are printed every tenth of a row.
 """
@@ -47,7 +47,7 @@ RATE = 2000.0
 
 
 def moves_found(model: SessionModel, measurements: Measurements, from_pair: int | None) -> tuple[DetectedMove, ...]:
-    """What the engine finds; it stops at the first move found after so many pairs, where that is asked for."""
+    """Moves found by the engine. With ``from_pair`` it stops at the first move found after that many pairs."""
     engine, pairs = OnlineRegistration(model, CONFIG, verdicts=False), 0
     for index, event in events_in_order(measurements):
         engine.add(event)
@@ -85,7 +85,7 @@ def shiryaev_roberts(ratios: FloatArray) -> FloatArray:
 
 
 def excursions(scores: FloatArray, threshold: float) -> int:
-    """How often a score comes to pass the threshold."""
+    """Number of times that a score rises above the threshold."""
     above = np.concatenate([[False], scores > threshold])
     return int(np.sum(above[1:] & ~above[:-1]))
 
@@ -96,7 +96,7 @@ def false_alarms(seed: int, *, pairs: int, first_hit: bool, outliers: float) -> 
     model, measurements, _ = make_measurements(rng, aims=12, pairs=pairs, first_hit=first_hit)
     if outliers > 0.0:
         spoilt = rng.uniform(size=pairs) < outliers
-        spoilt[:START] = False  # what the first registration does about outliers is not in question here
+        spoilt[:START] = False  # outliers in the first registration are not studied here
         kinds = rng.integers(len(KINDS), size=pairs)
         measurements = replace(
             measurements,
@@ -119,7 +119,7 @@ def ideal_clean_scores(seed: int, *, pairs: int, first_hit: bool, mm: float, deg
 
 @dataclass(frozen=True, slots=True)
 class Shifted:
-    """Pairs from the shift to the alarm (infinite: none), how far off its reported place is, and the ideal's scores."""
+    """Pairs from the shift to the alarm (infinite: none), error of the reported split point, and the ideal scores."""
 
     found_after: float
     misplaced: int
@@ -141,7 +141,7 @@ def shifted(seed: int, *, first_hit: bool, mm: float, degrees: float) -> Shifted
 
 
 def threshold_at(scores: list[list[float]], per_pairs: float) -> float:
-    """The lowest threshold with at most one excursion in so many pairs."""
+    """The lowest threshold with at most one excursion in ``per_pairs`` pairs."""
     pairs = sum(len(row) for row in scores)
     for threshold in np.arange(0.0, 20.0, 0.05):
         if sum(excursions(np.array(row), float(threshold)) for row in scores) <= pairs / per_pairs:
@@ -150,7 +150,7 @@ def threshold_at(scores: list[list[float]], per_pairs: float) -> float:
 
 
 def first_above(rows: FloatArray, threshold: float) -> FloatArray:
-    """Pairs after the shift at which each row passes the threshold; infinite where it does not."""
+    """Pairs after the shift at which each row exceeds the threshold; infinite where it does not."""
     above = rows > threshold
     return np.where(above.any(axis=1), above.argmax(axis=1) + 1.0, np.inf)
 

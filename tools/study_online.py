@@ -1,4 +1,4 @@
-"""How well the online registration agrees with the batch solver after every event, with and without outliers.
+"""Agreement of the online registration with the batch solver after every event, with and without outliers.
 
     python tools/study_online.py                          # 10 sessions of 50 pairs, clean and with 20 % outliers
     python tools/study_online.py --sessions 2 --pairs 30 --outliers 0.2 --shapes "first hit" "three looks"
@@ -7,7 +7,7 @@ After each pair from the 8th of its camera epoch on, the online optimum's Mahala
 same events, by the batch covariance. Prints, each figure beside its target: the largest distance of clean sessions
 (0.05), the shares of events within 0.05 (90 %) and 0.5 (99 %) with outliers, in how many sessions the same pairs are
 rejected at the end (all); for first hits, window only, three looks at each PM, and two camera epochs. Also processor
-time of ``add`` from the 41st pair of an epoch on, where outliers ask for full solves.
+time of ``add`` from the 41st pair of an epoch on, where outliers cause full solves.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SHAPES: dict[str, dict[str, Any]] = {
 
 
 def spoiled(measurements: Measurements, share: float, rng: np.random.Generator) -> tuple[Measurements, int]:
-    """False PMs, and markers that are somewhere else, in turn; and how many."""
+    """Pairs with false PMs and wrong markers in turn; and their number."""
     pairs: list[Pair] = list(measurements.pairs)
     bad = np.flatnonzero(rng.random(len(pairs)) < share)
     for number, i in enumerate(bad):
@@ -128,7 +128,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=50)
     parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.2], help="shares of outliers")
     parser.add_argument("--shapes", nargs="+", choices=SHAPES, default=list(SHAPES), help="kinds of session")
-    parser.add_argument("--every", type=int, default=1, help="compare after every so many pairs")
+    parser.add_argument("--every", type=int, default=1, help="compare after every n-th pair")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     for share in arguments.outliers:

@@ -1,9 +1,9 @@
-"""How well photoacoustic sources are found: every figure the requirement asks for, against its target.
+"""Detection of photoacoustic sources: every required figure against its target.
 
 Frames are simulated (fgreg.simulation.acoustics) with sources at x -20 to 20 mm and range 15 to 60 mm, pulses of 3 to
 7 MHz with 50 to 80 % bandwidth, 128 elements of 0.43 mm, 800 samples at 40 MHz that begin shortly before the wave does.
 The signal-to-noise ratio is the peak amplitude / sqrt(2) over the noise's standard deviation, per sample, on the
-element that hears the source loudest.
+element with the largest amplitude.
 
 Exit status is 1 if a target is missed.
 """
@@ -35,13 +35,13 @@ from fgreg.simulation.acoustics import Hearing, Pulse, noise_channels, simulate_
 ASSUMED_M_S = 1540.0
 SAMPLES = 800
 WRONG_MM = 1.0
-"""A find further than this from the source is not of the source."""
+"""A find farther than this from the source is a false find."""
 RANGES_MM = (15.0, 60.0)
 
 
 @dataclass
 class Tally:
-    """What came of many frames of one kind."""
+    """Results of many frames of one kind."""
 
     frames: int = 0
     wrong: int = 0
@@ -101,7 +101,7 @@ def channel_frames(
         rng = np.random.default_rng([seed, number])
         x, r = rng.uniform(-x_mm, x_mm), rng.uniform(*RANGES_MM)
         pulse = Pulse(rng.uniform(3.0, 7.0), rng.uniform(0.5, 0.8), asymmetry, rng.uniform(0.0, 2.0 * math.pi))
-        # In steps, as a session has one crop: the first sample is 1.5 to 6.5 us before the arrival.
+        # In steps, since a session has one crop: the first sample is 1.5 to 6.5 us before the arrival.
         probe = probe_for(max(0.0, 5.0 * math.floor((r / (speed_m_s * 1e-3) - 1.5) / 5.0)))
         source = np.array([x, 0.0, probe.radius_mm + r])
         hearing = Hearing(elevation=None)
@@ -112,7 +112,7 @@ def channel_frames(
 
 
 def with_ratio_fixed(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
-    """The same answer but for a sound speed taken for known: what does fitting it along cost?"""
+    """The same result with the sound speed fixed: what does estimating it cost?"""
     free = locate_in_channels(frame, probe)
     if isinstance(free, NoSignal) or probe.channels is None:
         return free
@@ -172,7 +172,7 @@ def progress(done: int, of: int) -> None:
 
 
 class Study:
-    """Collects figures and holds them against targets."""
+    """Collects figures and compares them with targets."""
 
     def __init__(self) -> None:
         self.figures: dict[str, Any] = {}
@@ -214,7 +214,7 @@ def accuracy(study: Study, options: argparse.Namespace) -> None:
         figures = channel_frames(options.frames, options.seed + 2, snr_db, asymmetry=0.5).summary()
         study.note(f"pulse falls 1.5 times as slowly {snr_db:g} dB", figures, line(figures))
         figures = channel_frames(options.frames, options.seed, snr_db, locate=with_ratio_fixed).summary()
-        study.note(f"sound speed taken for known {snr_db:g} dB", figures, line(figures))
+        study.note(f"sound speed fixed {snr_db:g} dB", figures, line(figures))
 
 
 def curve(study: Study, options: argparse.Namespace) -> None:
@@ -269,7 +269,7 @@ def image_false_finds(study: Study, options: argparse.Namespace) -> None:
 
 
 def sound_speed(study: Study, options: argparse.Namespace) -> None:
-    """A speed 2 % off has to show."""
+    """A speed 2 % off has to be detected."""
     for ratio in (1.02, 0.98, 1.0):
         for snr_db in (20.0, 10.0, 0.0):
             tally = channel_frames(options.frames, options.seed + 5, snr_db, speed_m_s=ratio * ASSUMED_M_S)

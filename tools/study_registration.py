@@ -2,7 +2,7 @@
 
 Pose level: sessions of 12 aims and 10 pairs with the documented noise, only the window known. RMS of the true target
 registration error (mean over targets), and its ratio to the explicit graph started at the truth with the noise known:
-what is lost to starts and approximations. Wrong solutions that are presented as ok: 0 wanted.
+the loss by starts and approximations. Wrong solutions with the verdict ok: target 0.
 
 Raw frames (--raw N): N sessions of 14 aims (0.3 mm) and 15 first-hit pairs, rendered, detected and solved.
 Tracking errors and their predicted sigmas are printed for both.
@@ -35,7 +35,7 @@ from graph_optimum import initial_values, optimize, read_shared
 
 @dataclass
 class Figures:
-    """What is collected over sessions."""
+    """Figures collected over sessions."""
 
     tre_mm: list[float] = field(default_factory=list)
     worst_mm: list[float] = field(default_factory=list)

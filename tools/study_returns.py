@@ -1,18 +1,18 @@
-"""Camera moves beside the test on pairs: static tags, loop closures, and reported moves.
+"""Camera moves apart from the test on pairs: static tags, loop closures, and reported moves.
 
-  tags-clean  frames of three static tags while nothing moves: false alarms (target: at most 1 in 2,000 pairs, 10 frames
+  tags-clean  frames of three static tags without a move: false alarms (target: at most 1 in 2,000 pairs, 10 frames
               each)
   tags-shifts shifts about the camera, 60 steady frames before: share found within 10 frames, that is before the next
               pair (target: 99 %). Tags 0.1, 0.1, 0.8 mm and 0.01 rad; a fifth of that variance wanders with a time
-              constant of 200 frames (and is drawn again by a shift), the rest is new in every frame
+              constant of 200 frames (and is drawn again after a shift), the rest is independent in every frame
   returns     15 pairs, then the scope taken away and put back (reported, without a motion), or to a place 2 mm or 1 deg
-              off, 5 mm or 3 deg off, or anywhere: after how many pairs the engine uses the old registration again, and
-              how often wrongly (target: at most 1 in 2,000 pairs)
-  reported    15 (or so many) pairs, a shift of up to 15 mm and 9 deg an axis, reported with a motion known to 2 mm and
+              off, 5 mm or 3 deg off, or anywhere: number of pairs until the engine uses the old registration again,
+              and how often wrongly (target: at most 1 in 2,000 pairs)
+  reported    15 (or --steady) pairs, a shift of up to 15 mm and 9 deg an axis, reported with a motion known to 2 mm and
               1 deg (each axis; or in all) or with none: RMS target error after n pairs, beside that of the steady epoch
               (target with motion: at most 1.2 of it after 3 pairs), of a fresh registration with the same aims, and of
               one with a known beam, 150 aims (target: no worse at every count, paired on the same pairs). In brackets
-              what an ideal estimator has: the information of all measurements at the truth, windows as Gaussians
+              the error of an ideal estimator: the information of all measurements at the truth, windows as Gaussians
 
 Each mode prints what it has after every tenth of the work.
 """
@@ -50,7 +50,7 @@ SHIFTS: tuple[Row, ...] = (("5 mm or 3 deg", 5.0, 3.0), ("2 mm or 1 deg", 2.0, 1
 
 
 class TagScene:
-    """Three tags some 100 mm before the camera, and their errors: some stay for a while, some are new each frame."""
+    """Three tags some 100 mm before the camera, with correlated and independent errors."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -63,7 +63,7 @@ class TagScene:
         self.settle()
 
     def settle(self) -> None:
-        """What stays of the errors is drawn again."""
+        """Draw the correlated errors again."""
         self.wander = {tag: self.rng.normal(size=6) for tag in self.tags}
 
     def move(self, motion: FloatArray) -> None:
@@ -92,7 +92,7 @@ def tags_clean(count: int, seed: int) -> None:
     scene, watch = TagScene(np.random.default_rng([seed, 0])), TagMoveDetector()
     alarms, before, highest = 0, False, []
     for n in range(1, count + 1):
-        if n % 1000 == 0:  # another scene: an epoch does not last for ever, and its start is what is compared with
+        if n % 1000 == 0:  # another scene: an epoch ends some time, and frames are compared with its start
             scene, watch, before = TagScene(np.random.default_rng([seed, n])), TagMoveDetector(), False
         watch, check = detect_tag_move(watch, scene.frame(), settings)
         alarms += check.alarm and not before
@@ -101,7 +101,7 @@ def tags_clean(count: int, seed: int) -> None:
         if n % max(count // 10, 1) == 0:
             top = ", ".join(f"{v:.1f}" for v in sorted(highest)[-4:])
             per = alarms / (n / FRAMES_PER_PAIR) * 2000.0
-            print(f"tags, nothing moves: {alarms} false alarms in {n} frames, {per:.2f} per 2,000 pairs (target <= 1); "
+            print(f"tags, no move: {alarms} false alarms in {n} frames, {per:.2f} per 2,000 pairs (target <= 1); "
                   f"highest chi squares {top}, limit {settings.threshold:.1f}", flush=True)  # fmt: skip
 
 
@@ -148,7 +148,7 @@ def returns(count: int, seed: int, steady: int, *, first_hit: bool) -> None:
 
 
 def _used_again_after(seed: int, motion: FloatArray, steady: int, *, first_hit: bool) -> float:
-    """Pairs of the new epoch after which the engine ties it to the old one; infinite: it does not."""
+    """Pairs of the new epoch after which the engine closes the loop to the old one; infinite: it does not."""
     model, measurements, _ = two_epochs(seed, motion, steady, AFTER, first_hit=first_hit, reported=True)
     engine, pairs = OnlineRegistration(model, CONFIG, verdicts=False), 0
     for index, event in events_in_order(measurements):

@@ -1,20 +1,20 @@
 """Searching PMs: positions needed and error left, beside the published searches on the same simulated PMs.
 
 A PM lies anywhere in a field of 70 deg. Where the stage stops it is received as peak * gain(rotation), 5 % noise, and
-heard where that reaches the hearing threshold, 1. Peaks are unknown and log-uniform from 2 to 8 thresholds: the weakest
-is heard just to the half width that the session says (6 deg), the strongest to 10.4 deg. The gain comes from
-fgreg.simulation; the planner knows it from the session's curve of 29 points only. A position is a stop at which the
-probe listens; the last turn, to the answer, is none (it is in the column "with it").
+detected where that reaches the detection threshold, 1. Peaks are unknown and log-uniform from 2 to 8 thresholds: the
+weakest is detected just up to the half width of the session (6 deg), the strongest up to 10.4 deg. The gain comes from
+fgreg.simulation; the planner knows it from the session's curve of 29 points only. A position is a stop with
+a pulse; the last turn, to the result, is none (the column "with it" includes it).
 
 Targets: on average at most 7 positions cold and at most 3 with a registration, mean error at most 0.3 deg in both.
 
 Re-implemented after Song et al. 2023 (automatic search with a transrectal ultrasound robot), which on their phantoms
 reports a weighted average (0.53 deg, 9 positions), golden section (0.48 deg, 28), ternary search (0.29 deg, 28) and
 126 positions for a step search:
-  weighted average  positions spread evenly over the field; mean of their angles, weighted with the amplitudes heard
-  golden, ternary   the interval search on the loudness. Where neither inner point is heard it has no slope to follow:
-                    here it is given one interval about the first hit of the planner's own sweep, whose positions count
-  step              positions spread evenly over the field; the loudest
+  weighted average  positions spread evenly over the field; mean of their angles, weighted with the amplitudes
+  golden, ternary   the interval search on the amplitude. Where neither inner point has a detection there is no slope:
+                    here it starts from the interval about the first hit of the planner's sweep, whose positions count
+  step              positions spread evenly over the field; the one of largest amplitude
 
     python tools/study_search.py --pms 1000
 """
@@ -50,7 +50,7 @@ GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 @dataclass(slots=True)
 class Room:
-    """One PM and the stage: what is received where it stops (deg), and how often it stopped."""
+    """One PM and the stage: amplitude where it stops (deg), and number of stops."""
 
     pm_deg: float
     peak: float
@@ -71,7 +71,7 @@ class Room:
 
 
 def session_sensitivity() -> SensitivityModel:
-    """What a session says: half width with its sigma, and a measured curve to 1.4 half widths."""
+    """Sensitivity of the session: half width with its sigma, and a measured curve to 1.4 half widths."""
     rotation = np.linspace(-1.4, 1.4, 29) * HALF_WIDTH_DEG
     return SensitivityModel(
         as_float_array([20.0, 30.0, 45.0]),
@@ -85,7 +85,7 @@ def session_sensitivity() -> SensitivityModel:
 def planned(
     room: Room, model: DetectionModel, settings: SearchSettings, prediction_deg: tuple[float, float] | None
 ) -> float:
-    """The planner's answer (deg), NaN where it found nothing."""
+    """The planner's result (deg), NaN where it found nothing."""
     prediction = None if prediction_deg is None else Prediction(*(math.radians(v) for v in prediction_deg))
     low, high = (math.radians(v) for v in FIELD_DEG)
     planner = SearchPlanner(model, low, high, math.radians(room.stands_deg), prediction, settings)
@@ -101,21 +101,21 @@ def spread(count: int) -> Sequence[float]:
 
 
 def weighted_average(room: Room) -> float:
-    """Mean of evenly spread positions, weighted with what is heard there."""
+    """Mean of evenly spread positions, weighted with the amplitudes there."""
     positions = spread(POSITIONS["weighted average"])
     heard = np.array([room.listen(position) for position in positions])
     return float(heard @ positions / heard.sum()) if heard.any() else math.nan
 
 
 def step_search(room: Room) -> float:
-    """The loudest of many evenly spread positions."""
+    """The position of largest amplitude of many evenly spread ones."""
     positions = spread(POSITIONS["step search"])
     heard = [room.listen(position) for position in positions]
     return positions[int(np.argmax(heard))] if max(heard) > 0 else math.nan
 
 
 def first_hit(room: Room) -> tuple[float, float] | None:
-    """Interval (deg) about the first position of a sweep that hears the PM."""
+    """Interval (deg) about the first position of a sweep at which the PM is detected."""
     count = math.ceil((FIELD_DEG[1] - FIELD_DEG[0]) / (2.0 * (HALF_WIDTH_DEG - 0.3)))
     step = (FIELD_DEG[1] - FIELD_DEG[0]) / count
     for i in range(count):
@@ -126,7 +126,7 @@ def first_hit(room: Room) -> tuple[float, float] | None:
 
 
 def golden_section(room: Room) -> float:
-    """Golden-section search for the loudest angle."""
+    """Golden-section search for the angle of largest amplitude."""
     interval = first_hit(room)
     if interval is None:
         return math.nan
@@ -146,7 +146,7 @@ def golden_section(room: Room) -> float:
 
 
 def ternary(room: Room) -> float:
-    """Ternary search for the loudest angle: two new positions each time."""
+    """Ternary search for the angle of largest amplitude: two new positions each time."""
     interval = first_hit(room)
     if interval is None:
         return math.nan
@@ -162,7 +162,7 @@ def ternary(room: Room) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one search did on many PMs: positions, errors (deg, NaN not found), travel (deg)."""
+    """Results of one search on many PMs: positions, errors (deg, NaN not found), travel (deg)."""
 
     stops: np.ndarray[tuple[int], np.dtype[np.float64]]
     errors: np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -226,7 +226,7 @@ def main() -> int:
         return search
 
     print(
-        f"{count} PMs, field {FIELD_DEG[1] - FIELD_DEG[0]:g} deg, heard from amplitude {THRESHOLD:g} on, "
+        f"{count} PMs, field {FIELD_DEG[1] - FIELD_DEG[0]:g} deg, detected from amplitude {THRESHOLD:g} on, "
         f"noise {NOISE:.0%}, peaks {strong[0]:g} to {strong[1]:g}, half width {HALF_WIDTH_DEG:g} deg; "
         f"search ends at sigma {math.degrees(settings.stop_sigma_rad):.2f} deg"
     )
@@ -251,7 +251,7 @@ def main() -> int:
         said = f"   published: {figure} deg" if figure else "   published: positions only"
         row = run(lambda room, _rng, search=search: search(room), count, strong, HALF_WIDTH_DEG, seed)  # type: ignore[misc]
         show(f"{name}, {POSITIONS[name]} positions", row, note=said)
-    print("\nwhere the session is wrong, or PMs are weaker than it says (no targets)")
+    print("\nwhere the session is wrong, or PMs are weaker than it states (no targets)")
     show("cold, window 0.3 deg wider", run(cold, count, strong, HALF_WIDTH_DEG + 0.3, seed))
     show("cold, window 0.6 deg narrower", run(cold, count, strong, HALF_WIDTH_DEG - 0.6, seed))
     show("cold, peaks 1.3 to 2", run(cold, count, (1.3, 2.0), HALF_WIDTH_DEG, seed))

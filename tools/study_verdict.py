@@ -1,14 +1,14 @@
-"""Is the verdict right? Mixed simulated sessions, good and bad, against their truth.
+"""Verdicts of mixed simulated sessions, good and bad, against their truth.
 
 Two thirds of the sessions have something wrong, of these kinds in turn:
 
   few pairs          3 to 7 pairs                      parallel beams   within 0.5 to 3 deg of one direction
   collinear spots    all on one line                   no roll          aims and pairs without roll about the beam
-  wrong noise        2 to 5 times what is declared     junk pairs       20 to 60 % of the PMs are something else
+  wrong noise        2 to 5 times what is declared     junk pairs       20 to 60 % of the PMs are outliers
   flipped marker     10 to 50 % of the pairs and aims have the mirrored planar pose
   swapped marker     the pairs' marker is another rigid body than the aims'
   sweep sign         every sweep is recorded the other way round, in a two-way session
-  reversed stage     wired the other way round than the session says
+  reversed stage     wired with the other sign than the session states
   sound speed        2 % off                           one-way          all sweeps from one side
 
 The other third is clean: 6 to 40 pairs, 8 to 20 aims, first hits from both sides or the window only. Noise is as
@@ -81,7 +81,7 @@ BAD = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """One session: what it was, how wrong the answer is (mm, worst target), and the verdict."""
+    """One session: its kind, error of the result (mm, worst target), and verdict."""
 
     seed: int
     kind: str
@@ -93,7 +93,7 @@ class Outcome:
 
 
 def configuration(kind: str, rng: np.random.Generator) -> SimulationConfig:
-    """The simulated session of a kind, before what is done to its measurements."""
+    """The simulated session of a kind, before its measurements are changed."""
     base = replace(
         FIRST_HIT,
         pairs=int(rng.integers(10, 31)),
@@ -161,7 +161,7 @@ def flipped(marker: MarkerObservation) -> MarkerObservation:
 
 
 def spoiled(kind: str, measurements: Measurements, rng: np.random.Generator) -> Measurements:
-    """What is done to the measurements themselves."""
+    """The measurements as changed for a kind of session."""
     pairs, aims = list(measurements.pairs), list(measurements.aims)
     if kind == "flipped marker":
         share = float(rng.uniform(0.1, 0.5))
