@@ -61,8 +61,8 @@ def credible_region(modes: tuple[Mode, ...], posterior: Posterior, probability: 
 def ellipsoid_contains(posterior: Posterior, trus_T_camera: FloatArray, epoch: int = 0) -> bool:
     """Whether a registration (4, 4) lies in the posterior's 95 % ellipsoid of that epoch.
 
-    It has the axes of the posterior's covariance in GTSAM's tangent about the estimate, and a size such that it contains
-    95 % of the posterior (which is not Gaussian with few pairs).
+    It has the axes of the posterior's covariance in GTSAM's tangent about the estimate, and a size such that it
+    contains 95 % of the posterior (which is not Gaussian with few pairs).
     """
     at = slice(6 * epoch, 6 * epoch + 6)
     information = np.linalg.inv(posterior.covariance[at, at])

@@ -64,9 +64,9 @@ class GraphCovariance:
     def of(self, key: int) -> FloatArray:
         """Marginal covariance of one variable, private or shared: a PM (3, 3), a distance or angle (1, 1), ...
 
-        The private variables of one PM or aim are connected to the rest by shared variables only. So those factors alone,
-        with their other private variables eliminated, give ``R x + S s = d``, and the covariance is R^-1 (I + S C S') R^-T with C
-        of the shared variables s.
+        The private variables of one PM or aim are connected to the rest by shared variables only. So those factors
+        alone, with their other private variables eliminated, give ``R x + S s = d``, and the covariance is
+        R^-1 (I + S C S') R^-T with C of the shared variables s.
         """
         if key in self._columns:
             return self.shared([key])

@@ -2,8 +2,8 @@
 
 A room is played by another process (tools/load_player.py): 30 stereo frames of 1280 x 720 px a second that were made
 beforehand, 10 laser pulses a second, a surgeon who follows the messages, a camera that is bumped. Measured are: the
-time from a frame's arrival at its driver to the stage order, or to the decision that there is none; counts of frames and
-pulses; memory, processor time and queues; the end.
+time from a frame's arrival at its driver to the stage order, or to the decision that there is none; counts of frames
+and pulses; memory, processor time and queues; the end.
 
     python tools/load_live.py --cache /var/tmp/fgreg           # ten minutes; the pictures (4.5 GB) are kept there
     python tools/load_live.py --cache /var/tmp/fgreg --seconds 60

@@ -1,8 +1,8 @@
 """A simulated room whose pictures are rendered beforehand, so that they cost almost nothing while it runs.
 
 The surgeon follows a fixed list: aims, then spots at tissue in laps, with the camera at one place and, after a bump, at
-another, then back again. He is as interactive as in fgreg.simulation.room, but starts to move only where a period of the
-hand's tremor starts, and travels for an integer number of periods. So each place is one short clip of pictures that
+another, then back again. He is as interactive as in fgreg.simulation.room, but starts to move only where a period of
+the hand's tremor starts, and travels for an integer number of periods. So each place is one short clip of pictures that
 repeats while he stays, and each way between places is another. Poses are computed at any time as in that room, with the
 same function of time as the clips.
 """

@@ -1,7 +1,7 @@
 """A process that answers tracking queries from the shared snapshot while the estimate's process is busy.
 
-Native calls of the estimate's updates hold their interpreter's lock, so other threads of that process wait. A client of this
-server waits for one round trip over a local socket. A camera loop that is a process of its own needs no server: it
+Native calls of the estimate's updates hold their interpreter's lock, so other threads of that process wait. A client of
+this server waits for one round trip over a local socket. A camera loop that is a process of its own needs no server: it
 holds a :class:`fgreg.online.shared_snapshot.SnapshotReader` and calls :func:`fgreg.tracking.query.track` itself.
 """
 

@@ -3,7 +3,8 @@
     python tools/structure.py ../before .
 
 A package is a folder in ``fgreg/``, or a module directly in ``fgreg/``. All imports count, also those in functions and
-under TYPE_CHECKING. Layers are packages in the longest chain of imports; those in a circle share one. Public names are those of ``fgreg.__all__``.
+under TYPE_CHECKING. Layers are packages in the longest chain of imports; those in a circle share one. Public names are
+those of ``fgreg.__all__``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Benefit of the advice: simulated surgeons who take their next shots as advised, or at random.
 
 Every session starts with 4 random pairs. Two surgeons go on to 10: one takes the best of
-`fgreg.registration.next_shot`'s candidates, the other a random one of the same candidates. Both have the same errors: the beam passes
-the spot by --aim-mm and its direction is off by --lean-deg. Tissue, probe, stage and all noise are those of the forward
-model; the end of a beam is its intersection with the tissue. A shot that ends outside the probe's field is repeated.
+`fgreg.registration.next_shot`'s candidates, the other a random one of the same candidates. Both have the same errors:
+the beam passes the spot by --aim-mm and its direction is off by --lean-deg. Tissue, probe, stage and all noise are
+those of the forward model; the end of a beam is its intersection with the tissue. A shot that ends outside the probe's
+field is repeated.
 
 Printed: root mean square TRE over sessions and targets at every number of pairs, both arms, and the ratio at 10
 (target: at most 0.80).

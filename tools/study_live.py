@@ -4,12 +4,12 @@
     python tools/study_live.py --made-up --seeds 1 2 3 4 5          # in simulated time: observations without pictures
     python tools/study_live.py --recorded FOLDER ...                # sessions of earlier runs: replay and solve only
 
-Each room is run as by `fgreg live`, without the viewer. For every event: the estimate reported right after it, and that of
-replay: verdict, epoch, pairs, and the difference of the registrations in sigma of the live one, in degrees and in mm.
-By design, live runs its full solves in worker processes, whose results come some events later than in replay. So both
-are settled at the end; then epochs, verdict and rejected pairs have to be the same and the registrations within 0.05
-sigma. A solve with --detect-moves is compared as well, and for each the true error at the targets with the predicted one.
-Every figure with a target is printed beside it.
+Each room is run as by `fgreg live`, without the viewer. For every event: the estimate reported right after it, and that
+of replay: verdict, epoch, pairs, and the difference of the registrations in sigma of the live one, in degrees and in
+mm. By design, live runs its full solves in worker processes, whose results come some events later than in replay. So
+both are settled at the end; then epochs, verdict and rejected pairs have to be the same and the registrations within
+0.05 sigma. A solve with --detect-moves is compared as well, and for each the true error at the targets with the
+predicted one. Every figure with a target is printed beside it.
 """
 
 from __future__ import annotations

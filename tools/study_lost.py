@@ -2,9 +2,9 @@
 
 A session runs in the simulated room (a process of its own) with the code of ``fgreg live``. Faults are caused one after
 another, each for some seconds and several times. Printed for each: time from the fault until it is reported to the
-operator; time from its end until the return is reported, and until the next stage order; and the activity of the session
-during the fault, per second: frames processed, pulses taken in, orders given. Exit status 1 where a report came later
-than a second, or not at all.
+operator; time from its end until the return is reported, and until the next stage order; and the activity of the
+session during the fault, per second: frames processed, pulses taken in, orders given. Exit status 1 where a report came
+later than a second, or not at all.
 
     python tools/study_lost.py --repeat 10 --fault camera-frozen watchdog-killed
 """

@@ -81,7 +81,7 @@ def margin_px(rig: StereoRig, camera_T_body: FloatArray, body_p: FloatArray) -> 
 
 
 def tilted(rng: np.random.Generator, tilt_rad: float, sight: FloatArray, *, facing: bool) -> FloatArray:
-    """A rotation whose z is tilted by ``tilt`` from the line of sight, in a random direction; ``facing``: z towards the camera."""
+    """A rotation with z tilted by ``tilt`` from the line of sight, in a random direction; ``facing``: to the camera."""
     around, roll = rng.uniform(-np.pi, np.pi, 2)
     lean = exp_so3(tilt_rad * np.array([np.cos(around), np.sin(around), 0.0]))
     turn = np.diag([1.0, -1.0, -1.0]) if facing else np.eye(3)

@@ -254,7 +254,7 @@ class _Builder:
         return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number, dependence)
 
     def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray, CameraDependence | None] | str:
-        """The aimed-at spot (3,) mm, camera frame, with its covariance (3, 3), which includes the laser's error, and how
+        """The aimed-at spot (3,) mm, camera frame, its covariance (3, 3), which includes the laser's error, and how
         it depends on the rig's constants."""
         laser = np.diag(np.square(self.model.noise.aim_mm))
         if event.camera_p_spot_mm is not None:
