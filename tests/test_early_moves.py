@@ -24,7 +24,7 @@ from fgreg.online.engine import OnlineRegistration
 from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
-from fgreg.registration.verdict import ABOUT_EVEN, FEW_PMS, possible_camera_move
+from fgreg.registration.verdict import ABOUT_EVEN, CLEARLY_MOVED, FEW_PMS, possible_camera_move
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
 from tests.online_streams import unreported_move
@@ -148,6 +148,10 @@ def test_a_steady_epoch_is_left_alone_by_screening() -> None:
         (math.log(7 * ABOUT_EVEN) + 0.1, 8, [Verdict.WARNING]),
         (math.log(7 * ABOUT_EVEN) + 0.1, 12, []),
         (math.log(7 * ABOUT_EVEN) + 0.1, 5, []),
+        (math.log(7 * CLEARLY_MOVED) - 0.1, 8, [Verdict.WARNING]),
+        (math.log(7 * CLEARLY_MOVED) + 0.1, 8, [Verdict.REFUSED]),
+        (math.log(40.0), 9, [Verdict.REFUSED]),
+        (math.log(40.0), FEW_PMS + 1, []),
         (ALARM + 0.1, 5, [Verdict.REFUSED]),
         (ALARM + 0.1, 8, [Verdict.REFUSED]),
         (math.log(FEW_PMS * ABOUT_EVEN) + 0.1, FEW_PMS + 1, []),

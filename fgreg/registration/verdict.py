@@ -46,6 +46,9 @@ ABOUT_EVEN = 0.6
 """Bayes factor, among few PMs, of a move at any split point (all equally likely) against none from which there is a
 warning. One in twelve sessions of 10 to 20 PMs without a move reaches it, and so does a move of 2 deg between 5 PMs and
 6."""
+CLEARLY_MOVED = 2.0
+"""The same Bayes factor from which the registration is refused. One in fifty registrations from 6 to 21 PMs without a
+move reaches it, mostly for one PM or two (first-hit pairs; none in 160 with windows only)."""
 SUSPICIOUS_Z = 4.0
 SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
@@ -210,16 +213,18 @@ def possible_camera_move(log_odds: float, before: int, after: int, pms: int) -> 
 
     One registration cannot fit both sides of a move. It lies somewhere between them, and the predicted error does not
     include that. Few PMs do not show a move clearly, so there is a warning where a move at any split point is about as
-    likely as none. Among many PMs those on the wrong side become outliers, or --detect-moves finds the move.
+    likely as none, and a refusal where it is much likelier. Among many PMs those on the wrong side become outliers, or
+    --detect-moves finds the move.
     """
     few, alarm = pms <= FEW_PMS, log_odds > ALARM
-    somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1)
-    if not (alarm or (few and pms >= TELLING_PMS and somewhere > ABOUT_EVEN)):
+    somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1) if few and pms >= TELLING_PMS else 0.0
+    if not (alarm or somewhere > ABOUT_EVEN):
         return []
+    clearly = alarm or somewhere > CLEARLY_MOVED
     return [
         Condition(
-            Verdict.REFUSED if few and alarm else Verdict.WARNING,
-            f"the pairs up to PM {before} and those from PM {after} {'do' if alarm else 'may'} not fit one "
+            Verdict.REFUSED if few and clearly else Verdict.WARNING,
+            f"the pairs up to PM {before} and those from PM {after} {'do' if clearly else 'may'} not fit one "
             f"registration (odds {math.exp(min(log_odds, 20.0)):.0f} to 1): if the camera was moved between them, "
             "report it (camera_moved) or solve with --detect-moves; where it was not, take more pairs",
         )
