@@ -83,7 +83,7 @@ def test_colour_is_three_bytes_a_pixel(scanner: Scanner, source: BkOemScanner) -
     np.testing.assert_array_equal(fetch(source)[0].image, colour)
 
 
-def test_a_zoom_that_was_not_told_is_asked_for(scanner: Scanner, source: BkOemScanner) -> None:
+def test_a_zoom_that_was_not_reported_is_queried(scanner: Scanner, source: BkOemScanner) -> None:
     wait_for(lambda: scanner.grabbing)
     scanner.send(grabbed(picture(scanner)))
     fetch(source)

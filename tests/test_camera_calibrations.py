@@ -196,7 +196,7 @@ def test_a_kalibr_file_that_cannot_be_used_says_why(tmp_path: Path, change: dict
         read_calibration([path])
 
 
-def test_millimetres_taken_for_metres_are_refused_until_the_unit_is_told(tmp_path: Path) -> None:
+def test_millimetres_read_as_metres_are_refused_until_the_unit_is_given(tmp_path: Path) -> None:
     files = [info(tmp_path, "left"), info(tmp_path, "right", p3=-3500.0)]
     with pytest.raises(InputError, match=r"cameras 5000 mm apart.*say so where lengths are in mm"):
         read_calibration(files)

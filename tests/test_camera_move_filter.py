@@ -83,7 +83,7 @@ def test_heaviest_labels_hold_nearly_all_of_the_evidence() -> None:
     np.testing.assert_allclose(found.log_bayes, exact, atol=0.3)
 
 
-def test_each_split_point_is_judged_as_if_it_were_the_only_one() -> None:
+def test_each_split_point_is_tested_as_if_it_were_the_only_one() -> None:
     before, terms = _terms(np.random.default_rng(5), 6)
     some = move_evidence(before, terms, np.array([2, 3]), SETTINGS)
     every = move_evidence(before, terms, np.arange(6), SETTINGS)

@@ -136,7 +136,7 @@ def test_a_rotation_in_its_window_leaves_the_moments_of_the_truncated_gaussian()
     assert test.moved.covariance[0, 0] == pytest.approx(float(weight @ (x - expected) ** 2), rel=0.01)
 
 
-def test_window_only_pairs_are_told_from_moved_ones_by_their_windows_ends() -> None:
+def test_window_only_pairs_are_distinguished_from_moved_ones_by_their_windows_ends() -> None:
     """A rotation well outside the window speaks more against steady than the Gaussian stand-in has it."""
     problem, state = _session(9, 12, first_hit=False, config=SHAPED)
     terms = linearise(problem, state)

@@ -76,7 +76,7 @@ def test_looks_at_one_pm_are_one_pm_and_the_move_is_before_its_first() -> None:
     assert found.first == 24
 
 
-def test_what_the_estimate_marks_as_outliers_since_the_move_speaks_for_it() -> None:
+def test_outliers_since_the_move_raise_its_odds() -> None:
     model, measurements, _ = moved_session(4, make_transform(np.eye(3), np.array([0.0, 14.0, 0.0])), 15, 4)
     case = move_case(measurements, model)
     assert not case.inlier[15:].any()
@@ -119,7 +119,7 @@ def test_six_pairs_are_too_few_for_a_test() -> None:
     assert find_camera_move(move_case(measurements, model), model, CONFIG) is None
 
 
-def test_what_was_known_of_the_registration_beforehand_holds_for_the_first_pms_only() -> None:
+def test_the_prior_of_the_registration_applies_to_the_first_pms_only() -> None:
     """A motion prior on the epoch's registration must not hide an early move, whose first side it is about."""
     model, measurements, truth = moved_session(3, SHIFT, 5, 13)
     case = move_case(measurements, model)

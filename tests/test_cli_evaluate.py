@@ -72,7 +72,7 @@ def test_svg_plots(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert (tmp_path / "tre.svg").read_text().startswith("<?xml")
 
 
-def test_sessions_of_one_name_are_told_apart(
+def test_sessions_of_one_name_are_distinguished(
     session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few = ("--subsets", "0", "--folds", "0", "--no-leave-one-out", "--jobs", "1", "--json")

@@ -24,7 +24,7 @@ def _run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     return code
 
 
-def test_solve_writes_a_result_and_says_what_came_of_it(
+def test_solve_writes_a_result_and_reports_it(
     pose_session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert _run(monkeypatch, "solve", pose_session) == 0

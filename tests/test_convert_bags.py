@@ -149,7 +149,7 @@ def test_looks_by_frames_get_the_nearest_images_and_the_angle_in_between(tmp_pat
     assert camera.right_T_left[0, 3] == pytest.approx(-5.0)
 
 
-def test_looks_without_a_stage_angle_or_images_near_them_are_left_out_and_told(tmp_path: Path) -> None:
+def test_looks_without_a_stage_angle_or_images_near_them_are_left_out_and_reported(tmp_path: Path) -> None:
     messages = [m for m in room() if not (m[0].startswith("/rig") and "image" in m[0] and m[1] > 1.5)]
     path = bags.write_bag(tmp_path / "bag", messages)
     done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
@@ -214,7 +214,7 @@ def test_aims_at_board_corners_take_images_even_where_poses_are_recorded(tmp_pat
     assert aim["marker"]["camera_T_marker"][2][3] == pytest.approx(204.0)  # between 200 and 205
 
 
-def test_what_a_recording_lacks_is_told_with_what_it_has(tmp_path: Path) -> None:
+def test_what_a_recording_lacks_is_reported_with_its_content(tmp_path: Path) -> None:
     where = setup(tmp_path)
     only = bags.write_bag(tmp_path / "a", [("/PSM1/measured_cp", 0.0, bags.pose_stamped(0.0, (0, 0, 0)))])
     message = refused(only, tmp_path / "s", "--setup", where)

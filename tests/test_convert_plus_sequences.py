@@ -144,7 +144,7 @@ def test_fields_say_type_pm_sweep_and_position_and_a_mapping_names_others(tmp_pa
     assert [event["type"] for event in events(tmp_path / "t")] == ["note", "track"]
 
 
-def test_frames_in_which_the_marker_was_not_tracked_are_left_out_and_told(tmp_path: Path) -> None:
+def test_frames_in_which_the_marker_was_not_tracked_are_left_out_and_reported(tmp_path: Path) -> None:
     path = by_hand(tmp_path / "scan.mha", three(MarkerToCameraTransformStatus="MISSING"))
     done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
     assert done.exit_code == 0, done.output
@@ -228,7 +228,7 @@ def test_a_bad_sequence_is_one_line_and_leaves_nothing(tmp_path: Path, old: byte
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.mha", "setup.yaml"]
 
 
-def test_a_mapping_that_names_what_no_frame_has_is_told_with_what_there_is(tmp_path: Path) -> None:
+def test_a_mapping_of_an_absent_field_is_reported_with_the_fields_present(tmp_path: Path) -> None:
     path = by_hand(tmp_path / "scan.mha", three())
     mapped = tmp_path / "map.yaml"
     mapped.write_text("format: fgreg-mapping/1\nfields: {scan: Winkel}\n")

@@ -170,7 +170,7 @@ def test_what_is_there_stays_there_unless_overwriting_is_asked_for(tmp_path: Pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r.json", "s"]
 
 
-def test_what_cannot_be_converted_is_told_in_one_line(tmp_path: Path) -> None:
+def test_what_cannot_be_converted_is_reported_in_one_line(tmp_path: Path) -> None:
     folder = result(tmp_path / "s")
     assert "expected one in .xml" in refused(folder, tmp_path / "r.stl")
     assert "found nothing, expected a recording" in refused(tmp_path / "nowhere", tmp_path / "r.xml")

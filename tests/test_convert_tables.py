@@ -175,7 +175,7 @@ def test_a_bad_table_is_one_line_that_names_its_own_and_leaves_nothing(tmp_path:
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["setup.yaml", "shots.csv"]
 
 
-def test_a_bad_setup_or_mapping_is_told_by_its_own_name(tmp_path: Path) -> None:
+def test_a_bad_setup_or_mapping_is_reported_by_its_own_name(tmp_path: Path) -> None:
     path = table(tmp_path, ROW + f"1,{POSE},2,3,30,0\n")
     assert "--setup: found nothing" in refused(path, tmp_path / "s")
     bad = setup(tmp_path, stage={"step_deg": -1})

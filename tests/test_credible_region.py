@@ -53,7 +53,7 @@ def test_the_region_holds_its_share_of_fresh_samples_and_nothing_far() -> None:
     assert 0.88 < share < 0.995
 
 
-def test_two_epochs_are_judged_together() -> None:
+def test_two_epochs_are_tested_together() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(2), pairs=20, epochs=2)
     found = posterior_mean(register(measurements, model, SolveConfig()), SolveConfig())
     region = credible_region(found.modes, found.posterior)
@@ -63,7 +63,7 @@ def test_two_epochs_are_judged_together() -> None:
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.2])
-def test_aims_summed_up_say_what_they_say_one_by_one(bias: float) -> None:
+def test_summed_aims_have_the_information_of_single_ones(bias: float) -> None:
     session = make_session(noise_model=NoiseModel(marker_bias_mm=bias))
     model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=8, session=session)
     problem = pack(measurements, model, shapes=True)

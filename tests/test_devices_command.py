@@ -101,7 +101,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     return exit_.value.code
 
 
-def test_each_device_says_what_comes_from_it_and_the_stage_is_not_touched(
+def test_each_device_is_described_and_the_stage_is_not_touched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pictures(tmp_path)
@@ -167,7 +167,7 @@ def test_one_of_two_inputs_without_frames_does_not_pass(tmp_path: Path) -> None:
     assert "/dev/video99" in found.says
 
 
-def test_a_connected_scanner_without_pulses_is_told_apart_from_none(tmp_path: Path) -> None:
+def test_a_connected_scanner_without_pulses_is_distinguished_from_none(tmp_path: Path) -> None:
     pictures(tmp_path)
     with scanner(rate_hz=0.01) as port, cube() as stage:
         pa = {"driver": "igtl", "port": port, "device": "Image_Pa", "silent_s": None}
@@ -187,7 +187,7 @@ def test_a_bad_config_is_one_line_and_status_2(
     assert run(monkeypatch, tmp_path / "none.yaml") == 2
 
 
-def test_without_a_config_the_machine_is_looked_at(
+def test_without_a_config_the_machine_is_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(endoscope, "video_devices", lambda: [])
@@ -228,7 +228,7 @@ def test_a_missing_library_is_said_with_the_extra_that_brings_it(monkeypatch: py
 
 
 @pytest.mark.parametrize(("trouble", "error"), [({"model": b"KST101\0\0"}, StageError), ({"drop": 1}, StageLost)])
-def test_who_is_no_cube_or_does_not_answer_is_told(
+def test_a_device_that_is_no_cube_or_does_not_answer_is_reported(
     trouble: dict[str, Any], error: type[StageError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(thorlabs_identify, "ANSWER_S", 0.4)
@@ -260,7 +260,7 @@ def test_the_simulated_room_answers(
     assert "+ operator       simulated  simulated operator: connected" in out
 
 
-def test_a_port_that_somebody_holds_is_told(tmp_path: Path) -> None:
+def test_a_port_in_use_is_reported(tmp_path: Path) -> None:
     pictures(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as holder, cube() as stage:
         taken = holder.getsockname()[1]

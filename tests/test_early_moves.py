@@ -90,7 +90,7 @@ def test_pairs_of_both_sides_are_not_solved_as_one_registration() -> None:
     assert any("not fit one registration" in reason for reason in solution.reasons)
 
 
-def test_steady_sessions_raise_no_alarm_and_hardly_a_doubt() -> None:
+def test_steady_sessions_raise_no_alarm_and_few_warnings() -> None:
     scores = []
     for seed in range(6):
         model, measurements, _ = make_measurements(
@@ -136,7 +136,7 @@ def test_without_an_estimate_there_is_nothing_to_test() -> None:
     assert find_camera_move(case, model, SolveConfig()) is None
 
 
-def test_a_steady_epoch_is_left_alone_by_screening() -> None:
+def test_screening_passes_over_a_steady_epoch() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(41), pairs=14)
     assert find_camera_move(move_case(measurements, model), model, SolveConfig()) is None
 

@@ -105,7 +105,7 @@ def test_frames_that_hold_both_views_are_halved(tmp_path: Path, layout: Layout, 
     assert means == pytest.approx([200, 40] if swap else [40, 200], abs=4)
 
 
-def test_a_layout_that_does_not_fit_the_frames_is_told(tmp_path: Path) -> None:
+def test_a_layout_that_does_not_fit_the_frames_is_reported(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), shade(3, (65, 48)))
     endoscope = Endoscope(EndoscopeConfig(InputConfig(str(tmp_path), loop=True), layout=Layout.SIDE_BY_SIDE))
     try:
@@ -163,7 +163,7 @@ def test_a_looped_folder_goes_on_with_times_that_only_increase(tmp_path: Path) -
     np.testing.assert_allclose(np.diff([frame.stamp.device_s for frame in frames[:8]]), 0.01, atol=1e-9)
 
 
-def test_frames_that_nobody_fetches_are_dropped_oldest_first_and_counted(tmp_path: Path) -> None:
+def test_frames_not_fetched_are_dropped_oldest_first_and_counted(tmp_path: Path) -> None:
     for i in range(30):
         cv2.imwrite(str(tmp_path / f"{i}.png"), shade(i))
     endoscope = Endoscope(EndoscopeConfig(InputConfig(str(tmp_path), fps=500.0), queue=4))
@@ -187,7 +187,7 @@ def test_frames_that_nobody_fetches_are_dropped_oldest_first_and_counted(tmp_pat
         ("nowhere/*.png", "found no such folder"),
     ],
 )
-def test_a_source_that_cannot_be_one_is_told_at_once(tmp_path: Path, source: str, message: str) -> None:
+def test_an_invalid_source_is_reported_at_once(tmp_path: Path, source: str, message: str) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.avi").write_text("no video")
     with pytest.raises(InputError, match=message):
@@ -242,7 +242,7 @@ def camera() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("failure", ["gone", "silent"])
-def test_a_stream_that_stops_is_told_within_a_second_and_comes_back_by_itself(camera: Any, failure: str) -> None:
+def test_a_stream_that_stops_is_reported_within_a_second_and_comes_back_by_itself(camera: Any, failure: str) -> None:
     assert SILENCE_S < 0.8  # the default leaves the live loop a fifth of a second
     url = f"http://127.0.0.1:{camera.server_address[1]}/video.mjpg"
     endoscope = Endoscope(EndoscopeConfig(InputConfig(url, silence_s=0.4)))
@@ -340,7 +340,7 @@ def test_a_device_plugged_in_again_has_its_own_clock_again() -> None:
     assert [g.index for g in found] == [0, 1, 2, 3]
 
 
-def test_a_capture_that_raises_is_looked_for_again() -> None:
+def test_a_capture_that_raises_is_opened_again() -> None:
     attempts = iter([RuntimeError("busy"), None])
 
     def opening() -> Scripted:

@@ -51,7 +51,7 @@ def started(case: Case) -> Iterator[EngineProcess]:
         yield engine
 
 
-def test_it_says_what_the_engine_says(case: Case, started: EngineProcess) -> None:
+def test_it_reports_what_the_engine_reports(case: Case, started: EngineProcess) -> None:
     model, measurements = case
     here = restored(OnlineRegistration(model, find_moves=False), measurements)
     there, known = started.refresh(), here.estimate

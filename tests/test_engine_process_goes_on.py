@@ -110,7 +110,7 @@ def test_what_a_process_recorded_is_opened_by_another_and_by_this_one_and_the_re
         assert end.pairs == unbroken.pairs + 5
 
 
-def test_a_process_that_ends_while_a_session_is_opened_is_told(
+def test_a_process_that_ends_while_a_session_is_opened_is_reported(
     session: tuple[Path, Shots], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, events = session
@@ -157,7 +157,7 @@ def test_a_killed_registration_is_revived_without_the_session_being_closed(sessi
         same(live.settle(), found, 1e-6)
 
 
-def test_a_revival_that_fails_half_way_counts_nothing_twice_and_blames_no_event(
+def test_a_restart_that_fails_half_way_counts_nothing_twice_and_blames_no_event(
     session: tuple[Path, Shots], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, events = session

@@ -94,7 +94,7 @@ def test_the_radius_is_estimated_with_its_prior() -> None:
     assert any("estimated radius" in reason for reason in solution.reasons)
 
 
-def test_what_the_frames_say_is_the_prior() -> None:
+def test_the_ratio_from_frames_is_the_prior() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=8)
     config = SolveConfig(estimate_sound_speed=True)
     prior = SoundSpeedPrior(1.03, 0.0005)

@@ -86,7 +86,7 @@ def test_nis_of_held_out_pms_is_chi_square_where_the_noise_is_as_stated() -> Non
     assert 0.75 < ratio < 1.3
 
 
-def test_nis_tells_noise_that_is_larger_than_stated() -> None:
+def test_nis_shows_noise_larger_than_stated() -> None:
     case = _case(4, pairs=14)
     boastful = tuple(
         replace(pair, marker=replace(pair.marker, covariance=pair.marker.covariance / 25.0))

@@ -131,7 +131,7 @@ def test_a_left_out_message_shows_in_the_count() -> None:
     assert [m.index for m in reader.feed(stream, 0.0)] == [0, 2]
 
 
-def test_what_nobody_asked_for_is_skipped_unread() -> None:
+def test_messages_not_wanted_are_skipped_unread() -> None:
     reader, rejections = decoder(frozenset({("IMAGE", "Image_Probe")}))
     stream = message("IMAGE", "Other", b"nonsense", checksum=1) + message("GET_IMAGE", "Image_Probe", b"")
     stream += message("IMAGE", "Image_Probe", image_body(np.ones((1, 2, 2), np.uint8)))

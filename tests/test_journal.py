@@ -232,7 +232,7 @@ FAULTS = [
 
 @pytest.mark.parametrize(("call", "code", "written"), FAULTS)
 @pytest.mark.parametrize("truncate_fails", [False, True])
-def test_a_failing_disk_is_told_leaves_no_damaged_line_and_is_forgotten_when_it_works_again(
+def test_a_failing_disk_is_reported_leaves_no_damaged_line_and_is_cleared_when_it_works_again(
     call: str, code: int, written: int | None, truncate_fails: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng, path = np.random.default_rng(5), folder / "events.jsonl"
@@ -271,7 +271,7 @@ TAMPERING: list[tuple[str, Callable[[Path], object]]] = [
 
 
 @pytest.mark.parametrize(("message", "tamper"), TAMPERING)
-def test_a_file_that_others_change_is_told_and_left_alone(
+def test_a_file_that_others_change_is_reported_and_left_alone(
     message: str, tamper: Callable[[Path], object], folder: Path
 ) -> None:
     path = folder / "events.jsonl"

@@ -123,7 +123,7 @@ def test_only_the_newest_picture_is_kept_and_the_others_are_counted(
     assert loop.status().lost == ()
 
 
-def test_pictures_that_nobody_fetched_in_time_are_counted(
+def test_pictures_not_fetched_in_time_are_counted(
     scanner: Scanner, live: tuple[LiveLoop, Notes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, _ = live
@@ -138,7 +138,7 @@ def test_pictures_that_nobody_fetched_in_time_are_counted(
     assert (loop.figures.pictures, loop.figures.unshown) == (4, 5 + 3)
 
 
-def test_a_lost_scanner_is_told_takes_its_picture_along_and_comes_back(
+def test_a_lost_scanner_is_reported_its_picture_is_removed_and_it_comes_back(
     scanner: Scanner, live: tuple[LiveLoop, Notes]
 ) -> None:
     loop, notes = live

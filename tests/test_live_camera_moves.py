@@ -202,7 +202,7 @@ def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:
         assert "moving" in registration.reasons[0]
 
 
-def test_a_move_that_the_operator_tells_holds_until_it_is_in_the_estimate(
+def test_a_move_that_the_operator_reports_invalidates_until_it_is_in_the_estimate(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add = stand.session.add
@@ -247,7 +247,7 @@ def test_a_move_that_the_disk_refuses_holds_until_it_is_recorded(stand: Stand, m
     assert move.camera_new_T_camera_old is not None
 
 
-def test_a_move_that_is_not_taken_in_holds_and_the_next_one_ties_nothing(
+def test_a_move_that_is_not_taken_in_invalidates_and_the_next_one_gives_no_motion_prior(
     stand: Stand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refuses = refusing_moves(stand, monkeypatch, EventRefused("of no use"))

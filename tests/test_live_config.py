@@ -178,7 +178,7 @@ def test_without_an_operator_it_is_the_keyboard_and_without_a_stage_nothing_turn
         assert config.live_setup(stack, lambda _: None).stage is None
 
 
-def test_the_gate_reckons_with_the_brakes_that_the_stage_is_told_to_use(tmp_path: Path) -> None:
+def test_the_gate_uses_the_deceleration_that_the_stage_is_set_to(tmp_path: Path) -> None:
     data = live_configs.config()
     data["stage"]["acceleration_deg_s2"] = 5
     with ExitStack() as stack:
@@ -223,7 +223,7 @@ def test_two_views_need_two_calibrated_cameras(tmp_path: Path) -> None:
     assert text.startswith("live.yaml: camera (line 3): found the layout separate where one camera is calibrated")
 
 
-def test_a_mistake_in_the_session_is_told_with_its_own_file_and_line(tmp_path: Path) -> None:
+def test_a_mistake_in_the_session_is_reported_with_its_own_file_and_line(tmp_path: Path) -> None:
     session = session_files.setup()
     session["probe"]["pitch_mm"] = -1
     text = error_of(live_configs.write(tmp_path, session=session))
@@ -274,7 +274,7 @@ def test_calibration_files_bring_the_camera_and_halve_it_for_fields(tmp_path: Pa
     assert halved.left.matrix[1] == pytest.approx([0.0, 405.0, 120.125])
 
 
-def test_pictures_are_rectified_where_that_is_asked_and_only_by_who_can(tmp_path: Path) -> None:
+def test_pictures_are_rectified_where_that_is_asked_and_possible(tmp_path: Path) -> None:
     session, data = session_files.setup(), live_configs.config()
     del session["camera"]
     stereo_calibration(tmp_path)
@@ -434,7 +434,7 @@ def test_a_port_that_is_taken_is_one_line_and_leaves_nothing_open(tmp_path: Path
         socket.create_server(("127.0.0.1", first)).close()
 
 
-def test_listening_to_other_machines_is_warned_of(tmp_path: Path) -> None:
+def test_listening_beyond_this_machine_gives_a_warning(tmp_path: Path) -> None:
     data = live_configs.config()
     data["sinks"][0]["host"] = "0.0.0.0"
     (warning,) = read_config(live_configs.write(tmp_path, data)).warnings
@@ -466,7 +466,7 @@ def test_the_readme_shows_a_config_that_reads(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_a_scanner_for_overlay_is_opened_only_where_somebody_looks(tmp_path: Path, seen: bool) -> None:
+def test_a_scanner_for_overlay_is_opened_only_for_a_display(tmp_path: Path, seen: bool) -> None:
     scanner = {"driver": "bk", "host": "127.0.0.1", "port": free_port()}
     config = read_config(live_configs.write(tmp_path, live_configs.room() | {"bmode": scanner}))
     with ExitStack() as stack:

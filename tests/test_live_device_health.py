@@ -35,7 +35,7 @@ def frame(rng: np.random.Generator, level: float = 90.0, contrast: float = 30.0,
     return StereoFrame(Stamp(0.0, 0.0), sides[0], sides[1], 0)
 
 
-def test_what_is_lost_and_back_is_told_once_each() -> None:
+def test_loss_and_return_are_reported_once_each() -> None:
     health = Health()
     health.found("probe", "")
     assert health.news() == []
@@ -49,7 +49,7 @@ def test_what_is_lost_and_back_is_told_once_each() -> None:
     assert health.lost == {}
 
 
-def test_a_loss_is_told_even_if_the_device_is_back_at_once() -> None:
+def test_a_loss_is_reported_even_if_the_device_is_back_at_once() -> None:
     device = Device(loses=["cable out"])
     source = Source(device, 0.0, sends=True)
     assert source.poll() == ()
@@ -78,7 +78,7 @@ def test_pictures_that_change_are_new_and_nothing_is_wrong_with_them() -> None:
 
 
 @pytest.mark.parametrize("frozen", ["left", "right"])
-def test_a_picture_that_repeats_is_no_new_look_and_soon_told(frozen: str) -> None:
+def test_a_repeated_picture_is_no_new_measurement_and_soon_reported(frozen: str) -> None:
     rng, pictures = np.random.default_rng(2), Pictures()
     first = frame(rng)
     assert pictures.is_new(first, 0.0)
@@ -97,7 +97,7 @@ def test_a_picture_that_repeats_is_no_new_look_and_soon_told(frozen: str) -> Non
 
 
 @pytest.mark.parametrize(("level", "told"), [(2.0, "shows nothing"), (90.0, "shows nothing"), (255.0, "frozen")])
-def test_black_plain_and_white_pictures_are_told(level: float, told: str) -> None:
+def test_black_plain_and_white_pictures_are_reported(level: float, told: str) -> None:
     rng, pictures = np.random.default_rng(3), Pictures()
     for i in range(30):
         pictures.is_new(frame(rng, level, 0.0, 0.4 * FLAT if level < 255.0 else 0.0), i * FRAME_S)
@@ -106,7 +106,7 @@ def test_black_plain_and_white_pictures_are_told(level: float, told: str) -> Non
     assert pictures.trouble(30 * FRAME_S) == ""
 
 
-def test_a_video_that_stops_is_told_and_single_pictures_are_no_video() -> None:
+def test_a_video_that_stops_is_reported_and_single_pictures_are_no_video() -> None:
     rng, video, stills = np.random.default_rng(4), Pictures(), Pictures()
     for i in range(10):
         video.is_new(frame(rng), i * FRAME_S)

@@ -31,7 +31,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         "disk-full",
     ],
 )  # all of them: tools/study_lost.py
-def test_what_is_lost_is_told_and_the_rest_goes_on(case: Rig, name: str) -> None:
+def test_a_loss_is_reported_and_the_rest_goes_on(case: Rig, name: str) -> None:
     fault = STUDIED[name]
     orders = fault.role in ("camera", "stage")  # what the stage's orders rest on
     found = trial(case, fault, 1.0, orders=orders, rest_s=0.5)

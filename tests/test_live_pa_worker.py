@@ -90,7 +90,7 @@ def test_one_that_ended_while_idle_is_noticed_and_replaced(pulse_locator: PulseL
     assert pulse_locator.locator.pid not in (None, pid)
 
 
-def test_one_that_hangs_is_told_and_trouble_ends_when_it_goes_on(pulse_locator: PulseLocator) -> None:
+def test_a_hung_worker_is_reported_until_it_works_again(pulse_locator: PulseLocator) -> None:
     pid = pulse_locator.locator.pid
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
@@ -101,7 +101,7 @@ def test_one_that_hangs_is_told_and_trouble_ends_when_it_goes_on(pulse_locator: 
     assert pulse_locator.locator.pid == pid
 
 
-def test_a_frame_that_cannot_be_looked_into_is_no_silence(pulse_locator: PulseLocator) -> None:
+def test_a_frame_that_cannot_be_processed_is_not_a_pulse_without_signal(pulse_locator: PulseLocator) -> None:
     pulse(pulse_locator, np.zeros((3, 5, 7), dtype=np.int16))
     (heard,) = turn(pulse_locator, lambda: not pulse_locator.waiting)
     assert heard.scan_rad is None  # as a pulse of which nobody knows anything

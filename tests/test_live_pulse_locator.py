@@ -71,7 +71,7 @@ def pulses(pulse_locator: PulseLocator, first: int, count: int) -> tuple[Located
     return tuple(out)
 
 
-def test_what_the_locating_process_has_no_time_for_is_handed_on_as_unknown_and_counted(
+def test_pulses_that_the_locating_process_cannot_process_are_handed_on_as_unknown_and_counted(
     pulse_locator: tuple[PulseLocator, SlowLocator],
 ) -> None:
     found, locator = pulse_locator
@@ -100,7 +100,7 @@ def test_a_process_that_keeps_up_passes_nothing_over(pulse_locator: tuple[PulseL
     assert [heard.scan_rad for heard in handed] == pytest.approx([0.1] * 49)
 
 
-def test_pulses_that_nobody_listens_to_say_nothing_and_are_not_looked_into(
+def test_pulses_not_wanted_are_not_processed_and_carry_no_information(
     pulse_locator: tuple[PulseLocator, SlowLocator],
 ) -> None:
     found, locator = pulse_locator

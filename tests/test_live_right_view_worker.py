@@ -63,7 +63,9 @@ def seen_of(worker: RightViewWorker) -> object:
     return None if reply is None else reply[0]
 
 
-def test_it_sees_what_is_seen_here(room: tuple[SessionModel, list[Pictures]], worker: RightViewWorker) -> None:
+def test_it_detects_the_same_as_this_process(
+    room: tuple[SessionModel, list[Pictures]], worker: RightViewWorker
+) -> None:
     model, pictures = room
     assert model.camera is not None
     assert model.marker is not None
@@ -87,7 +89,7 @@ def test_a_picture_without_a_marker_is_no_trouble(
     assert found.corners is None  # type: ignore[attr-defined]
 
 
-def test_another_size_of_pictures_begins_anew(
+def test_another_size_of_pictures_starts_a_new_worker(
     room: tuple[SessionModel, list[Pictures]], worker: RightViewWorker
 ) -> None:
     right = room[1][0][1]
@@ -99,7 +101,7 @@ def test_another_size_of_pictures_begins_anew(
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_where_it_ends_or_hangs_frames_are_looked_into_here_and_another_takes_over(
+def test_where_it_ends_or_hangs_frames_are_processed_here_and_another_takes_over(
     room: tuple[SessionModel, list[Pictures]], how: signal.Signals
 ) -> None:
     model, pictures = room

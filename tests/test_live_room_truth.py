@@ -61,7 +61,7 @@ def test_an_epoch_has_the_pose_of_its_last_pair_whether_a_move_was_noticed_or_no
     assert check_session(tmp_path) == ([], [])
 
 
-def test_a_session_that_goes_on_in_another_room_keeps_what_was_known_of_its_epochs(tmp_path: Path) -> None:
+def test_a_session_that_goes_on_in_another_room_keeps_the_truth_of_its_epochs(tmp_path: Path) -> None:
     first, second = room_with_bumps(5.0), room_with_bumps(2.0)
     record(tmp_path, [pair(1.0, 0), CameraMovedEvent(6.0, 0), pair(7.0, 1)])
     write_room_truth(first.truth_at, tmp_path, 0.0, -1.0)
@@ -77,7 +77,7 @@ def test_a_session_that_goes_on_in_another_room_keeps_what_was_known_of_its_epoc
     assert not (tmp_path / "ground_truth.yaml").exists()
 
 
-def test_the_room_tells_it_over_its_socket_in_host_time(tmp_path: Path) -> None:
+def test_the_room_sends_it_over_its_socket_in_host_time(tmp_path: Path) -> None:
     room = room_with_bumps(0.1)
     server = RoomServer(room, tmp_path / "socket")
     began = time.monotonic()

@@ -75,7 +75,7 @@ def test_a_camera_at_rest_has_not_moved() -> None:
     assert not any(moving for _, moving in arm.moving)
 
 
-def test_a_move_is_told_with_its_motion_once_it_is_over() -> None:
+def test_a_move_is_reported_with_its_motion_once_it_is_over() -> None:
     arm = moved_arm()
     ((t_s, move),) = arm.moves
     assert move.camera_new_T_camera_old is not None
@@ -132,7 +132,7 @@ def test_the_covariance_is_that_of_the_right_tangent() -> None:
     assert np.abs((move.covariance - spread) / np.outer(scale, scale)).max() < 0.1
 
 
-def test_what_is_stated_of_a_move_is_in_its_covariance() -> None:
+def test_the_stated_accuracy_of_a_move_is_in_its_covariance() -> None:
     move = moved_arm().moves[0][1]
     assert move.covariance is not None
     settings = HolderSettings()
@@ -140,7 +140,7 @@ def test_what_is_stated_of_a_move_is_in_its_covariance() -> None:
     assert np.allclose(np.sqrt(np.diag(move.covariance)), expected)
 
 
-def test_there_and_back_is_no_move_but_nothing_held_meanwhile() -> None:
+def test_there_and_back_is_no_move_but_invalid_meanwhile() -> None:
     arm = Arm()
     arm.run(1.0, lambda _: START)
     arm.run(1.0, lambda t: on_the_way(math.sin(math.pi * t)))
@@ -172,7 +172,7 @@ def test_creeping_adds_up() -> None:
     assert np.linalg.norm(total[:3, 3] + slow[:3, 3]) < 1.3
 
 
-def test_a_holder_that_was_silent_and_is_elsewhere_says_nothing_of_the_motion() -> None:
+def test_a_holder_that_was_silent_and_is_elsewhere_gives_no_motion() -> None:
     arm = Arm()
     arm.run(1.0, lambda _: START)
     arm.silence(3.0)

@@ -82,7 +82,7 @@ def test_reopened_at_any_moment_it_goes_on_with_the_estimate_of_before(pose_sess
     np.testing.assert_allclose(settled.trus_T_camera, batch.trus_T_camera, atol=1e-9)
 
 
-def test_raw_frames_are_looked_at_as_they_come_and_the_same_again_when_reopened(raw_session: Path) -> None:
+def test_raw_frames_are_processed_as_they_come_and_with_the_same_result_when_reopened(raw_session: Path) -> None:
     folder, events = empty_copy(raw_session)
     with LiveSession.open(folder, make_engine=BatchEngine) as live:
         feed(live, events)
@@ -243,7 +243,7 @@ def test_an_interrupt_between_disk_and_estimate_loses_nothing(
     assert [event.t for event in read_session(folder).events] == [event.t for event in events[:6]]
 
 
-def test_told_and_noticed_moves_of_the_camera_are_epochs_for_every_reader(tmp_path: Path) -> None:
+def test_reported_and_detected_moves_of_the_camera_are_epochs_for_every_reader(tmp_path: Path) -> None:
     config = replace(PRESETS["camera-move"], aims=8, pairs=14)
     write_session(simulate(config, 3), tmp_path / "s")
     folder, events = empty_copy(tmp_path / "s")

@@ -101,7 +101,7 @@ def test_a_fibre_that_moves_during_a_search_gives_no_pair() -> None:
     assert any("the fibre has moved during the search" in tell.text for _, tell in session.told)
 
 
-def test_a_pm_that_is_not_heard_is_given_up_and_said_so() -> None:
+def test_the_search_for_a_pm_that_is_not_detected_ends_with_a_message() -> None:
     session = rehearsal(aims=0, deaf_from_s=0.0)
     session.run(45.0)
     assert not any(isinstance(a, TakePairs) for _, a in session.asked)
@@ -124,7 +124,7 @@ def test_a_marker_lost_during_a_search_ends_it() -> None:
     assert not any(isinstance(a, TakePairs) for _, a in session.asked)
 
 
-def test_after_a_told_move_it_searches_again_and_halts_first(whole: Rehearsal) -> None:
+def test_after_a_reported_move_it_halts_and_searches_again(whole: Rehearsal) -> None:
     # last of the tests that use the session: it changes it
     from fgreg.online.events import CameraMoved
 
@@ -141,7 +141,7 @@ def test_after_a_told_move_it_searches_again_and_halts_first(whole: Rehearsal) -
     assert whole.workflow.stage is Stage.COLLECTING
 
 
-def test_an_epoch_that_stays_refused_is_told_with_what_helps() -> None:
+def test_an_epoch_that_stays_refused_is_reported_with_what_helps() -> None:
     session = rehearsal(aims=0)  # without a beam nothing can be registered
     session.workflow = Workflow(
         session.model, WorkflowSettings(aims=0, pms=2, most_pms=2, hearing_threshold=session.threshold)

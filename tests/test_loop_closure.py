@@ -61,7 +61,7 @@ def test_a_camera_put_back_has_evidence_for_it_and_closes_the_loop_where_that_su
     ],
     ids=["near", "far"],
 )
-def test_a_camera_elsewhere_is_not_taken_for_back(seed: int, motion: FloatArray) -> None:
+def test_a_camera_elsewhere_closes_no_loop(seed: int, motion: FloatArray) -> None:
     assert _closure(seed, motion, 12, settings=ANY) is None
 
 

@@ -70,7 +70,7 @@ def test_a_marker_that_has_leapt_is_found_all_the_same() -> None:
     assert np.abs(corners(watch.detect(leapt)) - corners(whole(model, leapt))).max() < SAME_PX
 
 
-def test_a_picture_without_a_marker_is_empty_and_the_next_one_is_looked_into_as_a_whole() -> None:
+def test_a_picture_without_a_marker_is_empty_and_the_next_one_is_processed_as_a_whole() -> None:
     model, room = of_room(640)
     watch = watching(model)
     image = room.pictures(0.0, 0)[0]

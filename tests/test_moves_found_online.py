@@ -129,7 +129,7 @@ def test_one_gross_outlier_is_no_move() -> None:
     assert not engine.inliers[15]
 
 
-def test_until_the_new_epoch_is_good_enough_the_verdict_says_so_and_queries_are_not_answered() -> None:
+def test_until_the_new_epoch_is_good_enough_the_verdict_is_refused_and_queries_are_not_answered() -> None:
     model, measurements, _ = unreported_move(3, SHIFT, 10, BEFORE)
     engine = _steady(OnlineRegistration(model), measurements)
     before = engine.track(_query(measurements))
@@ -222,7 +222,7 @@ def _with_tags(seed: int, pairs: int) -> tuple[OnlineRegistration, Measurements,
     return engine, measurements, tags, truth, t
 
 
-def test_an_alarm_from_tags_alone_stops_answers_at_once_and_then_ties_the_new_epoch() -> None:
+def test_an_alarm_from_tags_alone_stops_results_at_once_and_then_gives_the_motion_prior() -> None:
     engine, measurements, tags, truth, t = _with_tags(6, 1)
     steady = engine.track(_query(measurements))
     assert steady.sigma_rad is not None

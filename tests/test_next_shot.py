@@ -61,7 +61,7 @@ def test_shots_are_ranked_distinct_and_within_reach() -> None:
     assert advice.shots[0].candidate == advice.order[0] != worst
 
 
-def test_virtual_pairs_lie_on_their_beam_and_are_heard_where_it_says() -> None:
+def test_virtual_pairs_lie_on_their_beam_and_are_detected_where_stated() -> None:
     model, _, found = _registered(2, pairs=10)
     candidates = advise(found).candidates
     state = found.optimum.state
@@ -93,7 +93,7 @@ def test_the_sweep_comes_from_the_side_used_less() -> None:
     assert advise(window).candidates.sweep == 0
 
 
-def test_few_pairs_are_told_and_still_advised_on() -> None:
+def test_few_pairs_are_reported_and_still_get_advice() -> None:
     for seed in range(4):
         _, _, found = _registered(seed, pairs=4)
         advice = advise(found)
@@ -101,7 +101,7 @@ def test_few_pairs_are_told_and_still_advised_on() -> None:
         assert any("few" in note or "another registration" in note for note in advice.notes)
 
 
-def test_a_rival_registration_is_told_apart_first() -> None:
+def test_shots_that_exclude_another_minimum_come_first() -> None:
     rivals = 0
     for seed in range(8):
         _, _, found = _registered(seed, pairs=4)

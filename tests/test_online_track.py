@@ -30,7 +30,7 @@ def _engine(model: SessionModel) -> OnlineRegistration:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_after_settling_the_answers_are_those_of_the_full_solve(seed: int) -> None:
+def test_after_settling_the_results_are_those_of_the_full_solve(seed: int) -> None:
     model, used, queries = _session(seed, 25)
     engine = restored(_engine(model), used)
     engine.settle()

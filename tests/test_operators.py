@@ -150,7 +150,7 @@ def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -
     assert typed.told == [f"a line of more than {MAX_LINE_BYTES} characters is not understood"]
 
 
-def test_where_nobody_fetches_the_oldest_go_but_never_a_stop(typed: Typed) -> None:
+def test_commands_not_fetched_are_dropped_oldest_first_but_never_a_stop(typed: Typed) -> None:
     typed.type(b"stop\n" + b"next\n" * (MOST_WAITING + 10) + b"home\n")
     wait_for(lambda: typed.operator.dropped == 12)
     commands = typed.operator.poll()
@@ -158,7 +158,7 @@ def test_where_nobody_fetches_the_oldest_go_but_never_a_stop(typed: Typed) -> No
     assert (commands[0], commands[-1]) == (OperatorCommand(CommandKind.STOP), OperatorCommand(CommandKind.HOME))
 
 
-def test_what_is_told_is_one_line_with_the_word_that_is_wanted(typed: Typed) -> None:
+def test_a_message_is_one_line_with_the_command_that_is_wanted(typed: Typed) -> None:
     typed.operator.tell("the stage has to find\nits zero", wants=CommandKind.HOME)
     typed.operator.tell("registered", done=True)
     assert typed.told == ["the stage has to find\\nits zero: say home (h)", "registered"]
@@ -255,7 +255,7 @@ def test_texts_of_a_device_are_commands_and_others_are_not(switch: tuple[IgtlOpe
     ]
 
 
-def test_a_peer_is_told_and_answered(switch: tuple[IgtlOperator, socket.socket]) -> None:
+def test_a_peer_gets_messages_and_replies(switch: tuple[IgtlOperator, socket.socket]) -> None:
     operator, peer = switch
     wait_for(lambda: operator.connected)
     operator.tell("the stage is ready to follow the beam", wants=CommandKind.FOLLOW)
@@ -278,7 +278,7 @@ def test_a_switch_that_is_unplugged_is_lost_once_and_back(switch: tuple[IgtlOper
         assert collect(operator.poll, 1) == [OperatorCommand(CommandKind.HOME)]
 
 
-def test_several_operators_are_one_and_a_loss_keeps_nobodys_stop_back(
+def test_several_operators_are_one_and_a_loss_delays_no_stop(
     typed: Typed, switch: tuple[IgtlOperator, socket.socket]
 ) -> None:
     foot, peer = switch

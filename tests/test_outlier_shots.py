@@ -64,7 +64,7 @@ def _moved(first: Registration, second: Registration, model: SessionModel) -> fl
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_junk_is_named_and_the_answer_is_that_without_it(seed: int) -> None:
+def test_outliers_are_named_and_the_result_is_that_without_them(seed: int) -> None:
     model, spoiled, rest, _ = _spoiled(seed, junk=(2, 9, 16), flips=(5, 20), pairs=25)
     found, reference = register(spoiled, model, SolveConfig()), register(rest, model, SolveConfig())
     assert list(np.flatnonzero(~found.shots.pm_inlier)) == [2, 5, 9, 16, 20]
@@ -72,7 +72,7 @@ def test_junk_is_named_and_the_answer_is_that_without_it(seed: int) -> None:
     np.testing.assert_allclose(found.covariance, reference.covariance, rtol=1e-4, atol=1e-12)
 
 
-def test_junk_of_two_fifths_is_left_out() -> None:
+def test_outliers_of_two_fifths_are_rejected() -> None:
     junk, flips = (0, 3, 7, 11, 14, 19), (1, 8, 17, 22)
     model, spoiled, rest, _ = _spoiled(4, junk=junk, flips=flips, pairs=25)
     found, reference = register(spoiled, model, SolveConfig()), register(rest, model, SolveConfig())
@@ -96,7 +96,7 @@ def test_left_out_pairs_say_why_and_keep_their_figures() -> None:
     assert solution.verdict is Verdict.OK  # three of 25 left out, the rest is as good as any session
 
 
-def test_a_session_without_junk_is_plain_least_squares() -> None:
+def test_a_session_without_outliers_is_plain_least_squares() -> None:
     model, clean, _ = make_measurements(np.random.default_rng(6), pairs=20)
     found = register(clean, model, SolveConfig())
     assert found.shots.pm_inlier.all()
@@ -121,14 +121,14 @@ def test_flipped_markers_in_calibration_are_left_out() -> None:
     assert float(direction @ truth.marker_T_laser[:3, 2]) > np.cos(0.03)
 
 
-def test_the_explicit_graph_sees_only_what_is_kept() -> None:
+def test_the_explicit_graph_has_only_inliers() -> None:
     model, spoiled, _, _ = _spoiled(1, junk=(2, 9), pairs=16)
     found = register(spoiled, model, SolveConfig())
     assert len(found.measurements.pairs) == 14
     assert distance_to_explicit(found) < 0.05
 
 
-def test_one_junk_look_of_several_is_left_out_alone() -> None:
+def test_one_outlier_look_of_several_is_rejected_alone() -> None:
     model, clean, _ = make_measurements(np.random.default_rng(2), pairs=10, looks_per_pm=3)
     pairs = list(clean.pairs)
     pairs[13] = _elsewhere(pairs[13], np.random.default_rng(0))
@@ -140,14 +140,14 @@ def test_one_junk_look_of_several_is_left_out_alone() -> None:
     np.testing.assert_array_equal(here, other)
 
 
-def test_junk_in_one_epoch_leaves_the_other_alone() -> None:
+def test_outliers_in_one_epoch_do_not_affect_the_other() -> None:
     model, spoiled, _, _ = _spoiled(2, junk=(1, 4), pairs=24, epochs=2)
     solution = solve(spoiled, [], model, SolveConfig())
     assert [i for i, pair in enumerate(solution.pairs) if not pair.used] == [1, 4]
     assert [epoch.pairs for epoch in solution.epochs] == [10, 12]
 
 
-def test_too_few_pairs_to_tell_which_is_wrong_are_refused_and_the_suspect_named() -> None:
+def test_too_few_pairs_to_identify_the_outlier_are_refused_and_the_suspect_named() -> None:
     model, spoiled, _, _ = _spoiled(0, junk=(3,), pairs=7)
     solution = solve(spoiled, [], model, SolveConfig(limit_mm=1000.0))
     assert all(pair.used for pair in solution.pairs)
@@ -190,7 +190,7 @@ def test_good_pairs_innovations_follow_their_chi_square() -> None:
     assert np.mean(np.array(values) > 5.99) < 0.09  # 5 % of chi square, two degrees of freedom
 
 
-def test_consensus_finds_the_registration_among_junk() -> None:
+def test_consensus_finds_the_registration_among_outliers() -> None:
     model, spoiled, _, truth = _spoiled(3, junk=(0, 2, 4, 6, 8, 10, 12), flips=(14, 16, 18), pairs=25)
     starts = consensus_starts(pack(spoiled, model), truth.marker_T_laser, 45.0)
     far = [targets_moved(truth.trus_T_camera[0], start, model.targets_mm) for start in starts]
@@ -226,7 +226,7 @@ def test_a_pair_whose_beam_has_no_place_on_its_arc_is_left_out() -> None:
     assert float(found.optimum.evaluation.cost[0]) < plausible_cost(found.problem)
 
 
-def test_the_density_of_a_doubted_pm_is_that_of_good_or_junk() -> None:
+def test_the_density_of_a_doubtful_pm_is_the_mixture_of_inlier_and_outlier() -> None:
     model, spoiled, _, _ = _spoiled(0, junk=(2,), pairs=12)
     found = posterior_mean(register(spoiled, model, SolveConfig()), SolveConfig())
     doubted = found.modes[0].mixture
@@ -244,7 +244,7 @@ def test_the_density_of_a_doubted_pm_is_that_of_good_or_junk() -> None:
     assert both == pytest.approx(kept + log_k[2], abs=0.05)
 
 
-def test_junk_that_bends_the_estimate_until_it_fits_widens_the_posterior() -> None:
+def test_an_outlier_that_bends_the_estimate_until_it_fits_widens_the_posterior() -> None:
     # In these sessions a junk PM or two are within their limits at the optimum.
     squares = []
     for seed in (12, 28, 56):

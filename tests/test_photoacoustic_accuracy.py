@@ -124,7 +124,7 @@ def test_arrival_is_the_maximum_of_the_envelope_of_a_pulse_that_is_not_symmetric
     assert float(np.sqrt(np.mean(np.square(errors)))) < 0.02
 
 
-def test_a_flipped_probe_hears_the_source_on_the_same_side() -> None:
+def test_a_flipped_probe_locates_the_source_on_the_same_side() -> None:
     straight, flipped = probe_with(), probe_with(flip=True)
     frame = heard(straight, -7.0, 25.0, 20.0, 6)
     assert found(frame, straight).x_mm == pytest.approx(-7.0, abs=0.03)

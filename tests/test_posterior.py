@@ -152,7 +152,7 @@ def test_weighted_quantiles() -> None:
     assert weighted_quantile(values, np.array([0.97, 0.01, 0.01, 0.01]), 0.95)[0] == 3.0
 
 
-def test_the_answer_keeps_the_optimum_apart_from_the_mean() -> None:
+def test_the_result_has_the_optimum_besides_the_mean() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(6), pairs=8, first_hit=False)
     config = SolveConfig()
     registration = register(measurements, model, config)
@@ -170,7 +170,7 @@ def test_the_answer_keeps_the_optimum_apart_from_the_mean() -> None:
     assert ellipsoid_contains(found.posterior, truth.trus_T_camera[0])
 
 
-def test_a_posterior_that_runs_away_is_answered_by_the_optimum() -> None:
+def test_a_posterior_that_diverges_is_replaced_by_the_optimum() -> None:
     # The optimum with sites of five window-only pairs may be kilometres off; so may samples that rounding favours.
     model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=8, first_hit=False)
     registration = register(measurements, model, SolveConfig())

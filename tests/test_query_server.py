@@ -56,7 +56,7 @@ def running() -> Iterator[_Running]:
         yield _Running(shared, server, snapshot, queries)
 
 
-def test_answers_are_those_of_the_snapshot(running: _Running) -> None:
+def test_results_are_those_of_the_snapshot(running: _Running) -> None:
     running.shared.publish(running.snapshot)
     with running.server.client() as client:
         for query in running.queries:
@@ -98,7 +98,7 @@ def test_many_threads_get_their_own_answers(running: _Running) -> None:
     assert wrong == []
 
 
-def test_a_query_that_cannot_be_is_told_and_the_next_one_answered(running: _Running) -> None:
+def test_an_invalid_query_is_reported_and_the_next_one_answered(running: _Running) -> None:
     running.shared.publish(running.snapshot)
     query = running.queries[0]
     bad = replace(query, marker=replace(query.marker, camera_T_marker=np.full((4, 4), np.nan)))
@@ -120,7 +120,7 @@ def test_a_wrong_key_gets_no_answers(running: _Running) -> None:
         assert client.track(running.queries[0]).stage_rad is not None
 
 
-def test_before_the_first_estimate_clients_are_told() -> None:
+def test_before_the_first_estimate_clients_get_a_reason() -> None:
     model = make_session()
     query = Track(0.0, 0, make_measurements(np.random.default_rng(0), pairs=1)[1].pairs[0].marker)
     with SharedSnapshot(Layout.of(model)) as shared, QueryServer(shared.name) as server:

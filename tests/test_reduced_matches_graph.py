@@ -156,7 +156,7 @@ def test_hypotheses_that_have_come_together_go_on_as_one() -> None:
     assert len(distinct(problem, both, evaluate(problem, both, private_at(problem, both)))) >= 3
 
 
-def test_a_hypothesis_that_will_not_come_below_what_is_wanted_is_left() -> None:
+def test_a_hypothesis_that_cannot_reach_the_wanted_cost_is_dropped() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(8), pairs=10)
     problem = pack(measurements, model)
     start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)

@@ -150,7 +150,7 @@ def test_a_nominal_beam_the_wrong_way_round_is_turned_to_where_the_spots_are() -
     assert np.linalg.det(solution.laser.marker_T_laser[:3, :3]) == pytest.approx(1.0)
 
 
-def test_a_motion_without_a_covariance_ties_nothing() -> None:
+def test_a_motion_without_a_covariance_gives_no_prior() -> None:
     from dataclasses import replace
 
     model, measurements, _ = make_measurements(np.random.default_rng(2), pairs=24, epochs=2, known_motion=True)

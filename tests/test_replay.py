@@ -117,7 +117,7 @@ def test_queries_are_answered_from_what_was_known_at_their_time(
     assert cut[1].sigma_rad == pytest.approx(whole[1].sigma_rad, rel=1e-9)
 
 
-def test_a_told_move_of_the_camera_begins_an_epoch(tmp_path: Path, make_engine: MakeEngine) -> None:
+def test_a_reported_move_of_the_camera_begins_an_epoch(tmp_path: Path, make_engine: MakeEngine) -> None:
     folder = tmp_path / "moved"
     write_session(simulate(replace(PRESETS["camera-move"], aims=6, pairs=12), 3), folder)
     steps: list[ReplayStep] = []
@@ -162,7 +162,7 @@ def test_a_pair_that_the_engine_refuses_is_listed_with_its_reason(short: Path, m
     assert "no place" in report.solved.estimate.pairs[0].reason
 
 
-def test_lines_tell_what_is_known_after_each_event(
+def test_lines_report_the_estimate_after_each_event(
     short: Path, make_engine: MakeEngine, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(monkeypatch, make_engine, short) == 0

@@ -211,7 +211,7 @@ def test_rows_of_transforms_are_lines(tmp_path: Path, model: SessionModel) -> No
     ) in text
 
 
-def test_nothing_to_tell_is_written_and_read_too(tmp_path: Path, model: SessionModel) -> None:
+def test_a_result_without_content_is_written_and_read_too(tmp_path: Path, model: SessionModel) -> None:
     nothing = SessionEstimate("phantom-01", Verdict.REFUSED, (), None, (), (), ())
     write_result(nothing, model, tmp_path / "result.yaml", "0.3.0")
     data = yaml.safe_load((tmp_path / "result.yaml").read_text())

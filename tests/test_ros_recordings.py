@@ -105,7 +105,7 @@ def test_poses_that_are_none_are_left_out_and_counted(tmp_path: Path) -> None:
     assert device.dropped == 2
 
 
-def test_samples_come_when_they_are_due_and_old_ones_are_dropped_where_nobody_asks(tmp_path: Path) -> None:
+def test_samples_come_when_they_are_due_and_old_ones_are_dropped_where_not_fetched(tmp_path: Path) -> None:
     topic = "/ECM/measured_cp"
     path = bags.write_bag(
         tmp_path / "bag", [(topic, 0.01 * i, bags.pose_stamped(0.01 * i, (i, 0, 0))) for i in range(40)]
@@ -151,7 +151,7 @@ def test_raw_and_compressed_images_come_as_stereo_frames_matched_by_their_header
         assert frame.left.shape == (48, 64, 3)
 
 
-def test_the_unrectified_raw_topic_of_a_side_is_preferred_and_ambiguity_is_told(tmp_path: Path) -> None:
+def test_the_unrectified_raw_topic_of_a_side_is_preferred_and_ambiguity_is_reported(tmp_path: Path) -> None:
     grey = bags.image(0.0, "mono8", np.zeros((4, 6), np.uint8))
     names = ["/rig/left/image_raw", "/rig/left/image_rect", "/rig/right/image_rect", "/leftover/image_raw"]
     with Recording(bags.write_bag(tmp_path / "a", [(name, 0.0, grey) for name in names])) as recording:
@@ -184,7 +184,7 @@ def test_probe_frames_keep_their_numbers_in_either_byte_order(big: bool) -> None
     np.testing.assert_array_equal(array_of(bags.multi_array(waves)), waves)
 
 
-def test_messages_that_do_not_hold_what_they_say_are_told() -> None:
+def test_messages_that_do_not_hold_what_they_say_are_reported() -> None:
     short = bags.image(0.0, "mono8", np.zeros((4, 4), np.uint8))
     short.data = short.data[:7]
     with pytest.raises(ValueError, match="7 bytes of 4 x 4 px"):

@@ -73,7 +73,7 @@ def test_sweep_begins_at_the_nearer_end_and_comes_back_half_a_step_aside(stands_
     np.testing.assert_allclose(np.abs(np.diff(positions[7:])), 10.0)
 
 
-def test_weakest_pm_that_the_session_promises_is_heard_in_the_first_sweep() -> None:
+def test_weakest_pm_within_the_stated_window_is_detected_in_the_first_sweep() -> None:
     positions = sweep_positions(LOW, HIGH, _model().reach_rad, 0.0)
     assert len(positions) == 7
     for pm_deg in np.linspace(-35.0, 35.0, 1401):
@@ -110,7 +110,7 @@ def test_planning_uses_silence_too() -> None:
     assert after.angle_weight()[near].max() < 0.5 * after.angle_weight()[far].min()
 
 
-def test_two_looks_tell_the_angle_as_by_hand() -> None:
+def test_two_looks_give_the_angle_computed_by_hand() -> None:
     # log(a1 / a2) = -ln 2 ((p - s1)^2 - (p - s2)^2) / 36 is linear in p: 0.1155 per deg for looks 6 deg apart
     model = replace(_model(), width_sigma=0.0)
     belief = Belief.flat(model, LOW, HIGH)
@@ -122,7 +122,7 @@ def test_two_looks_tell_the_angle_as_by_hand() -> None:
     assert math.degrees(belief.sigma_rad()) == pytest.approx(expected_sigma, rel=0.15)
 
 
-def test_expected_sigma_is_what_looks_bring_on_average() -> None:
+def test_expected_sigma_is_the_average_after_a_look() -> None:
     rng = np.random.default_rng(11)
     model = _model()
     belief = Belief.flat(model, LOW, HIGH).after(0.0, 3.0).after(math.radians(6.0), 2.0)
@@ -174,7 +174,7 @@ def test_wrong_prediction_never_becomes_a_sweep_of_the_field() -> None:
     assert max(abs(math.degrees(turn.scan_rad) + 20.0) for turn in turns) <= 3.5 + 5.7 + 1e-9
 
 
-def test_pm_heard_from_outside_the_predicted_range_is_not_pressed_into_it() -> None:
+def test_pm_detected_from_outside_the_predicted_range_is_not_forced_into_it() -> None:
     for seed in range(6):
         guess = Prediction(0.0, math.radians(1.0))
         step, _ = _search(6.0 + seed, 6.0, np.random.default_rng(seed), guess)
@@ -184,7 +184,7 @@ def test_pm_heard_from_outside_the_predicted_range_is_not_pressed_into_it() -> N
             assert "search the field" in step.reason
 
 
-def test_single_false_hearing_does_not_end_in_an_answer_there() -> None:
+def test_single_false_detection_does_not_end_the_search_there() -> None:
     rng = np.random.default_rng(4)
     planner = SearchPlanner(_model(), LOW, HIGH, LOW)
     turns = 0

@@ -94,7 +94,7 @@ def test_half_width_is_taken_at_the_looks_depth() -> None:
     np.testing.assert_allclose(np.degrees(priors.centre_rad), [4.0, 4.5, 5.0, 7.0, 8.0])
 
 
-def test_a_step_wider_than_the_window_tells_no_more_than_the_window() -> None:
+def test_a_step_wider_than_the_window_adds_no_information_to_the_window() -> None:
     probe = make_session().probe
     wide = sensitivity_prior(look(30.0, 1), probe.sensitivity, 15.0 * DEG)
     window = sensitivity_prior(look(30.0, 0), probe.sensitivity, 15.0 * DEG)
@@ -211,7 +211,7 @@ def test_amplitudes_find_the_plane_whatever_the_peak(peak: float) -> None:
     assert sigma == pytest.approx(0.05 / np.linalg.norm(slope), rel=0.15)
 
 
-def test_amplitudes_say_nothing_alone_or_without_a_curve() -> None:
+def test_amplitudes_carry_no_information_alone_or_without_a_curve() -> None:
     with_curve, without = make_session(curve=True).probe.sensitivity, make_session().probe.sensitivity
     assert not amplitude_table(_ladder(1.0, [0.0], 1.0), with_curve, 0.05).used
     assert not amplitude_table(_ladder(1.0, [0.0, 2.0], 1.0), without, 0.05).used

@@ -252,7 +252,7 @@ def test_every_cut_of_the_log_reads(tmp_path: Path) -> None:
         assert len(read_session(tmp_path).events) == complete
 
 
-def test_warnings_for_what_is_hardly_meant(tmp_path: Path) -> None:
+def test_warnings_for_implausible_values(tmp_path: Path) -> None:
     setup = session_files.setup()
     setup["probe"]["sound_speed_m_s"] = 1.54
     setup["camera"]["left"]["matrix"][0][2] = 3200

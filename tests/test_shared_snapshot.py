@@ -248,7 +248,7 @@ def test_what_does_not_fit_or_is_not_finite_leaves_the_last_one() -> None:
         assert SnapshotReader(shared.name).snapshot().pairs == 6
 
 
-def test_memory_of_something_else_is_told() -> None:
+def test_memory_of_another_format_is_reported() -> None:
     memory = multiprocessing.shared_memory.SharedMemory(create=True, size=4096)
     try:
         with pytest.raises(ValueError, match="holds no snapshots"):

@@ -135,7 +135,7 @@ def test_range_x_and_scan_noise_have_the_declared_sigmas() -> None:
     assert np.std(scan[1] - scan[0]) == pytest.approx(0.1, rel=0.1)
 
 
-def test_stage_stops_at_the_first_angle_that_hears() -> None:
+def test_stage_stops_at_the_first_angle_with_a_detection() -> None:
     for seed in range(20):
         simulated = simulate(without_noise(pairs=10), seed)
         width = 6.0 + simulated.truth["x_window_edge_deg"]
@@ -177,7 +177,7 @@ def test_window_follows_depth() -> None:
     assert max(share) > 0.9
 
 
-def test_heard_at_the_first_stop_gives_no_sweep() -> None:
+def test_a_detection_at_the_first_stop_gives_no_sweep() -> None:
     # The stage's lower limit lies within the window of every PM: it hears before it has made a step.
     stage = StageModel(math.radians(2.0), (math.radians(-1.0), math.radians(60.0)))
     config = without_noise(pairs=6, stage=stage, sweep=Sweep.ONE_WAY, pm_angle_rad=math.radians(1.5))
@@ -224,7 +224,7 @@ def test_wrong_sound_speed_scales_ranges() -> None:
     assert slow.truth["x_sound_speed_ratio"] == pytest.approx(1500.0 / 1540.0)
 
 
-def test_junk_pairs_are_elsewhere_and_the_truth_says_which() -> None:
+def test_outlier_pairs_are_elsewhere_and_the_truth_lists_them() -> None:
     simulated = simulate(without_noise(pairs=20, junk_pairs=6), 5)
     junk = set(simulated.truth["x_junk_pms"])
     assert len(junk) == 6
@@ -277,7 +277,7 @@ def test_further_looks_of_a_sweep_are_at_later_steps() -> None:
         assert (steps >= 1).all()
 
 
-def test_tracks_ask_with_and_without_the_pm_heard() -> None:
+def test_track_events_have_a_look_at_the_pm_or_none() -> None:
     simulated = simulate(replace(PRESETS["first-hit"], tracks_heard=2, tracks_silent=2, track_looks=2), 3)
     tracks = [e for _, e in events(simulated, "track")]
     assert sorted("looks" in e for e in tracks) == [False, False, True, True]

@@ -82,7 +82,7 @@ def test_shots_without_a_marker_or_a_sound_are_listed_with_the_reason(raw_sessio
     assert all(pair.used for pair in report.estimate.pairs[2:])
 
 
-def test_a_marker_in_one_view_is_told_or_used_never_guessed(raw_session: Path) -> None:
+def test_a_marker_in_one_view_is_reported_or_used_never_guessed(raw_session: Path) -> None:
     events = _events(raw_session)
     for event in events:
         if event["type"] == "pair":
@@ -134,7 +134,7 @@ def test_a_damaged_frame_is_named_with_its_line(raw_session: Path, damage: str) 
     assert not (raw_session / "result.yaml").exists()
 
 
-def test_a_wrong_sound_speed_is_told(raw_session: Path) -> None:
+def test_a_wrong_sound_speed_is_reported(raw_session: Path) -> None:
     text = (raw_session / "session.yaml").read_text()
     wrong = text.replace("sound_speed_m_s: 1540.0", "sound_speed_m_s: 1510.0")
     assert wrong != text

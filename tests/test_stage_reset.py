@@ -19,7 +19,7 @@ def asked_for_resets(session: Rehearsal) -> list[tuple[float, Tell]]:
     return [(t, tell) for t, tell in session.told if tell.wants is CommandKind.RESET]
 
 
-def test_why_it_is_latched_is_told_at_once_and_again() -> None:
+def test_why_it_is_latched_is_reported_at_once_and_again() -> None:
     session = rehearsal(obliging=False)
     session.run(1.0)
     session.latched = "emergency stop: button"

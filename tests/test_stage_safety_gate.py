@@ -295,7 +295,7 @@ def test_stalled_main_program_stops_the_stage_and_needs_a_new_request() -> None:
     assert isinstance(room.go(MotionKind.SEARCH, 0.0)[0], Drive)
 
 
-def test_backlog_of_a_stall_is_worth_nothing() -> None:
+def test_messages_queued_during_a_stall_are_no_heartbeats() -> None:
     room = _room()
     room.request(MotionKind.SEARCH)
     late = Command(room.now, 9, MotionKind.SEARCH, 0.1, 0.1, None, "before the stall")
@@ -413,7 +413,7 @@ def test_silent_stage_is_stopped() -> None:
     assert _halts(room.run(0.5))[0] == "the stage is silent"
 
 
-def test_stage_that_does_not_stop_is_told_again_and_again() -> None:
+def test_stage_that_does_not_stop_gets_the_order_again_and_again() -> None:
     room = _room()
     room.go(MotionKind.SEARCH, 30.0, speed_deg_s=5.0)
     room.run(0.5)

@@ -85,13 +85,13 @@ def test_a_bumped_tag_is_set_apart_and_does_not_pass_for_a_moved_camera() -> Non
     np.testing.assert_allclose(found.camera_new_T_camera_old, np.eye(4), atol=1e-9)
 
 
-def test_two_tags_that_contradict_each_other_say_nothing() -> None:
+def test_two_tags_that_contradict_each_other_give_no_evidence() -> None:
     tags = _tags(np.random.default_rng(4), 2)
     bumped = tags | {1: tags[1] @ make_transform(np.eye(3), np.array([6.0, 0.0, 0.0]))}
     assert tag_motion(_exact(tags), _exact(bumped)) is None
 
 
-def test_no_tag_in_common_says_nothing() -> None:
+def test_no_tag_in_common_gives_no_evidence() -> None:
     tags = _exact(_tags(np.random.default_rng(4), 2))
     assert tag_motion({0: tags[0]}, {1: tags[1]}) is None
 

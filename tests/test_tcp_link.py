@@ -57,7 +57,7 @@ def connect(link: TcpLink[Line]) -> socket.socket:
     return socket.create_connection(("127.0.0.1", link.endpoint.port))
 
 
-def test_a_server_is_on_loopback_unless_told_otherwise(server: TcpLink[Line]) -> None:
+def test_a_server_is_on_loopback_unless_set_otherwise(server: TcpLink[Line]) -> None:
     assert server.endpoint.host == "127.0.0.1"
     with pytest.raises(OSError, match=r"refused|unreachable"):
         socket.create_connection(("127.0.0.2", server.endpoint.port), timeout=1.0)
@@ -72,7 +72,7 @@ def test_a_taken_port_and_a_bad_address_are_one_line(server: TcpLink[Line]) -> N
         Endpoint("", 18944)
 
 
-def test_a_client_that_finds_nobody_says_so_once_and_connects_when_there_is_somebody() -> None:
+def test_a_client_without_a_peer_reports_it_once_and_connects_when_there_is_one() -> None:
     port = free_port()
     link = TcpLink(Endpoint("127.0.0.1", port), Lines)
     try:
@@ -175,7 +175,9 @@ def test_a_receiver_that_does_not_read_gets_the_newest_and_then_nothing(
     assert "did not take what was sent" in str(server.take_loss())
 
 
-def test_nobody_fetching_drops_the_oldest_and_counts(server: TcpLink[Line], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_not_fetched_are_dropped_oldest_first_and_counted(
+    server: TcpLink[Line], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(tcp_link, "QUEUE_ITEMS", 10)
     with connect(server) as peer:
         peer.sendall(b"".join(b"%d\n" % number for number in range(100)))

@@ -163,7 +163,7 @@ def test_unplugged_cube_is_lost_at_once() -> None:
         stage.close()
 
 
-def test_port_that_is_not_there_or_silent_or_somebody_else_is_one_line() -> None:
+def test_port_that_is_absent_or_silent_or_of_another_device_is_one_line() -> None:
     with pytest.raises(StageLost, match="cannot be opened"):
         open_stage(MODEL, port="/nowhere/ttyUSB9")
     with _emulated() as cube:

@@ -111,7 +111,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_answer_is_that_of_a_solve_with_the_pm_in_it(kind: str) -> None:
+def test_a_result_is_that_of_a_solve_with_the_pm_in_it(kind: str) -> None:
     for seed in range(2):
         model, measurements, truth = make_measurements(np.random.default_rng(seed), pairs=24, **KINDS[kind])
         used, out = held_out(measurements, 2)

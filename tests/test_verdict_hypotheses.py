@@ -47,7 +47,7 @@ def test_a_marker_swapped_after_calibration_is_named() -> None:
     )
 
 
-def test_noise_of_three_times_what_is_stated_is_told() -> None:
+def test_noise_of_three_times_the_stated_one_is_reported() -> None:
     for seed in range(3):
         model, clean, _ = make_measurements(np.random.default_rng(seed), pairs=20)
         pairs = tuple(
@@ -97,7 +97,7 @@ def test_a_beam_that_dominates_the_error_is_to_be_calibrated_with_roll() -> None
     assert "the other way" in accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6))[0].text
 
 
-def test_one_shot_far_off_is_junk_but_several_a_little_off_are_noise() -> None:
+def test_one_shot_far_off_is_an_outlier_but_several_a_little_off_are_noise() -> None:
     nis = np.array([1.0, 2.0, 300.0, 16.0, 20.0] + [1.5] * 30)
     none, junk, several = (np.zeros(35, dtype=bool) for _ in range(3))
     junk[2] = True

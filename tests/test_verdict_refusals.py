@@ -49,7 +49,7 @@ def test_an_initial_registration_settles_few_pairs() -> None:
     assert not any("leave the registration open" in reason or "two registrations" in reason for reason in reasons)
 
 
-def test_two_minima_that_cannot_be_told_apart_are_refused_and_initial_resolves_them() -> None:
+def test_two_minima_that_cannot_be_distinguished_are_refused_and_initial_resolves_them() -> None:
     for seed in range(40):
         model, measurements, truth = make_measurements(np.random.default_rng(seed), pairs=4, first_hit=False)
         solution = solve(measurements, [], model, SolveConfig())
@@ -82,7 +82,7 @@ def _parallel(seed: int, tilt_rad: float) -> tuple[SessionModel, Measurements]:
 
 
 @pytest.mark.parametrize(("tilt_deg", "verdict"), [(0.2, Verdict.REFUSED), (2.3, Verdict.WARNING)])
-def test_parallel_beams_are_refused_and_nearly_parallel_ones_told(tilt_deg: float, verdict: Verdict) -> None:
+def test_parallel_beams_are_refused_and_nearly_parallel_ones_reported(tilt_deg: float, verdict: Verdict) -> None:
     model, measurements = _parallel(0, np.radians(tilt_deg))
     solution = solve(measurements, [], model, SolveConfig(limit_mm=1000.0))
     assert any("parallel" in reason and "fibre tilted" in reason for reason in solution.reasons)
@@ -128,7 +128,7 @@ def test_a_mirrored_session_is_refused_and_named(how: str) -> None:
     assert any("mirrored hypothesis fits better" in reason for reason in solution.reasons)
 
 
-def test_residuals_beyond_the_stated_noise_are_told() -> None:
+def test_residuals_beyond_the_stated_noise_are_reported() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(1), pairs=15)
     pairs = [
         replace(pair, look=replace(pair.look, covariance=as_float_array(pair.look.covariance / 400.0, 2, 2)))

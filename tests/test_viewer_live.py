@@ -73,7 +73,7 @@ def page(rows: dict[str, list[Row]], number: int) -> str:
     return str(found)
 
 
-def test_the_plane_stands_where_the_stage_is_and_the_goal_where_the_beam_will_be_heard(tmp_path: Path) -> None:
+def test_the_plane_is_at_the_stage_s_angle_and_the_goal_at_the_beam_s_predicted_angle(tmp_path: Path) -> None:
     rows = recorded(tmp_path / "a.rrd", [(update(0, NOW), None)])
     for entity, scan_rad in (("/world/stage", SCAN_RAD), ("/world/goal", GOAL_RAD)):
         up = transform_of(rows[entity][-1])[:3, :3] @ [0.0, 0.0, 1.0]
@@ -106,7 +106,7 @@ def test_a_bmode_picture_lies_in_the_plane_with_its_pixels_size_and_goes_when_it
     assert rows["/verdict/word"][-1].values["Points2D:labels"] == ["OK; LOST: bmode"]
 
 
-def test_a_picture_whose_place_is_not_known_is_shown_beside_only_and_says_so(tmp_path: Path) -> None:
+def test_a_picture_of_unknown_geometry_is_shown_in_its_view_only_and_says_so(tmp_path: Path) -> None:
     rows = recorded(tmp_path / "a.rrd", [(update(0, NOW), bmode(placed=False))])
     assert "its position in the plane is not known" in rows["/bmode/caption"][-1].values["Points2D:labels"][0]
     (plane,) = rows["/world/stage/plane"]

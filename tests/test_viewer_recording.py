@@ -367,7 +367,7 @@ def test_an_epoch_without_a_registration_hides_its_camera_instead_of_standing_at
     assert [row.shot for row in rows["/world/looks/arc"]] == [0, 1, 2, 3]
 
 
-def test_what_was_not_heard_or_is_not_finite_is_left_out(tmp_path: Path) -> None:
+def test_what_was_not_detected_or_is_not_finite_is_left_out(tmp_path: Path) -> None:
     rng = np.random.default_rng(14)
     model, measurements, truth = make_measurements(rng, aims=0, pairs=3)
     estimate = answer_from_truth(rng, model, measurements, truth)
