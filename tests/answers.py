@@ -1,4 +1,4 @@
-"""Estimates made up from a simulated truth, for tests of what only shows estimates."""
+"""Estimates derived from a simulated truth, for tests of code that only shows estimates."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def answer_from_truth(
     unused: tuple[int, ...] = (),
     tracks: tuple[TrackEstimate, ...] = (),
 ) -> SessionEstimate:
-    """The truth as an estimate, with made-up covariances and misfits; looks at positions ``unused`` are left out."""
+    """The truth as an estimate, with invented covariances and misfits; looks at positions ``unused`` are left out."""
     epochs = tuple(
         EpochEstimate(
             index=index,

@@ -1,4 +1,4 @@
-"""An engine that registers anew at every fifth pair of an epoch: simple, and can be told to refuse and to notice."""
+"""An engine that registers from scratch at every fifth pair of an epoch; it can refuse events and detect moves."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from fgreg.registration.solve import Solution, solve
 
 class BatchEngine:
     """Attributes:
-    refuse_t: times of events that it refuses once. notice: at the pair of this time the camera had moved at that of
-    the value.
+    refuse_t: times of events that it refuses once. notice: by the time of a pair at which it detects a camera move,
+    the time of that move.
     """
 
     def __init__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None = None) -> None:
@@ -32,7 +32,7 @@ class BatchEngine:
 
     @property
     def moves(self) -> tuple[DetectedMove, ...]:
-        return ()  # what it notices it tells by epochs only
+        return ()  # its detected moves appear as epochs only
 
     @property
     def loop_closures(self) -> tuple[DetectedLoopClosure, ...]:

@@ -1,4 +1,4 @@
-"""A BK scanner's OEM port, as far as the driver needs one; its framing goes byte by byte and shares nothing with it."""
+"""A BK scanner's OEM port, as far as the driver needs it; the framing works byte by byte and shares no code with it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 
 def frame(payload: bytes) -> bytes:
-    """What goes over the wire for a payload."""
+    """A payload as bytes on the wire."""
     out = bytearray([1])
     for byte in payload:
         if byte in (1, 4, 27):
@@ -55,17 +55,17 @@ def grabbed(pixels: npt.NDArray[np.uint8], ticks: int = 0) -> bytes:
 
 
 class Scanner:
-    """Answers queries; grabbed frames go out when the test says so.
+    """Answers queries; grabbed frames are sent when the test asks for them.
 
     Attributes:
         window: columns, rows.
-        heard: every payload received, in order.
-        grabbing: what the last GRAB_FRAME asked for.
+        received: every payload, in order.
+        grabbing: the argument of the last GRAB_FRAME.
     """
 
     def __init__(self) -> None:
         self.window = (6, 4)
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.grabbing = b""
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._server.getsockname()[1])
@@ -121,7 +121,7 @@ class Scanner:
                     pass
 
     def _answer(self, payload: bytes) -> None:
-        self.heard.append(payload)
+        self.received.append(payload)
         if payload.startswith(b"QUERY:GRAB_FRAME"):
             self.send(b"ACK;")
             self.grabbing = payload

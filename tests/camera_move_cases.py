@@ -24,7 +24,7 @@ CONFIG = SolveConfig()
 
 
 def aims_about(aims: Sequence[Aim], state: SharedState, model: SessionModel) -> Quadratic:
-    """What calibration shots and priors say of the shared variables of one epoch, about a state."""
+    """Information of calibration shots and priors on the shared variables of one epoch, about a state."""
     problem = pack_session(
         Measurements(tuple(aims), (), (EpochStart(0.0),)), model, replace(CONFIG, window_shape=False)
     )
@@ -32,7 +32,7 @@ def aims_about(aims: Sequence[Aim], state: SharedState, model: SessionModel) -> 
 
 
 def everything_about(problem: PackedProblem, state: SharedState) -> Quadratic:
-    """What all shots of a problem and its priors say, about a state of one hypothesis."""
+    """Information of all shots of a problem and its priors, about a state of one hypothesis."""
     private = initial_private(problem, state)
     for _ in range(4):
         _, private = refine(problem, state, private)

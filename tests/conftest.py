@@ -12,7 +12,7 @@ import pytest
 
 from fgreg.workers.threads import NAMES
 
-# One thread for linear algebra, as commands have it: pytest's -n gives every core a process. Before they are loaded.
+# One thread for linear algebra, as in commands: pytest's -n gives every core a process. Set before they are loaded.
 os.environ.update({name: "1" for name in NAMES if name not in os.environ})
 
 from fgreg.simulation.presets import PRESETS
@@ -20,7 +20,7 @@ from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # Started in the background: programs that tests start would not heed Ctrl-C either.
+    # Started in the background: programs that tests start would ignore Ctrl-C, too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -1,5 +1,5 @@
-"""A KDC101 with a PRM1Z8 at the other end of a pty. What it understands and says goes through an independent protocol
-library: orders are read by its parsers or compared with what it packs, replies have to pass through its unpacker."""
+"""A KDC101 with a PRM1Z8 at the other end of a pty, checked by an independent protocol library: orders are read by its
+parsers or compared with its packed messages, replies have to pass through its unpacker."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _SHORT = {
     0x0490: library.mot_req_dcstatusupdate(**_TO_CUBE, chan_ident=1),
 }
 _READ_AS = {0x0413: 0x0415, 0x0440: 0x0442, 0x0453: 0x0452}
-"""Orders with data have the layout of the answers by which the library knows it."""
+"""Orders with data have the layout of the replies that the library knows."""
 
 
 class CubeEmulator:
-    """Runs in a thread of its own; change its public attributes to have it misbehave.
+    """Runs in a thread of its own; change its public attributes to cause faults.
 
     Attributes:
-        device_deg: where the stage truly stands.
-        orders: (name, value) of what it was told to do.
+        device_deg: true angle of the stage.
+        orders: (name, value) of each order received.
         complaints: messages that the library would not have sent.
         drop: share of replies that get lost, every n-th: 0 none, 2 every second, 1 all.
         garbage: bytes sent before every reply.
-        deaf_to_velocity: ignores set velocities.
+        deaf_to_velocity: whether set velocities are ignored.
     """
 
     def __init__(self, device_deg: float = 0.0, model: bytes = b"KDC101\0\0") -> None:

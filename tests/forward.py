@@ -1,7 +1,7 @@
 """Simulated measurements for tests: scenes, shots and noise, with geometry of its own.
 
-Nothing of fgreg's factors, sensitivity, graph or simulation is used here: where a PM is on the arc and how far the
-stage has to turn for it are computed from the points themselves, so a test that agrees has two derivations behind it.
+No code of fgreg's factors, sensitivity, graph or simulation is used: a PM's place on the arc and the stage rotation to
+it are computed from the points themselves, so a test that agrees rests on two derivations.
 
 Millimetres and radians. ``camera`` OpenCV axes, ``trus`` x along the rotation axis, plane along (0, sin t, cos t).
 """
@@ -45,7 +45,7 @@ MOTION_SIGMA = (0.002, 0.002, 0.002, 0.3, 0.3, 0.3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What was simulated; tuples are in the order of ``Measurements.aims`` and ``.pairs``.
+    """The simulated truth; tuples are in the order of ``Measurements.aims`` and ``.pairs``.
 
     Attributes:
         trus_T_camera: one (4, 4) per epoch.
@@ -145,7 +145,7 @@ def _place_marker(
 ) -> tuple[FloatArray, float]:
     """A marker whose beam hits ``camera_p``: (camera_T_marker, lambda)."""
     lambda_mm = rng.uniform(25.0, 60.0)
-    # The beam leans off the camera's own line of sight, any way round.
+    # The beam is tilted from the camera's line of sight, in a random direction.
     sight = rotation_to_direction(camera_p / np.linalg.norm(camera_p))
     around, lean = rng.uniform(-math.pi, math.pi), spread_rad * math.sqrt(rng.uniform())
     off = exp_so3(lean * np.array([math.cos(around), math.sin(around), 0.0]))
@@ -193,7 +193,7 @@ def _stage_angle(
     ratio: float,
     centred: bool,
 ) -> float:
-    """The angle at which the stage heard the PM: the first of its steps inside the window, or anywhere in it."""
+    """Stage angle at which the PM was detected: the first step inside the window, or anywhere in it."""
     probe, step = session.probe, session.stage.step_rad
     bearing = math.atan2(float(trus_p_pm[1]), float(trus_p_pm[2]))
     fraction = 0.5 if centred else float(rng.uniform())
@@ -235,8 +235,8 @@ def make_measurements(
         pairs: PMs (each has ``looks_per_pm`` pairs), divided evenly among the epochs.
         first_hit: the stage stopped at its first hit, sweeping alternately either way; else only the window is known.
         one_way: first-hit sweeps all go towards larger angles.
-        noise: False makes every measurement exact, with the stage rotation at the centre of what is known of it (and
-            no bias, no edge error), so that the truth costs nothing.
+        noise: False makes every measurement exact, with the stage rotation at the centre of its prior (and no bias,
+            no edge error), so that the cost of the truth is zero.
         looks_per_pm: looks at each PM, at stage angles of their own.
         share_marker: the looks of one PM share one marker observation; else the marker moves between them.
         look_spacing_deg: looks after the first are so far on each, in the sweep's direction (towards the middle of the
@@ -289,7 +289,7 @@ def make_measurements(
             registrations.append(registrations[-1] @ inverse(new_T_old))
             if known_motion:
                 xi = rng.normal(size=6) * MOTION_SIGMA if noise else np.zeros(6)
-                measured = new_T_old @ make_transform(exp_so3(xi[:3]), xi[3:])  # first order is enough for so small
+                measured = new_T_old @ make_transform(exp_so3(xi[:3]), xi[3:])  # first order is enough for small ones
                 covariance = as_float_array(np.diag(np.square(MOTION_SIGMA)), 6, 6)
                 starts.append(EpochStart(t, as_float_array(measured, 4, 4), covariance))
             else:

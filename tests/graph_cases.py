@@ -1,4 +1,4 @@
-"""Sessions of every shape that the explicit graph has to take, for its tests."""
+"""Sessions of every shape that the explicit graph supports, for its tests."""
 
 from __future__ import annotations
 

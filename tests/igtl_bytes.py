@@ -1,4 +1,4 @@
-"""OpenIGTLink by the protocol's text, written for tests: shares nothing with the drivers or with pyigtl."""
+"""OpenIGTLink by the protocol's text, written for tests: shares no code with the drivers or with pyigtl."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def message(
     checksum: int | None = None,
     extended: tuple[int, int, int] | None = None,
 ) -> bytes:
-    """A message; ``checksum`` and ``extended`` (sizes of extended header, metadata header, metadata) may be lies."""
+    """A message; ``checksum`` and ``extended`` (sizes of extended header, metadata header, metadata) may be false."""
     body = content
     if version == 2:
         pairs = [(key.encode(), value.encode()) for key, value in (metadata or {}).items()]

@@ -1,7 +1,7 @@
-"""Kills a recording process again and again, and looks at what it left on disk.
+"""Kills a recording process again and again, and checks the files on disk.
 
-A mother process has everything imported and forks a recorder for each life: it opens the session, goes on where the
-file ends, and says which event is taken in only after ``add`` (or ``append``) has returned. Nothing else is between.
+A parent process has everything imported and forks a recorder for each run: it opens the session, continues at the end
+of the file, and acknowledges an event directly after ``add`` (or ``append``) has returned.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def event_at(folder: Path, index: int) -> AimEvent | PairEvent:
 
 
 def record(folder: Path, source: Path, *, estimate: bool) -> None:
-    """One life: takes in events until it is killed."""
+    """One run: takes in events until it is killed."""
     if estimate:
         with LiveSession.open(folder) as live:
             live_on(live.add, live.journal.lines, source)
@@ -82,7 +82,7 @@ def live_on(add: Callable[[AimEvent | PairEvent], object], index: int, source: P
 
 
 def mother() -> None:
-    """Forks a recorder for each line on standard input; tells its number, and when it is dead."""
+    """Forks a recorder for each line on standard input; prints its process id, and when it has ended."""
     source = Path(sys.argv[1])
     template(source)
     for line in sys.stdin:
@@ -91,7 +91,7 @@ def mother() -> None:
         if child == 0:
             try:
                 record(Path(folder), source, estimate=kind == "estimate")
-            except BaseException as error:  # told, not raised: the mother's copy must not go on
+            except BaseException as error:  # printed, not raised: the forked copy must not continue
                 os.write(1, f"failed {error!r}\n".encode())
             os._exit(1)
         os.write(1, f"born {child}\n".encode())
@@ -101,13 +101,13 @@ def mother() -> None:
 
 @dataclass(slots=True)
 class Toll:
-    """What became of all lives.
+    """Counts over all runs.
 
     Attributes:
-        lives: how many were ended. taken: events acknowledged.
+        lives: number of runs. taken: events acknowledged.
         missing: acknowledged events that are not on disk. damaged: lines (but an unfinished last one) that are not,
-            byte by byte, what was given; events that nobody gave count too.
-        unasked: whole events on disk whose acknowledgement the kill came before. torn: last lines cut short.
+            byte by byte, the given ones; events that were never given count, too.
+        unasked: complete events on disk that were killed before the acknowledgement. torn: last lines cut short.
         sessions: the folders.
     """
 
@@ -129,7 +129,7 @@ def check(folder: Path, source: Path, acknowledged: int, toll: Toll) -> None:
     path = folder / "events.jsonl"
     *lines, tail = (path.read_bytes() if path.exists() else b"").split(b"\n")
     toll.damaged += sum(line + b"\n" != expected(source, folder, index) for index, line in enumerate(lines))
-    toll.damaged += max(0, len(lines) - acknowledged - 1)  # one event at most was on its way
+    toll.damaged += max(0, len(lines) - acknowledged - 1)  # at most one event was not acknowledged yet
     toll.damaged += bool(tail) and not expected(source, folder, len(lines)).startswith(tail)
     toll.missing += max(0, acknowledged - len(lines))
     toll.torn += bool(tail)
@@ -142,8 +142,8 @@ def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: 
     Args:
         scratch: an empty folder. seed: of the moments and the session.
         estimate: record with the estimate (:class:`LiveSession`) rather than the journal alone.
-        longest: events after which a new session is begun, so that reopening stays short.
-        most_s: the latest moment, from birth, or from the first event of that life.
+        longest: events after which a new session begins, so that opening stays short.
+        most_s: latest time of a kill, from the start or from the first event of that run.
 
     Raises:
         AssertionError: a recorder failed by itself.
@@ -166,7 +166,7 @@ def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: 
             word, number = child.stdout.readline().split()
             if word != "born":
                 raise AssertionError(f"{word} {number}")
-            # Every other life counts from its first event: on a busy machine it would else never get that far.
+            # Every other run counts from its first event: on a busy machine it would not get that far otherwise.
             heard = child.stdout.readline().strip() if toll.lives % 2 else ""
             time.sleep(rng.uniform(0.0, most_s))
             os.kill(int(number), signal.SIGKILL)
@@ -177,7 +177,7 @@ def run_kills(scratch: Path, *, kills: int, seed: int, estimate: bool, longest: 
                 toll.taken += 1
             toll.lives += 1
             check(folder, source, acknowledged, toll)
-            acknowledged = _whole_lines(folder)  # the next life goes on behind what is there
+            acknowledged = _whole_lines(folder)  # the next run continues after these
         child.stdin.close()
     return toll
 
@@ -194,12 +194,12 @@ def _new_session(folder: Path, source: Path) -> Path:
 
 
 def count_events(folder: Path) -> int:
-    """Events that a reader finds."""
+    """Events as read from disk."""
     return len([json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()])
 
 
 def difference_from_uninterrupted(folder: Path, source: Path) -> float:
-    """Largest difference of registration and covariance: reopened, and the same events taken in without a break."""
+    """Largest difference of registration and covariance: reopened, against the same events without an interruption."""
     with LiveSession.open(folder) as live:
         reopened, model, config = live.estimate, live.journal.model, live.config
     feed, extractor = EpochFeed(online_engine(model, config, None)), MeasurementExtractor(model)

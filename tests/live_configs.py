@@ -11,7 +11,7 @@ from tests import session_files
 
 
 def config() -> dict[str, Any]:
-    """Every role, none of whose devices is there."""
+    """Every role; none of the devices exists."""
     return {
         "format": "fgreg-live/1",
         "session": "session.yaml",

@@ -1,4 +1,4 @@
-"""A live session in the simulated room whose devices are broken and mended on purpose, for tests and measurements."""
+"""A live session in the simulated room with faults of its devices caused on purpose, for tests and measurements."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SEED, AIMS, BUMP_EVERY_S, WIDTH_PX = 1, 0, math.inf, 320
 
 
 class Listening:
-    """The session's operator, with what he was told and when."""
+    """The session's operator, with the messages and their times."""
 
     def __init__(self, operator: Any) -> None:
         self._operator = operator
@@ -51,7 +51,7 @@ class Listening:
 
 @dataclass(eq=False)
 class Rig:
-    """A session under way, turned by whoever studies it."""
+    """A running session, stepped by the test."""
 
     room: RoomProcess
     session: Running
@@ -59,7 +59,7 @@ class Rig:
     devices: Devices
 
     def run(self, seconds: float, until: Callable[[], object] = lambda: False) -> bool:
-        """Turns of the loop for some seconds, or until something is so; whether it came to be so."""
+        """Step the loop for some seconds, or until a condition holds; whether it does."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             if not self.session.loop.turn():
@@ -69,12 +69,12 @@ class Rig:
         return False
 
     def told_after(self, since_s: float, text: str) -> float | None:
-        """Seconds from a moment until something was told that begins so."""
+        """Seconds from a time until a message with this beginning."""
         times = (at_s - since_s for at_s, said in self.operator.told if at_s >= since_s and said.startswith(text))
         return next(times, None)
 
     def counts(self) -> FloatArray:
-        """Frames looked into, pulses taken in, orders given."""
+        """Frames processed, pulses taken in, orders given."""
         figures = self.session.loop.figures
         return np.array([figures.frames, figures.pulses, figures.orders], dtype=float)
 
@@ -105,7 +105,7 @@ def rig(folder: Path) -> Iterator[Rig]:
         yield ready
 
 
-# --- faults: each is begun, and says how it is mended ---------------------------------------------------------------
+# --- faults: each function starts one and returns how to end it ---------------------------------------------------
 
 Mend = Callable[[], None]
 
@@ -158,7 +158,7 @@ def _break(case: Rig, name: str) -> Mend:
 
 @dataclass(frozen=True)
 class Fault:
-    """How a fault is made, and by which role it is told."""
+    """How a fault is caused, and the role that is reported lost."""
 
     role: str
     begin: Callable[[Rig, str], Mend]
@@ -183,7 +183,7 @@ STUDIED = {
 
 @dataclass
 class Trial:
-    """One fault: seconds until told, until told to be back, until the next order; counts per second meanwhile."""
+    """One fault: seconds until the loss is reported, until the return is, until the next order; counts per second."""
 
     told_s: float = math.nan
     back_s: float = math.nan
@@ -192,7 +192,7 @@ class Trial:
 
 
 def trial(case: Rig, fault: Fault, lasts_s: float, *, orders: bool = True, rest_s: float = 2.0) -> Trial:
-    """Make a fault where all is well, mend it, and let the session go on: until the next order, and a while more."""
+    """Cause a fault in a working session, end it, and let the session go on until some time after the next order."""
     found, pulse_locator = Trial(), case.session.loop.pulse_locator
     case.run(PATIENCE_S, lambda: not case.session.loop.lost and pulse_locator.locator.ready)
     before, began = case.counts(), time.monotonic()

@@ -1,4 +1,4 @@
-"""What tests of network drivers share: waiting, and a peer that is nothing but a socket."""
+"""Helpers for tests of network drivers: waiting, and a peer that is a plain socket."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def wait_for(condition: Callable[[], object], limit_s: float = 5.0) -> None:
-    """Until it holds; fails where it does not within the limit."""
+    """Wait until the condition holds; fails after the limit."""
     end = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < end, "waited in vain"
@@ -38,7 +38,7 @@ def serve() -> tuple[socket.socket, int]:
 
 
 def free_port() -> int:
-    """A port where nobody listens."""
+    """A port where no one listens."""
     server, port = serve()
     server.close()
     return port

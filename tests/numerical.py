@@ -41,7 +41,7 @@ def numerical_jacobian(factor: gtsam.NoiseModelFactor, values: gtsam.Values, key
 
 
 def analytic_jacobian(factor: gtsam.NoiseModelFactor, values: gtsam.Values, key: int) -> FloatArray:
-    """What the factor gives GTSAM for one of its variables, divided by its noise."""
+    """The factor's Jacobian for one of its variables, divided by its noise."""
     linear = factor.linearize(values)
     blocks, _ = linear.jacobian()
     start = 0

@@ -1,4 +1,4 @@
-"""Streams of events for the online registration, and how far an estimate is from the batch solver's."""
+"""Streams of events for the online registration, and the distance of an estimate from the batch solver's."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def restored(engine: OnlineRegistration, measurements: Measurements) -> OnlineRe
 
 
 def first(measurements: Measurements, pairs: int) -> Measurements:
-    """The measurements up to so many pairs."""
+    """The measurements up to a number of pairs."""
     taken = measurements.pairs[:pairs]
     epochs = measurements.epochs[: taken[-1].epoch + 1] if taken else measurements.epochs[:1]
     return replace(measurements, pairs=taken, epochs=epochs)

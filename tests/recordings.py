@@ -30,7 +30,7 @@ def _rows(path: Path, blueprint: bool) -> Iterator[tuple[str, Row]]:
     store = reader.blueprints()[-1] if blueprint else None
     for chunk in reader.stream(store=store):
         batch = chunk.to_record_batch()
-        # Times as integers: nanoseconds do not fit what pyarrow makes of them without pandas.
+        # Times as integers: without pandas pyarrow cannot represent nanoseconds.
         columns = {name: batch.column(name).to_pylist() for name in batch.schema.names if ":" in name or name == "shot"}
         if "time" in batch.schema.names:
             columns["time"] = batch.column("time").cast("int64").to_pylist()

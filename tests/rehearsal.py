@@ -1,4 +1,4 @@
-"""A session conducted in a simulated room in made-up time: no processes, no pictures, observations with known noise."""
+"""A session in a simulated room in simulated time: no processes, no pictures, observations with known noise."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ TRACK_SIGMA_RAD = math.radians(2.0)
 
 @dataclass(eq=False)
 class Rehearsal:
-    """One session; :meth:`run` lets time pass.
+    """One session; :meth:`run` advances the time.
 
     Attributes:
-        obliging: the operator says what he is asked to say.
-        frame_s: from one picture to the next.
-        deaf_from_s: from then on the probe hears nothing. blind_from_s: nor does the camera see the marker.
-        latched: why the stage may not move, as the gate would say it; a release ends it.
-        told: all that the operator was told, with the time. asked: all actions but words.
-        begun_mm: error of the registration and what was predicted, when the stage began to follow; set by the test.
-        errors_deg: while the stage follows a beam held still, how far its plane is off, at the end of each hold.
+        obliging: whether the operator gives the commands that are asked for.
+        frame_s: interval of the pictures.
+        deaf_from_s: from this time the probe detects nothing. blind_from_s: from this time the camera sees no marker.
+        latched: why the stage may not move, as from the safety gate; a release clears it.
+        told: all messages to the operator, with their times. asked: all other actions.
+        begun_mm: error of the registration and its prediction when the stage began to follow; set by the test.
+        errors_deg: error of the plane's angle at the end of each hold while the stage follows.
     """
 
     room: Room
@@ -89,7 +89,7 @@ class Rehearsal:
         self._noted_s = -math.inf
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the time."""
         end = self.now_s + seconds
         while self.now_s < end:
             self._frame()
@@ -164,7 +164,7 @@ class Rehearsal:
             case TakeAim():
                 self._aim()
             case TakeMove():
-                raise AssertionError("nobody told a move")
+                raise AssertionError("no one reported a move")
             case TakePairs(pm, looks):
                 spot = one_spot(looks)
                 for look in spot.looks:
@@ -200,7 +200,7 @@ class Rehearsal:
         amplitude = float(config.elevation.amplitude(room.plane_rad(t_s) - scan, width))
         amplitude *= math.exp(0.05 * rng.standard_normal())
         where = None if moving else scan + config.noise.scan_rad * rng.standard_normal()
-        if not self.workflow.wants_pulses:  # then nobody looks into it (fgreg.live.marker_tracker)
+        if not self.workflow.wants_pulses:  # then it is not processed (fgreg.live.pulse_locator)
             return LocatedPulse(t_s, None, marker, unpaired)
         if amplitude < self.threshold or t_s >= self.deaf_from_s:
             return LocatedPulse(t_s, where, marker, unpaired)
@@ -210,7 +210,7 @@ class Rehearsal:
         return LocatedPulse(t_s, where, marker, unpaired, x, distance, covariance, amplitude)
 
     def _observation(self, pm: int, pose: TimedPose) -> MarkerObservation:
-        """One observation a PM."""
+        """One observation per PM."""
         return MarkerObservation(
             as_float_array(pose.parent_T_child, 4, 4), as_float_array(pose.covariance, 6, 6), 1_000_000 + pm
         )

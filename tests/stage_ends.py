@@ -1,4 +1,4 @@
-"""Main programs that come to an end while their stage turns, and how long it then took to stop: tests and benchmark."""
+"""Main programs that end while their stage turns, and the time until it stops: for tests and benchmark."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def main_program(folder: Path, end: str) -> Iterator[tuple[subprocess.Popen[str]
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGSTOP)
-"""What ends or halts a main program: Ctrl-C, a polite kill, a closed terminal, a rude kill, a suspension."""
+"""Signals that end or halt a main program: Ctrl-C, SIGTERM, a closed terminal, SIGKILL, a suspension."""
 
 
 @contextmanager
@@ -74,7 +74,7 @@ def live_program(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def orders(folder: Path) -> list[dict[str, Any]]:
-    """What the watchdog of a live program has ordered so far."""
+    """The orders of a live program's watchdog up to now."""
     path = folder / "stage-orders.log"
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
@@ -83,7 +83,7 @@ def orders(folder: Path) -> list[dict[str, Any]]:
 def live_stopped_after(folder: Path, phase: str, number: signal.Signals) -> float:
     """Seconds from a signal to a live program, sent while its stage homes or searches, to the order that ends motion.
 
-    0 where a busy machine had the stage stopped by then for want of a heartbeat.
+    0 where the stage had already been stopped for a missing heartbeat on a busy machine.
     """
     with live_program(folder) as process:
         wait_until(lambda: any(order["command"] == phase for order in orders(folder)), 120.0)

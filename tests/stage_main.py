@@ -1,4 +1,4 @@
-"""A main program for tests: has the stage turn, and then comes to an end in the way that its argument says.
+"""A main program for tests: turns the stage, and then ends in the way given by its argument.
 
     python -m tests.stage_main FOLDER END
 
@@ -76,7 +76,7 @@ def main(folder: Path, end: str) -> None:
         beat_for(link, 60.0)
     elif end == "fork and die":
         if os.fork() == 0:
-            time.sleep(5.0)  # holds copies of the sockets: the watchdog sees no end of them
+            time.sleep(5.0)  # holds copies of the sockets, so that the watchdog does not see them closed
             os._exit(0)
         os._exit(0)
     elif end == "fall off the end":

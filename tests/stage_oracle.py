@@ -1,7 +1,7 @@
-"""What motion is legal, written down a second time: from the history of what happened, in degrees, without state.
+"""A second definition of legal motion: from the history of events, in degrees, without state.
 
-Shares no code with fgreg.stage.safety_gate. It says no wherever a necessary condition is missing; that the gate may
-refuse more than that is tested elsewhere.
+Shares no code with fgreg.stage.safety_gate. It refuses wherever a necessary condition is missing; that the gate may
+refuse more is tested elsewhere.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ TOLERANCE_DEG = 0.5
 
 @dataclass
 class Oracle:
-    """History of (time, what, details), oldest first; times as the gate was told them."""
+    """History of (time, what, details), oldest first; times as given to the gate."""
 
     history: list[tuple[float, str, dict[str, Any]]] = field(default_factory=list)
 
@@ -33,7 +33,7 @@ class Oracle:
         return found[-1] if found else None
 
     def _last_beat(self) -> dict[str, Any] | None:
-        """The one that was sent last, of those since the clock was last in doubt."""
+        """The last one sent since the clock was last in doubt."""
         beats = [d for _, name, d in self.history[self._since("clock jump") :] if name == "beat"]
         return max(beats, key=lambda beat: beat["sent"], default=None)
 
@@ -55,7 +55,7 @@ class Oracle:
         return status if status is not None and now - status["at"] <= 0.3 + 1e-9 else None
 
     def drive_is_legal(self, now: float, kind: str, target: float | None, speed: float, sent: float, sigma: Any) -> str:
-        """Why not; empty where nothing speaks against it."""
+        """Why not; empty where it is legal."""
         trouble = self._since("clock jump", "emergency", "fault")
         if trouble and self._newest("reset", trouble) is None:
             return "no reset since the trouble"

@@ -100,7 +100,7 @@ def damaged(draw: st.DrawFn, valid: bytes) -> bytes:
 
 
 def outcome(read: Callable[[], Read]) -> Read | InputError:
-    """What was read, or the error, which is one line. Anything else that is raised is the test's failure."""
+    """The result of reading, or the error, which is one line. Any other exception fails the test."""
     try:
         return read()
     except InputError as error:

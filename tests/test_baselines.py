@@ -1,4 +1,4 @@
-"""The methods fgreg is compared with do what they are said to do."""
+"""The methods that fgreg is compared with work as published."""
 
 from __future__ import annotations
 

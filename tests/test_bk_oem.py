@@ -48,13 +48,13 @@ def fetch(driver: BkOemScanner, number: int = 1) -> list[BmodeFrame]:
 def test_the_scanner_is_asked_for_its_geometry_and_for_frames(scanner: Scanner, source: BkOemScanner) -> None:
     wait_for(lambda: scanner.grabbing)
     assert scanner.grabbing == b'QUERY:GRAB_FRAME "ON",25;'
-    assert scanner.heard[:4] == [
+    assert scanner.received[:4] == [
         b"QUERY:US_WIN_SIZE;",
         b"QUERY:B_GEOMETRY_PIXEL:A;",
         b"QUERY:B_GEOMETRY_TISSUE:A;",
         b"QUERY:B_GEOMETRY_US_FRAME_GRAB:A;",
     ]
-    assert scanner.heard[4].startswith(b'CONFIG:DATA:SUBSCRIBE "US_WIN_SIZE"')
+    assert scanner.received[4].startswith(b'CONFIG:DATA:SUBSCRIBE "US_WIN_SIZE"')
     source.close()
     wait_for(lambda: scanner.grabbing == b'QUERY:GRAB_FRAME "OFF";')
 
@@ -87,12 +87,12 @@ def test_a_zoom_that_was_not_reported_is_queried(scanner: Scanner, source: BkOem
     wait_for(lambda: scanner.grabbing)
     scanner.send(grabbed(picture(scanner)))
     fetch(source)
-    asked = scanner.heard.count(b"QUERY:US_WIN_SIZE;")
+    asked = scanner.received.count(b"QUERY:US_WIN_SIZE;")
     scanner.window = (10, 8)
     scanner.send(grabbed(picture(scanner)))
-    wait_for(lambda: source.poll() or scanner.heard.count(b"QUERY:US_WIN_SIZE;") > asked)
+    wait_for(lambda: source.poll() or scanner.received.count(b"QUERY:US_WIN_SIZE;") > asked)
     assert "for a window of 6 x 4" in source.last_rejection
-    wait_for(lambda: len(scanner.heard) >= 10)
+    wait_for(lambda: len(scanner.received) >= 10)
     scanner.send(grabbed(picture(scanner, 1)))
     (shown,) = fetch(source)
     np.testing.assert_array_equal(shown.image, picture(scanner, 1))
@@ -106,7 +106,7 @@ def test_what_is_not_a_picture_is_left_out_and_the_next_one_is_shown(scanner: Sc
     wrong = [
         b"garbage between messages",
         whole[:20],  # cut off by the next message
-        frame(grabbed(good)[:-9]),  # fewer bytes than told
+        frame(grabbed(good)[:-9]),  # fewer bytes than stated
         frame(b"DATA:GRAB_FRAME #9;"),
         frame(b"DATA:GRAB_FRAME #x12345;"),
         frame(b"DATA:GRAB_FRAME;"),

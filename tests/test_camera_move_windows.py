@@ -65,7 +65,7 @@ def test_whitened_pairs_have_the_reduced_problems_cost_gradient_and_hessian(look
     gradient = np.einsum("nqd,nq->nd", jacobian, residual) * scale
     np.testing.assert_allclose(gradient, part.gradient[0] * scale, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(np.sum(residual**2, axis=-1) + terms.rest[0], part.cost[0], rtol=1e-9)
-    if looks == 1:  # two equations in two rows: nothing is left that no step takes away
+    if looks == 1:  # two equations in two rows: a step can remove the whole residual
         np.testing.assert_allclose(terms.rest[0], 0.0, atol=1e-6)
 
 
@@ -77,7 +77,7 @@ def test_steps_are_counted_from_the_base_wherever_pairs_are_linearised() -> None
     terms = linearise(problem, many.retract(step, problem.columns), base)
     there = terms.residual[1] + terms.jacobian[1] @ step[1]
     from_base = terms.residual[0] + terms.jacobian[0] @ step[1]
-    # The rows may be turned against each other: what counts is their square.
+    # The rows may differ by a rotation: their square counts.
     np.testing.assert_allclose(np.sum(there**2, -1), np.sum(from_base**2, -1), rtol=0.1, atol=0.05)
 
 
@@ -137,7 +137,7 @@ def test_a_rotation_in_its_window_leaves_the_moments_of_the_truncated_gaussian()
 
 
 def test_window_only_pairs_are_distinguished_from_moved_ones_by_their_windows_ends() -> None:
-    """A rotation well outside the window speaks more against steady than the Gaussian stand-in has it."""
+    """A rotation well outside the window is stronger evidence for a move than its Gaussian approximation."""
     problem, state = _session(9, 12, first_hit=False, config=SHAPED)
     terms = linearise(problem, state)
     assert terms.windows is not None

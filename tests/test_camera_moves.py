@@ -120,7 +120,7 @@ def test_six_pairs_are_too_few_for_a_test() -> None:
 
 
 def test_the_prior_of_the_registration_applies_to_the_first_pms_only() -> None:
-    """A motion prior on the epoch's registration must not hide an early move, whose first side it is about."""
+    """A motion prior on the epoch's registration must not hide an early move: it is about the first side."""
     model, measurements, truth = moved_session(3, SHIFT, 5, 13)
     case = move_case(measurements, model)
     assert case.known is not None

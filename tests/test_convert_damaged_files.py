@@ -1,4 +1,4 @@
-"""Bytes changed, cut out or put in at random: a file is read, or refused in one line; nothing else ever comes out."""
+"""Bytes changed, cut out or put in at random: a file is read, or refused in one line; there is no other outcome."""
 
 from __future__ import annotations
 

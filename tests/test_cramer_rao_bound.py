@@ -1,4 +1,4 @@
-"""The bound at the truth: against errors of many solves, and what more or better data do to it."""
+"""The bound at the truth: against errors of many solves, and its change with more or better data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The 95 % region of the registration: by density, so that it follows the posterior's arms."""
+"""The 95 % region of the registration: by density, so that it follows the posterior's tails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``fgreg devices``: what comes from each device of a configuration, who is silent, and no stage that is touched."""
+"""``fgreg devices``: data of each device of a configuration, silent devices; no stage is touched."""
 
 from __future__ import annotations
 

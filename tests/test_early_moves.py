@@ -1,6 +1,6 @@
 """Unreported moves before an epoch's seventh PM.
 
-Refused or doubted while pairs of both sides are mixed, then found, and never taken for one registration.
+Refused or a warning while pairs of both sides are mixed, then found, and never solved as one registration.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BUMP = make_transform(exp_so3(np.array([0.03, -0.02, 0.03])), np.array([3.0, -4.
 
 @cache
 def _ran(before: int) -> tuple[SessionModel, Measurements, tuple[Truth, Truth], OnlineRegistration]:
-    """A session with a move after so few PMs, and the engine that went through it: to look at only."""
+    """A session with a move after few PMs, and the engine that took it in: read only."""
     model, measurements, truths = unreported_move(3, BUMP, 12, before)
     engine = OnlineRegistration(model, verdicts=False)
     for _, event in events_in_order(measurements):

@@ -205,7 +205,7 @@ def test_a_device_that_was_never_there_is_lost_within_a_second_and_closing_does_
 
 
 class Camera(http.server.BaseHTTPRequestHandler):
-    """A network camera: motion JPEG over HTTP, whatever the server's ``mode`` says at the moment."""
+    """A network camera: motion JPEG over HTTP, as the server's ``mode`` says."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -256,7 +256,7 @@ def test_a_stream_that_stops_is_reported_within_a_second_and_comes_back_by_itsel
         assert time.monotonic() - began < 1.0
         assert not endoscope.connected
         assert ("no frame for 0.4 s" in losses[0]) or ("delivers no more" in losses[0])
-        assert endoscope.poll() == []  # told once
+        assert endoscope.poll() == []  # reported once
         camera.mode = "sending"
         again, losses = collect(endoscope, lambda frames, _: len(frames) >= 3)
         assert losses == []
@@ -277,7 +277,7 @@ def test_where_the_right_camera_is_lost_the_left_one_goes_on_alone_until_it_is_b
     try:
         collect(endoscope, lambda frames, _: sum(frame.right is not None for frame in frames) > 5)
         camera.mode = "gone"
-        # A loop so slow that there are frames at every call is told as well.
+        # The loss is reported also to a loop so slow that there are frames at every call.
         _, losses = collect(endoscope, lambda _, losses: bool(losses), pause_s=0.06)
         assert "the left camera goes on alone" in losses[0]
         alone, _ = collect(endoscope, lambda frames, _: len(frames) > 5)
@@ -290,7 +290,7 @@ def test_where_the_right_camera_is_lost_the_left_one_goes_on_alone_until_it_is_b
 
 
 class Scripted:
-    """A capture that does as it is told: pictures with positions, then nothing more."""
+    """A scripted capture: pictures with positions, then nothing more."""
 
     def __init__(self, positions_s: list[float]) -> None:
         self.positions_s, self.next = positions_s, 0

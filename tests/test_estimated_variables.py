@@ -1,4 +1,4 @@
-"""Sound speed and probe radius as variables, and a wrong sound speed that nobody estimates."""
+"""Sound speed and probe radius as variables, and a wrong sound speed that is not estimated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Solves from parts of a session: what is held out, how it is predicted, and that figures do not depend on the run."""
+"""Solves from parts of a session: held-out shots, their prediction, and figures that do not depend on the run."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def test_too_few_pairs_are_a_failure_and_not_an_error() -> None:
 
 
 def test_figures_do_not_depend_on_the_number_of_processes() -> None:
-    # Enough pairs in every fold and subset: what three or four leave open, rounding decides, which differs by a last
-    # bit with where arrays lie in memory.
+    # Enough pairs in every fold and subset: with three or four, rounding decides between minima, and that depends on
+    # where arrays lie in memory.
     cases = [_case(5, pairs=14), _case(6, pairs=14)]
     config = EvaluationConfig(folds=2, subsets=2, sizes=(10,), leave_one_out=False)
     calls: list[tuple[int, int]] = []

@@ -1,4 +1,4 @@
-"""Influence of each pair: the closed form against solving again, and the pair that pulls hardest."""
+"""Influence of each pair: the closed form against solving again, and the pair of largest influence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_outlier_has_the_largest_influence() -> None:
         model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=14)
         pairs = list(measurements.pairs)
         pairs[4] = replace(pairs[4], look=replace(pairs[4].look, x_mm=pairs[4].look.x_mm + 10.0))
-        # Solved with it kept: registering would leave it out as junk.
+        # Solved with it as an inlier: registering would reject it as an outlier.
         clean, moved = register(measurements, model, SolveConfig()), replace(measurements, pairs=tuple(pairs))
         problem = pack(moved, model)
         found = replace(clean, measurements=moved, problem=problem, optimum=optimize(problem, clean.optimum.state))
@@ -44,7 +44,7 @@ def test_an_outlier_has_the_largest_influence() -> None:
 
 def test_a_pair_that_alone_determines_something_has_infinite_influence() -> None:
     model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=12, epochs=2)
-    # Without epoch 1's pairs nothing says where that camera is; three leave it just determined, two do not.
+    # Without epoch 1's pairs that registration is undetermined; three leave it just determined, two do not.
     kept = tuple(p for p in measurements.pairs if p.epoch == 0 or p.pm in (6, 7, 8))
     found = register(replace(measurements, pairs=kept), model, SolveConfig())
     items = {item.pm: item for item in influences(found, model.targets_mm)}

@@ -83,7 +83,7 @@ def test_covariance_is_in_the_right_tangent_of_the_observed_pose() -> None:
 
 @pytest.mark.parametrize("with_bias", [False, True])
 def test_normalised_error_of_simulated_detections_is_one(with_bias: bool) -> None:
-    # The format's noise, drawn about the camera's axes; the covariance is told about the right tangent.
+    # The format's noise, drawn about the camera's axes; the covariance is of the right tangent.
     rng = np.random.default_rng(54)
     noise = NoiseModel(marker_translation_mm=(0.1, 0.2, 0.8), marker_rotation_rad=(0.01, 0.02, 0.03))
     bias = np.array([0.5, -0.4, 0.3]) if with_bias else np.zeros(3)

@@ -1,4 +1,4 @@
-"""A full solve that fails is reported; an old verdict is not passed for a new one."""
+"""A full solve that fails is reported; an old verdict is not reported as a new one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_full_solve_that_fails_is_reported_for_as_long_as_it_does(monkeypatch:
             assert after.verdict is Verdict.WARNING
             assert any("the full solve failed: ArithmeticError: no posterior" in reason for reason in after.reasons)
             assert after.trus_T_camera is not None
-    # The next event asks again.
+    # The next event submits it again.
     again = engine.add(measurements.pairs[16])
     assert again.settled
     assert again.verdict is Verdict.OK

@@ -1,4 +1,4 @@
-"""What the explicit graph holds: which variables are shared by what, and what is left out."""
+"""Content of the explicit graph: which factors share which variables, and what is left out."""
 
 from __future__ import annotations
 

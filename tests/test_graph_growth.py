@@ -1,4 +1,4 @@
-"""One linearisation takes a fixed number of callbacks per pair, and a dropped graph leaves nothing behind."""
+"""One linearisation takes a fixed number of callbacks per pair, and a deleted graph leaves no memory behind."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_far_starts_get_there_without_creeping_along_the_coincidences(case: str,
 
 @pytest.mark.parametrize("seed", [2, 4, 6, 7])
 def test_a_gain_far_beyond_what_was_promised_is_no_overflow(seed: int) -> None:
-    # At sigmas of 1e-3 mm the last steps promise nothing and rounding may give more than that.
+    # At sigmas of 1e-3 mm the last steps predict no decrease, and rounding may give more than that.
     explicit, shared, _ = make_case(seed, noise=True, **FULL_CASES["nearly no noise"])
     assert optimize(explicit, initial_values(explicit, shared)).converged
 

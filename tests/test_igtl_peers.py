@@ -1,7 +1,7 @@
 """OpenIGTLink with an independent peer: Debian's example programs, compiled from their package against its C++ library.
 
-They speak protocol 2, header version 1. What they make of header version 2 is checked, too: that is what the switch is
-for.
+They speak protocol 2, header version 1. Their handling of header version 2 is checked, too, since the option exists
+for them.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def test_a_receiver_that_stops_reading_and_dies_is_one_loss(programs: Programs) 
         wait_for(lambda: not sink.connected)
         with pytest.raises(DeviceLost, match="hung up"):
             sink.send(registration("ok"))
-        sink.send(registration("ok"))  # to nobody, and no loss again
+        sink.send(registration("ok"))  # to no one, and no loss again
         assert not sink.connected
         with socket.create_connection(("127.0.0.1", sink.endpoint.port)):
             wait_for(lambda: sink.connected)

@@ -1,4 +1,4 @@
-"""OpenIGTLink devices in their roles: no pulse lost, no refused registration out as a transform, losses said once."""
+"""OpenIGTLink devices in their roles: no pulse lost, no refused registration sent, losses reported once."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_every_pulse_arrives_in_order_with_both_times(scanner: tuple[socket.sock
         peer, _ = server.accept()
         with peer:
             began = host_now()
-            for number in range(200):  # a burst: all are there before anybody polls
+            for number in range(200):  # a burst: all are there before the first poll
                 peer.sendall(image(number) + message("TRANSFORM", "ProbeToTracker", transform_body(MATRIX)))
             frames = collect(source.poll, 200)
             assert [frame.index for frame in frames] == list(range(200))

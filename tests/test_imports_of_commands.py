@@ -1,4 +1,4 @@
-"""Which modules a command loads: what it does not use, it must not wait for."""
+"""Which modules a command loads: only those that it uses."""
 
 from __future__ import annotations
 

@@ -30,14 +30,14 @@ from tests.network_peers import wait_for
 
 
 class NothingYet:
-    """An estimate that has told nothing."""
+    """A reader without an estimate."""
 
     def read(self) -> Received:
         raise NoSnapshotError("nothing yet")
 
 
 class Quiet:
-    """A device that is there and has nothing to say."""
+    """A connected device that sends nothing."""
 
     name, connected, dropped = "quiet", True, 0
 
@@ -45,15 +45,15 @@ class Quiet:
         return ()
 
     def tell(self, text: str, **_: object) -> None:
-        """Nobody listens."""
+        """No one listens."""
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Nothing to close."""
 
 
 @dataclass(eq=False)
 class Notes:
-    """A recorder that keeps what it is given."""
+    """A recorder that stores the events."""
 
     state: RecorderState = field(default_factory=lambda: RecorderState(RegistrationState()))
     kept: list[NoteEvent] = field(default_factory=list)

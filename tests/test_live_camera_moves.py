@@ -1,4 +1,4 @@
-"""The live loop while the camera is moved: nothing that rests on where it was is followed, paired or sent."""
+"""The live loop while the camera moves: nothing that depends on its old pose is followed, paired or sent."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Device:
 
 
 class Link:
-    """A stage that has been homed and may follow; ``beats``: registrations it was told, ``orders`` to follow."""
+    """A stage that has been homed and may follow; ``beats``: registrations it was sent, ``orders`` to follow."""
 
     def __init__(self) -> None:
         self.beats: list[str | None] = []
@@ -118,7 +118,7 @@ class Stand:
         self.base_T_camera: FloatArray = np.eye(4)
 
     def turn(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Turns of the loop with a pose and a sample of the arm in each."""
+        """Steps of the loop with a pose and a sample of the holder in each."""
         end = host_now() + seconds
         while host_now() < end and not until():
             now = host_now()

@@ -1,4 +1,4 @@
-"""``fgreg live`` with the simulated room, in real time: whatever the machine is busy with, it ends cleanly."""
+"""``fgreg live`` with the simulated room, in real time: it ends cleanly also on a busy machine."""
 
 from __future__ import annotations
 

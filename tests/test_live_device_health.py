@@ -1,4 +1,4 @@
-"""Devices that come and go are told once when they go and once when they come; a bad picture is as good as none."""
+"""Losses and returns of devices are reported once each; a bad picture counts as none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FRAME_S = 1.0 / 30.0
 
 @dataclass
 class Device:
-    """A device that does as the test says."""
+    """A scripted device."""
 
     connected: bool = True
     name: str = "the device"

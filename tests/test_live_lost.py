@@ -1,4 +1,4 @@
-"""Devices that disappear from a live session: told and recorded, the rest goes on, what comes back is used again."""
+"""Devices lost in a live session: reported and recorded, the rest goes on, a device that returns is used again."""
 
 from __future__ import annotations
 

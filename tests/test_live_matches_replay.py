@@ -1,4 +1,4 @@
-"""A live session and a replay of what it recorded: settled, they tell the same."""
+"""A live session and a replay of what it recorded: settled, they report the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Looks at one spot as one PM, with what a trembling hand makes of it."""
+"""Looks at one spot as one PM, with the tremor of the hand."""
 
 from __future__ import annotations
 

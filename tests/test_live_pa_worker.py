@@ -1,4 +1,4 @@
-"""The process that locates sources: one that ends or hangs is replaced, and no frame counts as silence for it."""
+"""The process that locates sources is replaced where it ends or hangs; its frames do not count as without a signal."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def turn(pulse_locator: PulseLocator, until: Callable[[], object]) -> list[Locat
 
 
 def pulse(pulse_locator: PulseLocator, data: np.ndarray | None = None) -> None:
-    """One pulse, heard by nobody but the noise, some time after the last."""
+    """One pulse of noise only, some time after the last."""
     turn(pulse_locator, _after(0.02))
     now = time.monotonic()
     data = np.random.default_rng(1).integers(-20, 20, (128, 2000), dtype=np.int16) if data is None else data
@@ -75,7 +75,7 @@ def test_pulses_under_way_when_it_is_killed_are_located_by_the_next(
     os.kill(pid, signal.SIGKILL)
     heard = turn(pulse_locator, lambda: not pulse_locator.waiting)
     assert len(heard) == 3
-    assert [one.scan_rad for one in heard] == [0.1, None, None]  # one at a time is looked into: nothing heard
+    assert [one.scan_rad for one in heard] == [0.1, None, None]  # one is processed at a time: no signal
     turn(pulse_locator, lambda: not pulse_locator.trouble)
     assert pulse_locator.locator.pid not in (None, pid)
 
@@ -104,5 +104,5 @@ def test_a_hung_worker_is_reported_until_it_works_again(pulse_locator: PulseLoca
 def test_a_frame_that_cannot_be_processed_is_not_a_pulse_without_signal(pulse_locator: PulseLocator) -> None:
     pulse(pulse_locator, np.zeros((3, 5, 7), dtype=np.int16))
     (heard,) = turn(pulse_locator, lambda: not pulse_locator.waiting)
-    assert heard.scan_rad is None  # as a pulse of which nobody knows anything
+    assert heard.scan_rad is None  # as a pulse without information
     assert "could not be processed" in pulse_locator.trouble

@@ -1,4 +1,4 @@
-"""Pulses in the pulse locator: none is lost, none piles up, and none that was not looked into counts as silent."""
+"""Pulses in the pulse locator: none is lost or piles up, and none that was not processed counts as without a signal."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PERIOD_S = 0.1
 
 
 class SlowLocator:
-    """A process that takes as long as the test says."""
+    """A process of a given duration."""
 
     trouble = ""
 
@@ -42,7 +42,7 @@ class SlowLocator:
         return any(not future.done() for future in self.under_way)
 
     def check(self) -> None:
-        """It is there."""
+        """It runs."""
 
     def close(self) -> None:
         """Nothing to end."""

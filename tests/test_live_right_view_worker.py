@@ -1,4 +1,4 @@
-"""The right view in a process of its own: the same corners, and whatever happens to it no frame is lost."""
+"""The right view in a process of its own: the same corners, and no frame is lost if it fails."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def worker(room: tuple[SessionModel, list[Pictures]]) -> Iterator[RightViewWorke
 
 
 def ready(worker: RightViewWorker, image: UInt8Image) -> None:
-    """Until it has looked at a picture."""
+    """Until it has processed a picture."""
     end = time.monotonic() + 60.0
     while not worker.submit(image):
         assert time.monotonic() < end
@@ -55,7 +55,7 @@ def ready(worker: RightViewWorker, image: UInt8Image) -> None:
 
 
 def seen_of(worker: RightViewWorker) -> object:
-    """What it answers, on a machine that may be busy."""
+    """Its result, on a machine that may be busy."""
     process = worker._worker
     assert process is not None
     process.answer_s = 60.0

@@ -1,4 +1,4 @@
-"""The ground truth of a session from the simulated room: each epoch's pose is where the camera stood at its end."""
+"""The ground truth of a session from the simulated room: each epoch's pose is the camera's at its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Moves of the camera by its holder's account: noticed at once, measured between rests, never guessed."""
+"""Moves of the camera as its holder reports them: detected at once, measured between rests, never guessed."""
 
 from __future__ import annotations
 

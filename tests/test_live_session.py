@@ -154,7 +154,7 @@ def test_an_event_that_no_session_may_hold_is_recorded_as_refused(pose_session: 
         replace(pair, trus=replace(pair.trus, x_mm=math.nan)),
         replace(pair, t=math.inf),
         replace(pair, t=-1e11),
-        replace(pair, pm=-1, t=1e11),  # must not carry the session's clock away
+        replace(pair, pm=-1, t=1e11),  # must not advance the session's clock
         replace(pair, marker=MarkerRecord(left=Path("/etc/passwd"))),
         replace(pair, marker=MarkerRecord(np.eye(4), np.zeros((300, 300)))),
     ]
@@ -262,7 +262,7 @@ def test_reported_and_detected_moves_of_the_camera_are_epochs_for_every_reader(t
     recorded = read_session(folder)
     moves = [event for event in recorded.events if isinstance(event, CameraMovedEvent)]
     assert [(move.detected, move.since_t) for move in moves] == [(True, after[0].t)]
-    # Reopened with an engine that notices again, and with one that has to be told.
+    # Reopened with an engine that detects again, and with one that needs the report.
     for engine in (noticing, BatchEngine):
         with LiveSession.open(folder, make_engine=engine) as live:
             same(live.estimate, estimate)
@@ -270,7 +270,7 @@ def test_reported_and_detected_moves_of_the_camera_are_epochs_for_every_reader(t
             assert len(read_session(folder).events) == len(recorded.events)
     solved = extract_measurements(recorded.events, recorded.model).measurements
     assert [pair.epoch for pair in solved.pairs] == epochs
-    # A move that is told is an epoch as well.
+    # A reported move starts an epoch as well.
     (folder / "events.jsonl").unlink()
     with LiveSession.open(folder, make_engine=BatchEngine) as live:
         feed(live, events)

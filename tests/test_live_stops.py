@@ -1,4 +1,4 @@
-"""However ``fgreg live`` is ended, its stage is told to stop, and to nothing else after that."""
+"""However ``fgreg live`` is ended, its stage gets a stop order, and no other order after that."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The course of a session: calibrating, searching PMs, following, beginning anew; in a simulated room, made-up time."""
+"""The course of a session: calibrating, searching PMs, following, starting again; in a simulated room and time."""
 
 from __future__ import annotations
 

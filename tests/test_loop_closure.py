@@ -19,11 +19,11 @@ from tests.camera_move_cases import everything_about, move_case, moved_session
 CONFIG = SolveConfig()
 BEFORE = 20
 ANY = LoopClosureSettings(accept=1e-9)
-"""Tells of any evidence for the same place."""
+"""Accepts any evidence for the same place."""
 
 
 def _case(seed: int, motion: FloatArray, pairs: int, *, spoil: bool = False) -> tuple[MoveCase, SessionModel]:
-    """So many pairs of a second epoch, with an earlier one of 20."""
+    """A number of pairs of a second epoch, with an earlier one of 20."""
     model, whole, _ = moved_session(seed, motion, BEFORE, pairs)
     later = list(whole.pairs[BEFORE:])
     if spoil:

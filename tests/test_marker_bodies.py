@@ -104,7 +104,7 @@ def test_dictionaries(dictionary: str) -> None:
 
 def test_apriltags_are_drawn_as_the_tag_frame_assumes() -> None:
     # OpenCV 4.10 to 5.0 draws tag 0 of 36h11 with these rows, half a turn from the official picture (0xd5d628584). A
-    # version that draws it otherwise turns every recorded session's tag frames: this has to be noticed, then mended.
+    # version that draws it otherwise turns every recorded session's tag frames: this test shows it.
     book = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     bits = np.asarray(cv2.aruco.generateImageMarker(book, 0, 8))[1:-1, 1:-1] > 0
     assert int("".join(str(int(b)) for b in bits.ravel()), 2) == 0x21A146BAB

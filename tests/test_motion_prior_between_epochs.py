@@ -1,4 +1,4 @@
-"""The scope put back: an epoch whose registration is tied to an earlier one than the last, in batch and online."""
+"""The scope put back: a motion prior to an earlier epoch than the last, in batch and online."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def there_and_back(seed: int, counts: tuple[int, ...]) -> tuple[SessionModel, Me
     t = 0.0
     for epoch, count in enumerate(counts):
         truths.append(home if epoch % 2 == 0 else home @ inverse(AWAY))
-        # One seed, so that all have the same window edge; without aims all that follows is drawn anew.
+        # One seed, so that all have the same window edge; without aims everything after it differs.
         model, part, _ = make_measurements(
             np.random.default_rng([seed, 1]), aims=12 + epoch if epoch else 11, pairs=count, marker_T_laser=beam,
             trus_T_camera=truths[-1],

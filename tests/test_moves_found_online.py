@@ -1,4 +1,4 @@
-"""Camera moves that no one reports: the engine finds them, and never passes an old transform for the present one."""
+"""Camera moves that no one reports: the engine finds them, and never reports an old transform as the current one."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TAG_SIGMA = np.array([0.002, 0.002, 0.002, 0.1, 0.1, 0.3])
 
 @cache
 def _ran(seed: int) -> tuple[SessionModel, Measurements, tuple[Truth, Truth], OnlineRegistration]:
-    """A session with an unreported move, and the engine that went through it: to look at only."""
+    """A session with an unreported move, and the engine that took it in: read only."""
     model, measurements, truths = unreported_move(seed, SHIFT, 8, BEFORE)
     engine = OnlineRegistration(model, verdicts=False)
     for _, event in events_in_order(measurements):

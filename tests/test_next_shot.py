@@ -1,4 +1,4 @@
-"""Advice on the next shot: its figures are what solving with that shot gives, and it is worth following."""
+"""Advice on the next shot: its figures are those of solving with that shot, and it improves the registration."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_virtual_pairs_lie_on_their_beam_and_are_detected_where_stated() -> None
         assert np.linalg.norm(np.cross(spot - origin, direction)) < 1e-9
         distance, _, rotation = hear(trus_p, pair.look.scan_rad, model.probe.radius_mm)
         assert pair.look.range_mm == pytest.approx(distance)
-        # In the middle of the step in which it is first heard: 6 deg less half of 2.
+        # In the middle of the step of its first detection: 6 deg less half of 2.
         assert rotation * pair.look.sweep == pytest.approx(math.radians(5.0), abs=1e-4)
 
 

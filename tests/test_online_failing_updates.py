@@ -39,7 +39,7 @@ def _base(pairs: int) -> tuple[SessionModel, Measurements, OnlineRegistration]:
 
 
 def _engine(pairs: int) -> tuple[OnlineRegistration, Measurements, tuple[Pair, ...]]:
-    """An engine with so many pairs taken in, and the pairs that follow."""
+    """An engine with a number of pairs taken in, and the pairs that follow."""
     model, measurements, base = _base(pairs)
     engine = OnlineRegistration(model, verdicts=False, find_moves=False)
     for name in ("_state", "_t", "_serial", "_estimate", "_misplaced"):  # all are values
@@ -118,7 +118,7 @@ def test_a_failing_update_changes_nothing_and_later_events_work(
     assert engine.state is state
     assert _bits(engine.estimate) == before
     assert len(engine.measurements().pairs) == pairs
-    # The next events give what they give where nothing had failed.
+    # The next events give the same as without the failure.
     for pair, expected in zip(after, _expected(pairs), strict=True):
         found = engine.add(pair)
         np.testing.assert_allclose(
@@ -145,7 +145,7 @@ def test_a_failure_while_pairs_go_into_the_marginal_prior_changes_nothing(monkey
 def test_numbers_that_overflow_at_few_pairs_leave_the_pair_and_the_full_solve_registers_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # Among few pairs that contradict each other full steps lead anywhere: that is no defect of the pair.
+    # Among few pairs that contradict each other full steps may diverge: that is no defect of the pair.
     model, measurements, _ = _base(6)
     engine, _, after = _engine(6)
     with monkeypatch.context() as patch:

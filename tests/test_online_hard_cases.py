@@ -1,4 +1,4 @@
-"""Events that come when little is known, or late: none is refused or lost, and nothing counts by halves."""
+"""Events that come when little is known, or late: none is refused or lost, and none counts in part."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Queries while the session goes on: the answers of the full solve, and refusals where there is no registration."""
+"""Queries while the session goes on: the results of the full solve, and refusals where there is no registration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Junk among pairs and aims: left out and named, good ones kept, the answer that of the session without it."""
+"""Outliers among pairs and aims: rejected and named, good ones stay inliers, the result that of the session without."""
 
 from __future__ import annotations
 
@@ -239,13 +239,13 @@ def test_the_density_of_a_doubtful_pm_is_the_mixture_of_inlier_and_outlier() -> 
     kept_private = found.modes[0].optimum.evaluation.private
     both = log_posterior(doubted.problem, state, private)[0]
     kept = log_posterior(one_pm, state, kept_private)[0]
-    # Far off as it is, the junk PM counts as junk, whatever its misfit; the good ones count in full.
+    # The outlier PM is far off and counts as an outlier for any misfit; the good ones count in full.
     assert log_posterior(without, state, private)[0] < kept - 100.0
     assert both == pytest.approx(kept + log_k[2], abs=0.05)
 
 
 def test_an_outlier_that_bends_the_estimate_until_it_fits_widens_the_posterior() -> None:
-    # In these sessions a junk PM or two are within their limits at the optimum.
+    # In these sessions one or two outlier PMs are within their limits at the optimum.
     squares = []
     for seed in (12, 28, 56):
         model, spoiled, truth, _ = _mixed_junk(seed, 0.4)

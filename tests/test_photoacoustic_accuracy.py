@@ -1,4 +1,4 @@
-"""A source in channel data is found where it is, with a covariance that means what it says."""
+"""A source in channel data is found where it is, with an honest covariance."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def many(snr_db: float, frames: int, seed: int) -> tuple[npt.NDArray[np.float64]
 
 def test_path_of_a_3_4_5_triangle() -> None:
     assert path_mm(3.0, 4.0, 1.0, np.array([0.0, 3.0, 6.0])) == pytest.approx([5.0, 4.0, 5.0])
-    # A tissue twice as fast halves what the assumed speed makes of the way across.
+    # Tissue with twice the sound speed halves the lateral distance computed with the assumed one.
     assert path_mm(6.0, 4.0, 2.0, np.array([0.0])) == pytest.approx([5.0])
 
 

@@ -66,7 +66,7 @@ def test_a_flash_on_all_channels_is_no_source_and_hides_none(
 
 @pytest.mark.parametrize("amplitude", [3.0, 20.0, 100.0])
 def test_a_flat_wave_that_few_channels_share_is_no_source(probe: ProbeModel, amplitude: float) -> None:
-    # A quarter of the channels: the median does not see it, so it is not taken away; its shape has to give it away.
+    # A quarter of the channels: the median does not see it, so it is not subtracted; its shape has to show it.
     rng = np.random.default_rng(5)
     for at_us in (2.0, 9.0, 15.0):
         for first, last in ((48, 80), (0, 40)):

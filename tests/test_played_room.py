@@ -1,4 +1,4 @@
-"""A room whose pictures were made beforehand: what is shown is what is there at that moment."""
+"""A room whose pictures were rendered beforehand: the picture shown is that of the poses at that time."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def test_the_result_has_the_optimum_besides_the_mean() -> None:
 
 
 def test_a_posterior_that_diverges_is_replaced_by_the_optimum() -> None:
-    # The optimum with sites of five window-only pairs may be kilometres off; so may samples that rounding favours.
+    # The optimum with sites of five window-only pairs may be kilometres off; so may samples selected by rounding.
     model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=8, first_hit=False)
     registration = register(measurements, model, SolveConfig())
     mode = Mode(registration.problem, registration.optimum, registration.covariance)

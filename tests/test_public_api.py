@@ -1,4 +1,4 @@
-"""The public names: what ``import fgreg`` offers and loads, and that README's Python needs nothing else."""
+"""The public names: content and imports of ``import fgreg``, and README's Python, which needs nothing else."""
 
 from __future__ import annotations
 

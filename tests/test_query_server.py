@@ -1,4 +1,4 @@
-"""The query process: answers beside a busy process, and ends with it."""
+"""The query process: answers while another process is busy, and ends with it."""
 
 from __future__ import annotations
 

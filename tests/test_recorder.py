@@ -1,4 +1,4 @@
-"""The recorder loses nothing that was handed over: what a full disk refuses waits, and is said."""
+"""The recorder loses nothing that was handed over: what a full disk refuses waits, and is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reduced problem and the explicit graph are two derivations of one answer."""
+"""The reduced problem and the explicit graph are two derivations of one estimate."""
 
 from __future__ import annotations
 

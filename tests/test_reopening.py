@@ -31,7 +31,7 @@ SIGMAS = 0.05
 
 
 def _spoiled(measurements: Measurements, every: int) -> Measurements:
-    """With the sound of something else at every so many pairs."""
+    """With another source at every n-th pair."""
     pairs = list(measurements.pairs)
     for place in range(every // 2, len(pairs), every):
         look = pairs[place].look

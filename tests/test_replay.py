@@ -112,7 +112,7 @@ def test_queries_are_answered_from_what_was_known_at_their_time(
     path.write_text("".join(json.dumps(event) + "\n" for event in events[: events.index(late) + 1]))
     cut = replay_session(ReplayRequest(short), FAST, make_engine=make_engine).solved.estimate.tracks
     assert cut[0].stage_rad is None
-    # Not bit by bit: what rounding decides depends on where arrays lie in memory.
+    # Not bit by bit: rounding depends on where arrays lie in memory.
     assert cut[1].stage_rad == pytest.approx(whole[1].stage_rad, rel=0, abs=1e-9)
     assert cut[1].sigma_rad == pytest.approx(whole[1].sigma_rad, rel=1e-9)
 

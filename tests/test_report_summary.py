@@ -32,7 +32,7 @@ from tests.forward import make_measurements, make_session
 def make_answer(
     seed: int = 21, pairs: int = 8, epochs: int = 1, verdict: Verdict = Verdict.OK, reasons: tuple[str, ...] = ()
 ) -> tuple[SessionModel, SessionEstimate, SummaryExtras]:
-    """An answer with one look left out, one track answered and one not, on a stage that counts backwards from 5 deg."""
+    """A result with one look left out, one track answered and one not, on a stage that counts backwards from 5 deg."""
     rng = np.random.default_rng(seed)
     stage = StageModel(math.radians(2.0), (-1.5, 1.5), direction=-1, zero_device_rad=math.radians(5.0))
     model, measurements, truth = make_measurements(

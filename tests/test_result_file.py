@@ -48,7 +48,7 @@ def transform(random: np.random.Generator) -> FloatArray:
 
 
 def an_estimate(seed: int = 1) -> SessionEstimate:
-    """An estimate with everything in it: epochs with and without answer, looks used and not, tracks likewise."""
+    """An estimate with everything in it: epochs with and without registration, looks used and not, tracks likewise."""
     random = np.random.default_rng(seed)
     gauge_free = covariance(random, 6, 1e-3)
     gauge_free[[2, 5], :] = gauge_free[:, [2, 5]] = 0.0  # roll about the beam and shift along it

@@ -27,7 +27,7 @@ QUARTER = (0.010, -0.020, 0.150, HALF, 0.0, 0.0, HALF)
 
 
 def play(device: MotionSource | StereoCamera, limit_s: float = 5.0) -> list[Any]:
-    """Everything until the end is told."""
+    """Everything until the end is reported."""
     out: list[Any] = []
     until = time.monotonic() + limit_s
     while time.monotonic() < until:

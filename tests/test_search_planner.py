@@ -1,4 +1,4 @@
-"""The search for a PM: steps that jump no window, few positions, an honest sigma, and giving up where nothing is."""
+"""The search for a PM: steps that skip no window, few positions, an honest sigma, and an end where there is no PM."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _model() -> DetectionModel:
 
 
 def _amplitude(pm_deg: float, peak: float, scan_rad: float, rng: np.random.Generator | None = None) -> float | None:
-    """What a probe with a window of +-6 deg receives: written down here again, apart from the planner's model."""
+    """Amplitude of a probe with a window of +-6 deg, independent of the planner's model."""
     off = pm_deg - math.degrees(scan_rad)
     received = peak * 2.0 ** (-((off / 6.0) ** 2)) * (1.0 + (0.05 * rng.standard_normal() if rng else 0.0))
     return received if received >= THRESHOLD else None

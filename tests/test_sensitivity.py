@@ -1,4 +1,4 @@
-"""Rotation against arc angle, and what window and sweep say about a look."""
+"""Rotation against arc angle, and the information of window and sweep on a look."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def test_moments_are_derivatives_of_the_probability(mean: float) -> None:
 def test_moments_far_out_stay_finite(sign: float) -> None:
     low, high = sorted((sign * 500.0, sign * 501.0))
     slope, curvature = interval_moments(low, high, 1.0)
-    # Nearly all of what is left sits at the nearer end: the mean is pulled there.
+    # Nearly all of the remaining mass is at the nearer end, and so is the mean.
     assert slope == pytest.approx(sign * 500.0, rel=1e-4)
     assert -1e-4 <= curvature <= 1.0 + 1e-4
 
@@ -205,7 +205,7 @@ def test_amplitudes_find_the_plane_whatever_the_peak(peak: float) -> None:
     weight /= weight.sum()
     mean = weight @ table.plane_rad
     sigma = math.degrees(math.sqrt(weight @ (table.plane_rad - mean) ** 2))
-    # log a_i = log p - ln 2 (phi - t_i)^2 / 36: linear in phi but for what the peak takes up, slope 2 ln 2 t_i / 36.
+    # log a_i = log p - ln 2 (phi - t_i)^2 / 36: linear in phi up to the peak's part, slope 2 ln 2 t_i / 36.
     times = np.array([-0.5, 1.5, 3.0])
     slope = 2.0 * math.log(2.0) / 36.0 * (times - times.mean())
     assert sigma == pytest.approx(0.05 / np.linalg.norm(slope), rel=0.15)

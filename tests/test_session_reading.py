@@ -1,4 +1,4 @@
-"""A valid session reads as what it says: units, defaults, every type of event, and what is tolerated."""
+"""A valid session is read as written: units, defaults, every type of event, and what is tolerated."""
 
 from __future__ import annotations
 

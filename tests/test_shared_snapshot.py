@@ -1,4 +1,4 @@
-"""The snapshot in shared memory: always whole, whatever becomes of the writer, and nothing left behind."""
+"""The snapshot in shared memory: always complete, also if the writer fails, and no memory left behind."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ def test_window_follows_depth() -> None:
 
 
 def test_a_detection_at_the_first_stop_gives_no_sweep() -> None:
-    # The stage's lower limit lies within the window of every PM: it hears before it has made a step.
+    # The stage's lower limit lies within the window of every PM: it detects them before the first step.
     stage = StageModel(math.radians(2.0), (math.radians(-1.0), math.radians(60.0)))
     config = without_noise(pairs=6, stage=stage, sweep=Sweep.ONE_WAY, pm_angle_rad=math.radians(1.5))
     assert all("sweep" not in e["trus"] for _, e in events(simulate(config, 1), "pair"))

@@ -1,4 +1,4 @@
-"""Messages and limits between the main program and the watchdog: what is not as it should be is none at all."""
+"""Messages and limits between the main program and the watchdog: invalid ones are refused."""
 
 from __future__ import annotations
 

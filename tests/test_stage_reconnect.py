@@ -1,4 +1,4 @@
-"""A watchdog that is gone is replaced; its stage is stopped first of all, and moves when the operator says so."""
+"""A watchdog that has ended is replaced; its stage is stopped first, and moves at the operator's request."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _Kept:
         time.sleep(0.01)
 
     def until(self, condition: Callable[[], object], seconds: float = 30.0) -> float:
-        """Turns until something is so; the longest of them, s."""
+        """Steps until a condition holds; duration of the longest, s."""
         end, longest = time.monotonic() + seconds, 0.0
         while not condition():
             began = time.monotonic()
@@ -98,7 +98,7 @@ def test_watchdog_that_is_gone_is_replaced_latched_and_its_stage_stopped_first(k
     orders = [line for line in read_trace(kept.folder / "trace") if line["what"] in ("stop", "move", "home")]
     first = next(line for line in orders if line["pid"] == link.pid)
     assert first["what"] == "stop"
-    # Nothing moves without the operator's word, and with it all does.
+    # Nothing moves without the operator's request, and everything with it.
     link.request(MotionKind.SEARCH, "pedal")
     link.search_to(math.radians(3.0), "on")
     kept.until(lambda: any("latched" in report.reason for report in kept.reports))

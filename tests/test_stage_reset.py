@@ -1,4 +1,4 @@
-"""A latched stage: the operator is told why, until it is reset; after that it moves only if it is asked to again."""
+"""A latched stage: the reason is reported until it is reset; after that it moves only if it is asked to again."""
 
 from __future__ import annotations
 

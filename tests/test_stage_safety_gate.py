@@ -1,4 +1,4 @@
-"""The gate lets good motion out, and stops it for each thing that can go wrong, with the reason."""
+"""The gate allows legal motion, and stops it for each possible fault, with the reason."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class _Room:
         return actions
 
     def run(self, seconds: float, marker: bool = True) -> list[Action]:
-        """Let time pass in ticks; what the gate did."""
+        """Advance the time by ticks; the gate's actions."""
         actions = []
         for _ in range(round(seconds / 0.02)):
             self.now += 0.02
@@ -109,7 +109,7 @@ def _halts(actions: list[Action]) -> list[str]:
 
 
 def _refusal(actions: list[Action]) -> str:
-    """The reason of the one thing that was let out: a refusal."""
+    """The reason of the only action: a refusal."""
     (only,) = actions
     assert isinstance(only, Refusal)
     return only.reason
@@ -196,7 +196,7 @@ def test_good_stage_is_never_latched_however_it_is_turned_about(
 
 @pytest.mark.parametrize("delay", [0, 5])
 def test_stage_that_goes_on_where_it_should_turn_about_is_found_within_its_brakes_way(delay: int) -> None:
-    """A long way that lies behind it is no excuse: what counts is how far it can still get."""
+    """The distance already turned does not matter: the remaining reach counts."""
     room = _room()
     room.delay = delay
     room.go(MotionKind.TRACK, -50.0)

@@ -1,4 +1,4 @@
-"""No sequence of commands, faults and clock jumps gets an illegal motion out of the gate."""
+"""No sequence of commands, faults and clock jumps makes the gate allow an illegal motion."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ DISTURBANCES = [
 
 
 class GateMachine(RuleBasedStateMachine):
-    """A stage that follows what the gate lets out, a main program that says anything, and a clock that jumps."""
+    """A stage that follows the gate, a main program that sends anything, and a clock that jumps."""
 
     def __init__(self) -> None:
         super().__init__()

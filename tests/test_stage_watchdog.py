@@ -1,4 +1,4 @@
-"""The watchdog process: whatever happens to the main program, the stage stops; and it says what it does first."""
+"""The watchdog process: the stage stops whatever happens to the main program; orders are recorded first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Static tags: the camera's motion against them, false alarms while nothing moves, tags that go their own way."""
+"""Static tags: the camera's motion against them, false alarms without a move, tags that move by themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The package's layout: few layers, no import circles, next to nothing beside the packages."""
+"""The package's layout: few layers, no import circles, few modules outside the packages."""
 
 from __future__ import annotations
 

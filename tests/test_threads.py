@@ -1,4 +1,4 @@
-"""What a live session asks of the interpreter and of linear algebra, and that it is as before afterwards."""
+"""Settings of the interpreter and of linear algebra in a live session, and their restoration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Queries with the PM heard: the answers of the session's own solve, whatever was heard."""
+"""Queries with the PM detected: the results of the session's own solve, for any looks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ANGLE_SIGMAS, SIGMA_SHARE = 0.02, 0.02
 
 
 def _agree(query: Track, session: Solved) -> TrackEstimate:
-    """Reference and answer, which have to agree; the answer."""
+    """The result of a query, which has to agree with the reference."""
     expected, answer = tracking_reference.track(query, session), track(query, session.snapshot)
     assert expected.stage_rad is not None
     assert expected.sigma_rad is not None

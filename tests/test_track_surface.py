@@ -1,4 +1,4 @@
-"""Queries with nothing heard: rays end where a fine grid says, answers spread as samples do."""
+"""Queries without a detection: rays end where a fine grid says, results spread as samples do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers to tracking queries: right within their sigma, refused where there is nothing to go by."""
+"""Results of tracking queries: right within their sigma, refused where there is no registration."""
 
 from __future__ import annotations
 

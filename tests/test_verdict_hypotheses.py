@@ -105,6 +105,6 @@ def test_one_shot_far_off_is_an_outlier_but_several_a_little_off_are_noise() -> 
     assert understated_noise(none, nis) == []
     assert understated_noise(junk, nis) == []
     assert understated_noise(several, nis)[0].verdict is Verdict.WARNING
-    # Among plenty of gross junk two that are only a little off are junk, too.
+    # Among many gross outliers two that are only a little off are outliers, too.
     nis[5:13], several[5:13] = 500.0, True
     assert understated_noise(several, nis) == []

@@ -133,7 +133,7 @@ def test_looks_that_were_not_measured_have_no_measured_pair() -> None:
     rng = np.random.default_rng(6)
     session, measurements, truth = make_measurements(rng, aims=0, pairs=4)
     estimate = answer_from_truth(rng, session, measurements, truth, unused=(1, 2))
-    # The second look was measured and left out, the third was never heard.
+    # The second look was measured and left out, the third was never detected.
     heard = Measurements((), tuple(measurements.pairs[i] for i in (0, 1, 3)), measurements.epochs)
     assert measured_pairs(estimate.pairs, heard) == (*measurements.pairs[:2], None, measurements.pairs[3])
 

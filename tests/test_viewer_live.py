@@ -1,4 +1,4 @@
-"""A session under way as the viewer and the terminal show it: where things are, what comes next, what is gone."""
+"""A session under way as the viewer and the terminal show it: poses, next step, lost devices."""
 
 from __future__ import annotations
 

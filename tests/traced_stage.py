@@ -1,4 +1,4 @@
-"""A simulated stage that writes down what it was told and how it moved, to be looked at when all else is dead."""
+"""A simulated stage that records its orders and motion in a file, to be read after all processes have ended."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fgreg.stage.interface import StageError, StageLost, StageStatus
 
 
 class TracedStage(SimulatedStage):
-    """Each call and each status is one line of ``trace``; a file ``trouble`` beside it says what goes wrong."""
+    """Each call and each status is one line of ``trace``; a file ``trouble`` beside it gives the fault."""
 
     def __init__(self, model: StageModel, trace: Path, **options: Any) -> None:
         self._trace = trace
@@ -72,6 +72,6 @@ def open_stage(model: StageModel, *, trace: str, homed: bool = True) -> TracedSt
 
 
 def read_trace(path: Path) -> list[dict[str, Any]]:
-    """What was written so far, whole lines only."""
+    """The complete lines written up to now."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
