@@ -17,6 +17,7 @@ from fgreg.errors import InputError
 from fgreg.session.session_reader import read_session
 
 ABSENT = object()
+BESIDE: list[list[float]] = [[1.0, 0.0, 0.0, -5.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 IDENTITY: list[list[float]] = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 # A quarter turn about x, then 10, 20, 150 mm.
 QUARTER: list[list[float]] = [
@@ -54,7 +55,7 @@ def setup() -> dict[str, Any]:
             "image": {"pixel_mm": [0.1, 0.2], "origin_mm": [1.0, -20.0]},
         },
         "stage": {"step_deg": 2.0, "limits_deg": [-60, 60], "direction": -1, "zero_deg": 5.0},
-        "camera": {"image_size": [640, 480], "left": camera, "right": dict(camera), "right_T_left": IDENTITY},
+        "camera": {"image_size": [640, 480], "left": camera, "right": dict(camera), "right_T_left": BESIDE},
         "marker": {
             "dictionary": "DICT_4X4_50",
             "tags": [{"id": 0, "size_mm": 30.0, "marker_T_tag": IDENTITY}, {"id": 3, "size_mm": 12.5}],

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgreg.errors import InputError
-from fgreg.model.events import Event, PairEvent, TrackEvent
+from fgreg.model.events import AimEvent, Event, PairEvent, TrackEvent
+from fgreg.model.plausible import implausible_distances
 from fgreg.model.session_model import SessionModel
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.session.event_reader import EventLog, frames_of, read_events
@@ -129,10 +130,23 @@ def _warnings(setup: Setup | None, log: EventLog) -> list[str]:
             if any(not lower - 1e-6 <= look.scan_deg <= upper + 1e-6 for look in looks):
                 beyond.append(event.line)
     out = [*setup.warnings, *log.warnings]
+    out += [f"{EVENTS_FILE}: {text}" for text in _distances(log)]
     if beyond:
         where = f"{EVENTS_FILE}: line {beyond[0]}" + (f" and {len(beyond) - 1} more" if beyond[1:] else "")
         out.append(f"{where}: scan_deg is outside stage.limits_deg, [{lower:g}, {upper:g}]")
     return out
+
+
+def _distances(log: EventLog) -> tuple[str, ...]:
+    """Doubts about the unit of poses, spots and ranges."""
+    shots = [event for event in log.events if isinstance(event, AimEvent | PairEvent)]
+    spots = [event.camera_p_spot_mm for event in shots if isinstance(event, AimEvent)]
+    ranges = [event.trus.range_mm for event in shots if isinstance(event, PairEvent)]
+    return implausible_distances(
+        [pose for event in shots if (pose := event.marker.camera_T_marker) is not None],
+        [spot for spot in spots if spot is not None],
+        [value for value in ranges if value is not None],
+    )
 
 
 def _read_truth(folder: Path, problems: list[InputError]) -> GroundTruth | None:

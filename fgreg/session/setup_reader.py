@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from fgreg.errors import InputError
+from fgreg.model.plausible import implausible, implausible_setup
 from fgreg.model.session_model import NAME, SESSION, BoardModel, MarkerModel, ProbeModel, SessionModel, StereoRig
 from fgreg.schema.problems import FieldError, Problem, input_error
 
@@ -51,13 +52,14 @@ def read_setup(data: Mapping[str, object], file: str, default_name: str, problem
 
     probe, camera, board = part("probe", ProbeModel), part("camera", StereoRig), part("board", BoardModel)
     marker = part("marker", MarkerModel)
+    doubts = implausible(*parts.values()) if model is None else implausible_setup(model)
     return Setup(
         model=model,
         present=_present(data) | {problem.meant for problem in found if problem.meant and len(problem.path) == 1},
         probe=probe,
         camera=camera,
         board=board,
-        warnings=tuple(_warnings(file, probe, camera, marker, board)),
+        warnings=tuple(f"{file}: {text}" for text in (*doubts, *_shared_ids(marker, board))),
     )
 
 
@@ -75,25 +77,10 @@ def _present(data: Mapping[str, object]) -> frozenset[str]:
     return frozenset(names)
 
 
-def _warnings(
-    file: str, probe: ProbeModel | None, camera: StereoRig | None, marker: MarkerModel | None, board: BoardModel | None
-) -> list[str]:
-    """Warnings about values that are allowed but implausible."""
-    out = []
-    if probe is not None and not 1300.0 <= probe.sound_speed_m_s <= 1700.0:
-        out.append(
-            f"{file}: probe.sound_speed_m_s is {probe.sound_speed_m_s:g}; in tissue and water it is 1300 to 1700"
-        )
-    for side in ("left", "right"):
-        model = getattr(camera, side, None)
-        if model is not None:
-            (width, height), (cx, cy) = model.image_size, model.matrix[:2, 2]
-            if not (0 <= cx <= width and 0 <= cy <= height):
-                out.append(
-                    f"{file}: camera.{side}.matrix has its centre ({cx:g}, {cy:g}) outside {width} x {height} px"
-                )
-    if marker is not None and board is not None and board.charuco is not None:
-        on_board = board.markers
-        if board.charuco.dictionary == marker.dictionary and any(tag.id < on_board for tag in marker.tags):
-            out.append(f"{file}: marker.tags share ids with the board: one may be taken for the other")
-    return out
+def _shared_ids(marker: MarkerModel | None, board: BoardModel | None) -> list[str]:
+    """Whether a tag of the marker may be taken for one of the board."""
+    if marker is None or board is None or board.charuco is None:
+        return []
+    if board.charuco.dictionary != marker.dictionary or all(tag.id >= board.markers for tag in marker.tags):
+        return []
+    return ["marker.tags share ids with the board: one may be taken for the other"]
