@@ -389,7 +389,7 @@ class TcpLink(Generic[Item]):
             elif peer.block and now - peer.block_since_s > MESSAGE_S:
                 self._hang_up(peer, f"did not take what was sent for {MESSAGE_S:g} s")
         if self._silent_s is not None and self._state == "there" and now - self._received_s > self._silent_s:
-            self._lost("silent", f"{self._endpoint}: nothing heard for {self._silent_s:g} s")
+            self._lost("silent", f"{self._endpoint}: nothing received for {self._silent_s:g} s")
 
     def _hang_up(self, peer: _Peer[Item], reason: str) -> None:
         self._peers.remove(peer)

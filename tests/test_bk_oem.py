@@ -165,7 +165,7 @@ def test_a_frozen_picture_is_a_silent_scanner(scanner: Scanner) -> None:
     driver = BkOemScanner(Endpoint("127.0.0.1", scanner.port), silent_s=0.2)
     try:
         wait_for(lambda: scanner.grabbing)
-        with pytest.raises(DeviceLost, match=r"nothing heard for 0\.2 s"):
+        with pytest.raises(DeviceLost, match=r"nothing received for 0\.2 s"):
             wait_for(driver.poll)
         assert not driver.connected
         scanner.send(grabbed(picture(scanner)))

@@ -136,7 +136,7 @@ def test_a_stream_that_stops_is_lost_and_back_with_its_next_message(scanner: tup
             collect(source.poll, 1)
             peer.sendall(message("TRANSFORM", "ProbeToTracker", transform_body(MATRIX)))  # does not count
             began = time.monotonic()
-            with pytest.raises(DeviceLost, match=r"nothing heard for 0\.8 s"):
+            with pytest.raises(DeviceLost, match=r"nothing received for 0\.8 s"):
                 wait_for(source.poll)
             assert time.monotonic() - began >= 0.7
             peer.sendall(image(1))

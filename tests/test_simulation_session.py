@@ -399,7 +399,7 @@ def test_geometry_out_of_sight_or_out_of_reach_is_refused() -> None:
     with pytest.raises(ValueError, match="camera can see"):
         simulate(SimulationConfig(marker_distance_mm=(300.0, 310.0)), 1)
     stage = StageModel(math.radians(2.0), (math.radians(50.0), math.radians(60.0)))
-    with pytest.raises(ValueError, match="never heard"):
+    with pytest.raises(ValueError, match="never detected"):
         simulate(SimulationConfig(stage=stage), 1)
 
 

@@ -197,7 +197,7 @@ def test_a_silent_device_is_lost_once_and_back_with_its_next_message() -> None:
             peer.sendall(b"a\n")
             collect(link.poll, 1)
             wait_for(lambda: not link.connected)
-            assert "nothing heard for 0.2 s" in str(link.take_loss())
+            assert "nothing received for 0.2 s" in str(link.take_loss())
             time.sleep(0.3)
             assert link.take_loss() is None
             peer.sendall(b"b\n")

@@ -264,11 +264,11 @@ class _Join:
                 return {**mark, "t": t, "marker": marker}
             case "track":
                 rest = {key: value for key, value in mark.items() if key not in _OF_LOOK}
-                return {**rest, "t": t, "marker": self._marker(t), **self._heard(t, mark)}
+                return {**rest, "t": t, "marker": self._marker(t), **self._look_fields(t, mark)}
             case _:
                 return {**mark, "t": t}
 
-    def _heard(self, t: float, mark: Document) -> Document:
+    def _look_fields(self, t: float, mark: Document) -> Document:
         """The probe part of a query: the look at its time, else the stage's angle."""
         try:
             look_s, look = _nearest(self._streams.looks, t, self._mapping.max_gap_s, "look")

@@ -52,7 +52,7 @@ def _page(name: str, advice: Advice) -> list[RenderableType]:
         ("spot", "camera, mm"),
         ("beam leans", "in the image, deg"),
         ("direction", "camera"),
-        ("heard at", "deg"),
+        ("detected at", "deg"),
         ("sweep", ""),
         ("TRE then", "mm"),
         *([("tells apart", "chi square")] if rival else []),

@@ -66,7 +66,7 @@ class TrusRecord:
         int,
         Key(
             "+1 or -1 where the stage was stepping that way (device angle increasing or decreasing by `step_deg`) and "
-            "stopped at the first angle at which the PM was heard",
+            "stopped at the first angle at which the PM was detected",
             OneOf((0, 1, -1)),
             brief=True,
         ),
@@ -137,9 +137,9 @@ class TrackEvent:
     t: Seconds
     line: int
     marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
-    trus: Annotated[TrusRecord | None, Key("the look, where the PM is heard now")] = None
+    trus: Annotated[TrusRecord | None, Key("the look, where the PM is detected now")] = None
     several: Annotated[tuple[TrusRecord, ...], Key("several such looks, instead", name="looks", brief=True)] = ()
-    scan_deg: Annotated[float | None, Key("where the stage stands, where the PM is not heard", SCAN_DEG)] = None
+    scan_deg: Annotated[float | None, Key("where the stage stands, where the PM is not detected", SCAN_DEG)] = None
 
     def __post_init__(self) -> None:
         if self.trus is not None and self.several:
@@ -149,7 +149,7 @@ class TrackEvent:
 
     @property
     def looks(self) -> tuple[TrusRecord, ...]:
-        """The query's looks at the PM; empty where it is not heard now."""
+        """The query's looks at the PM; empty where it is not detected now."""
         return self.several if self.trus is None else (self.trus,)
 
 

@@ -59,7 +59,7 @@ class MarkerObservation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """One hearing of a PM in the TRUS image plane.
+    """One detection of a PM in the TRUS image plane.
 
     Attributes:
         scan_rad: stage angle t of the plane (TRUS convention).
@@ -107,7 +107,7 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A query in camera epoch ``epoch``; ``looks`` where the PM is heard now.
+    """A query in camera epoch ``epoch``; ``looks`` where the PM is detected now.
 
     ``look_markers``: one per look, where the marker was detected at each look; else ``marker`` is used for all.
     """

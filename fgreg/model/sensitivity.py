@@ -230,13 +230,13 @@ def amplitude_table(looks: Sequence[Look], sensitivity: SensitivityModel, amplit
     mean. The stage reading's noise enters by the curve's slope. Needs two looks with amplitudes, and a curve.
     """
     scan = np.array([look.scan_rad for look in looks])
-    heard = [(look.scan_rad, look.scan_sigma_rad, look.amplitude) for look in looks if look.amplitude]
+    detected = [(look.scan_rad, look.scan_sigma_rad, look.amplitude) for look in looks if look.amplitude]
     reach = float(sensitivity.half_width_rad.max()) + TABLE_MARGIN_RAD
     plane = np.linspace(scan.min() - reach, scan.max() + reach, TABLE_SIZE)
     curve = amplitude_curve(sensitivity)
-    if len(heard) < 2 or curve is None:
+    if len(detected) < 2 or curve is None:
         return AmplitudeTable(plane, np.zeros(TABLE_SIZE), False)
-    at, at_sigma, amplitude = np.array(heard, dtype=np.float64).T[:, :, None]
+    at, at_sigma, amplitude = np.array(detected, dtype=np.float64).T[:, :, None]
     rotation = plane - at
     peak = np.log(amplitude) - np.interp(rotation, curve.rotation_rad, curve.log_amplitude)
     slope = np.interp(rotation, curve.rotation_rad, curve.slope)

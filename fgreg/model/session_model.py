@@ -64,7 +64,7 @@ def _positive(**values: float) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensitivityModel:
-    """Half width of the window in which the probe hears a source, as *stage rotation*, against depth.
+    """Half width of the window in which the probe detects a source, as *stage rotation*, against depth.
 
     Attributes:
         depth_mm, half_width_rad: (n,).
@@ -75,7 +75,7 @@ class SensitivityModel:
     half_width_rad: Annotated[
         FloatArray,
         Key(
-            "how far the stage may be turned away from a source that is still heard, at each depth; linear between, "
+            "how far the stage may be turned away from a source that is still detected, at each depth; linear between, "
             "constant beyond",
             Numbers(None, Number(0.0, 45.0, above=True, unit="deg", degrees=True)),
         ),
@@ -163,7 +163,7 @@ class ProbeModel:
     sound_speed_m_s: Annotated[
         float, Key("that ranges were, or are to be, computed with", Number(0.0, 1e5, above=True, unit="m/s"))
     ]
-    sensitivity: Annotated[SensitivityModel, Key("the window in which a source is heard")]
+    sensitivity: Annotated[SensitivityModel, Key("the window in which a source is detected")]
     channels: Annotated[ChannelModel | None, Key("of channel data")] = None
     image: Annotated[ImageModel | None, Key("of envelope images")] = None
 

@@ -1,4 +1,4 @@
-"""The tissue surface that the PMs trace, for the end of a beam whose PM is not heard.
+"""The tissue surface that the PMs trace, for the end of a beam whose PM is not detected.
 
 Heights over the PMs' best plane are a plane plus a Gaussian process (kriging with a linear trend). Its amplitude comes
 from the data. Its predictive sigma is widened where leave-one-out errors of the PMs show that it is too small.

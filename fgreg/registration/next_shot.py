@@ -65,7 +65,7 @@ class Candidates:
         camera_p_spot_mm: (n, 3) spot to aim at. camera_d: (n, 3) unit direction of the beam.
         camera_T_marker: (n, 4, 4) expected marker pose. trus_p_mm: (n, 3) expected PM.
         tilt_rad: (n, 2) tilt from the mean beam towards the image's right and its lower edge.
-        scan_rad: (n,) plane angle at which the PM would be heard first. sweep: +1 or -1 (plane), 0 where not swept.
+        scan_rad: (n,) plane angle of the PM's first detection. sweep: +1 or -1 (plane), 0 where not swept.
         pairs: the noise-free virtual pairs, each of a PM of its own.
     """
 
@@ -88,7 +88,7 @@ class AdvisedShot:
         camera_p_spot_mm: (3,) spot to aim at. camera_d: (3,) direction of the beam.
         tilt_right_rad, tilt_down_rad: tilt from the mean of the beams up to now, to the image's right and lower edge.
         trus_p_mm: (3,) expected PM.
-        device_rad: stage angle at which it would be heard. sweep: +1 or -1, direction of the device's sweep; 0: none.
+        device_rad: stage angle of its first detection. sweep: +1 or -1, direction of the device's sweep; 0: none.
         expected_mm: predicted TRE after it (mean over targets of the root of the expected square).
         separation: chi square by which it would separate the rival registration; None without a rival.
     """
@@ -247,7 +247,7 @@ def propose(registration: Registration, place: int) -> Candidates:
     on_beam = state.beam_origin()[0] + lambda_mm * state.beam_direction()[0]
     camera_T_marker = make_transform(turned, camera_p - turned @ on_beam + state.bias_mm[0])
     sweep = _sweep_side(registration, place)
-    scan = np.array([_heard_at(p, sweep, model) for p in trus_p_spot])
+    scan = np.array([_first_detection(p, sweep, model) for p in trus_p_spot])
     low, high = sorted(model.stage.scan_from_device(limit) for limit in model.stage.limits_device_rad)
     aperture = model.probe.element_x_mm
     keep = (scan >= low) & (scan <= high) & (trus_p_spot[:, 0] > aperture.min()) & (trus_p_spot[:, 0] < aperture.max())
@@ -341,7 +341,7 @@ def _sweep_side(registration: Registration, place: int) -> int:
     return 0 if not sides else 1 if sides.count(1) <= sides.count(-1) else -1
 
 
-def _heard_at(trus_p: FloatArray, sweep: int, model: SessionModel) -> float:
+def _first_detection(trus_p: FloatArray, sweep: int, model: SessionModel) -> float:
     """Expected plane angle of the look: the middle of the interval that a first hit, or the window, allows."""
     bearing, radius = math.atan2(float(trus_p[1]), float(trus_p[2])), model.probe.radius_mm
     scan = bearing

@@ -1,4 +1,4 @@
-"""What to simulate: everything that shapes a simulated session, in one frozen record."""
+"""Configuration of a simulated session, in one frozen record."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ from fgreg.simulation.render import Optics
 class Sweep(StrEnum):
     """How the stage finds a PM.
 
-    ``window``: anywhere the PM is heard, uniformly, direction unknown (``sweep`` 0). ``alternating``: stepped from one
-    limit to the first angle that hears it, every other PM from the other limit. ``one_way``: always from the lower.
+    ``window``: uniform over the angles at which the PM is detected, direction unknown (``sweep`` 0). ``alternating``:
+    steps from one limit up to the first detection, every other PM from the other limit. ``one_way``: always from the
+    lower limit.
     """
 
     WINDOW = "window"
@@ -72,24 +73,24 @@ def default_rig(width_px: int = 1280) -> StereoRig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimulationConfig:
-    """Everything that shapes a simulated session; angles rad, lengths mm. ``dataclasses.replace`` makes variants.
+    """All parameters of a simulated session; angles rad, lengths mm. ``dataclasses.replace`` makes variants.
 
     Recorded:
         name: of the session.
         frames: raw frames (images and channel data) instead of poses and (x, range).
         aims, pairs: calibration shots and PMs of the registration, over all epochs.
-        looks_per_pm: looks at each PM, at different stage angles where it is heard; one ``pair`` event each.
+        looks_per_pm: looks at each PM, at different stage angles with a detection; one ``pair`` event each.
         amplitudes: record the amplitude of each look, and the curve in the session.
-        tracks_heard, tracks_silent: track events with one look at their PM, and without (``scan_deg`` only).
-        track_looks: looks of a track event that is heard.
+        tracks_heard, tracks_silent: number of track events with a look at their PM, and without (``scan_deg`` only).
+        track_looks: looks of a track event with a detection.
         sweep: how the stage finds PMs.
         epochs: camera epochs; the camera moves between them.
         camera_move_known: the move is recorded, with errors of the two sigmas (rotation, translation) and covariance.
         initial_laser: record a rough ``initial.marker_T_laser`` (3 deg, 2 mm off per axis).
 
     Errors that the session does not declare:
-        junk_pairs: PMs whose looks are of something else, anywhere in the image.
-        reversed_stage, reversed_elements: wired the other way round than the session says.
+        junk_pairs: number of outlier PMs: their looks are at another source, anywhere in the image.
+        reversed_stage, reversed_elements: wired with the other sign than the session states.
         sound_speed_true_m_s: the tissue's; the probe's where None.
         window_edge_rad: error of the known half width; drawn from ``edge_sigma`` where None.
         edge_jitter_rad: a soft edge: the half width varies by this (sigma) from look to look.
@@ -106,10 +107,10 @@ class SimulationConfig:
         laser_offset_mm, laser_tilt_rad: spans of the beam's distance from the marker's origin and of its angle to the
             marker's -z (the printed face looks back at the camera).
         marker_T_laser: fixes the calibration, else drawn.
-        camera_distance_mm: span, to the middle of the tissue. camera_roll_rad: the image's long side lies across the
-            probe's axis, but for this to either side. board_distance_mm: span of the boards' distances.
-        marker_distance_mm, tag_tilt_rad: shots outside this span, or with the tag's face turned farther away than
-            this, or with the tag not wholly in both images, are not taken.
+        camera_distance_mm: span, to the middle of the tissue. camera_roll_rad: largest angle of the image's
+            long side from the direction across the probe's axis. board_distance_mm: span of the boards' distances.
+        marker_distance_mm, tag_tilt_rad: shots outside this span, or with the tag's face tilted more than this, or
+            with the tag not completely in both images, are not taken.
     """
 
     name: str = "simulated"

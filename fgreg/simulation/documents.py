@@ -13,7 +13,7 @@ from fgreg.model.session_model import SESSION, SessionModel
 from fgreg.simulation.config import SimulationConfig
 
 DECIMALS = 9
-"""Of mm, degrees, or parts of a rotation."""
+"""Digits after the point of mm, degrees, and entries of a rotation."""
 
 
 def rows(array: FloatArray) -> list[Any]:
@@ -23,7 +23,7 @@ def rows(array: FloatArray) -> list[Any]:
 
 
 def round_array(array: FloatArray) -> FloatArray:
-    """An array as files have it."""
+    """An array rounded as in files."""
     return np.asarray(np.round(np.asarray(array, dtype=np.float64), DECIMALS) + 0.0)
 
 
@@ -36,7 +36,7 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
     """The content of ``session.yaml``; devices that recorded nothing (cameras without frames) are left out."""
     sensitivity = config.probe.sensitivity
     if config.amplitudes:
-        # Measured at the middle depth, as a user would: turn the stage across a source and write down what is heard.
+        # Measured at the middle depth, as a user would: turn the stage across a source and record the amplitudes.
         width = float(sensitivity.half_width_at(float(np.mean(config.pm_depth_mm))))
         rotation = np.linspace(-1.4, 1.4, 29) * width
         amplitude = as_float_array(config.elevation.amplitude(rotation, width))

@@ -26,7 +26,7 @@ def undistorted_rays(camera: CameraModel, column_px: FloatArray, row_px: FloatAr
     yd = (row_px - k[1, 2]) / k[1, 1]
     xd = (column_px - k[0, 2] - k[0, 1] * yd) / k[0, 0]
     x, y = xd.copy(), yd.copy()
-    with np.errstate(all="ignore"):  # a lens that folds diverges; that is told below
+    with np.errstate(all="ignore"):  # a distortion that folds diverges, which is reported below
         for _ in range(25):
             fx, fy = distort(x, y, camera.distortion)
             ex, ey = fx - xd, fy - yd

@@ -34,7 +34,7 @@ PAPER = SimulationConfig(
 """Poses, with the published noise: marker bias 0.1 mm, sigmas 0.1, 0.1, 0.8 mm and 0.01 rad, aim 1 mm; window only."""
 
 FIRST_HIT = SimulationConfig(name="first-hit", aims=12, pairs=15, tracks_heard=2, tracks_silent=2)
-"""Poses; each PM found by stepping from alternating sides up to the first angle that hears it."""
+"""Poses; each PM found by stepping from alternating sides up to the first detection."""
 
 PRESETS: dict[str, SimulationConfig] = {
     "phantom": PHANTOM,

@@ -1,7 +1,7 @@
 """A whole session from a configuration and a seed: content of its files, ground truth, and frames on demand.
 
-Forward only: beams are drawn in space, PMs are where they end, the stage is turned until the probe hears them, and
-what is recorded is measured there, with noise as ``session.yaml``'s ``noise`` block describes it.
+Forward only: beams are drawn in space, PMs are at their ends, the stage is turned until the probe detects them, and
+the looks are measured there, with noise as ``session.yaml``'s ``noise`` block describes it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class SimulatedSession:
     """A session in memory.
 
     Attributes:
-        config, seed: what it was made from.
+        config, seed: its input.
         session, events, truth: the contents of ``session.yaml``, ``events.jsonl`` and ``ground_truth.yaml``.
         frames: by the name that events use; each is rendered when called, the same every time.
         scene: the truth behind it.
@@ -171,32 +171,32 @@ class _Recorder:
     def _looks(self, trus_p_pm_mm: FloatArray, looks: int, first_sign: int, junk: BoolArray) -> _Looks:
         config, rng, noise = self.config, self.look_rng, self.config.noise
         n = trus_p_pm_mm.shape[0]
-        heard = sweeps.look(config, trus_p_pm_mm, looks, first_sign, self.scene.window_edge_rad, self.stage_rng)
-        device = heard.device_rad + noise.scan_rad * self.stage_rng.standard_normal((n, looks))
+        stops = sweeps.look(config, trus_p_pm_mm, looks, first_sign, self.scene.window_edge_rad, self.stage_rng)
+        device = stops.device_rad + noise.scan_rad * self.stage_rng.standard_normal((n, looks))
         source = np.repeat(trus_p_pm_mm[:, None], looks, axis=1)
         junk_x: FloatArray = rng.uniform(-config.pm_x_mm, config.pm_x_mm, (n, 1))
         junk_rho: FloatArray = config.probe.radius_mm + rng.uniform(*config.pm_depth_mm, (n, 1))
         strength = np.exp(rng.uniform(-0.7, 0.7, n))[:, None]
         if junk.any():
-            scan = heard.scan_rad[junk]
+            scan = stops.scan_rad[junk]
             rho = junk_rho[junk]
             x = np.broadcast_to(junk_x[junk], scan.shape)
             source[junk] = np.stack([x, rho * np.sin(scan), rho * np.cos(scan)], axis=-1)
         speed = config.probe.sound_speed_m_s
         slowness = speed / (config.sound_speed_true_m_s or speed)
-        distance = sweeps.range_mm(source, heard.scan_rad, config.probe.radius_mm)
+        distance = sweeps.range_mm(source, stops.scan_rad, config.probe.radius_mm)
         mirror = -1.0 if config.reversed_elements else 1.0
-        offset = sweeps.plane_angle_rad(source) - heard.scan_rad
-        amplitude = strength * config.elevation.amplitude(offset, heard.half_width_rad)
+        offset = sweeps.plane_angle_rad(source) - stops.scan_rad
+        amplitude = strength * config.elevation.amplitude(offset, stops.half_width_rad)
         return _Looks(
             np.degrees(device),
-            heard.device_sweep,
+            stops.device_sweep,
             mirror * source[..., 0] + noise.lateral_mm * rng.standard_normal((n, looks)),
             distance * slowness + noise.range_mm * rng.standard_normal((n, looks)),
             amplitude * np.exp(config.amplitude_noise * rng.standard_normal((n, looks))),
             source,
-            heard.scan_rad,
-            heard.half_width_rad,
+            stops.scan_rad,
+            stops.half_width_rad,
         )
 
     def _observed(self, shots: Shots) -> list[MarkerRecord | None]:
@@ -244,8 +244,10 @@ class _Recorder:
         if looks is None:
             event = TrackEvent(t, 0, marker, scan_deg=round(idle_deg, 4))
         else:
-            heard = tuple(self._look(f"{name}-look-{k}", looks, j, k) for k in range(looks.scan_deg.shape[1]))
-            event = TrackEvent(t, 0, marker, heard[0] if len(heard) == 1 else None, heard if len(heard) > 1 else ())
+            records = tuple(self._look(f"{name}-look-{k}", looks, j, k) for k in range(looks.scan_deg.shape[1]))
+            event = TrackEvent(
+                t, 0, marker, records[0] if len(records) == 1 else None, records if len(records) > 1 else ()
+            )
         self._add(event, tracks.camera_T_marker[j])
 
     def _pm_marker(
@@ -331,7 +333,9 @@ def _part(shots: Shots, which: slice) -> Shots:
     return Shots(shots.camera_T_marker[which], shots.lambda_mm[which], shots.spot_mm[which])
 
 
-def _interleaved(heard: int, silent: int) -> BoolArray:
-    """``heard`` times True and ``silent`` times False, evenly mixed."""
-    order = [((i + 0.5) / heard, True) for i in range(heard)] + [((i + 0.6) / silent, False) for i in range(silent)]
+def _interleaved(detected: int, silent: int) -> BoolArray:
+    """``detected`` times True and ``silent`` times False, evenly mixed."""
+    order = [((i + 0.5) / detected, True) for i in range(detected)] + [
+        ((i + 0.6) / silent, False) for i in range(silent)
+    ]
     return np.array([kind for _, kind in sorted(order)], dtype=bool)

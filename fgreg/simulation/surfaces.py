@@ -1,4 +1,4 @@
-"""Flat things that a camera can see: tags, boards, plain patches, and the background behind them."""
+"""Flat objects that a camera sees: tags, boards, plain patches, and the background behind them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Sheet:
 
 
 class Surface(Protocol):
-    """Anything flat that can be drawn."""
+    """Interface of a flat object that can be drawn."""
 
     def sheet(self) -> Sheet:
         """Plane, texture and colours, in the camera frame that the surface is expressed in."""
@@ -107,7 +107,7 @@ class BoardSurface:
 class PatchSurface:
     """A rectangle of one colour, seen from both sides: fibre, instrument shaft, clutter. Origin at its centre.
 
-    ``depth_bias_mm`` counts as additional distance when it is decided what hides what.
+    ``depth_bias_mm`` is added to the distance in the order of occlusion.
     """
 
     camera_T_patch: FloatArray

@@ -1,4 +1,4 @@
-"""The stage as it turns in search of a PM, and what the probe measures where it stops."""
+"""Stage motion in the search for a PM, and the looks where it stops."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from fgreg.simulation.config import SimulationConfig, Sweep
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Heard:
-    """Looks at n PMs, ``looks`` each, all (n, looks). Truth only.
+class Stops:
+    """Stage positions of the looks at n PMs, ``looks`` each, all (n, looks). Truth only.
 
     Attributes:
         device_rad: where the stage stands. scan_rad: the plane's angle there.
@@ -29,7 +29,7 @@ class Heard:
 
 
 def true_stage(config: SimulationConfig) -> StageModel:
-    """The stage as it is wired, which may not be what the session says."""
+    """The stage as wired, which may differ from the session."""
     return replace(config.stage, direction=-config.stage.direction) if config.reversed_stage else config.stage
 
 
@@ -49,10 +49,10 @@ def plane_angle_rad(trus_p_mm: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(trus_p_mm[..., 1], trus_p_mm[..., 2]))
 
 
-def _heard(
+def _detected(
     config: SimulationConfig, trus_p_mm: FloatArray, scan_rad: FloatArray, edge_rad: FloatArray
 ) -> tuple[BoolArray, FloatArray]:
-    """Whether the probe hears points (n, 1, 3) at stage angles (n, m), and the half widths there."""
+    """Whether the probe detects points (n, 1, 3) at stage angles (n, m), and the half widths there."""
     depth = range_mm(trus_p_mm, scan_rad, config.probe.radius_mm)
     width = half_width_rad(config.probe.sensitivity, depth) + edge_rad
     return np.abs(plane_angle_rad(trus_p_mm) - scan_rad) < width, width
@@ -65,11 +65,11 @@ def look(
     first_sign: int,
     window_edge_rad: float,
     rng: np.random.Generator,
-) -> Heard:
-    """Turns the stage until each of n PMs (n, 3) is heard.
+) -> Stops:
+    """Turn the stage until each of n PMs (n, 3) is detected.
 
     With sweeps, the device is stepped from one of its limits (alternating from ``first_sign``, or always upwards) and
-    stops at the first angle at which the PM is heard; further looks follow on the next steps. Without, each look is
+    stops at the first angle at which the PM is detected; further looks follow on the next steps. Without, each look is
     anywhere in the window.
 
     Raises:
@@ -90,26 +90,28 @@ def look(
         low, high = stage.limits_device_rad
         steps = np.arange(math.ceil((high - low) / stage.step_rad)) + phase
         path = np.where(signs[:, None] > 0, low, high) + signs[:, None] * stage.step_rad * steps
-        hears, _ = _heard(config, p, stage.direction * (path - stage.zero_device_rad), edge)
-        hears &= (path >= low) & (path <= high)
-        if not hears.any(axis=1).all():
-            raise ValueError("a PM is never heard between the stage's limits: widen them or take smaller steps")
-        order = np.argsort(~hears, axis=1, kind="stable")  # the angles that hear, in the order they are reached
-        count = hears.sum(axis=1)
+        detected, _ = _detected(config, p, stage.direction * (path - stage.zero_device_rad), edge)
+        detected &= (path >= low) & (path <= high)
+        if not detected.any(axis=1).all():
+            raise ValueError("a PM is never detected between the stage's limits: widen them or take smaller steps")
+        order = np.argsort(
+            ~detected, axis=1, kind="stable"
+        )  # the angles with a detection, in the order they are reached
+        count = detected.sum(axis=1)
         pick = np.floor(np.arange(looks) * np.maximum(count[:, None] / looks, 1.0)).astype(np.int64) % count[:, None]
         index = np.take_along_axis(order, pick, axis=1)
         device = np.take_along_axis(path, index, axis=1)
         scan = stage.direction * (device - stage.zero_device_rad)
         sweep = np.zeros((n, looks), dtype=np.int64)
-        sweep[:, 0] = np.where(index[:, 0] > 0, signs, 0)  # heard at the first stop: nothing is known
-    _, width = _heard(config, p, scan, edge)
-    return Heard(device, scan, sweep, width)
+        sweep[:, 0] = np.where(index[:, 0] > 0, signs, 0)  # a detection at the first stop: no direction is known
+    _, width = _detected(config, p, scan, edge)
+    return Stops(device, scan, sweep, width)
 
 
 def _anywhere(
     config: SimulationConfig, trus_p_mm: FloatArray, looks: int, edge_rad: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Stage angles (n, looks), uniform over those that hear each PM."""
+    """Stage angles (n, looks), uniform over those with a detection of each PM."""
     n = trus_p_mm.shape[0]
     widest = float(config.probe.sensitivity.half_width_rad.max()) + max(float(edge_rad.max(initial=0.0)), 0.0)
     scan = np.full((n, looks), np.nan)
@@ -118,6 +120,6 @@ def _anywhere(
         if not missing.any():
             return scan
         trial = plane_angle_rad(trus_p_mm) + rng.uniform(-widest, widest, (n, looks))
-        hears, _ = _heard(config, trus_p_mm, trial, edge_rad)
-        scan = np.where(missing & hears, trial, scan)
-    raise ValueError("a PM is heard nowhere: its window is too narrow")
+        detected, _ = _detected(config, trus_p_mm, trial, edge_rad)
+        scan = np.where(missing & detected, trial, scan)
+    raise ValueError("a PM is detected nowhere: its window is too narrow")

@@ -1,7 +1,7 @@
 """Printed patterns as piecewise constant textures: tags, chessboards, ChArUco boards, plain patches.
 
-A texture is a grid of equal squares; inside a square an optional block of equal modules sits at a fixed inset. That
-covers a tag (one square, its modules inside the quiet zone), a chessboard (no modules) and a ChArUco board.
+A texture is a grid of equal squares; a square can contain a block of equal modules at a fixed inset. So it describes a
+tag (one square, its modules inside the quiet zone), a chessboard (no modules) and a ChArUco board.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def board_texture(board: BoardModel, margin_squares: float = 0.5) -> CellTexture
     table = np.full((rows + 2, columns + 2, states, states), WHITE, dtype=np.uint8)
     table[1:-1, 1:-1][black] = BLACK
     if board.charuco is not None:
-        # Markers sit in the white squares, numbered along the rows (OpenCV's current, non-legacy pattern).
+        # Markers are in the white squares, numbered along the rows (OpenCV's current, non-legacy pattern).
         for tag_id, (row, column) in enumerate(np.argwhere(~black)):
             table[row + 1, column + 1, 1:-1, 1:-1] = tag_modules(board.charuco.dictionary, tag_id)
     start = (1.0 - margin_squares) * board.square_mm

@@ -1,4 +1,4 @@
-"""Writes a simulated session as the folder that the format's text describes."""
+"""Writes a simulated session as a folder in the session format."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ Progress = Callable[[int, int], None]
 def write_session(
     simulated: SimulatedSession, folder: Path, overwrite: bool = False, progress: Progress | None = None
 ) -> None:
-    """Writes ``session.yaml``, ``events.jsonl``, ``frames/`` and ``ground_truth.yaml``.
+    """Write ``session.yaml``, ``events.jsonl``, ``frames/`` and ``ground_truth.yaml``.
 
-    The folder is complete or not there: all is written beside it under another name first. The bytes depend on the
+    The folder is complete or absent: it is written under another name beside it first. The bytes depend on the
     configuration and the seed only.
 
     Args:
         folder: made where it does not exist.
-        overwrite: replace a folder that holds a session; without, only an empty folder will do.
+        overwrite: replace a folder that holds a session; otherwise the folder has to be new or empty.
         progress: called after each frame.
 
     Raises:
-        InputError: the folder is not empty and ``overwrite`` is not set, or it holds something else than a session.
+        InputError: the folder is not empty and ``overwrite`` is not set, or it holds no session.
     """
     folder = Path(folder).resolve()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -78,7 +78,7 @@ def encoded(name: str, frame: Frame) -> bytes:
     """The bytes of a frame's file: PNG for images, NPY for channel data.
 
     Raises:
-        ValueError: neither by its name.
+        ValueError: its name is neither.
     """
     if name.endswith(".png"):
         done, data = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 7])
