@@ -15,6 +15,8 @@ __all__ = [  # noqa: F405
     "AimEvent",
     "CameraMoved",
     "CameraMovedEvent",
+    "Check",
+    "CheckEvent",
     "EpochEstimate",
     "EpochStart",
     "EventRefused",

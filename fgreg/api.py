@@ -15,11 +15,13 @@ from fgreg.model.estimate import TrackEstimate as TrackEstimate
 from fgreg.model.estimate import Verdict as Verdict
 from fgreg.model.events import AimEvent as AimEvent
 from fgreg.model.events import CameraMovedEvent as CameraMovedEvent
+from fgreg.model.events import CheckEvent as CheckEvent
 from fgreg.model.events import MarkerRecord as MarkerRecord
 from fgreg.model.events import PairEvent as PairEvent
 from fgreg.model.events import TrackEvent as TrackEvent
 from fgreg.model.events import TrusRecord as TrusRecord
 from fgreg.model.measurements import Aim as Aim
+from fgreg.model.measurements import Check as Check
 from fgreg.model.measurements import EpochStart as EpochStart
 from fgreg.model.measurements import Look as Look
 from fgreg.model.measurements import MarkerObservation as MarkerObservation
@@ -36,6 +38,7 @@ from fgreg.online.live_session import LiveSession as LiveSession
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.pipeline.solve import SolveReport as SolveReport
 from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.registration.checks import with_checks
 from fgreg.registration.solve import solve as solve_batch
 from fgreg.session.session_reader import Session as Session
 from fgreg.session.session_reader import read_session as read_session
@@ -94,6 +97,7 @@ def solve_measurements(
     config: SolveConfig | None = None,
     *,
     tracks: Sequence[Track] = (),
+    checks: Sequence[Check] = (),
 ) -> SessionEstimate:
     """Solve measurements of your own, without files.
 
@@ -102,8 +106,11 @@ def solve_measurements(
         model: how the session was set up.
         config: limit of the verdict, and settings of the estimate.
         tracks: queries, answered from all measurements; they never enter the estimate.
+        checks: points known to both devices; nor do they.
     """
-    return solve_batch(measurements, tracks, model, config or SolveConfig()).as_session(model.name)
+    config = config or SolveConfig()
+    solved = solve_batch(measurements, tracks, model, config).as_session(model.name)
+    return with_checks(solved, checks, config.limit_mm)
 
 
 def _path(path: str | Path | None) -> Path | None:

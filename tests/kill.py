@@ -23,6 +23,7 @@ import numpy as np
 from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.model.events import AimEvent, PairEvent
 from fgreg.model.measurements import Aim, Pair
+from fgreg.online.checks import CheckPoints
 from fgreg.online.live_session import EpochFeed, LiveSession, online_engine
 from fgreg.session.event_writer import event_document, event_line
 from fgreg.session.journal import Journal
@@ -202,7 +203,10 @@ def difference_from_uninterrupted(folder: Path, source: Path) -> float:
     """Largest difference of registration and covariance: reopened, against the same events without an interruption."""
     with LiveSession.open(folder) as live:
         reopened, model, config = live.estimate, live.journal.model, live.config
-    feed, extractor = EpochFeed(online_engine(model, config, None)), MeasurementExtractor(model)
+    feed, extractor = (
+        EpochFeed(online_engine(model, config, None), CheckPoints(config.limit_mm)),
+        MeasurementExtractor(model),
+    )
     unbroken = None
     for event in read_session(folder).events:
         if isinstance(event, AimEvent | PairEvent):

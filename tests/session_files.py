@@ -108,6 +108,21 @@ def events() -> list[dict[str, Any]]:
         {"type": "camera_moved", "t": 9.0, "detected": True, "since_t": 8.5},
         {"type": "refused", "t": 9.5, "event": {"type": "pair", "t": 1.0}, "reason": "earlier than the last"},
         {"type": "stage", "t": 10.0, "command": "turn", "scan_deg": 12.0, "reason": "track"},
+        {
+            "type": "check",
+            "t": 11.0,
+            "camera_p_mm": [1, 2, 150],
+            "covariance": diagonal(0.04, 0.04, 0.25),
+            "trus_p_mm": [3, 4, 40],
+            "trus_covariance": diagonal(0.04, 0.04, 0.04),
+        },
+        {
+            "type": "check",
+            "t": 12.0,
+            "left": [330, 250.5],
+            "right": [300, 250.5],
+            "trus": {"scan_deg": 4.0, "x_mm": 1.0, "range_mm": 30.0, "covariance": diagonal(0.04, 0.04)},
+        },
     ]
     return cast(list[dict[str, Any]], json.loads(json.dumps(data)))
 
@@ -204,6 +219,11 @@ def result() -> dict[str, Any]:
         "session": "phantom-01",
         "verdict": "ok",
         "reasons": ["plain words"],
+        "assumptions": [{"text": "one medium along the beam", "checks": [0]}],
+        "checks": [
+            {"t": 80.5, "error_mm": [0.1, -0.2, 0.5], "predicted_95_mm": 1.2, "nis": 0.5, "verdict": "ok"},
+            {"t": 81.0, "error_mm": None, "predicted_95_mm": None, "nis": None, "verdict": "warning", "reason": "far"},
+        ],
         "laser": {"marker_T_laser": IDENTITY, "covariance": diagonal(1e-6, 1e-6, 0, 0.01, 0.01, 0)},
         "epochs": [epoch],
         "pairs": [used, {"pm": 1, "epoch": 0, "used": False, "reason": "not heard"}],

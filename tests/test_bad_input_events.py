@@ -99,6 +99,14 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("13.command", ABSENT, "line 14: command", "nothing", "a text"),
     ("13.scan_deg", "0", "line 14: scan_deg", "'0'", "within +-180"),
     ("0.text", 3, "line 1: text", "3", "a text"),
+    ("14.camera_p_mm", ABSENT, "line 15", "neither", "camera_p_mm, or left and right"),
+    ("14.trus_p_mm", ABSENT, "line 15", "neither", "trus_p_mm or trus"),
+    ("14.trus", {"scan_deg": 0, "x_mm": 0, "range_mm": 20}, "line 15", "both", "trus_p_mm or trus"),
+    ("14.trus_covariance", session_files.diagonal(1, 1), "line 15: trus_covariance", "", "3 lists of 3 numbers"),
+    ("15.right", ABSENT, "line 16: right", "nothing", "[u, v], with left"),
+    ("15.left", [1.0], "line 16: left", "[1.0]", "2 numbers"),
+    ("15.covariance", session_files.diagonal(1, 1, 1), "line 16: covariance", "without camera_p_mm", "both"),
+    ("15.trus.range_mm", 0, "line 16: trus.range_mm", "0", "> 0"),
 ]
 
 

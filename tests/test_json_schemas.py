@@ -98,6 +98,12 @@ WRONG: list[tuple[Document, str, Any]] = [
     (Document.EVENTS, "8.looks", ABSENT),
     (Document.EVENTS, "11.detected", ABSENT),
     (Document.EVENTS, "12.reason", ""),
+    (Document.EVENTS, "14.camera_p_mm", ABSENT),
+    (Document.EVENTS, "14.left", [1, 2]),
+    (Document.EVENTS, "14.trus", {"scan_deg": 0, "x_mm": 0, "range_mm": 20}),
+    (Document.EVENTS, "15.right", ABSENT),
+    (Document.EVENTS, "15.trus.range_mm", ABSENT),
+    (Document.EVENTS, "15.trus", ABSENT),
     (Document.RESULT, "fgreg", ABSENT),
     (Document.RESULT, "verdict", "fine"),
     (Document.RESULT, "epochs.0.predicted_tre_mm.mean", -1),
@@ -151,7 +157,7 @@ def test_no_setup_that_the_reader_takes_is_refused(folder: Path, data: Any) -> N
 
 
 @QUICK
-@given(data=mutated(lambda: session_files.events()[3]), other=st.sampled_from(range(14)), more=st.data())
+@given(data=mutated(lambda: session_files.events()[3]), other=st.sampled_from(range(16)), more=st.data())
 def test_no_event_that_the_reader_takes_is_refused(folder: Path, data: Any, other: int, more: st.DataObject) -> None:
     session_files.write(folder)
     event = more.draw(mutated(lambda: session_files.events()[other]))
@@ -188,7 +194,7 @@ def test_the_readme_has_the_drivers_of_today() -> None:
 def test_the_format_page_has_the_tables_of_today() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert TABLES["with_tables"](page) == page, "run python tools/make_format_tables.py"
-    assert page.count("<!-- table: ") == 7
+    assert page.count("<!-- table: ") == 8
     for key in ("probe.sensitivity.edge_sigma_deg", "camera_new_T_camera_old", "epochs[].predicted_tre_mm.p95"):
         assert f"`{key}`" in page
 

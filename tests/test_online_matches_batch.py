@@ -8,12 +8,13 @@ import gtsam
 import numpy as np
 import pytest
 
+from fgreg.geometry.target_error import gaussian_quantile_mm
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration, is_due
-from fgreg.online.estimate import gaussian_quantile_mm, gaussian_tre
+from fgreg.online.estimate import gaussian_tre
 from fgreg.online.events import CameraMoved
 from fgreg.online.full_solve import FullSolveCase, result_of
 from fgreg.online.reported_estimate import NOT_SOLVED

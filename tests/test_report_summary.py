@@ -22,7 +22,16 @@ from fgreg.cli.report import (
     summary_dict,
 )
 from fgreg.geometry.transforms import exp_so3, make_transform
-from fgreg.model.estimate import AimEstimate, LaserEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
+from fgreg.model.estimate import (
+    AimEstimate,
+    Assumption,
+    CheckEstimate,
+    LaserEstimate,
+    PairEstimate,
+    SessionEstimate,
+    TrackEstimate,
+    Verdict,
+)
 from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.viewer.result import measured_pairs
 from tests.answers import answer_from_truth, random_covariance
@@ -173,6 +182,27 @@ def test_tracks_are_answered_or_have_a_reason() -> None:
     assert "Tracks: 1 of 2 answered" in text
     assert row_of(text, "200.0") == ["200.0", "-12.3", "0.6", "41.3"]
     assert "201.5 s: no tissue surface is known yet" in text
+
+
+def test_checks_and_assumptions_are_listed_with_their_figures() -> None:
+    model, estimate, extra = make_answer()
+    checks = (
+        CheckEstimate(80.5, np.array([0.1, -0.2, 2.5]), 1.2, 14.5, Verdict.WARNING),
+        CheckEstimate(81.0, None, None, None, Verdict.WARNING, "its rays are parallel"),
+    )
+    assumptions = (Assumption("one medium", (0, 1)), Assumption("a centred window"))
+    estimate = replace(estimate, checks=checks, assumptions=assumptions)
+    text = plain(model, estimate, extra)
+    assert "Checks: 1 of 2 compared" in text
+    assert row_of(text, "80.5") == ["80.5", "0.10", "-0.20", "2.50", "2.51", "1.20", "14.5", "warning"]
+    assert "81.0 s, not compared: its rays are parallel" in text
+    assert "one medium (covered by 2 checks)" in text
+    assert "a centred window (no check covers it)" in text
+    assert max(len(line) for line in text.splitlines()) <= 80
+    found = json.loads(json.dumps(summary_dict(model, estimate, extra), allow_nan=False))
+    assert found["checks"][0]["error_mm"] == [0.1, -0.2, 2.5]
+    assert found["checks"][1]["reason"] == "its rays are parallel"
+    assert found["assumptions"][0] == {"text": "one medium", "checks": [0, 1]}
 
 
 def test_errors_against_the_truth_are_shown_where_it_is_known() -> None:

@@ -17,6 +17,8 @@ from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
 from fgreg.model.estimate import (
     AimEstimate,
+    Assumption,
+    CheckEstimate,
     EpochEstimate,
     LaserEstimate,
     PairEstimate,
@@ -90,6 +92,11 @@ def an_estimate(seed: int = 1) -> SessionEstimate:
             TrackEstimate(92.0, None, None, None, causal=True, reason="no registration yet"),
         ),
         aims=(AimEstimate(1.0, used=True),),
+        checks=(
+            CheckEstimate(80.5, np.array([0.1, -0.2, 2.5]), 1.2, 14.5, Verdict.WARNING),
+            CheckEstimate(81.0, None, None, None, Verdict.WARNING, "far"),
+        ),
+        assumptions=(Assumption("one medium", (0,)), Assumption("a centred window")),
     )
 
 
@@ -99,12 +106,18 @@ def test_fields_are_those_of_the_format_as_another_reader_sees_them(tmp_path: Pa
     write_result(estimate, model, path, "0.3.0")
     data = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert list(data) == [
-        *("format", "fgreg", "session", "verdict", "reasons", "laser", "epochs", "pairs", "tracks"),
+        *("format", "fgreg", "session", "verdict", "reasons", "assumptions", "checks"),
+        *("laser", "epochs", "pairs", "tracks"),
     ]
     assert [data[key] for key in ("format", "fgreg", "session", "verdict")] == [
         *("fgreg-result/1", "0.3.0", "phantom-01", "warning"),
     ]
     assert tuple(data["reasons"]) == estimate.reasons
+    assert data["assumptions"] == [{"text": "one medium", "checks": [0]}, {"text": "a centred window", "checks": []}]
+    assert data["checks"] == [
+        {"t": 80.5, "error_mm": [0.1, -0.2, 2.5], "predicted_95_mm": 1.2, "nis": 14.5, "verdict": "warning"},
+        {"t": 81.0, "error_mm": None, "predicted_95_mm": None, "nis": None, "verdict": "warning", "reason": "far"},
+    ]
     assert list(data["laser"]) == ["marker_T_laser", "covariance"]
     first, second = data["epochs"]
     assert list(first) == [
@@ -307,7 +320,7 @@ def test_places_where_no_result_can_be(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             remove_result(path)
         assert caught.value.found == found
-    assert len(read_session(session).events) == 14
+    assert len(read_session(session).events) == 16
 
 
 def written(tmp_path: Path, model: SessionModel) -> dict[str, Any]:
@@ -353,7 +366,8 @@ def test_a_result_with_a_mistake_is_refused(
 
 def test_every_key_of_a_result_is_needed(tmp_path: Path, model: SessionModel) -> None:
     data = written(tmp_path, model)
-    keys = [*data, *(f"laser.{key}" for key in data["laser"]), *(f"epochs.0.{key}" for key in data["epochs"][0])]
+    keys = [key for key in data if key not in ("assumptions", "checks")]  # which older results lack
+    keys += [*(f"laser.{key}" for key in data["laser"]), *(f"epochs.0.{key}" for key in data["epochs"][0])]
     keys += [*(f"pairs.0.{key}" for key in data["pairs"][0]), *(f"tracks.0.{key}" for key in data["tracks"][0])]
     keys += ["pairs.1.reason", "tracks.1.reason", "epochs.0.predicted_tre_mm.worst"]
     for key in keys:

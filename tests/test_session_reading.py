@@ -12,7 +12,16 @@ import yaml
 from numpy.testing import assert_allclose
 
 from fgreg.errors import InputError
-from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent, StageEvent, TrackEvent
+from fgreg.model.events import (
+    AimEvent,
+    CameraMovedEvent,
+    CheckEvent,
+    NoteEvent,
+    PairEvent,
+    RefusedEvent,
+    StageEvent,
+    TrackEvent,
+)
 from fgreg.model.session_model import NoiseModel, default_targets_mm
 from fgreg.session.session_reader import read_ground_truth, read_session
 from tests import session_files
@@ -95,10 +104,10 @@ def test_what_the_probe_is_made_of_is_never_guessed(tmp_path: Path, key: str) ->
 def test_every_event(tmp_path: Path) -> None:
     session = read_session(session_files.write(tmp_path))
     events = session.events
-    assert [event.line for event in events] == list(range(1, 15))
+    assert [event.line for event in events] == list(range(1, 17))
     assert [event.t for event in events[3:6]] == [3.0, 3.0, 4.0]
     kinds = [NoteEvent, AimEvent, AimEvent, *[PairEvent] * 4, *[TrackEvent] * 3, *[CameraMovedEvent] * 2]
-    assert [type(event) for event in events] == [*kinds, RefusedEvent, StageEvent]
+    assert [type(event) for event in events] == [*kinds, RefusedEvent, StageEvent, CheckEvent, CheckEvent]
     frames = tmp_path.resolve() / "frames"
 
     _, spot, corner, posed, framed, both, own = events[:7]
@@ -140,12 +149,26 @@ def test_every_event(tmp_path: Path) -> None:
     assert known.detected is False
     assert isinstance(noticed, CameraMovedEvent)
     assert (noticed.detected, noticed.since_t, noticed.covariance) == (True, 8.5, None)
-    refused, stage = events[12:]
+    refused, stage, place, seen = events[12:]
     assert isinstance(refused, RefusedEvent)
     assert (refused.event, refused.reason) == ({"type": "pair", "t": 1.0}, "earlier than the last")
     assert refused.refused_line is None
     assert isinstance(stage, StageEvent)
     assert (stage.command, stage.scan_deg, stage.reason) == ("turn", 12.0, "track")
+    assert isinstance(place, CheckEvent)
+    assert place.camera_p_mm is not None
+    assert place.covariance is not None
+    assert place.trus_p_mm is not None
+    assert place.trus_covariance is not None
+    assert_allclose([*place.camera_p_mm, *place.trus_p_mm], [1, 2, 150, 3, 4, 40])
+    assert_allclose([*np.diag(place.covariance), *np.diag(place.trus_covariance)], [0.04, 0.04, 0.25, *[0.04] * 3])
+    assert (place.left, place.right, place.trus) == (None, None, None)
+    assert isinstance(seen, CheckEvent)
+    assert seen.left is not None
+    assert seen.right is not None
+    assert seen.trus is not None
+    assert_allclose([*seen.left, *seen.right], [330, 250.5, 300, 250.5])
+    assert (seen.trus.scan_deg, seen.trus.x_mm, seen.trus.range_mm) == (4.0, 1.0, 30.0)
 
 
 def test_names_that_start_with_x_are_the_users_own_at_every_level(tmp_path: Path) -> None:
@@ -216,7 +239,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_tolerated(tmp_path: Path) -
         path = folder / name
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
     session = read_session(folder)
-    assert len(session.events) == 14
+    assert len(session.events) == 16
     assert session.warnings == ()
 
 
@@ -229,9 +252,9 @@ def test_a_last_line_cut_short_is_dropped_with_a_warning(tmp_path: Path, rest: b
     with (folder / "events.jsonl").open("ab") as file:
         file.write(rest)
     session = read_session(folder)
-    assert len(session.events) == 14
+    assert len(session.events) == 16
     assert len(session.warnings) == 1
-    assert "line 15" in session.warnings[0]
+    assert "line 17" in session.warnings[0]
 
 
 def test_a_whole_last_line_without_its_line_end_counts(tmp_path: Path) -> None:
@@ -239,7 +262,7 @@ def test_a_whole_last_line_without_its_line_end_counts(tmp_path: Path) -> None:
     path = folder / "events.jsonl"
     path.write_bytes(path.read_bytes().rstrip(b"\n"))
     session = read_session(folder)
-    assert (len(session.events), session.warnings) == (14, ())
+    assert (len(session.events), session.warnings) == (16, ())
 
 
 def test_every_cut_of_the_log_reads(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from fgreg.convert.mapping import MAPPING
 from fgreg.drivers.registry import ENTRIES
 from fgreg.model.estimate import RESULT
-from fgreg.model.events import EVENTS, MarkerRecord, TrusRecord
+from fgreg.model.events import EVENTS, MarkerRecord, PlaneRecord, TrusRecord
 from fgreg.model.session_model import SESSION
 from fgreg.schema.kinds import Converted, Kind, ListOf
 from fgreg.schema.record import Field, Record, record
@@ -24,7 +24,7 @@ from fgreg.session.ground_truth import GROUND_TRUTH
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "sessions" / "README.md")
-_PARTS = {MarkerRecord: "marker", TrusRecord: "trus"}
+_PARTS = {MarkerRecord: "marker", TrusRecord: "trus", PlaneRecord: "plane"}
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

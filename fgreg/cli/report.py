@@ -128,6 +128,10 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
         parts += ["", *_pairs(model, estimate, extra)]
     if estimate.tracks:
         parts += ["", *_tracks(estimate, truth)]
+    if estimate.checks:
+        parts += ["", *_checks(estimate)]
+    if estimate.assumptions:
+        parts += ["", *_assumptions(estimate)]
     closing = [*_aims(estimate.aims), *_timing(estimate.timing), *_closing(extra)]
     if closing:
         parts += ["", *closing]
@@ -323,6 +327,39 @@ def _tracks(estimate: SessionEstimate, truth: TruthFigures) -> Iterator[Renderab
     yield from (_bullet(f"{track.t:.1f} s: {track.reason}") for track in tracks[:MOST_ROWS] if track.stage_rad is None)
 
 
+def _checks(estimate: SessionEstimate) -> Iterator[RenderableType]:
+    checks = estimate.checks
+    compared = [check for check in checks if check.error_mm is not None]
+    yield _heading(f"Checks: {len(compared)} of {len(checks)} compared (error of the registration, TRUS axes)")
+    table = _table(
+        ("time", "s"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("length", "mm"), ("95 % below", "mm"), ("NIS", ""),
+        ("verdict", ""),
+    )  # fmt: skip
+    for check in compared[:MOST_ROWS]:
+        assert check.error_mm is not None
+        table.add_row(
+            f"{check.t:.1f}",
+            *(_number(float(value), 2) for value in check.error_mm),
+            _number(float(np.linalg.norm(check.error_mm)), 2),
+            _number(check.predicted_95_mm, 2),
+            _number(check.nis, 1),
+            check.verdict.value,
+            style=None if check.verdict is Verdict.OK else STYLES[check.verdict].removeprefix("bold "),
+        )
+    yield Padding(table, (0, 0, 0, 2))
+    if len(compared) > MOST_ROWS:
+        yield f"  and {len(compared) - MOST_ROWS} more"
+    yield from (_bullet(f"{check.t:.1f} s, not compared: {check.reason}") for check in checks if check.error_mm is None)
+
+
+def _assumptions(estimate: SessionEstimate) -> Iterator[RenderableType]:
+    yield _heading("Assumed, and not shown by the data")
+    for assumption in estimate.assumptions:
+        count = len(assumption.checks)
+        covered = f"covered by {count} check{'s' if count > 1 else ''}" if count else "no check covers it"
+        yield _bullet(f"{assumption.text} ({covered})")
+
+
 def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
     if not aims:
         return
@@ -386,6 +423,18 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
             }
             for track in estimate.tracks
         ],
+        "checks": [
+            {
+                "t": check.t,
+                "error_mm": None if check.error_mm is None else [_plain(value) for value in check.error_mm],
+                "predicted_95_mm": _plain(check.predicted_95_mm),
+                "nis": _plain(check.nis),
+                "verdict": check.verdict.value,
+                "reason": check.reason,
+            }
+            for check in estimate.checks
+        ],
+        "assumptions": [{"text": entry.text, "checks": list(entry.checks)} for entry in estimate.assumptions],
         "aims": [
             {
                 "t": aim.t,

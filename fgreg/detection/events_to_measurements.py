@@ -7,11 +7,12 @@ over the session before any covariance is computed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgreg.detection.check_points import check_measurement
 from fgreg.detection.corner_noise import CornerNoise, Misfit, Weighed, pool_corner_noise
 from fgreg.detection.results import (
     BoardFit,
@@ -28,6 +29,7 @@ from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
+    CheckEvent,
     Event,
     MarkerRecord,
     PairEvent,
@@ -41,6 +43,7 @@ from fgreg.model.events import (
 from fgreg.model.measurements import (
     Aim,
     CameraDependence,
+    Check,
     EpochStart,
     Look,
     MarkerObservation,
@@ -63,12 +66,13 @@ class ExtractedMeasurements:
         measurements: usable aims, pairs and epochs.
         tracks: tracking queries whose marker was found.
         aim_events, pair_events, track_events: index into the session's events of each aim, pair, track.
-        unused: reason, by event index, for every unused aim, pair or track; unused_aims: indices of unused aims.
+        unused: reason, by event index, for every unused aim, pair, track or check; unused_aims: indices of unused aims.
         markers: detection of each event whose marker came from frames.
         boards: the same for the board.
         finds: PA localisation in each frame, by (event index, look).
         marker_noise, board_noise: pooled corner noise.
         epoch_of: camera epoch of every event.
+        checks: usable checks, by event index.
     """
 
     measurements: Measurements
@@ -84,6 +88,7 @@ class ExtractedMeasurements:
     marker_noise: CornerNoise
     board_noise: CornerNoise
     epoch_of: tuple[int, ...]
+    checks: Mapping[int, Check] = field(default_factory=dict)
 
 
 def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
@@ -122,7 +127,7 @@ def extract_measurements(
     for index, event in enumerate(events):
         if event.line not in refused:
             builder.add(index, event, epoch_of[index])
-        elif isinstance(event, AimEvent | PairEvent | TrackEvent):
+        elif isinstance(event, AimEvent | PairEvent | TrackEvent | CheckEvent):
             builder.unused[index] = f"it was refused when it was taken: {refused[event.line]}"
     return ExtractedMeasurements(
         measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts),
@@ -138,6 +143,7 @@ def extract_measurements(
         marker_noise=builder.marker_noise,
         board_noise=builder.board_noise,
         epoch_of=epoch_of,
+        checks=builder.checks,
     )
 
 
@@ -189,12 +195,20 @@ class _Builder:
         self.aim_events: list[int] = []
         self.pair_events: list[int] = []
         self.track_events: list[int] = []
+        self.checks: dict[int, Check] = {}
         self.unused: dict[int, str] = {}
         self.ids: dict[object, int] = {}
         self.next_id = 0
 
     def add(self, index: int, event: Event, epoch: int) -> None:
         """Turn one event into a measurement, or store the reason why not."""
+        if isinstance(event, CheckEvent):
+            check = check_measurement(event, epoch, self.model)
+            if isinstance(check, str):
+                self.unused[index] = check
+            else:
+                self.checks[index] = check
+            return
         if not isinstance(event, AimEvent | PairEvent | TrackEvent):
             return
         marker = self._marker(index, event)

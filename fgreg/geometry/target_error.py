@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import chndtrix, gammaincinv
 
 from fgreg.geometry.transforms import FloatArray, exp_so3, hat, inverse, transform_points
+
+QUANTILE = 0.95
+_FREEDOM = np.linspace(1.0, 3.0, 4001)
+_CHI2 = 2.0 * gammaincinv(0.5 * _FREEDOM, QUANTILE)
+"""Quantiles of chi squares of one to three degrees of freedom; linear interpolation is accurate to 1e-7."""
 
 
 def tre_mm(trus_T_camera: FloatArray, true_trus_T_camera: FloatArray, targets_mm: FloatArray) -> FloatArray:
@@ -45,3 +51,44 @@ def moved_mm(step: FloatArray, trus_T_camera: FloatArray, targets_mm: FloatArray
     step = np.asarray(step, dtype=np.float64)
     moved = np.einsum("...ij,nj->...ni", exp_so3(step[..., :3]), camera_p) + step[..., None, 3:] - camera_p
     return np.asarray(np.linalg.norm(moved, axis=-1))
+
+
+def gaussian_quantile_mm(covariance: FloatArray) -> FloatArray:
+    """(n,) 95 % quantiles of |e| for zero-mean Gaussian errors e of covariances (n, 3, 3).
+
+    |e|^2 is a weighted sum of chi squares. One chi square matches its first four cumulants (Liu, Tang and Zhang, 2009).
+    Exact for one, two or three equal axes; within 1 % of |e| for all others.
+    """
+    flat, square = covariance.reshape(-1, 9), (covariance @ covariance).reshape(-1, 9)
+    c1 = flat[:, ::4].sum(axis=1)
+    c2 = square[:, ::4].sum(axis=1)
+    c3 = (square * flat).sum(axis=1)  # both are symmetric
+    freedom = np.maximum(c2**3 / np.maximum(c3**2, 1e-300), 1.0)
+    chi2 = np.interp(freedom, _FREEDOM, _CHI2)  # three axes are never worth more than three
+    return np.asarray(np.sqrt(np.maximum(c1 + (chi2 - freedom) * np.sqrt(c2 / freedom), 0.0)))
+
+
+def offset_quantile_mm(mean_mm: FloatArray, covariance: FloatArray) -> float:
+    """95 % quantile of |e| for a Gaussian error e of mean (3,) and covariance (3, 3).
+
+    As :func:`gaussian_quantile_mm`, with the cumulants of noncentral chi squares; within 2 % of |e|.
+    """
+    cumulants = []
+    power = np.eye(3)
+    for k in range(1, 5):
+        shifted = k * float(mean_mm @ power @ mean_mm)
+        power = power @ covariance
+        cumulants.append(float(np.trace(power)) + shifted)
+    c1, c2, c3, c4 = cumulants
+    skew, tail = c3 / c2**1.5, c4 / c2**2
+    if skew**2 > tail:
+        scale = 1.0 / (skew - np.sqrt(skew**2 - tail))
+        noncentral = skew * scale**3 - scale**2
+        freedom = scale**2 - 2.0 * noncentral
+        quantile = float(chndtrix(QUANTILE, freedom, noncentral))
+    else:
+        scale, noncentral = 1.0 / skew, 0.0
+        freedom = 1.0 / skew**2
+        quantile = 2.0 * float(gammaincinv(0.5 * freedom, QUANTILE))
+    standard = (quantile - freedom - noncentral) / (np.sqrt(2.0) * scale)
+    return float(np.sqrt(max(c1 + standard * np.sqrt(2.0 * c2), 0.0)))

@@ -18,7 +18,7 @@ from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.actions import RegistrationState
 from fgreg.model.estimate import Verdict
-from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent
+from fgreg.model.events import AimEvent, CameraMovedEvent, CheckEvent, NoteEvent, PairEvent
 from fgreg.online.engine_process import EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import LiveSession
@@ -30,7 +30,7 @@ AGAIN_S = 5.0
 RESTARTED = "the registration's process had ended; a new one has taken in the recorded events"
 ENGINE_ENDED = "the registration's process has ended and is being restarted: later events are not in the estimate"
 
-Recorded = AimEvent | PairEvent | CameraMovedEvent | NoteEvent
+Recorded = AimEvent | PairEvent | CameraMovedEvent | CheckEvent | NoteEvent
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,6 +148,45 @@ class TrackEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CheckEstimate:
+    """The registration at one check point. Figures are None where there are none, with a reason."""
+
+    t: Annotated[float, Key("of the check", SECONDS)]
+    error_mm: Annotated[
+        FloatArray | None,
+        Key(
+            "where the registration puts the camera's point, less where the TRUS probe has it; TRUS axes; null where "
+            "it could not be compared",
+            Numbers(3, _SIZE),
+            null=True,
+        ),
+    ]
+    predicted_95_mm: Annotated[
+        float | None, Key("95 % quantile of its length, by the registration and the check", _NOT_NEGATIVE, null=True)
+    ]
+    nis: Annotated[
+        float | None,
+        Key("squared error over its predicted covariance, three degrees of freedom", _NOT_NEGATIVE, null=True),
+    ]
+    verdict: Annotated[Verdict, Key("warning: off by more than that explains, or not compared", VERDICT)]
+    reason: Annotated[str, Key("why it was not compared", brief=True, required_if=("error_mm", None))] = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Assumption:
+    """What the data of line and arc cannot show."""
+
+    text: Annotated[str, Key("the assumption, and what it is worth")]
+    checks: Annotated[
+        tuple[int, ...],
+        Key(
+            "places in `checks` of those that have covered it, from 0; empty: nothing has",
+            ListOf(_COUNT, "a list of places in `checks`", empty=True),
+        ),
+    ] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class AimEstimate:
     """One calibration shot: distance of the spot from the beam (mm), and its misfit (``nis`` as of a pair)."""
 
@@ -197,6 +236,13 @@ class SessionEstimate:
             ListOf(Text(), "a list of texts", empty=True),
         ),
     ]
+    assumptions: Annotated[
+        tuple[Assumption, ...],
+        Key("what the session's data cannot show", ListOf(record(Assumption), empty=True)),
+    ] = field(default=(), kw_only=True)
+    checks: Annotated[
+        tuple[CheckEstimate, ...], Key("one per check event", ListOf(record(CheckEstimate), empty=True))
+    ] = field(default=(), kw_only=True)
     laser: Annotated[LaserEstimate | None, Key("the beam", null=True)]
     epochs: Annotated[
         tuple[EpochEstimate, ...],

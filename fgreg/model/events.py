@@ -11,7 +11,18 @@ from typing import Annotated, ClassVar
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.files import FrameKind, FrameName
-from fgreg.schema.kinds import NOT_NEGATIVE, POINT_MM, SCAN_DEG, SECONDS, Anything, Integer, IntegerPair, Number, OneOf
+from fgreg.schema.kinds import (
+    NOT_NEGATIVE,
+    POINT_MM,
+    SCAN_DEG,
+    SECONDS,
+    Anything,
+    Integer,
+    IntegerPair,
+    Number,
+    Numbers,
+    OneOf,
+)
 from fgreg.schema.matrices import Covariance, Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key, Tagged
@@ -19,6 +30,7 @@ from fgreg.schema.record import Key, Tagged
 RANGE_MM = Number(0.0, 300.0, above=True, unit="mm")
 LATERAL_MM = Number(-200.0, 200.0, unit="mm")
 
+_PIXEL = Numbers(2, Number(-1e5, 1e5, unit="px"))
 _CAMERA_FRAME = FrameName(FrameKind.CAMERA)
 Seconds = Annotated[float, Key("s, not decreasing", SECONDS)]
 
@@ -183,6 +195,60 @@ class CameraMovedEvent:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PlaneRecord:
+    """A point as seen in the image plane, with the stage turned to where it is brightest."""
+
+    scan_deg: Annotated[float, Key("what the device reads", SCAN_DEG)]
+    x_mm: Annotated[float, Key("along the axis of rotation", LATERAL_MM)]
+    range_mm: Annotated[float, Key("from the element, not from the axis", RANGE_MM)]
+    covariance: Annotated[
+        FloatArray | None, Key("over (x_mm, range_mm); `noise` of session.yaml where absent", Covariance(2))
+    ] = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckEvent:
+    """A point known to both devices. It is never added to the estimate: it checks the registration."""
+
+    JSON_RULES: ClassVar = (
+        {"oneOf": [{"required": ["camera_p_mm"]}, {"required": ["left", "right"]}]},
+        {"dependentRequired": {"left": ["right"], "right": ["left"]}},
+        {"oneOf": [{"required": ["trus_p_mm"]}, {"required": ["trus"]}]},
+    )
+
+    t: Seconds
+    line: int
+    camera_p_mm: Annotated[FloatArray | None, Key("[x, y, z] of the point in the camera's frame", POINT_MM)] = None
+    covariance: Annotated[
+        FloatArray | None,
+        Key(
+            "of `camera_p_mm`; `noise.marker_translation_mm` where absent",
+            Covariance(3),
+            requires="camera_p_mm",
+        ),
+    ] = None
+    left: Annotated[
+        FloatArray | None, Key("[u, v] of the point in the left frame, as recorded; instead of `camera_p_mm`", _PIXEL)
+    ] = None
+    right: Annotated[FloatArray | None, Key("[u, v] in the right frame", _PIXEL, requires="left")] = None
+    trus_p_mm: Annotated[FloatArray | None, Key("[x, y, z] of the point in the TRUS frame", POINT_MM)] = None
+    trus_covariance: Annotated[
+        FloatArray | None,
+        Key("of `trus_p_mm`; that of a point seen in the plane where absent", Covariance(3), requires="trus_p_mm"),
+    ] = None
+    trus: Annotated[PlaneRecord | None, Key("the point as seen in the plane; instead of `trus_p_mm`")] = None
+
+    def __post_init__(self) -> None:
+        if (self.left is None) != (self.right is None):
+            given, absent = ("left", "right") if self.right is None else ("right", "left")
+            raise FieldError.of("nothing", f"[u, v], with {given}", absent)
+        if (self.camera_p_mm is None) == (self.left is None):
+            raise FieldError.of("neither" if self.left is None else "both", "camera_p_mm, or left and right")
+        if (self.trus_p_mm is None) == (self.trus is None):
+            raise FieldError.of("neither" if self.trus is None else "both", "trus_p_mm or trus")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RefusedEvent:
     """An event that was not taken in: ``event`` as recorded (a mapping as a rule), and why.
 
@@ -227,7 +293,7 @@ class NoteEvent:
     text: Annotated[str, Key("for the record")]
 
 
-Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | RefusedEvent | StageEvent | NoteEvent
+Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent | RefusedEvent | StageEvent | NoteEvent
 
 EVENTS = Tagged(
     "type",
@@ -236,6 +302,7 @@ EVENTS = Tagged(
         "pair": PairEvent,
         "track": TrackEvent,
         "camera_moved": CameraMovedEvent,
+        "check": CheckEvent,
         "refused": RefusedEvent,
         "stage": StageEvent,
         "note": NoteEvent,

@@ -121,6 +121,23 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Check:
+    """A point known to both devices, in camera epoch ``epoch``; it never enters the estimate.
+
+    Attributes:
+        camera_p_mm, trus_p_mm: (3,) in the camera's and in the TRUS frame.
+        covariance, trus_covariance: (3, 3) of each, in its own frame.
+    """
+
+    t: float
+    epoch: int
+    camera_p_mm: FloatArray
+    covariance: FloatArray
+    trus_p_mm: FloatArray
+    trus_covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class EpochStart:
     """Start of a camera epoch, with the motion (and its 6x6 covariance, right tangent) where kinematics measured it.
 

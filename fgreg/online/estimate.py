@@ -5,16 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincinv
 
-from fgreg.geometry.target_error import target_jacobians
+from fgreg.geometry.target_error import gaussian_quantile_mm, target_jacobians
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.estimate import PredictedTre, Verdict
-
-QUANTILE = 0.95
-_FREEDOM = np.linspace(1.0, 3.0, 4001)
-_CHI2 = 2.0 * gammaincinv(0.5 * _FREEDOM, QUANTILE)
-"""Quantiles of chi squares of one to three degrees of freedom; linear interpolation is accurate to 1e-7."""
+from fgreg.model.estimate import CheckEstimate, PredictedTre, Verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +28,7 @@ class OnlineEstimate:
         pairs: inlier looks of this epoch.
         optimum_trus_T_camera: (4, 4) the graph's optimum, comparable with :mod:`fgreg.registration.register`.
         settled: whether the full solve has covered exactly these measurements.
+        checks: the registration at the check points of this epoch.
     """
 
     t: float
@@ -48,21 +43,7 @@ class OnlineEstimate:
     pairs: int
     optimum_trus_T_camera: FloatArray | None
     settled: bool
-
-
-def gaussian_quantile_mm(covariance: FloatArray) -> FloatArray:
-    """(n,) 95 % quantiles of |e| for zero-mean Gaussian errors e of covariances (n, 3, 3).
-
-    |e|^2 is a weighted sum of chi squares. One chi square matches its first four cumulants (Liu, Tang and Zhang, 2009).
-    Exact for one, two or three equal axes; within 1 % of |e| for all others.
-    """
-    flat, square = covariance.reshape(-1, 9), (covariance @ covariance).reshape(-1, 9)
-    c1 = flat[:, ::4].sum(axis=1)
-    c2 = square[:, ::4].sum(axis=1)
-    c3 = (square * flat).sum(axis=1)  # both are symmetric
-    freedom = np.maximum(c2**3 / np.maximum(c3**2, 1e-300), 1.0)
-    chi2 = np.interp(freedom, _FREEDOM, _CHI2)  # three axes are never worth more than three
-    return np.asarray(np.sqrt(np.maximum(c1 + (chi2 - freedom) * np.sqrt(c2 / freedom), 0.0)))
+    checks: tuple[CheckEstimate, ...] = ()
 
 
 def gaussian_tre(covariance: FloatArray, trus_T_camera: FloatArray, targets_mm: FloatArray) -> PredictedTre:

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
+from fgreg.detection.check_points import check_measurement
 from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.geometry.transforms import FloatArray
@@ -18,6 +19,7 @@ from fgreg.model.estimate import TrackEstimate
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
+    CheckEvent,
     Event,
     NoteEvent,
     PairEvent,
@@ -26,19 +28,21 @@ from fgreg.model.events import (
     TrackEvent,
     refused_lines,
 )
-from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
+from fgreg.model.measurements import Aim, Check, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.online.checks import CheckPoints
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
+from fgreg.registration.checks import CHECKS_REFUSE
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
 
-Estimating = AimEvent | PairEvent | CameraMovedEvent
-"""Events that the estimate depends on."""
+Estimating = AimEvent | PairEvent | CameraMovedEvent | CheckEvent
+"""Events that the estimate or its verdict depends on."""
 
 
 EARLIEST_S = 1e9
@@ -71,13 +75,16 @@ MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engin
 class EpochFeed:
     """Hands measurements to an engine in the current epoch; the engine may detect camera moves, too.
 
+    Args:
+        checks: get the times at which epochs begin.
+
     Attributes:
         epoch: number of the current epoch.
         noticed: detected camera moves for which there is no ``camera_moved`` event yet.
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: Engine, checks: CheckPoints) -> None:
+        self._engine, self._checks = engine, checks
         self.epoch = 0
         self.noticed = 0
 
@@ -94,6 +101,7 @@ class EpochFeed:
             moved = CameraMoved(event.t, event.camera_new_T_camera_old, event.covariance, event.detected, event.since_t)
             estimate = self._engine.add(moved)
             self.epoch = estimate.epoch
+            self._checks.moved(event.t if event.since_t is None else event.since_t, self.epoch)
             return estimate
         estimate = self._engine.add(replace(event, epoch=self.epoch) if isinstance(event, Pair) else event)
         self.notice(estimate)
@@ -101,7 +109,11 @@ class EpochFeed:
 
     def notice(self, estimate: OnlineEstimate) -> None:
         """Count the epochs that the engine began because it detected a move."""
-        self.noticed += max(0, estimate.epoch - self.epoch)
+        began = max(0, estimate.epoch - self.epoch)
+        self.noticed += began
+        if began:
+            for number, start in enumerate(self.starts()[self.epoch + 1 :], self.epoch + 1):
+                self._checks.moved(start.t, number)
         self.epoch = estimate.epoch
 
     def starts(self) -> tuple[EpochStart, ...]:
@@ -114,7 +126,6 @@ class LiveSession:
 
     Attributes:
         journal: the recorded events.
-        estimate: after the last event that was taken in; None before the first.
         config: of the estimate.
         late: whether events may come after others that happened later; they then get the time of the last event.
         engine: the one that took in the recorded events; a revived session has another one.
@@ -124,7 +135,7 @@ class LiveSession:
 
     def __init__(self, journal: Journal, make_engine: MakeEngine, config: SolveConfig) -> None:
         self.journal, self.config = journal, config
-        self.estimate: OnlineEstimate | None = None
+        self._estimate: OnlineEstimate | None = None  # without the checks
         self.late = False
         self._make_engine = make_engine
         self._untaken: list[Event] = []  # on disk, not in the estimate yet, because of an interruption
@@ -136,8 +147,14 @@ class LiveSession:
 
     def _begin_with(self, engine: Engine) -> None:
         """Start with an engine that has taken in nothing yet."""
-        self._engine, self._feed = engine, EpochFeed(engine)
+        self._checks = CheckPoints(self.config.limit_mm)
+        self._engine, self._feed = engine, EpochFeed(engine, self._checks)
         self._extractor = MeasurementExtractor(self.journal.model)
+
+    @property
+    def estimate(self) -> OnlineEstimate | None:
+        """After the last event that was taken in, with the checks of its epoch; None before the first."""
+        return self._checks.applied(self._estimate)
 
     @classmethod
     def open(
@@ -208,8 +225,8 @@ class LiveSession:
                 if event.line not in refused:
                     with contextlib.suppress(EventRefused):  # the refusal is noted now: it was not recorded before
                         self._take(event)
-        if self.estimate is not None:
-            self.estimate = self._engine.estimate
+        if self._estimate is not None:
+            self._estimate = self._engine.estimate
         self.engine = self._engine
         self._record_moves()
         self._write_waiting()
@@ -256,6 +273,8 @@ class LiveSession:
             kept = self.journal.append(query).event
             if isinstance(kept, TrackEvent):
                 query = kept
+        if self._checks.refuse(self._estimate):
+            return TrackEstimate(query.t, None, None, None, causal=True, reason=CHECKS_REFUSE)
         found = self._extractor.add(query, self._feed.epoch)
         if isinstance(found, Track):
             return replace(self._engine.track(found), causal=True)
@@ -283,8 +302,8 @@ class LiveSession:
         except EngineGone:
             self._gone = True
             raise
-        if self.estimate is not None or estimate.epoch > before:
-            self.estimate = estimate
+        if self._estimate is not None or estimate.epoch > before:
+            self._estimate = estimate
         self._feed.notice(estimate)
         self._record_moves()
         self._write_waiting()
@@ -292,8 +311,8 @@ class LiveSession:
 
     def settle(self) -> OnlineEstimate:
         """Run the full solve of everything now."""
-        self.estimate = self._engine.settle()
-        return self.estimate
+        self._estimate = settled = self._engine.settle()
+        return self._checks.applied(settled) or settled
 
     def measurements(self) -> Measurements:
         """All measurements that were taken in."""
@@ -354,6 +373,10 @@ class LiveSession:
                         raise
             elif isinstance(event, CameraMovedEvent):
                 estimate = self._feed.add(event)
+            elif isinstance(event, CheckEvent):
+                check = check_measurement(event, self._feed.epoch, self.journal.model)
+                if isinstance(check, Check):
+                    self._checks.add(check)
         except (EventRefused, InputError) as error:
             reason = error.reason if isinstance(error, EventRefused) else str(error)
             self._refuse(event, event.line, reason)
@@ -362,7 +385,7 @@ class LiveSession:
             self._gone, self._ended_at = True, event
             raise
         if estimate is not None:
-            self.estimate = estimate
+            self._estimate = estimate
 
     def _record_moves(self) -> None:
         """Moves that the engine found out by itself become events: the epochs are then the same for every reader."""

@@ -17,9 +17,10 @@ import numpy as np
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.errors import EventRefused, InputError
 from fgreg.model.estimate import Quantiles, Timing, TrackEstimate, Verdict
-from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent, TrackEvent, refused_lines
-from fgreg.model.measurements import Aim, Pair, Track
+from fgreg.model.events import AimEvent, CameraMovedEvent, CheckEvent, PairEvent, TrackEvent, refused_lines
+from fgreg.model.measurements import Aim, Check, Pair, Track
 from fgreg.model.solve_config import SolveConfig
+from fgreg.online.checks import CheckPoints
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import Engine, EpochFeed, MakeEngine, online_engine
 from fgreg.online.recorded_moves import EpochsFound
@@ -35,6 +36,7 @@ from fgreg.pipeline.solve import (
     show_frames,
     sound_speed_prior,
 )
+from fgreg.registration.checks import CHECKS_REFUSE
 from fgreg.registration.solve import solve
 from fgreg.session.result_file import write_result
 from fgreg.session.session_reader import Session, read_ground_truth, read_session
@@ -44,7 +46,7 @@ from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.spawn import spawn_viewer
 
-Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent
+Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,7 @@ def replay_session(
         # Moves that were detected during recording are events: they are used as recorded, without a new search.
         recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
         engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config, prior)
-        player = _Player(session, extracted, engine, viewer, request.speed)
+        player = _Player(session, extracted, engine, viewer, request.speed, config)
         player.play(on_step)
         taken, found = player.taken(), player.found()
         solution = solve(
@@ -154,8 +156,8 @@ def replay_session(
             prior,
         )
         settled = engine.settle() if player.estimate is not None else None
-        estimate = replace(session_estimate(session, replace(taken, track_events=()), solution), timing=player.timing())
-        estimate = replace(estimate, tracks=player.answers(estimate.tracks))
+        estimate = session_estimate(session, replace(taken, track_events=()), solution, config)
+        estimate = replace(estimate, timing=player.timing(), tracks=player.answers(estimate.tracks))
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         viewer.result(session.model, taken.measurements, estimate, truth, extracted.tracks)
         write_result(estimate, session.model, result_path, __version__)
@@ -174,10 +176,14 @@ class _Player:
         engine: Engine,
         viewer: Viewer | NullViewer,
         speed: float | None,
+        config: SolveConfig,
     ) -> None:
         self._session, self._extracted, self._engine = session, extracted, engine
-        self._viewer, self._speed, self._feed = viewer, speed, EpochFeed(engine)
-        self._measured: dict[int, Aim | Pair | Track] = {
+        self._viewer, self._speed = viewer, speed
+        self._checks = CheckPoints(config.limit_mm)
+        self._feed = EpochFeed(engine, self._checks)
+        self._measured: dict[int, Aim | Pair | Track | Check] = {
+            **extracted.checks,
             **dict(zip(extracted.aim_events, extracted.measurements.aims, strict=True)),
             **dict(zip(extracted.pair_events, extracted.measurements.pairs, strict=True)),
             **dict(zip(extracted.track_events, extracted.tracks, strict=True)),
@@ -186,7 +192,12 @@ class _Player:
         self._add_ms: list[float] = []
         self._track_ms: list[float] = []
         self._answers: dict[int, TrackEstimate] = {}
-        self.estimate: OnlineEstimate | None = None
+        self._estimate: OnlineEstimate | None = None  # without the checks
+
+    @property
+    def estimate(self) -> OnlineEstimate | None:
+        """After the last event, with the checks of its epoch; None before the first."""
+        return self._checks.applied(self._estimate)
 
     def play(self, on_step: OnStep | None) -> None:
         """Replay all events, each at its time where there is a speed."""
@@ -202,10 +213,10 @@ class _Player:
                 wait = began + (event.t - shown[0][1].t) / self._speed - time.monotonic()
                 time.sleep(max(0.0, wait))
             step = replace(self._take(index, event), done=done, total=len(shown))
-            if not isinstance(event, CameraMovedEvent):
+            if isinstance(event, AimEvent | PairEvent | TrackEvent):
                 show_frames(self._viewer, self._session, self._extracted, index, event, shot)
             self._show(index, event, shot, step)
-            shot += not isinstance(event, CameraMovedEvent)
+            shot += isinstance(event, AimEvent | PairEvent | TrackEvent)
             if on_step is not None:
                 on_step(step)
 
@@ -214,17 +225,22 @@ class _Player:
         refused, elapsed_ms, answer, noticed = self._unused.get(index, ""), None, None, False
         start = time.perf_counter()
         if isinstance(measured, Track):
-            answer = replace(self._engine.track(replace(measured, epoch=self._feed.epoch)), causal=True)
+            if self._checks.refuse(self._estimate):
+                answer = TrackEstimate(event.t, None, None, None, causal=True, reason=CHECKS_REFUSE)
+            else:
+                answer = replace(self._engine.track(replace(measured, epoch=self._feed.epoch)), causal=True)
             elapsed_ms = 1e3 * (time.perf_counter() - start)
             self._track_ms.append(elapsed_ms)
             self._answers[index] = answer
+        elif isinstance(measured, Check):
+            self._checks.add(replace(measured, epoch=self._feed.epoch))
         elif measured is not None or isinstance(event, CameraMovedEvent):
             before = self._feed.noticed
             try:
                 estimate = self._feed.add(event if isinstance(event, CameraMovedEvent) else _shot(measured))
                 elapsed_ms = 1e3 * (time.perf_counter() - start)
                 self._add_ms.append(elapsed_ms)
-                self.estimate = estimate or self.estimate
+                self._estimate = estimate or self._estimate
                 noticed = self._feed.noticed > before
             except EventRefused as error:
                 refused = self._unused[index] = error.reason
@@ -233,12 +249,12 @@ class _Player:
     def _show(self, index: int, event: Shown, shot: int, step: ReplayStep) -> None:
         if isinstance(self._viewer, NullViewer):
             return
-        known = self.estimate
+        known, measured = self.estimate, self._measured.get(index)
         self._viewer.update(
             ViewerUpdate(
                 t=event.t,
                 number=shot,
-                shot=self._measured.get(index) if not step.refused else None,
+                shot=None if step.refused or isinstance(measured, Check) else measured,
                 note=describe(step),
                 trus_T_camera=None if known is None else known.trus_T_camera,
                 covariance=None if known is None else known.covariance,
@@ -264,6 +280,7 @@ class _Player:
             extracted,
             measurements=measurements,
             epoch_of=epoch_of,
+            checks={index: replace(check, epoch=epoch_of[index]) for index, check in extracted.checks.items()},
             aim_events=tuple(i for i in extracted.aim_events if i not in self._unused),
             pair_events=tuple(i for i in extracted.pair_events if i not in self._unused),
             tracks=(),
@@ -287,7 +304,7 @@ class _Player:
         return Timing(quantiles(self._add_ms), quantiles(self._track_ms))
 
 
-def _shot(measured: Aim | Pair | Track | None) -> Aim | Pair:
+def _shot(measured: Aim | Pair | Track | Check | None) -> Aim | Pair:
     if not isinstance(measured, Aim | Pair):
         raise AssertionError("neither an aim nor a pair")
     return measured
@@ -318,6 +335,8 @@ def describe(step: ReplayStep) -> str:
             what = "track"
         case CameraMovedEvent():
             what = "camera moved" + (" (found out)" if event.detected else "")
+        case CheckEvent():
+            what = "check"
     if step.refused:
         what += f", not used: {step.refused}"
     elif isinstance(event, PairEvent) and left_out(step.estimate):

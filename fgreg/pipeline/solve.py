@@ -20,10 +20,19 @@ from fgreg.detection.results import MarkerFit, NoSignal, PaFind, pool_sound_spee
 from fgreg.errors import InputError
 from fgreg.geometry.target_error import beam_error, tre_mm
 from fgreg.geometry.transforms import FloatArray, transform_points
-from fgreg.model.estimate import AimEstimate, PairEstimate, SessionEstimate, TrackEstimate, Verdict
-from fgreg.model.events import AimEvent, Event, PairEvent, TrackEvent, looks_of
+from fgreg.model.estimate import (
+    AimEstimate,
+    CheckEstimate,
+    PairEstimate,
+    SessionEstimate,
+    TrackEstimate,
+    Verdict,
+)
+from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, TrackEvent, looks_of
+from fgreg.model.measurements import Check
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import Condition
@@ -147,7 +156,7 @@ def solve_session(
             conditions,
             prior,
         )
-        estimate = session_estimate(session, extracted, solution)
+        estimate = session_estimate(session, extracted, solution, config)
         errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
         show(viewer, session, extracted, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
@@ -178,6 +187,7 @@ def with_moves(extracted: ExtractedMeasurements, found: EpochsFound) -> Extracte
         extracted,
         measurements=split_epochs(extracted.measurements, found.moves, found.loop_closures),
         tracks=tuple(replace(track, epoch=epoch_of[index]) for index, track in tracks),
+        checks={index: replace(check, epoch=epoch_of[index]) for index, check in extracted.checks.items()},
         epoch_of=epoch_of,
     )
 
@@ -220,11 +230,14 @@ def detection_conditions(extracted: ExtractedMeasurements, config: SolveConfig) 
     return found
 
 
-def session_estimate(session: Session, extracted: ExtractedMeasurements, solution: Solution) -> SessionEstimate:
-    """The solution with every shot of the session in it, in event order; unused ones have their reason."""
+def session_estimate(
+    session: Session, extracted: ExtractedMeasurements, solution: Solution, config: SolveConfig
+) -> SessionEstimate:
+    """The solution with every shot and check of the session in it, in event order; unused ones have their reason."""
     pairs = dict(zip(extracted.pair_events, solution.pairs, strict=True))
     tracks = dict(zip(extracted.track_events, solution.tracks, strict=True))
     aims = dict(zip(extracted.aim_events, solution.aims, strict=True))
+    checks: dict[int, Check | CheckEstimate] = dict(extracted.checks)
     for index, event in enumerate(session.events):
         reason = extracted.unused.get(index, "")
         if isinstance(event, PairEvent) and index not in pairs:
@@ -233,8 +246,18 @@ def session_estimate(session: Session, extracted: ExtractedMeasurements, solutio
             tracks[index] = TrackEstimate(event.t, None, None, None, causal=False, reason=reason)
         elif isinstance(event, AimEvent) and index not in aims:
             aims[index] = AimEstimate(event.t, used=False, reason=reason)
+        elif isinstance(event, CheckEvent) and index not in checks:
+            checks[index] = not_compared(event.t, reason)
+    solved = solution.as_session(session.model.name)
+    checked = with_checks(solved, [checks[i] for i in sorted(checks)], config.limit_mm)
+    if checked.epochs and checked.epochs[-1].verdict is Verdict.REFUSED is not solved.epochs[-1].verdict:
+        for index in extracted.track_events:
+            if extracted.epoch_of[index] == checked.epochs[-1].index:
+                tracks[index] = replace(
+                    tracks[index], stage_rad=None, sigma_rad=None, lambda_mm=None, reason=CHECKS_REFUSE
+                )
     return replace(
-        solution.as_session(session.model.name),
+        checked,
         pairs=tuple(pairs[i] for i in sorted(pairs)),
         tracks=tuple(tracks[i] for i in sorted(tracks)),
         aims=tuple(aims[i] for i in sorted(aims)),

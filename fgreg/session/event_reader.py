@@ -9,7 +9,17 @@ from pathlib import Path
 from typing import IO
 
 from fgreg.errors import InputError, one_line
-from fgreg.model.events import EVENTS, AimEvent, Event, MarkerRecord, PairEvent, RefusedEvent, TrackEvent, TrusRecord
+from fgreg.model.events import (
+    EVENTS,
+    AimEvent,
+    CheckEvent,
+    Event,
+    MarkerRecord,
+    PairEvent,
+    RefusedEvent,
+    TrackEvent,
+    TrusRecord,
+)
 from fgreg.schema.files import FrameKind
 from fgreg.schema.kinds import SECONDS
 from fgreg.schema.problems import FieldError, Problem, input_error, path_text, shown
@@ -148,6 +158,10 @@ def _misfits(event: Event, setup: Setup | None) -> Iterator[Problem]:
             yield Problem(("event",), f"line {line}", "an earlier line of this file")
     if setup is None:
         return
+    if isinstance(event, CheckEvent) and event.left is not None and "camera.right" not in setup.present:
+        yield Problem(
+            ("left",), "pixels, but no camera with camera.right in session.yaml", "them there, or camera_p_mm"
+        )
     corner = event.corner if isinstance(event, AimEvent) else None
     for path, record in _records(event):
         if isinstance(record, MarkerRecord):

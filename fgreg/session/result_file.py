@@ -20,7 +20,7 @@ RESULT_FILE = "result.yaml"
 _SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml"})
 _MAX_BYTES = 256_000_000
 _MAX_NODES = 20_000_000
-_ONE_LINE = frozenset({"predicted_tre_mm", "pairs", "tracks", "add", "track"})
+_ONE_LINE = frozenset({"predicted_tre_mm", "checks", "pairs", "tracks", "add", "track"})
 
 _FORMAT_LINE = b"format: fgreg-result/"
 

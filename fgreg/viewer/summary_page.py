@@ -48,6 +48,7 @@ def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_erro
     lines += [_epoch_row(epoch) for epoch in estimate.epochs]
     for epoch in estimate.epochs:
         lines += _transform(epoch, refused=estimate.verdict is Verdict.REFUSED)
+    lines += _checks(estimate)
     for index, (translation_mm, rotation_rad) in enumerate(camera_errors):
         lines += [
             "",
@@ -70,3 +71,23 @@ def _transform(epoch: EpochEstimate, *, refused: bool) -> list[str]:
     note = " (refused: for inspection only)" if refused else ""
     rows = ["  ".join(f"{value:10.5f}" for value in row) for row in np.asarray(epoch.trus_T_camera)]
     return ["", f"`trus_T_camera`, epoch {epoch.index}{note}:", "", "```", *rows, "```"]
+
+
+def _checks(estimate: SessionEstimate) -> list[str]:
+    """The registration at the check points; nothing where there are none."""
+    compared = [check for check in estimate.checks if check.error_mm is not None]
+    if not compared:
+        return []
+    lines = [
+        "",
+        "Checks, error in TRUS axes:",
+        "",
+        "| t | x | y | z | 95 % below | NIS | verdict |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for check in compared:
+        error = " | ".join(f"{value:.2f}" for value in np.asarray(check.error_mm))
+        lines.append(
+            f"| {check.t:.1f} s | {error} | {check.predicted_95_mm:.2f} | {check.nis:.1f} | {check.verdict.value} |"
+        )
+    return lines

@@ -1,0 +1,222 @@
+"""The registration at check points: points known to both devices, which never enter the estimate.
+
+The error at a check is where the registration puts the camera's point, less where the TRUS probe has it. Its predicted
+covariance is the registration's at that point plus the check's own. The checks of one camera epoch give three tests,
+whose false alarms together are 0.3 % of sessions:
+
+- a common shift of all of them, three degrees of freedom. Such a shift is what a refracting layer between fibre and
+  tissue makes of a registration, and what line and arc cannot show;
+- each of them alone;
+- the mean error has to stay below the limit with its own 95 %: a bound that does not use the registration's covariance,
+  since that does not include what the checks are for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtrc
+
+from fgreg.geometry.target_error import gaussian_quantile_mm, offset_quantile_mm
+from fgreg.geometry.transforms import FloatArray, hat
+from fgreg.model.estimate import Assumption, CheckEstimate, SessionEstimate, Verdict, worst_verdict
+from fgreg.model.measurements import Check
+from fgreg.registration.verdict import Condition, verdict_of
+
+SHIFT_P, ALONE_P = 2e-3, 1e-3
+"""False alarms of the common shift, and of all checks of an epoch taken alone."""
+MAIN_SHARE = 0.8
+"""Share of the error's length from which one axis alone is named."""
+NOT_REGISTERED = "there is no registration of its camera epoch"
+CHECKS_REFUSE = "the checks refuse the registration of its camera epoch"
+
+ASSUMPTIONS = (
+    "one medium along the beam: a layer of water, gel or glass between fibre and tissue refracts the beam and shifts "
+    "the registration along the layer's normal, by 2.5 mm for 10 mm of water",
+    "the sensitivity window is centred on the image plane: where it is not, the registration is turned about the "
+    "probe's axis",
+)
+"""What line and arc cannot show."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedEpoch:
+    """The checks of one camera epoch: an estimate for each, and the conditions of the verdict.
+
+    ``covers``: whether they agree with the registration, and bound its mean error below the limit.
+    """
+
+    checks: tuple[CheckEstimate, ...]
+    conditions: tuple[Condition, ...]
+    covers: bool
+
+
+def check_registration(
+    checks: Sequence[Check], trus_T_camera: FloatArray, covariance: FloatArray, limit_mm: float
+) -> CheckedEpoch:
+    """Compare a registration with the checks of its camera epoch.
+
+    Args:
+        checks: at least one.
+        trus_T_camera: (4, 4). covariance: (6, 6) over its right tangent.
+        limit_mm: of the error.
+    """
+    rotation, n = trus_T_camera[:3, :3], len(checks)
+    camera_p = np.stack([check.camera_p_mm for check in checks])
+    trus_p = np.stack([check.trus_p_mm for check in checks])
+    error = camera_p @ rotation.T + trus_T_camera[:3, 3] - trus_p
+    own = np.stack([rotation @ check.covariance @ rotation.T + check.trus_covariance for check in checks])
+    gain = np.concatenate([-rotation @ hat(camera_p), np.broadcast_to(rotation, (n, 3, 3))], axis=-1)
+    predicted = own + gain @ covariance @ gain.swapaxes(1, 2)
+    nis = np.einsum("ni,ni->n", error, np.linalg.solve(predicted, error[..., None])[..., 0])
+    alone = chdtrc(3, nis) < ALONE_P / n
+    # The mean, each check weighted by its own precision.
+    weight = np.linalg.inv(own)
+    own_mean = np.linalg.inv(weight.sum(axis=0))
+    share = own_mean @ weight
+    mean = np.einsum("nij,nj->i", share, error)
+    mean_gain = np.einsum("nij,njk->ik", share, gain)
+    spread = own_mean + mean_gain @ covariance @ mean_gain.T
+    shift_p = float(chdtrc(3, mean @ np.linalg.solve(spread, mean)))
+    bound_mm = offset_quantile_mm(mean, own_mean)
+    quantiles = gaussian_quantile_mm(predicted)
+    off = alone | (shift_p < SHIFT_P)
+    found = _conditions(checks, error, alone, mean, shift_p, bound_mm, spread, limit_mm)
+    estimates = tuple(
+        CheckEstimate(check.t, error[i], float(quantiles[i]), float(nis[i]), Verdict.WARNING if off[i] else Verdict.OK)
+        for i, check in enumerate(checks)
+    )
+    return CheckedEpoch(estimates, tuple(found), not found)
+
+
+def _conditions(
+    checks: Sequence[Check],
+    error: FloatArray,
+    alone: FloatArray,
+    mean: FloatArray,
+    shift_p: float,
+    bound_mm: float,
+    spread: FloatArray,
+    limit_mm: float,
+) -> list[Condition]:
+    found = []
+    norm = float(np.linalg.norm(mean))
+    several = len(checks) > 1
+    middle = np.mean([check.trus_p_mm for check in checks], axis=0)
+    if shift_p < SHIFT_P:
+        expected = float(gaussian_quantile_mm(spread[None])[0])
+        surely_mm = 2.0 * norm - bound_mm
+        text = (
+            f"the check{'s are' if several else ' is'} off by {norm:.1f} mm {direction_text(mean, middle)}, "
+            f"{expected:.1f} mm expected at most: look for a layer of water or gel between fibre and tissue, and check "
+            "radius, ranges and sensitivity window in session.yaml; register again, or locate the checks again"
+        )
+        found.append(Condition(Verdict.REFUSED if surely_mm > 2.0 * limit_mm else Verdict.WARNING, text))
+    if bound_mm >= limit_mm:
+        advice = "register again" if shift_p < SHIFT_P else "locate the checks more accurately, or take more of them"
+        text = (
+            f"the mean error at the check{'s' if several else ''} is {norm:.1f} mm, at most {bound_mm:.1f} mm (95 %), "
+            f"and has to be below {limit_mm:g} mm: {advice}"
+        )
+        found.append(Condition(Verdict.WARNING, text))
+    if several:
+        for i in np.flatnonzero(alone).tolist():
+            where = direction_text(error[i], checks[i].trus_p_mm)
+            text = (
+                f"the check at {checks[i].t:.1f} s is off by {np.linalg.norm(error[i]):.1f} mm {where}: locate it again"
+            )
+            found.append(Condition(Verdict.WARNING, text))
+    return found
+
+
+def direction_text(error_mm: FloatArray, trus_p_mm: FloatArray) -> str:
+    """Along which of the probe's own axes an error (3,) is at a point (3,), both TRUS, in plain words."""
+    radial = np.array([0.0, trus_p_mm[1], trus_p_mm[2]])
+    radial = radial / max(float(np.linalg.norm(radial)), 1e-9)
+    sideways = np.array([0.0, radial[2], -radial[1]])
+    parts = [
+        (float(error_mm[0]), "along the probe", "too far towards +x", "too far towards -x"),
+        (float(error_mm @ radial), "along the line to the probe", "too far from it", "too near it"),
+        (float(error_mm @ sideways), "sideways", "at too large stage angles", "at too small stage angles"),
+    ]
+    parts.sort(key=lambda part: -abs(part[0]))
+    norm = float(np.linalg.norm(error_mm))
+    if abs(parts[0][0]) >= MAIN_SHARE * norm:
+        _, axis, plus, minus = parts[0]
+        return f"{axis} (the registration puts points {plus if parts[0][0] > 0 else minus})"
+    named = [
+        f"{abs(size):.1f} mm {axis} ({plus if size > 0 else minus})"
+        for size, axis, plus, minus in parts
+        if abs(size) >= 0.3 * norm
+    ]
+    return "(" + " and ".join(named) + ")"
+
+
+def assumptions(covered: Sequence[int] = ()) -> tuple[Assumption, ...]:
+    """The assumptions of every result; ``covered``: places of the checks that have covered them."""
+    return tuple(Assumption(text, tuple(covered)) for text in ASSUMPTIONS)
+
+
+def with_checks(estimate: SessionEstimate, checks: Sequence[Check | CheckEstimate], limit_mm: float) -> SessionEstimate:
+    """The estimate with its checks, their effect on the verdicts, and the assumptions that they cover.
+
+    Args:
+        estimate: of the session, without checks.
+        checks: in event order; those that are not usable with the reason.
+        limit_mm: of the error.
+    """
+    results: dict[int, CheckEstimate] = {}
+    covered: list[int] = []
+    conditions: dict[int, tuple[Condition, ...]] = {}
+    current = len(estimate.epochs) - 1
+    for epoch in estimate.epochs:
+        mine = {i: at for i, at in enumerate(checks) if isinstance(at, Check) and at.epoch == epoch.index}
+        if not mine or epoch.trus_T_camera is None or epoch.covariance is None:
+            continue
+        found = check_registration([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm)
+        results.update(zip(mine, found.checks, strict=True))
+        conditions[epoch.index] = found.conditions
+        if epoch.index == current and found.covers:
+            covered += mine
+    for i, at in enumerate(checks):
+        if i not in results:
+            results[i] = at if isinstance(at, CheckEstimate) else not_compared(at.t, NOT_REGISTERED)
+    return replace(
+        with_conditions(estimate, conditions),
+        checks=tuple(results[i] for i in range(len(checks))),
+        assumptions=assumptions(covered),
+    )
+
+
+def not_compared(t: float, reason: str) -> CheckEstimate:
+    """The estimate of a check that is not usable."""
+    return CheckEstimate(t, None, None, None, Verdict.WARNING, reason)
+
+
+def with_conditions(estimate: SessionEstimate, conditions: Mapping[int, Sequence[Condition]]) -> SessionEstimate:
+    """The estimate with more conditions of some of its epochs. The camera is in the last epoch."""
+    several, current = len(estimate.epochs) > 1, len(estimate.epochs) - 1
+    verdicts = {
+        index: verdict_of(found) if index == current else min(verdict_of(found), Verdict.WARNING, key=_severity)
+        for index, found in conditions.items()
+    }
+    texts = [
+        f"epoch {index}: {condition.text}" if several else condition.text
+        for index, found in conditions.items()
+        for condition in found
+    ]
+    return replace(
+        estimate,
+        verdict=worst_verdict(estimate.verdict, *verdicts.values()),
+        reasons=(*estimate.reasons, *texts),
+        epochs=tuple(
+            replace(epoch, verdict=worst_verdict(epoch.verdict, verdict_of(conditions.get(epoch.index, ()))))
+            for epoch in estimate.epochs
+        ),
+    )
+
+
+def _severity(verdict: Verdict) -> int:
+    return verdict.severity
