@@ -78,7 +78,7 @@ def take_shot(
     kind = config.sweep if sweep else Sweep.WINDOW
     heard = sweeps.look(replace(config, sweep=kind), trus_p[None], 1, sweep or 1, scene.window_edge_rad, rng)
     scan, signed = float(heard.scan_rad[0, 0]), int(heard.device_sweep[0, 0])
-    distance = float(sweeps.range_mm(trus_p, np.asarray(scan), config.probe.radius_mm))
+    distance = float(config.array.range_mm(trus_p, np.asarray(scan)))
     w = rng.standard_normal(3) * noise.marker_rotation_rad
     shift = rng.standard_normal(3) * noise.marker_translation_mm
     seen = make_transform(exp_so3(w) @ camera_T_marker[:3, :3], camera_T_marker[:3, 3] + shift)

@@ -55,6 +55,7 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import MarkerObservation, Measurements
 from fgreg.model.session_model import NoiseModel, SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.model.systematic import Constant
 from fgreg.registration.solve import solve
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.session_reader import read_ground_truth, read_session
@@ -125,7 +126,7 @@ def configuration(kind: str, rng: np.random.Generator) -> SimulationConfig:
             return replace(base, reversed_stage=True)
         case "sound speed":
             factor = 1.02 if rng.uniform() < 0.5 else 0.98
-            return replace(base, sound_speed_true_m_s=factor * base.probe.sound_speed_m_s)
+            return replace(base, deviations={Constant.SOUND_SPEED: factor - 1.0})
         case "one-way":
             return replace(base, sweep=Sweep.ONE_WAY)
         case _:

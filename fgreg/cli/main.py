@@ -8,6 +8,7 @@ evaluate each string twice, a tenth of ``fgreg --help``.
 
 import gc
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -230,6 +231,26 @@ def check(session: SessionArgument, as_json: JsonOption = False) -> None:
         raise typer.Exit(EXIT_BAD_INPUT)
 
 
+def _named_values(option: str, texts: list[str] | None) -> list[tuple[str, str]]:
+    """NAME=VALUE texts in two."""
+    parts = [text.partition("=") for text in texts or []]
+    for name, sign, value in parts:
+        if not (name and sign and value):
+            raise InputError(option, f"{name}{sign}{value}", "NAME=VALUE")
+    return [(name, value) for name, _, value in parts]
+
+
+def _number(option: str, text: str) -> float:
+    """A finite number of an option."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(option, text, "a number")
+    return value
+
+
 @app.command()
 def simulate(
     out: Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to write; new or empty.")] = None,
@@ -237,6 +258,23 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", help="Same seed, same session, byte by byte.")] = 1,
     pairs: Annotated[int | None, typer.Option("--pairs", help="Number of photoacoustic markers.")] = None,
     aims: Annotated[int | None, typer.Option("--aims", help="Number of calibration shots.")] = None,
+    sweep: Annotated[
+        str | None, typer.Option("--sweep", help="How PMs are found: window, alternating, one-way or two-sided.")
+    ] = None,
+    off: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--off",
+            metavar="NAME=VALUE",
+            help="True less declared: a key of systematic (radius_mm=1, tag_size=-0.03, array_tilt_deg[0]=1), or "
+            "water_mm, beam_offset_mm, window_deg, slip_deg, camera_move_mm. Repeatable.",
+        ),
+    ] = None,
+    declare: Annotated[
+        list[str] | None,
+        typer.Option("--declare", metavar="KEY=VALUE", help="What session.yaml has instead: probe.radius_mm=0.01."),
+    ] = None,
+    camera: Annotated[bool, typer.Option("--camera", help="Poses, of a session that has camera and board.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     list_presets: Annotated[bool, typer.Option("--list", help="List the presets and end.")] = False,
     quiet: QuietOption = False,
@@ -247,6 +285,8 @@ def simulate(
     """
     from dataclasses import replace
 
+    from fgreg.simulation.config import Sweep
+    from fgreg.simulation.deviations import with_deviations
     from fgreg.simulation.presets import PRESETS
     from fgreg.simulation.simulate import simulate as run
     from fgreg.simulation.write import write_session
@@ -268,8 +308,22 @@ def simulate(
             config = replace(config, **{key: value})  # type: ignore[arg-type]
     if seed < 0:
         raise InputError("--seed", str(seed), "a number >= 0")
+    if sweep is not None:
+        if sweep not in list(Sweep):
+            raise InputError("--sweep", sweep, "one of " + ", ".join(Sweep))
+        config = replace(config, sweep=Sweep(sweep))
+    values = {name: _number("--off", value) for name, value in _named_values("--off", off)}
+    try:
+        config = with_deviations(config, values)
+    except ValueError as error:
+        raise InputError("--off", str(error), "a name among these") from error
+    declared = {key: _number("--declare", value) for key, value in _named_values("--declare", declare)}
+    config = replace(config, declared=declared, camera_declared=camera)
     with _progress(quiet) as progress:
-        simulated = run(config, seed)
+        try:
+            simulated = run(config, seed)
+        except ValueError as error:
+            raise InputError("the simulation", str(error), "a session that can be realised") from error
         write_session(simulated, out, overwrite, lambda done, total: progress("rendering", done, total))
     if not quiet:
         typer.echo(f"{out}: {config.aims} aims, {config.pairs} PMs, {len(simulated.frames)} frames, seed {seed}")

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import ChannelModel, ProbeModel
+from fgreg.simulation.array import TrueArray
 
 ChannelArray = npt.NDArray[np.float32]
 
@@ -102,19 +103,28 @@ class Hearing:
     elevation: Elevation | None = field(default_factory=Elevation)
 
 
-def element_positions(probe: ProbeModel, scan_rad: float) -> FloatArray:
-    """TRUS positions (elements, 3), mm, in the order of the data's rows, at stage angle ``scan_rad``."""
-    middle = 0.5 * (probe.elements - 1)
-    out = np.empty((probe.elements, 3))
-    for i in range(probe.elements):
-        x = probe.pitch_mm * (i - middle)
-        out[i] = (-x if probe.flip else x), probe.radius_mm * math.sin(scan_rad), probe.radius_mm * math.cos(scan_rad)
-    return out
+def element_positions(probe: ProbeModel, scan_rad: float, array: TrueArray | None = None) -> FloatArray:
+    """TRUS positions (elements, 3), mm, in the order of the data's rows, at stage angle ``scan_rad``.
+
+    ``array``: where it is mounted; as declared where None.
+    """
+    array = array or TrueArray.of(probe, {})
+    x = array.pitch_ratio * probe.pitch_mm * (np.arange(probe.elements) - 0.5 * (probe.elements - 1))
+    at = np.asarray(scan_rad)
+    return np.asarray(array.middle_mm(at) + (-x if probe.flip else x)[:, None] * array.along(at))
 
 
-def rotation_offset_rad(trus_p_mm: FloatArray, scan_rad: FloatArray | float) -> FloatArray:
-    """Turn of the stage (rad, TRUS convention) from ``scan_rad`` that brings points (..., 3) into the plane."""
-    offset = np.arctan2(trus_p_mm[..., 1], trus_p_mm[..., 2]) - scan_rad
+def rotation_offset_rad(
+    trus_p_mm: FloatArray, scan_rad: FloatArray | float, array: TrueArray | None = None
+) -> FloatArray:
+    """Turn of the stage (rad, TRUS convention) from ``scan_rad`` to where points (..., 3) are loudest.
+
+    That brings them into the plane, but for an ``array`` whose window is not centred on it.
+    """
+    if array is None:
+        offset = np.arctan2(trus_p_mm[..., 1], trus_p_mm[..., 2]) - scan_rad
+    else:
+        offset = array.rotation_rad(trus_p_mm, np.asarray(scan_rad))
     return np.asarray(np.remainder(offset + np.pi, 2.0 * np.pi) - np.pi)
 
 
@@ -129,6 +139,7 @@ def simulate_channels(
     sound_speed_true_m_s: float | None = None,
     hearing: Hearing | None = None,
     half_width_rad: float | None = None,
+    array: TrueArray | None = None,
 ) -> ChannelArray:
     """Channel data of one laser pulse, in units of the noise's standard deviation.
 
@@ -143,6 +154,8 @@ def simulate_channels(
         samples: per element.
         sound_speed_true_m_s: the tissue's; the probe's own where absent.
         half_width_rad: of the window at this depth; the probe's table where absent.
+        array: where it is mounted, its pitch and the delay of its trigger (not the sound speed); as declared where
+            absent.
 
     Returns:
         (elements, samples) float32.
@@ -156,16 +169,18 @@ def simulate_channels(
     speed_mm_us = (sound_speed_true_m_s or probe.sound_speed_m_s) * 1e-3
     source = np.asarray(trus_p_source_mm, dtype=np.float64)
     out = rng.standard_normal((probe.elements, samples), dtype=np.float32)
-    amplitude = _element_amplitudes(probe, source, scan_rad, pulse, hearing, speed_mm_us)
+    array = array or TrueArray.of(probe, {})
+    elements = element_positions(probe, scan_rad, array)
+    amplitude = _element_amplitudes(probe, source, elements, pulse, hearing, speed_mm_us)
     loudest = math.sqrt(2.0) * 10.0 ** (snr_db / 20.0)
     amplitude *= loudest / amplitude.max()
     if hearing.elevation is not None:
-        offset = float(rotation_offset_rad(source, scan_rad))
+        offset = float(rotation_offset_rad(source, scan_rad, array))
         if half_width_rad is None:
-            depth = math.hypot(*(source[1:] - element_positions(probe, scan_rad)[0, 1:]))
+            depth = float(array.distance_mm(source, np.asarray(scan_rad)))
             half_width_rad = float(np.interp(depth, probe.sensitivity.depth_mm, probe.sensitivity.half_width_rad))
         amplitude *= float(hearing.elevation.amplitude(offset, half_width_rad))
-    distance_mm = np.linalg.norm(source - element_positions(probe, scan_rad), axis=1)
+    distance_mm = np.linalg.norm(source - elements, axis=1) - array.range_offset_mm
     centre = (distance_mm / speed_mm_us + channels.pulse_delay_us - channels.t0_us) * channels.sampling_mhz
     reach = math.ceil(pulse.support_us * channels.sampling_mhz) + 1
     index = np.rint(centre).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
@@ -248,10 +263,10 @@ def _channels_of(probe: ProbeModel) -> ChannelModel:
 
 
 def _element_amplitudes(
-    probe: ProbeModel, source: FloatArray, scan_rad: float, pulse: Pulse, hearing: Hearing, speed_mm_us: float
+    probe: ProbeModel, source: FloatArray, elements: FloatArray, pulse: Pulse, hearing: Hearing, speed_mm_us: float
 ) -> FloatArray:
     """Relative amplitude on each element of a source, but for the loss off the plane."""
-    away = source - element_positions(probe, scan_rad)
+    away = source - elements
     distance = np.linalg.norm(away, axis=1)
     sine = np.abs(away[:, 0]) / distance
     width_in_wavelengths = hearing.element_width * probe.pitch_mm * pulse.centre_mhz / speed_mm_us

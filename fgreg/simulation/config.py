@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,9 @@ from fgreg.model.session_model import (
     StereoRig,
     TagModel,
 )
+from fgreg.model.systematic import Constant, Systematic
 from fgreg.simulation.acoustics import Elevation, Pulse
+from fgreg.simulation.array import TrueArray
 from fgreg.simulation.render import Optics
 
 
@@ -32,11 +36,13 @@ class Sweep(StrEnum):
     ``window``: uniform over the angles at which the PM is detected, direction unknown (``sweep`` 0). ``alternating``:
     steps from one limit up to the first detection, every other PM from the other limit. ``one_way``: always from the
     lower limit.
+    ``two_sided``: each PM from both limits, ``looks_per_pm`` looks from either.
     """
 
     WINDOW = "window"
     ALTERNATING = "alternating"
     ONE_WAY = "one-way"
+    TWO_SIDED = "two-sided"
 
 
 def default_probe(channels: ChannelModel | None = None) -> ProbeModel:
@@ -86,16 +92,29 @@ class SimulationConfig:
         sweep: how the stage finds PMs.
         epochs: camera epochs; the camera moves between them.
         camera_move_known: the move is recorded, with errors of the two sigmas (rotation, translation) and covariance.
+        camera_moves_reported: each move is an event; where not, nothing recorded tells of it.
         initial_laser: record a rough ``initial.marker_T_laser`` (3 deg, 2 mm off per axis).
+        camera_declared: poses, but of a session that has the camera, marker and board: what deviates in these acts on
+            poses as it would on frames.
+        checks: points known to both devices (``SimulatedSession.checks``). check_sigma_mm: per axis, of the camera's
+            and of the TRUS side.
 
     Errors that the session does not declare:
         junk_pairs: number of outlier PMs: their looks are at another source, anywhere in the image.
         reversed_stage, reversed_elements: wired with the other sign than the session states.
-        sound_speed_true_m_s: the tissue's; the probe's where None.
-        window_edge_rad: error of the known half width; drawn from ``edge_sigma`` where None.
-        edge_jitter_rad: a soft edge: the half width varies by this (sigma) from look to look.
-        marker_bias_mm: the constant offset of marker poses; drawn from ``noise.marker_bias_mm`` where None.
+        deviations: true less declared value of the rig's constants. Absent: none; but the window's edge and the
+            marker's bias are drawn from their standard deviations.
+        edge_jitter_rad: a soft edge: the half width varies by this (sigma) from PM to PM.
+        beam_offset_mm: each PM lies beside the beam by this (sigma, each axis across it).
+        water_mm, water_index: depth of water, with a level surface, above each PM (along TRUS z), and its index of
+            refraction: the beam bends where it enters. (Images are drawn without water.)
+        stage_slip_rad, stage_slip_at: the plane stays behind the reading by this angle, for good, after this share of
+            the PMs.
+        camera_move_mm: the camera moves by this in a random direction, without a turn; else turns and shifts are drawn.
         declared_noise: the session's ``noise`` block; the true one (``noise``) where None.
+        declared_camera: the session's camera; the true one (``camera``, but for ``deviations``) where None.
+        declared: values that the session has instead of the true ones, by key: ``{"probe.radius_mm": 0.01}``.
+        systematic: what the session says of its constants' standard deviations.
 
     Geometry:
         pm_x_mm, pm_angle_rad, pm_depth_mm: half extent along the axis and in stage angle, span of depths from the
@@ -127,17 +146,28 @@ class SimulationConfig:
     epochs: int = 1
     camera_move_known: bool = False
     camera_move_sigma: tuple[float, float] = (math.radians(0.3), 0.5)
+    camera_moves_reported: bool = True
     initial_laser: bool = False
+    camera_declared: bool = False
+    checks: int = 0
+    check_sigma_mm: tuple[float, float] = (0.35, 0.35)
 
     junk_pairs: int = 0
     reversed_stage: bool = False
     reversed_elements: bool = False
-    sound_speed_true_m_s: float | None = None
-    window_edge_rad: float | None = None
+    deviations: Mapping[Constant, float] = field(default_factory=dict)
     edge_jitter_rad: float = 0.0
-    marker_bias_mm: tuple[float, float, float] | None = None
+    beam_offset_mm: float = 0.0
+    water_mm: float = 0.0
+    water_index: float = 1.33
+    stage_slip_rad: float = 0.0
+    stage_slip_at: float = 0.5
+    camera_move_mm: float | None = None
     noise: NoiseModel = field(default_factory=NoiseModel)
     declared_noise: NoiseModel | None = None
+    declared_camera: StereoRig | None = None
+    declared: Mapping[str, Any] = field(default_factory=dict)
+    systematic: Systematic = field(default_factory=Systematic)
 
     pm_x_mm: float = 20.0
     pm_angle_rad: float = math.radians(35.0)
@@ -172,9 +202,21 @@ class SimulationConfig:
     def __post_init__(self) -> None:
         if self.epochs < 1 or self.looks_per_pm < 1 or self.track_looks < 1:
             raise ValueError("epochs, looks_per_pm and track_looks have to be at least 1")
-        if min(self.aims, self.pairs, self.tracks_heard, self.tracks_silent) < 0:
-            raise ValueError("aims, pairs and tracks have to be 0 or more")
+        if min(self.aims, self.pairs, self.tracks_heard, self.tracks_silent, self.checks) < 0:
+            raise ValueError("aims, pairs, tracks and checks have to be 0 or more")
+        if not (self.water_mm >= 0.0 and self.water_index >= 1.0):
+            raise ValueError("water_mm has to be 0 or more, water_index at least 1")
         if not 0 <= self.junk_pairs <= self.pairs:
             raise ValueError(f"junk_pairs is {self.junk_pairs}, expected 0 to {self.pairs}")
         if self.frames and self.probe.channels is None:
             raise ValueError("raw frames need probe.channels")
+
+    @property
+    def array(self) -> TrueArray:
+        """The probe's array as it is."""
+        return TrueArray.of(self.probe, self.deviations)
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether the session has the camera, the marker and the board."""
+        return self.frames or self.camera_declared

@@ -47,16 +47,23 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
             config.probe, sensitivity=sensitivity, channels=config.probe.channels if config.frames else None, image=None
         ),
         stage=config.stage,
-        camera=config.camera if config.frames else None,
-        marker=config.marker if config.frames else None,
-        board=config.board if config.frames else None,
+        camera=(config.declared_camera or config.camera) if config.has_camera else None,
+        marker=config.marker if config.has_camera else None,
+        board=config.board if config.has_camera else None,
         noise=config.declared_noise or config.noise,
         initial_marker_T_laser=marker_T_laser_guess,
+        systematic=config.systematic,
     )
     document: dict[str, Any] = _rounded(SESSION.write(model))
     document.pop("targets_mm")
     if config.targets_mm is not None:
         document["targets_mm"] = rows(config.targets_mm)
+    for key, value in config.declared.items():
+        *within, last = key.split(".")
+        place = document
+        for name in within:
+            place = place[name]
+        place[last] = value
     return document
 
 

@@ -11,6 +11,7 @@ from fgreg.geometry.transforms import FloatArray, make_transform, transform_poin
 from fgreg.model.session_model import CameraModel
 from fgreg.simulation.acoustics import Hearing, quantised, simulate_channels
 from fgreg.simulation.config import SimulationConfig
+from fgreg.simulation.misreading import true_board, true_marker, true_rig, view_shift_mm
 from fgreg.simulation.render import UInt8Image, render_frame
 from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Surface, TagSurface
 
@@ -45,25 +46,28 @@ class ShotPicture:
         Raises:
             ValueError: there is no right camera.
         """
-        camera, camera_T_left = config.camera.left, np.eye(4)
+        rig = true_rig(config)
+        camera, camera_T_left = rig.left, np.eye(4)
         if right:
-            if config.camera.right is None or config.camera.right_T_left is None:
+            if rig.right is None or rig.right_T_left is None:
                 raise ValueError("the rig has no right camera")
-            camera, camera_T_left = config.camera.right, config.camera.right_T_left
+            camera, camera_T_left = rig.right, rig.right_T_left
         return self._render(config, camera, camera_T_left, int(right))
 
     def _render(
         self, config: SimulationConfig, camera: CameraModel, camera_T_left: FloatArray, stream: int
     ) -> UInt8Image:
+        camera_T_marker = self.camera_T_marker.copy()
+        camera_T_marker[:3, 3] += view_shift_mm(config, camera_T_marker)
         surfaces: list[Surface] = [
-            TagSurface(config.marker.dictionary, tag.id, tag.size_mm, self.camera_T_marker @ tag.marker_T_tag)
-            for tag in config.marker.tags
+            TagSurface(config.marker.dictionary, tag.id, tag.size_mm, camera_T_marker @ tag.marker_T_tag)
+            for tag in true_marker(config).tags
         ]
         # The bare fibre about the laser frame's origin. It is behind the marker's printed face: never over it.
         fibre = transform_points(self.camera_T_laser, np.array([[0.0, 0.0, -4.0], [0.0, 0.0, 8.0]]))
         surfaces.append(_strip(fibre[0], fibre[1], 0.9, 0.7, depth_bias_mm=25.0))
         if self.camera_T_board is not None:
-            surfaces.append(BoardSurface(config.board, self.camera_T_board))
+            surfaces.append(BoardSurface(true_board(config), self.camera_T_board))
             away = make_transform(np.eye(3), np.array([0.0, 0.0, DRAPE_MM]))
             background = Background(self.camera_T_board @ away, 0.1, 0.3, self.scene_seed)
         else:
@@ -132,8 +136,9 @@ class LookPicture:
             pulse=config.pulse,
             snr_db=config.snr_db,
             samples=config.samples,
-            sound_speed_true_m_s=config.sound_speed_true_m_s,
+            sound_speed_true_m_s=config.array.sound_speed_ratio * config.probe.sound_speed_m_s,
             hearing=Hearing(elevation=config.elevation),
             half_width_rad=self.half_width_rad,
+            array=config.array,
         )
         return quantised(channels[::-1] if config.reversed_elements else channels)

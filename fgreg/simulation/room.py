@@ -272,13 +272,13 @@ class Room:
 
     def _above_tissue(self, trus_p_mm: FloatArray) -> FloatArray:
         """Distance (n,) of points (n, 3) outside the tissue's surface, away from the probe."""
-        angle = sweeps.plane_angle_rad(trus_p_mm)
+        angle = np.arctan2(trus_p_mm[:, 1], trus_p_mm[:, 2])
         surface = self.scene.tissue.point(trus_p_mm[:, 0], angle)
         return np.asarray(np.hypot(trus_p_mm[:, 1], trus_p_mm[:, 2]) - np.hypot(surface[:, 1], surface[:, 2]))
 
     def plane_rad(self, t_s: float) -> float:
         """Plane angle at which the beam's end lies in the plane."""
-        return float(sweeps.plane_angle_rad(self.spot_mm(t_s)))
+        return float(self.config.scene.array.plane_angle_rad(self.spot_mm(t_s)))
 
     def truth_at(self, camera_s: Sequence[float], spots_s: Sequence[float]) -> dict[str, Any]:
         """Ground truth (plain numbers), to evaluate an estimate, never to make one.
@@ -320,7 +320,7 @@ class Room:
     def channel_data(self, t_s: float, scan_rad: float, index: int) -> npt.NDArray[np.int16]:
         """(elements, samples) the probe's data of a pulse at ``t_s`` with its plane at ``scan_rad``."""
         config, source = self.config.scene, self.spot_mm(t_s)
-        depth = sweeps.range_mm(source, np.asarray(scan_rad), config.probe.radius_mm)
+        depth = config.array.distance_mm(source, np.asarray(scan_rad))
         width = float(sweeps.half_width_rad(config.probe.sensitivity, depth)) + self.scene.window_edge_rad
         return LookPicture(source, scan_rad, width, (self.config.seed, index, 2)).record(config)
 

@@ -18,6 +18,7 @@ from fgreg.geometry.transforms import (
     transform_points,
 )
 from fgreg.model.session_model import CameraModel, StereoRig, TagModel
+from fgreg.model.systematic import Constant
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.lens import project_points
 
@@ -28,6 +29,7 @@ ROUNDS = 40
 PATIENCE = 12
 """Number of rounds of candidates before a shot is given up, and before its PM is moved."""
 EDGE_PX = 12.0
+_MARKER_BIAS = (Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
 
 
 class UnseenError(ValueError):
@@ -123,6 +125,8 @@ def draw_scene(config: SimulationConfig, rng: np.random.Generator) -> Scene:
         camera_p_middle = transform_points(inverse(transforms[-1]), trus_p_middle)
         turn = exp_so3(rng.normal(0.0, math.radians(5.0), 3))
         shift = rng.normal(0.0, 3.0, 3)
+        if config.camera_move_mm is not None:
+            turn, shift = np.eye(3), config.camera_move_mm * _normalised(shift)
         move = make_transform(turn, camera_p_middle - turn @ camera_p_middle + shift)
         moves.append(move)
         transforms.append(transforms[-1] @ inverse(move))
@@ -136,12 +140,11 @@ def draw_scene(config: SimulationConfig, rng: np.random.Generator) -> Scene:
     roll_rad = float(rolls[int(np.argmax(facing))]) + rng.uniform(-1.0, 1.0)
 
     edge, bias = rng.standard_normal(), rng.standard_normal(3)
-    window_edge_rad = config.window_edge_rad
-    if window_edge_rad is None:
-        window_edge_rad = config.probe.sensitivity.edge_sigma_rad * float(edge)
+    fixed = config.deviations
+    window_edge_rad = fixed.get(Constant.WINDOW_EDGE, config.probe.sensitivity.edge_sigma_rad * float(edge))
     marker_bias_mm = config.noise.marker_bias_mm * bias
-    if config.marker_bias_mm is not None:
-        marker_bias_mm = np.array(config.marker_bias_mm, dtype=np.float64)
+    if not fixed.keys().isdisjoint(_MARKER_BIAS):
+        marker_bias_mm = np.array([fixed.get(constant, 0.0) for constant in _MARKER_BIAS])
     return Scene(
         tuple(transforms),
         tuple(moves),
@@ -202,7 +205,9 @@ def draw_pm_shots(config: SimulationConfig, scene: Scene, epochs: IntArray, rng:
         return _Targets(draw_pms(shape))
 
     camera_T_trus = inverse(np.stack(scene.trus_T_camera))[epochs]
-    plan = _Plan(camera_T_trus, scene.trus_beam, scene.trus_side, config.lambda_mm, config.beam_roll_rad)
+    plan = _Plan(
+        camera_T_trus, scene.trus_beam, scene.trus_side, config.lambda_mm, config.beam_roll_rad, config.water_mm
+    )
     return _draw_shots(config, scene, plan, draw, rng)[0]
 
 
@@ -274,6 +279,21 @@ class _Plan:
     side: FloatArray
     lambda_mm: tuple[float, float]
     roll_rad: float
+    water_mm: float = 0.0
+
+
+def refraction_mm(direction: FloatArray, water_mm: float, index: float) -> FloatArray:
+    """(..., 3) from the point in water that a beam hits to where it would go on in air as far as it goes in water.
+
+    The water's surface is level (normal TRUS z), ``water_mm`` above the point; ``direction`` (..., 3) is the beam's in
+    air, in TRUS axes, downwards. By Snell's law the part along the surface is that in air over ``index``.
+    """
+    if water_mm == 0.0:
+        return np.zeros_like(direction)
+    bent = direction / index
+    bent[..., 2] = -np.sqrt(1.0 - np.sum(np.square(bent[..., :2]), axis=-1))
+    way_mm = water_mm / -bent[..., 2:]
+    return np.asarray(way_mm * (direction - bent))
 
 
 def _draw_shots(
@@ -300,10 +320,12 @@ def _draw_shots(
         lam = rng.uniform(*plan.lambda_mm, shape)
         roll = scene.roll_rad + rng.uniform(-plan.roll_rad, plan.roll_rad, shape)
         tip = targets.spot_mm - lam[..., None] * direction
+        if plan.water_mm > 0.0:
+            tip = tip + refraction_mm(direction, plan.water_mm, config.water_index)
         frame_T_laser = make_transform(_laser_rotation(direction, plan.side, roll), tip)
         pose = plan.camera_T_frame[pending][:, None] @ (frame_T_laser @ laser_T_marker)
         good = _visible(config, pose)
-        if config.frames and targets.corner.size:
+        if config.has_camera and targets.corner.size:
             shot, candidate = np.nonzero(good)
             good[shot, candidate] = _corner_visible(
                 config, pose[shot, candidate], targets.camera_T_board[shot, candidate], targets.corner[shot, candidate]

@@ -7,7 +7,7 @@ the looks are measured there, with noise as ``session.yaml``'s ``noise`` block d
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, exp_so3, inverse, make_transform
+from fgreg.geometry.transforms import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    exp_so3,
+    inverse,
+    make_transform,
+    transform_points,
+)
 from fgreg.model.events import (
     EVENTS,
     AimEvent,
@@ -27,8 +35,11 @@ from fgreg.model.events import (
     TrusRecord,
 )
 from fgreg.simulation import sweeps
-from fgreg.simulation.config import SimulationConfig
+from fgreg.simulation.array import map_by_declared
+from fgreg.simulation.config import SimulationConfig, Sweep
+from fgreg.simulation.deviations import named
 from fgreg.simulation.documents import degrees, round_array, rows, session_document
+from fgreg.simulation.misreading import marker_poses_read, points_read, spots_read
 from fgreg.simulation.pictures import LookPicture, ShotPicture
 from fgreg.simulation.scene import AimShots, Scene, Shots, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
@@ -49,6 +60,8 @@ class SimulatedSession:
         frames: by the name that events use; each is rendered when called, the same every time.
         scene: the truth behind it.
         true_camera_T_marker: true marker poses by index into ``events``.
+        checks: ``check`` events, to be appended to ``events``: points of the last epoch that camera and scanner see.
+        check_points_mm: (checks, 3) where they truly are, TRUS.
     """
 
     config: SimulationConfig
@@ -59,6 +72,8 @@ class SimulatedSession:
     frames: Mapping[str, Callable[[], Frame]]
     scene: Scene
     true_camera_T_marker: Mapping[int, FloatArray]
+    checks: list[Document]
+    check_points_mm: FloatArray
 
 
 def simulate(config: SimulationConfig, seed: int) -> SimulatedSession:
@@ -91,10 +106,11 @@ class _Recorder:
     """Collects the events of one session in the order in which they happen."""
 
     def __init__(self, config: SimulationConfig, seed: int) -> None:
-        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(8)]
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(10)]
         self.config, self.seed = config, seed
         self.scene_rng, self.aim_rng, self.shot_rng, self.miss_rng = streams[:4]
-        self.marker_rng, self.stage_rng, self.look_rng, self.misc_rng = streams[4:]
+        self.marker_rng, self.stage_rng, self.look_rng, self.misc_rng = streams[4:8]
+        self.beside_rng, self.check_rng = streams[8:]
         self.events: list[Document] = []
         self.frames: dict[str, Callable[[], Frame]] = {}
         self.true_markers: dict[int, FloatArray] = {}
@@ -106,11 +122,17 @@ class _Recorder:
         pair_epochs = np.arange(config.pairs) * config.epochs // max(config.pairs, 1)
         track_epochs = np.arange(kinds.size) * config.epochs // max(kinds.size, 1)
         scene, aims, shots = self._plan(np.concatenate([pair_epochs, track_epochs]))
+        if config.beam_offset_mm:
+            shots = self._beside_their_beams(shots, np.concatenate([pair_epochs, track_epochs]))
         pms, tracks = _part(shots, slice(0, config.pairs)), _part(shots, slice(config.pairs, None))
         junk = np.zeros(config.pairs, dtype=bool)
         junk[self.misc_rng.permutation(config.pairs)[: config.junk_pairs]] = True
-        pm_looks = self._looks(pms.spot_mm, config.looks_per_pm, 1, junk)
-        track_looks = self._looks(tracks.spot_mm, config.track_looks, -1, np.zeros(kinds.size, dtype=bool))
+        slipped = (np.arange(config.pairs) >= config.stage_slip_at * config.pairs).astype(np.float64)
+        pm_looks = self._looks(config, pms.spot_mm, config.looks_per_pm, 1, junk, config.stage_slip_rad * slipped)
+        once = replace(config, sweep=Sweep.ALTERNATING) if config.sweep is Sweep.TWO_SIDED else config
+        clean = np.zeros(kinds.size, dtype=bool)
+        after = np.full(kinds.size, config.stage_slip_rad)
+        track_looks = self._looks(once, tracks.spot_mm, config.track_looks, -1, clean, after)
         idle_deg = np.degrees(self.misc_rng.uniform(-config.pm_angle_rad, config.pm_angle_rad, kinds.size))
 
         self._aims(aims)
@@ -124,8 +146,11 @@ class _Recorder:
             for j in np.flatnonzero(track_epochs == epoch):
                 looks = track_looks if kinds[j] else None
                 self._track(int(j), epoch, tracks, track_markers, looks, float(idle_deg[j]))
-                angle = sweeps.true_stage(config).device_from_scan(float(sweeps.plane_angle_rad(tracks.spot_mm[j])))
-                answers.append({"t": self.events[-1]["t"], "stage_deg": degrees(angle)})
+                angle = sweeps.true_stage(config).device_from_scan(
+                    float(config.array.plane_angle_rad(tracks.spot_mm[j]))
+                )
+                answers.append({"t": self.events[-1]["t"], "stage_deg": degrees(angle + config.stage_slip_rad)})
+        checks, check_points = self._checks()
         return SimulatedSession(
             config,
             self.seed,
@@ -135,6 +160,8 @@ class _Recorder:
             self.frames,
             scene,
             self.true_markers,
+            checks,
+            check_points,
         )
 
     def _plan(self, epochs: IntArray) -> tuple[Scene, AimShots, Shots]:
@@ -152,8 +179,7 @@ class _Recorder:
 
     def _truth(self, pms: Shots, answers: list[Document], junk: BoolArray) -> Document:
         config, scene = self.config, self.scene
-        speed = config.probe.sound_speed_m_s
-        return {
+        truth = {
             "trus_T_camera": [rows(transform) for transform in scene.trus_T_camera],
             "marker_T_laser": rows(scene.marker_T_laser),
             "pms": {i: rows(spot) for i, spot in enumerate(pms.spot_mm)},
@@ -161,17 +187,64 @@ class _Recorder:
             "x_seed": self.seed,
             "x_window_edge_deg": degrees(scene.window_edge_rad),
             "x_marker_bias_mm": [0.0, 0.0, 0.0] if config.frames else rows(scene.marker_bias_mm),
-            "x_sound_speed_ratio": (config.sound_speed_true_m_s or speed) / speed,
+            "x_sound_speed_ratio": config.array.sound_speed_ratio,
             "x_reversed_stage": config.reversed_stage,
             "x_reversed_elements": config.reversed_elements,
             "x_junk_pms": [int(i) for i in np.flatnonzero(junk)],
             "x_lambda_mm": rows(pms.lambda_mm),
         }
+        if config.deviations:
+            truth["x_deviations"] = {name: round(value, 9) for name, value in named(config.deviations).items()}
+        return truth
 
-    def _looks(self, trus_p_pm_mm: FloatArray, looks: int, first_sign: int, junk: BoolArray) -> _Looks:
-        config, rng, noise = self.config, self.look_rng, self.config.noise
+    def _beside_their_beams(self, shots: Shots, epochs: IntArray) -> Shots:
+        """The shots with their PMs a little beside the beam, across it."""
+        trus_T_camera = np.stack(self.scene.trus_T_camera)[epochs]
+        trus_beam = (trus_T_camera @ shots.camera_T_marker @ self.scene.marker_T_laser)[:, :3, 2]
+        away = self.config.beam_offset_mm * self.beside_rng.standard_normal(shots.spot_mm.shape)
+        away -= np.sum(away * trus_beam, axis=1, keepdims=True) * trus_beam
+        return replace(shots, spot_mm=shots.spot_mm + away)
+
+    def _checks(self) -> tuple[list[Document], FloatArray]:
+        """Points of the tissue as the camera (in its last place) and the scanner, turned to them, read them."""
+        config, rng, n = self.config, self.check_rng, self.config.checks
+        x = rng.uniform(-config.pm_x_mm, config.pm_x_mm, n)
+        trus_p = self.scene.tissue.point(x, rng.uniform(-config.pm_angle_rad, config.pm_angle_rad, n))
+        camera_p = transform_points(inverse(self.scene.trus_T_camera[-1]), trus_p)
+        scan = config.array.plane_angle_rad(trus_p)
+        measured = config.array.x_mm(trus_p, scan), config.array.range_mm(trus_p, scan)
+        by_scanner = map_by_declared(config.probe, scan + config.stage_slip_rad, *measured)
+        sigma = np.array(config.check_sigma_mm)
+        noise = sigma[:, None, None] * rng.standard_normal((2, n, 3))
+        by_camera = rows(points_read(config, camera_p) + noise[0])
+        covariances = [rows(s**2 * np.eye(3)) for s in sigma]
+        checks = [
+            {
+                "type": "check",
+                "t": self._now(),
+                "camera_p_mm": by_camera[i],
+                "covariance": covariances[0],
+                "trus_p_mm": rows(by_scanner[i] + noise[1, i]),
+                "trus_covariance": covariances[1],
+            }
+            for i in range(n)
+        ]
+        return checks, trus_p
+
+    def _looks(
+        self,
+        config: SimulationConfig,
+        trus_p_pm_mm: FloatArray,
+        looks: int,
+        first_sign: int,
+        junk: BoolArray,
+        slip_rad: FloatArray,
+    ) -> _Looks:
+        rng, noise, array = self.look_rng, config.noise, config.array
         n = trus_p_pm_mm.shape[0]
-        stops = sweeps.look(config, trus_p_pm_mm, looks, first_sign, self.scene.window_edge_rad, self.stage_rng)
+        edge_rad = self.scene.window_edge_rad
+        stops = sweeps.look(config, trus_p_pm_mm, looks, first_sign, edge_rad, self.stage_rng, slip_rad)
+        looks = stops.scan_rad.shape[1]
         device = stops.device_rad + noise.scan_rad * self.stage_rng.standard_normal((n, looks))
         source = np.repeat(trus_p_pm_mm[:, None], looks, axis=1)
         junk_x: FloatArray = rng.uniform(-config.pm_x_mm, config.pm_x_mm, (n, 1))
@@ -182,17 +255,14 @@ class _Recorder:
             rho = junk_rho[junk]
             x = np.broadcast_to(junk_x[junk], scan.shape)
             source[junk] = np.stack([x, rho * np.sin(scan), rho * np.cos(scan)], axis=-1)
-        speed = config.probe.sound_speed_m_s
-        slowness = speed / (config.sound_speed_true_m_s or speed)
-        distance = sweeps.range_mm(source, stops.scan_rad, config.probe.radius_mm)
         mirror = -1.0 if config.reversed_elements else 1.0
-        offset = sweeps.plane_angle_rad(source) - stops.scan_rad
+        offset = array.rotation_rad(source, stops.scan_rad)
         amplitude = strength * config.elevation.amplitude(offset, stops.half_width_rad)
         return _Looks(
             np.degrees(device),
             stops.device_sweep,
-            mirror * source[..., 0] + noise.lateral_mm * rng.standard_normal((n, looks)),
-            distance * slowness + noise.range_mm * rng.standard_normal((n, looks)),
+            mirror * array.x_mm(source, stops.scan_rad) + noise.lateral_mm * rng.standard_normal((n, looks)),
+            array.range_mm(source, stops.scan_rad) + noise.range_mm * rng.standard_normal((n, looks)),
             amplitude * np.exp(config.amplitude_noise * rng.standard_normal((n, looks))),
             source,
             stops.scan_rad,
@@ -206,13 +276,13 @@ class _Recorder:
         noise, n = self.config.noise, shots.lambda_mm.size
         w = self.marker_rng.standard_normal((n, 3)) * noise.marker_rotation_rad
         shift = self.marker_rng.standard_normal((n, 3)) * noise.marker_translation_mm + self.scene.marker_bias_mm
-        turned = exp_so3(w) @ shots.camera_T_marker[:, :3, :3]
-        poses = make_transform(turned, shots.camera_T_marker[:, :3, 3] + shift)
+        read = marker_poses_read(self.config, shots.camera_T_marker)
+        poses = make_transform(exp_so3(w) @ read[:, :3, :3], read[:, :3, 3] + shift)
         return [MarkerRecord(pose) for pose in round_array(poses)]
 
     def _aims(self, aims: AimShots) -> None:
         markers = self._observed(aims.shots)
-        spots = round_array(aims.camera_p_spot_mm)
+        spots = round_array(spots_read(self.config, aims.camera_p_spot_mm, aims.camera_T_board, aims.corner))
         for i, marker in enumerate(markers):
             pose = aims.shots.camera_T_marker[i]
             if marker is None:
@@ -305,6 +375,8 @@ class _Recorder:
         )
 
     def _camera_moved(self, move: FloatArray) -> None:
+        if not self.config.camera_moves_reported:
+            return
         t = self._now()
         if not self.config.camera_move_known:
             self._add(CameraMovedEvent(t, 0), None)
