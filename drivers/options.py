@@ -63,14 +63,14 @@ def _check_device(text: str) -> None:
 
 
 def _check_host(text: str) -> None:
-    """Raises InputError for what cannot be a host."""
+    """Raises InputError for an invalid host."""
     from fgreg.drivers.tcp_link import Endpoint
 
     Endpoint(text, 1)
 
 
 def _check_fourcc(text: str) -> None:
-    """Raises InputError for what is no FOURCC."""
+    """Raises InputError for an invalid FOURCC."""
     if len(text) != 4 or not text.isascii():
         raise InputError("fourcc", repr(text), "four characters such as MJPG")
 
@@ -90,9 +90,9 @@ _GAP = Number(0.0, 1.0, above=True, unit="s")
 _MM = Number(-500.0, 500.0, unit="mm")
 _RECORDING = ExistingPath()
 
-Silent = Annotated[float | None, Key("silent for so long, it counts as lost; null: never", _SECONDS, null=True)]
+Silent = Annotated[float | None, Key("longest silence until it counts as lost; null: no limit", _SECONDS, null=True)]
 Flip = Annotated[bool, Key("its columns run against TRUS x")]
-Limits = Annotated[Mapping[str, Any] | None, Key("besides those of session.yaml", LIMITS)]
+Limits = Annotated[Mapping[str, Any] | None, Key("in addition to those of session.yaml", LIMITS)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +105,7 @@ class EndoscopeOptions:
     """One or two video inputs."""
 
     left: Annotated[
-        str,
-        Key("device number or path, stream, video file, folder of pictures", VideoSource(), example="/dev/video0"),
+        str, Key("device number or path, stream, video file, folder of pictures", VideoSource(), example="/dev/video0")
     ]
     right: Annotated[
         str | None, Key("the right input, where there are two", VideoSource(), null=True, example="/dev/video1")
@@ -120,22 +119,25 @@ class EndoscopeOptions:
             example="separate",
         ),
     ] = None
-    swap: Annotated[bool, Key("left and right are the other way round in each frame")] = False
+    swap: Annotated[bool, Key("left and right are exchanged in each frame")] = False
     fields: Annotated[str, Key("of interlaced frames", Text(allowed=("whole", "top", "bottom", "both")))] = "whole"
-    width: Annotated[int | None, Key("asked of a device, px", Integer(16, 8192), null=True, example="1280")] = None
-    height: Annotated[int | None, Key("asked of a device, px", Integer(16, 8192), null=True, example="720")] = None
-    fps: Annotated[float | None, Key("asked of a device; a folder's pace", _RATE, null=True, example="30")] = None
+    width: Annotated[int | None, Key("wanted from a device, px", Integer(16, 8192), null=True, example="1280")] = None
+    height: Annotated[int | None, Key("wanted from a device, px", Integer(16, 8192), null=True, example="720")] = None
+    fps: Annotated[float | None, Key("wanted from a device; rate of a folder", _RATE, null=True, example="30")] = None
     fourcc: Annotated[
         str | None,
         Key(
-            "kind of pixels asked of a device", Text("four characters", check=_check_fourcc), null=True, example="MJPG"
+            "pixel format requested from a device",
+            Text("four characters", check=_check_fourcc),
+            null=True,
+            example="MJPG",
         ),
     ] = None
-    loop: Annotated[bool, Key("files and folders begin again at their end")] = False
+    loop: Annotated[bool, Key("files and folders are repeated at their end")] = False
     delay_s: Annotated[float, Key("from the exposure to the device's time stamp", Number(-1.0, 1.0, unit="s"))] = 0.0
-    max_gap_s: Annotated[float, Key("most time between left and right", _GAP)] = 0.017
+    max_gap_s: Annotated[float, Key("longest time between left and right", _GAP)] = 0.017
     by_arrival: Annotated[bool, Key("match two inputs by their times of arrival")] = False
-    silence_s: Annotated[float, Key("silent for so long, it counts as lost", _SECONDS)] = 0.7
+    silence_s: Annotated[float, Key("longest silence until it counts as lost", _SECONDS)] = 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +145,7 @@ class RecordingOptions:
     """A ROS 2 recording that is played."""
 
     path: Annotated[Path, Key("rosbag2 folder, .mcap or .db3", _RECORDING, example="recording.mcap")]
-    speed: Annotated[float, Key("how many times as fast as it was recorded", Number(0.0, 100.0, above=True))] = 1.0
+    speed: Annotated[float, Key("factor on the recorded speed", Number(0.0, 100.0, above=True))] = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,7 +158,7 @@ class RecordedCameraOptions(RecordingOptions):
     right: Annotated[
         str | None, Key("topic of the right images; found by its name", null=True, example="/rig/right/image_raw")
     ] = None
-    max_gap_s: Annotated[float, Key("most time between left and right", _GAP)] = 0.017
+    max_gap_s: Annotated[float, Key("longest time between left and right", _GAP)] = 0.017
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,7 +169,7 @@ class RecordedMotionOptions(RecordingOptions):
         str | None, Key("of the holder's poses; found by its name", null=True, example="/ECM/measured_cp")
     ] = None
     tip_T_camera: Annotated[
-        FloatArray | None, Key("where the camera is on what the poses are of, mm", Transform(), null=True)
+        FloatArray | None, Key("the camera in the frame that the poses are of, mm", Transform(), null=True)
     ] = None
 
 
@@ -176,7 +178,7 @@ class ThorlabsOptions:
     """PRM1Z8 on a KDC101 or TDC001."""
 
     port: Annotated[
-        str | None, Key("serial port; the only cube that is plugged in", null=True, example="/dev/ttyUSB0")
+        str | None, Key("serial port; default: the only connected cube", null=True, example="/dev/ttyUSB0")
     ] = None
     acceleration_deg_s2: Annotated[float, Key("of every motion", Number(0.0, 100.0, above=True, unit="deg/s^2"))] = 20.0
     limits: Limits = None
@@ -184,10 +186,10 @@ class ThorlabsOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StandInOptions:
-    """A simulated stage beside real devices."""
+    """A simulated stage together with real devices."""
 
-    device_deg: Annotated[float, Key("where it stands at first", Number(-180.0, 180.0, unit="deg"))] = 0.0
-    homed: Annotated[bool, Key("it knows its zero position at first")] = False
+    device_deg: Annotated[float, Key("angle at the start", Number(-180.0, 180.0, unit="deg"))] = 0.0
+    homed: Annotated[bool, Key("it is homed at the start")] = False
     max_speed_deg_s: Annotated[float, Key("of the motor", Number(0.0, 100.0, above=True, unit="deg/s"))] = 25.0
     acceleration_deg_s2: Annotated[float, Key("of the motor", Number(0.0, 1000.0, above=True, unit="deg/s^2"))] = 25.0
     limits: Limits = None
@@ -204,9 +206,9 @@ class RoomStageOptions:
 class Connection:
     """A peer that speaks OpenIGTLink."""
 
-    host: Annotated[str, Key("the other side's; with listen: where to listen", _HOST)] = "127.0.0.1"
+    host: Annotated[str, Key("of the peer; with listen: address to listen at", _HOST)] = "127.0.0.1"
     port: Annotated[int, Key("TCP port", _PORT)] = IGTL_PORT
-    listen: Annotated[bool, Key("wait for the other side to connect")] = False
+    listen: Annotated[bool, Key("wait for the peer to connect")] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,7 +216,7 @@ class IgtlProbeOptions(Connection):
     """Images, one for each laser pulse."""
 
     device: Annotated[str, _named("of the pulses' images")] = "Image_Probe"
-    transposed: Annotated[bool, Key("its rows are what session.yaml has as columns")] = False
+    transposed: Annotated[bool, Key("its rows are the columns of session.yaml")] = False
     silent_s: Silent = 0.8
 
 
@@ -254,7 +256,7 @@ class BkOptions:
         ),
     ]
     port: Annotated[int, Key("of its OEM interface", _PORT)] = BK_PORT
-    rate_hz: Annotated[int, Key("pictures asked for, a second", Integer(1, 100))] = 20
+    rate_hz: Annotated[int, Key("pictures requested per second", Integer(1, 100))] = 20
     flip: Flip = False
     silent_s: Silent = 0.8
 
@@ -264,7 +266,7 @@ class IgtlSinkOptions(Connection):
     """Receiver of the registration."""
 
     port: Annotated[int, Key("TCP port", _PORT)] = SINK_PORT
-    listen: Annotated[bool, Key("wait for the other side to connect")] = True
+    listen: Annotated[bool, Key("wait for the peer to connect")] = True
     registration: Annotated[str, _named("of the registration")] = "CameraToTrus"
     plane: Annotated[str, _named("of the image plane")] = "PlaneToTrus"
     status: Annotated[str, _named("of the state")] = "RegistrationStatus"
@@ -276,5 +278,5 @@ class IgtlSinkOptions(Connection):
 class IgtlOperatorOptions(Connection):
     """Texts of a foot switch, or of a button in 3D Slicer."""
 
-    device: Annotated[str, _named("of its words")] = "Operator"
-    answers: Annotated[str, _named("of what it is told")] = "OperatorTold"
+    device: Annotated[str, _named("of its commands")] = "Operator"
+    answers: Annotated[str, _named("of messages to it")] = "OperatorTold"

@@ -40,7 +40,7 @@ EXTRAS: Mapping[str, tuple[str, str]] = {
     "ros": ("rosbags", "ROS 2 recordings"),
     "plots": ("matplotlib", "plots of fgreg evaluate"),
 }
-"""Of the package: the module that each brings, and what it is for."""
+"""Extras of the package: the module of each, and its purpose."""
 
 _DISTRIBUTIONS = {"serial": "pyserial"}
 
@@ -58,8 +58,8 @@ class DriverEntry:
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
         check: ``module:function``, called with the options: raises InputError, ValueError, opens no device.
-        ask: ``module:function``, called with DriverContext and the options: says what is there, or raises; of devices
-            that are not to be opened only to see whether they answer.
+        ask: ``module:function``, called with DriverContext and the options: describes the device, or raises; for devices
+            that must not be opened only for a check.
     """
 
     role: Role
@@ -73,7 +73,7 @@ class DriverEntry:
     ask: str | None = None
 
     def require(self) -> None:
-        """Raises MissingExtraError where its library is not installed."""
+        """Raise MissingExtraError where its library is not installed."""
         if self.extra is not None and not installed(self.extra):
             raise MissingExtraError(distribution(self.extra), self.extra)
 
@@ -83,7 +83,7 @@ class DriverEntry:
         return record(self.options, ("driver", self.name))
 
     def checked(self, chosen: Any) -> None:
-        """Raises InputError, MissingExtraError, ValueError where options, right each by itself, cannot be."""
+        """Raises InputError, MissingExtraError, ValueError where options do not fit together."""
         self.require()
         if self.check is not None:
             load(self.check)(chosen)
@@ -95,7 +95,7 @@ class DriverEntry:
 
 
 def installed(extra: str) -> bool:
-    """Whether an extra's library is there; it is not imported."""
+    """Whether an extra's library is installed; it is not imported."""
     try:
         return importlib.util.find_spec(EXTRAS[extra][0]) is not None
     except (ImportError, ValueError):
@@ -103,7 +103,7 @@ def installed(extra: str) -> bool:
 
 
 def distribution(extra: str) -> str:
-    """What the package index calls an extra's library."""
+    """Name of an extra's library in the package index."""
     module = EXTRAS[extra][0]
     return _DISTRIBUTIONS.get(module, module)
 
@@ -167,7 +167,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
     DriverEntry(
         Role.STAGE,
         "stand-in",
-        "a simulated stage beside real devices, for rehearsals: nothing turns",
+        "a simulated stage together with real devices, for rehearsals: nothing turns",
         options.StandInOptions,
         "simulated_stage:open_stage",
         ask="simulated_stage:ask_stage",
@@ -207,7 +207,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
     DriverEntry(
         Role.SINKS,
         "igtl",
-        "3D Slicer, PLUS: takes the registration over OpenIGTLink",
+        "3D Slicer, PLUS: receivers of the registration over OpenIGTLink",
         options.IgtlSinkOptions,
         "igtl:open_sink",
         extra="igtl",
@@ -215,7 +215,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
     DriverEntry(
         Role.OPERATOR,
         "keyboard",
-        "whoever sits at the terminal",
+        "the operator at the terminal",
         options.NoOptions,
         "keyboard:open_keyboard",
         ask="keyboard:ask_keyboard",
@@ -237,7 +237,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         room=True,
     ),
 )
-"""All of them; the first of a role is the one that examples show."""
+"""All drivers; examples show the first of a role."""
 
 
 def drivers_of(role: Role) -> Mapping[str, DriverEntry]:
