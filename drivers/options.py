@@ -121,17 +121,12 @@ class EndoscopeOptions:
     ] = None
     swap: Annotated[bool, Key("left and right are exchanged in each frame")] = False
     fields: Annotated[str, Key("of interlaced frames", Text(allowed=("whole", "top", "bottom", "both")))] = "whole"
-    width: Annotated[int | None, Key("wanted from a device, px", Integer(16, 8192), null=True, example="1280")] = None
-    height: Annotated[int | None, Key("wanted from a device, px", Integer(16, 8192), null=True, example="720")] = None
-    fps: Annotated[float | None, Key("wanted from a device; rate of a folder", _RATE, null=True, example="30")] = None
+    width: Annotated[int | None, Key("requested width, px", Integer(16, 8192), null=True, example="1280")] = None
+    height: Annotated[int | None, Key("requested height, px", Integer(16, 8192), null=True, example="720")] = None
+    fps: Annotated[float | None, Key("requested rate; rate of a folder", _RATE, null=True, example="30")] = None
     fourcc: Annotated[
         str | None,
-        Key(
-            "pixel format requested from a device",
-            Text("four characters", check=_check_fourcc),
-            null=True,
-            example="MJPG",
-        ),
+        Key("requested pixel format", Text("four characters", check=_check_fourcc), null=True, example="MJPG"),
     ] = None
     loop: Annotated[bool, Key("files and folders are repeated at their end")] = False
     delay_s: Annotated[float, Key("from the exposure to the device's time stamp", Number(-1.0, 1.0, unit="s"))] = 0.0

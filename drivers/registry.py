@@ -58,8 +58,8 @@ class DriverEntry:
         extra: of the package, where it needs one.
         room: whether the device is one of the simulated room.
         check: ``module:function``, called with the options: raises InputError, ValueError, opens no device.
-        ask: ``module:function``, called with DriverContext and the options: describes the device, or raises; for devices
-            that must not be opened only for a check.
+        ask: ``module:function``, called with DriverContext and the options: describes the device, or raises; for
+            devices that must not be opened only for a check.
     """
 
     role: Role
