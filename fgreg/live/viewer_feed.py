@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,12 +22,13 @@ from fgreg.model.events import AimEvent, NoteEvent, PairEvent
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
 from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
-from fgreg.viewer.recording import Viewer
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.spawn import spawn_viewer
 from fgreg.viewer.status_line import Now
+
+if TYPE_CHECKING:
+    from fgreg.viewer.recording import Viewer
 
 LOOK_S = 0.5
 """Time between two drawings of the tracking state; drawing takes processor time from the loop."""
@@ -40,8 +41,8 @@ INSTEAD = (
 )
 
 
-class ViewerFeed(Protocol):
-    """Interface of a session's display."""
+class ViewerFeed:
+    """A session's display; this one shows nothing."""
 
     def session(self, model: SessionModel) -> None:
         """The session begins."""
@@ -51,19 +52,6 @@ class ViewerFeed(Protocol):
 
     def status(self, status: Status) -> None:
         """A step of the loop has ended."""
-
-
-class NullFeed:
-    """Shows nothing."""
-
-    def session(self, model: SessionModel) -> None:
-        """Nothing is drawn."""
-
-    def taken(self, event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
-        """Nothing is drawn."""
-
-    def status(self, status: Status) -> None:
-        """Nothing is drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +67,7 @@ class _Drawing:
     ended: bool = False
 
 
-class RerunFeed:
+class RerunFeed(ViewerFeed):
     """Draws on a thread of its own; if it cannot keep up, the oldest drawings are left out.
 
     Attributes:
@@ -176,6 +164,8 @@ class RerunFeed:
                 self.left_out += 1
 
     def _draw(self, drawing: _Drawing) -> None:
+        from fgreg.viewer.live import ViewerUpdate  # loads Rerun
+
         estimate, number, status, model = drawing.estimate, self._number, drawing.status, self._model
         invalid = "" if status is None else status.invalid
         if model is None:
@@ -244,7 +234,7 @@ def viewer_feed(rrd: Path | None, name: str, *, live: bool, say: Callable[[str],
         InputError: the recording cannot be written there.
     """
     if rrd is None and not live:
-        yield NullFeed()
+        yield ViewerFeed()
         return
     url = None
     if live:

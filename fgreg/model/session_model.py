@@ -478,7 +478,7 @@ class SessionModel:
             default="those of a careful lab",
             brief=True,
         ),
-    ] = Systematic()
+    ] = Systematic()  # noqa: RUF009 - frozen
 
     def __post_init__(self) -> None:
         if not len(self.targets_mm):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,10 +42,11 @@ from fgreg.registration.solve import solve
 from fgreg.session.result_file import write_result
 from fgreg.session.session_reader import Session, read_ground_truth, read_session
 from fgreg.version import __version__
-from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
-from fgreg.viewer.recording import Viewer
 from fgreg.viewer.spawn import spawn_viewer
+
+if TYPE_CHECKING:
+    from fgreg.viewer.recording import Viewer
 
 Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent
 
@@ -249,6 +251,8 @@ class _Player:
     def _show(self, index: int, event: Shown, shot: int, step: ReplayStep) -> None:
         if isinstance(self._viewer, NullViewer):
             return
+        from fgreg.viewer.live import ViewerUpdate  # loads Rerun
+
         known, measured = self.estimate, self._measured.get(index)
         self._viewer.update(
             ViewerUpdate(

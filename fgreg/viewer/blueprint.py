@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+import rerun.blueprint as rrb
 
 from fgreg.model.estimate import Verdict
 from fgreg.viewer.scene import Eye
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 WORLD_NAME = {
     None: "World: TRUS frame, mm (no result in this recording)",
@@ -49,8 +47,6 @@ class Contents:
 
 def make_blueprint(contents: Contents, verdict: Verdict | None, eye: Eye | None) -> rrb.Blueprint:
     """The blueprint: the 3D world at the left; images, text and plots at the right; the cursor at the last shot."""
-    import rerun.blueprint as rrb
-
     until_now = rrb.VisibleTimeRanges(
         [
             rrb.VisibleTimeRange(

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import rerun as rr
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
@@ -95,8 +96,6 @@ class LiveDrawing:
 
     def _now(self, update: ViewerUpdate, now: Now) -> None:
         """Draw the current and the desired stage angle, and the verdict as a colour."""
-        import rerun as rr
-
         rec, stage = self._rec, self._model.stage
         if now.scan_rad is None:
             rec.log("world/stage", shapes.transform(None))
@@ -197,8 +196,6 @@ class LiveDrawing:
         return tip
 
     def _figures(self, update: ViewerUpdate) -> None:
-        import rerun as rr
-
         rec = self._rec
         if update.tre is not None and math.isfinite(update.tre.worst_mm):
             rec.log("online/predicted_worst_mm/worst", rr.Scalars(min(update.tre.worst_mm, LARGEST_PLOTTED_MM)))

@@ -25,6 +25,7 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
+import rerun as rr
 
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, exp_so3
@@ -126,8 +127,6 @@ class Viewer:
 
     def session(self, model: SessionModel) -> None:
         """Draw the static parts: probe, array, axes, cameras, the marker's outline, the plots' styles."""
-        import rerun as rr
-
         self._model = model
         rec, probe = self._rec, model.probe
         length = scene.array_length_mm(probe)

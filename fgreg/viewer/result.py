@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import rerun as rr
 
 from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
 from fgreg.model.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
@@ -213,8 +214,6 @@ class ResultDrawing:
         return tip
 
     def _say(self, what: str, used: bool, reason: str, residual_mm: float | None) -> None:
-        import rerun as rr
-
         words = [what] if used else [what, f"not used: {reason}"]
         if residual_mm is not None:
             words.append(f"residual {residual_mm:.3f} mm")
@@ -250,8 +249,6 @@ class ResultDrawing:
             self.rec.series("plots/nis/limit_95", (first[0], last[0]), (first[1], last[1]), limits)
 
     def _static(self, judge: Callable[..., None]) -> None:
-        import rerun as rr
-
         if self.truth is not None and self.truth.trus_p_pm_mm:
             known = np.array(list(self.truth.trus_p_pm_mm.values()))
             self.rec.static("world/truth/pms", shapes.small_points(known, shapes.TRUTH, 2.5))

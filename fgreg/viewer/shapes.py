@@ -1,6 +1,6 @@
 """Elements of a recording: colours, a stream with two timelines, Rerun archetypes from arrays.
 
-``rerun`` is imported at the first use, not with this module: its import takes more than half a second.
+This module imports Rerun, which takes more than half a second; see :mod:`fgreg.viewer.null_viewer`.
 """
 
 from __future__ import annotations
@@ -8,19 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import rerun as rr
+import rerun.blueprint as rrb
 
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.model.session_model import CameraModel, SessionModel
 from fgreg.viewer.pa_frame import PaPicture
 from fgreg.viewer.scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
-
-if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
 
 Color = tuple[int, int, int]
 Image8 = npt.NDArray[np.uint8]
@@ -60,8 +57,6 @@ class Recorder:
     """
 
     def __init__(self, path: Path | None, name: str, url: str | None = None) -> None:
-        import rerun as rr
-
         self._stream = rr.RecordingStream("fgreg")
         sinks: list[rr.FileSink | rr.GrpcSink] = []
         if path is not None:
@@ -86,15 +81,11 @@ class Recorder:
 
     def clear(self, *paths: str) -> None:
         """Clear these paths and all below them from the current time on."""
-        import rerun as rr
-
         for path in paths:
             self._stream.log(path, rr.Clear(recursive=True))
 
     def series(self, path: str, shots: Sequence[int], seconds: Sequence[float], values: Sequence[float]) -> None:
         """Log all values of a plot at once; three sequences of the same length."""
-        import rerun as rr
-
         indexes = [rr.TimeColumn("shot", sequence=shots), rr.TimeColumn("time", duration=seconds)]
         self._stream.send_columns(path, indexes=indexes, columns=rr.Scalars.columns(scalars=values))
 
@@ -118,8 +109,6 @@ def transform(a_T_b: FloatArray | None) -> rr.Transform3D:
 
     A scale of 0 does not work: Rerun treats it as an error and shows everything at the parent's origin.
     """
-    import rerun as rr
-
     if a_T_b is None:
         return rr.Transform3D(parent_frame=NOWHERE)
     return rr.Transform3D(translation=a_T_b[:3, 3], mat3x3=a_T_b[:3, :3])
@@ -127,30 +116,22 @@ def transform(a_T_b: FloatArray | None) -> rr.Transform3D:
 
 def axes(lengths_mm: FloatArray | float) -> rr.Arrows3D:
     """Red, green, blue arrows along x, y, z; one length, or (3,)."""
-    import rerun as rr
-
     vectors = np.diag(np.broadcast_to(lengths_mm, 3))
     return rr.Arrows3D(origins=np.zeros((3, 3)), vectors=vectors, colors=AXES, radii=[ui(1.5)])
 
 
 def axis_labels(lengths_mm: FloatArray, labels: Sequence[str]) -> rr.Points3D:
     """Names at the ends of :func:`axes`."""
-    import rerun as rr
-
     return rr.Points3D(np.diag(lengths_mm), colors=AXES, radii=[ui(0.5)], labels=labels)
 
 
 def point(p_mm: FloatArray | Sequence[float], color: Color, size: float, label: str | None = None) -> rr.Points3D:
     """One point, ``size`` screen points in radius, with its label shown."""
-    import rerun as rr
-
     return rr.Points3D([p_mm], colors=[color], radii=[ui(size)], labels=None if label is None else [label])
 
 
 def strips(strips_mm: Sequence[FloatArray], color: Color, size: float, label: str | None = None) -> rr.LineStrips3D:
     """Lines through (n, 3) points each, ``size`` screen points in radius."""
-    import rerun as rr
-
     return rr.LineStrips3D(strips_mm, colors=[color], radii=[ui(size)], labels=None if label is None else [label])
 
 
@@ -158,8 +139,6 @@ def arrow(
     origin_mm: FloatArray, tip_mm: FloatArray, color: Color, size: float, label: str | None = None
 ) -> rr.Arrows3D:
     """One arrow, ``size`` screen points in radius."""
-    import rerun as rr
-
     labels = None if label is None else [label]
     return rr.Arrows3D(
         origins=[origin_mm], vectors=[tip_mm - origin_mm], colors=[color], radii=[ui(size)], labels=labels
@@ -171,8 +150,6 @@ def ellipsoids(centres_mm: FloatArray, covariances: FloatArray, color: Color) ->
 
     Those longer than LARGEST_ELLIPSOID_MM are left out: they would hide the scene and mean only "unknown".
     """
-    import rerun as rr
-
     shapes = [ellipsoid_95(covariance) for covariance in covariances]
     drawn = [i for i, shape in enumerate(shapes) if shape.half_sizes_mm.max() <= LARGEST_ELLIPSOID_MM]
     shapes = [shapes[i] for i in drawn]
@@ -187,8 +164,6 @@ def ellipsoids(centres_mm: FloatArray, covariances: FloatArray, color: Color) ->
 
 def small_points(points_mm: FloatArray, color: Color, size: float) -> rr.Points3D:
     """Points (n, 3) without labels, ``size`` screen points in radius."""
-    import rerun as rr
-
     return rr.Points3D(points_mm, colors=[color], radii=[ui(size)])
 
 
@@ -199,8 +174,6 @@ def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) ->
         corners_mm: (4, 3), the picture's first row first, each row from its first column; then back along the last.
         picture: RGB.
     """
-    import rerun as rr
-
     triangles = [[0, 1, 2], [0, 2, 3]]
     return rr.Mesh3D(
         vertex_positions=corners_mm,
@@ -219,8 +192,6 @@ def plane_outline(corners_mm: FloatArray, color: Color = PLANE) -> rr.LineStrips
 
 def probe(length_mm: float, radius_mm: float) -> rr.Capsules3D:
     """The housing: a cylinder about the x axis with round ends, just inside the array's face."""
-    import rerun as rr
-
     return rr.Capsules3D(
         lengths=[length_mm],
         radii=[radius_mm],
@@ -235,8 +206,6 @@ def probe(length_mm: float, radius_mm: float) -> rr.Capsules3D:
 
 def pinhole(camera: CameraModel, color: Color) -> rr.Pinhole:
     """A camera's frustum, without its distortion."""
-    import rerun as rr
-
     return rr.Pinhole(
         image_from_camera=camera.matrix,
         resolution=camera.image_size,
@@ -262,16 +231,12 @@ def draw_cameras(rec: Recorder, model: SessionModel, color: Color) -> None:
 
 def picture(image: Image8) -> rr.EncodedImage | rr.Image:
     """A (h, w) grey or (h, w, 3) BGR image as JPEG."""
-    import rerun as rr
-
     image = np.ascontiguousarray(image)
     return rr.Image(image, color_model="BGR" if image.ndim == 3 else "L").compress(jpeg_quality=JPEG_QUALITY)
 
 
 def flat(color: Color) -> rr.Image:
     """A strip of one colour."""
-    import rerun as rr
-
     return rr.Image(np.full((*BANNER, 3), color, dtype=np.uint8))
 
 
@@ -295,15 +260,11 @@ def canvas(image: Image8) -> Image8:
 
 def points_2d(pixels: FloatArray, color: Color, size: float, labels: Sequence[str] | None = None) -> rr.Points2D:
     """Points (n, 2) on an image, with their labels shown."""
-    import rerun as rr
-
     return rr.Points2D(pixels, colors=[color], radii=[ui(size)], labels=labels, show_labels=labels is not None)
 
 
 def strips_2d(strips_px: Sequence[FloatArray], color: Color, size: float) -> rr.LineStrips2D:
     """Lines on an image."""
-    import rerun as rr
-
     return rr.LineStrips2D(strips_px, colors=[color], radii=[ui(size)])
 
 
