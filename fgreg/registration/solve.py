@@ -28,6 +28,7 @@ from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
+from fgreg.registration.camera_conditions import camera_conditions
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import Posterior, predicted_tre
 from fgreg.registration.posterior_mean import (
@@ -118,14 +119,19 @@ def solve(
     try:
         registration = register(measurements, model, config, sound_speed_prior, known)
     except EstimationError as error:
-        return _no_solution(measurements, tracks, [*conditions, Condition(Verdict.REFUSED, str(error))])
+        seen = camera_conditions(measurements, model, config)
+        return _no_solution(measurements, tracks, [*conditions, *seen, Condition(Verdict.REFUSED, str(error))])
     answered = posterior_mean(registration, config)
     posterior, centred = answered.posterior, answered.registration
+    state = centred.optimum.state
     readout = read_laser(centred, model)
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
     aims = read_aims(measurements, centred, readout.origin_shift_mm)
     common = [
         *conditions,
+        *camera_conditions(
+            measurements, model, config, [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
+        ),
         *_common_conditions(registration, pairs, aims),
         *sampling(posterior.effective),
         *_variable_conditions(centred, sound_speed_prior, config),
