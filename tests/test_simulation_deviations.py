@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from fgreg.cli.main import app
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, log_so3, make_transform
+from fgreg.model.camera_dependence import nominal_pose_gain
 from fgreg.model.session_model import CameraModel, NoiseModel, StereoRig, TagModel
 from fgreg.model.systematic import NONE, Constant, Systematic
 from fgreg.session.session_reader import read_session
@@ -245,6 +246,12 @@ def simple_rig(width: int = 1280, both: bool = True) -> StereoRig:
     return StereoRig(camera, camera, as_float_array(right_T_left)) if both else StereoRig(camera)
 
 
+def undistorted(rig: StereoRig) -> StereoRig:
+    assert rig.right is not None
+    left, right = (replace(c, distortion=as_float_array(np.zeros(5))) for c in (rig.left, rig.right))
+    return replace(rig, left=left, right=right)
+
+
 ANGLE = math.radians(0.2)
 
 
@@ -344,6 +351,25 @@ def test_poses_of_a_session_carry_what_the_camera_misreads() -> None:
         read = np.array(simulated.events[i]["marker"]["camera_T_marker"])
         assert read[2, 3] / true[2, 3] == pytest.approx(1.0 / 0.97, abs=0.006)
         assert np.linalg.norm(log_so3(read[:3, :3] @ true[:3, :3].T)) < 0.02
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_estimator_moves_poses_back_to_where_they_were(camera: bool, tmp_path: Path) -> None:
+    # Two derivations of one thing: solved again by the declared rig, and linearised (which leaves distortion out).
+    config = quiet(pairs=3, aims=3, camera_declared=camera, camera=undistorted(default_rig()))
+    simulated = simulate(config, 1)
+    write_session(simulated, tmp_path / "s")
+    model = read_session(tmp_path / "s").model
+    true = np.stack(list(simulated.true_camera_T_marker.values()))
+    sigmas = Systematic().sigmas(0.0, 0.0)
+    for constant in list(Constant)[Constant.CAMERA_SCALE :]:
+        off = 0.3 * float(sigmas[constant])
+        read = marker_poses_read(replace(config, deviations={constant: off}), true)
+        turn = log_so3(true[:, :3, :3] @ np.swapaxes(read[:, :3, :3], 1, 2))
+        needed = np.concatenate([100.0 * turn, true[:, :3, 3] - read[:, :3, 3]], axis=1)  # turns at 100 mm
+        gain = nominal_pose_gain(model, read)[:, :, constant - Constant.MARKER_BIAS_X] * off
+        gain[:, :3] *= 100.0
+        np.testing.assert_allclose(gain, needed, atol=max(0.01 * np.abs(needed).max(), 1e-6), err_msg=constant.name)
 
 
 def test_marker_bias_is_fixed_where_it_is_given() -> None:
@@ -449,14 +475,12 @@ def test_constants_are_drawn_from_their_sigmas() -> None:
 
 
 def test_session_declares_what_it_is_told(tmp_path: Path) -> None:
-    straight = default_rig()
-    straight = replace(straight, left=replace(straight.left, distortion=as_float_array(np.zeros(5))))
     config = replace(
         PRESETS["first-hit"],
         aims=2,
         pairs=2,
         camera_declared=True,
-        declared_camera=straight,
+        declared_camera=undistorted(default_rig()),
         declared={"probe.radius_mm": 0.01},
         systematic=NONE,
     )

@@ -1,0 +1,515 @@
+"""What a lab that is not as declared does to the answer, its error bar and its verdict.
+
+Sessions of the simulator (which shares no code with the estimator), each solved from its folder by ``fgreg.solve``. A
+cell is KIND/NOISE/PAIRS or KIND/NOISE/PAIRS/two-sided.
+
+  kind   as-declared  nothing deviates
+         drawn        all constants drawn from the declared standard deviations, all at once; each PM beside its beam
+                      and each window's width varying, as declared. drawn-poses: in a session without a camera
+         careful      the constants of a careful lab, each at its magnitude with a random sign, and the same per PM
+         3s-NAME      one constant off by three of its standard deviations, either sign (NAME: a key of `systematic`)
+         else         one thing wrong, by far; --list has them all
+  noise  frames       what detection in clean frames leaves of the marker; published: noise of poses as published
+  pairs  first-hit pairs from alternating sides; two-sided: each PM heard from both sides
+
+Printed for each cell: true error at the worst target (RMS and 95 % over sessions), bound (95 % error that the result
+predicts there, RMS), share of sessions whose bound holds, share of targets within their own bounds, share of sessions
+with the truth in the registration's 95 % region (ellipsoids, from the covariance), predicted over true RMS at all
+targets, verdicts, `ok` beyond the bound, beyond twice the bound, and beyond bound and 3 mm; sessions that are not `ok`
+with a bound below the limit ("denied"); the same shares by quarter of the predicted error; the error that a target
+shows which the scanner sees as well, whose map is wrong by the same constants; time. Standard errors after +-.
+
+Where the camera moved, the truth is that of the camera now; "unseen" are sessions with fewer epochs than the camera had
+places, and not refused. A cell that misses an aim says so.
+
+    python tools/study_systematics.py --sessions 100 --cells radius-1mm/frames/15 drawn/published/25
+    python tools/study_systematics.py --sessions 1000 --cells 'drawn/*' --out drawn.jsonl --jobs 2
+
+The second goes on where an earlier run with this --out ended.
+
+Session k of a cell is the same whatever else is run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import json
+import math
+import sys
+import tempfile
+import time
+import warnings
+import zlib
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import fgreg
+from fgreg.geometry.target_error import target_jacobians, tre_mm
+from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
+from fgreg.model.session_model import NoiseModel
+from fgreg.model.systematic import CAMERA, NONE, Constant, Systematic
+from fgreg.simulation.array import map_by_declared
+from fgreg.simulation.config import SimulationConfig, Sweep
+from fgreg.simulation.deviations import NAMES, deviations_of, drawn_deviations
+from fgreg.simulation.presets import FIRST_HIT
+from fgreg.simulation.simulate import SimulatedSession, simulate
+from fgreg.simulation.write import write_session
+
+LIMIT_MM = 3.0
+CHI2_6 = 12.592
+"""95 % quantile of chi square, 6 degrees of freedom."""
+NOISES = {
+    "frames": NoiseModel((0.001, 0.001, 0.002), (5e-5, 5e-5, 5e-5), 0.0, (0.3, 0.3, 0.1), 0.26, 0.17),
+    "published": NoiseModel(marker_bias_mm=0.1),
+}
+PAIRS = (10, 15, 25)
+CAREFUL = {
+    "radius_mm": 0.2,
+    "range_offset_mm": 0.15,
+    "sound_speed": 0.005,
+    "array_tilt_deg[0]": 0.2,
+    "array_tilt_deg[1]": 0.2,
+    "array_tilt_deg[2]": 0.2,
+    "array_offset_mm": 0.15,
+    "window_centre_deg": 0.3,
+    "tag_size": 0.002,
+    "focal[0]": 0.002,
+    "focal[1]": 0.002,
+    "backlash_deg": 0.1,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One thing that is wrong.
+
+    Attributes:
+        off: constants by name, in the files' units; with a random sign where ``either``.
+        changes: further fields of the simulation.
+        camera: the session has the camera, whose errors act through the detection's corners.
+        most: aim, of the share ``ok`` beyond its bound (and beyond 3 mm where ``far``), in percent.
+        far: its error exceeds 3 mm.
+        limit_mm: of the verdict.
+    """
+
+    off: dict[str, float]
+    changes: dict[str, object]
+    camera: bool = False
+    either: bool = False
+    most: float = 20.0
+    far: bool = False
+    limit_mm: float = LIMIT_MM
+
+
+def _off(camera: bool = False, most: float = 20.0, far: bool = False, **off: float) -> Row:
+    return Row(off, {}, camera, either=True, most=most, far=far)
+
+
+ROWS: dict[str, Row] = {
+    "radius-1mm": _off(radius_mm=1.0),
+    "range-1mm": _off(range_offset_mm=1.0),
+    "sound-speed-2%": _off(sound_speed=0.02),
+    "array-1mm": _off(array_offset_mm=1.0),
+    "tilt-1deg": Row({"array_tilt_deg[0]": 1.0}, {}, either=True),
+    "skew-1deg": Row({"array_tilt_deg[1]": 1.0}, {}, either=True),
+    "backlash-1deg": _off(backlash_deg=1.0),
+    "camera-scale-1%": _off(camera_scale=0.01, most=50.0),
+    "tag-1%": _off(tag_size=0.01),
+    "tag-3%": Row({"tag_size": -0.03}, {}, most=10.0, far=True),
+    "print-3%": Row({"tag_size": -0.03, "board_size": -0.03}, {}, camera=True, most=2.0, far=True),
+    "print-4%": Row({"tag_size": -0.04, "board_size": -0.04}, {}, camera=True, most=2.0, far=True),
+    "print+4%": Row({"tag_size": 0.04, "board_size": 0.04}, {}, camera=True, most=2.0, far=True),
+    "focal-0.5%": Row({"focal[0]": 0.005, "focal[1]": 0.005}, {}, camera=True, either=True),
+    "focal-1%": Row({"focal[0]": 0.01, "focal[1]": 0.01}, {}, camera=True, either=True),
+    "centre-5px": Row({f"principal_point_px[{i}]": 5.0 for i in range(4)}, {}, camera=True, either=True),
+    "stereo-0.2deg": Row({"stereo_rotation_deg[1]": 0.2}, {}, camera=True, either=True),
+    "window-5-7": _off(window_centre_deg=1.0),
+    "water-10mm": Row({}, {"water_mm": 10.0}, far=True, most=100.0),
+    "water-10mm-3-checks": Row({}, {"water_mm": 10.0, "checks": 3}, far=True, most=10.0),
+    "water-10mm-6-checks": Row({}, {"water_mm": 10.0, "checks": 6}, far=True, most=10.0),
+    "as-declared-3-checks": Row({}, {"checks": 3}),
+    "jump-3mm": Row({}, {"epochs": 2, "camera_move_mm": 3.0, "camera_moves_reported": False}, far=True, most=2.0),
+    "jump-3mm-reported": Row({}, {"epochs": 2, "camera_move_mm": 3.0}),
+    "move-deleted": Row({}, {"epochs": 2, "camera_moves_reported": False}, far=True, most=2.0),
+    "slip-1deg": Row({}, {"stage_slip_rad": math.radians(1.0)}),
+    "radius-in-metres": Row({}, {"declared": {"probe.radius_mm": 0.01}}, far=True, most=2.0, limit_mm=10.0),
+}
+TABLE = (
+    "careful/frames/15",
+    "radius-1mm/frames/15",
+    "range-1mm/frames/15",
+    "camera-scale-1%/frames/15",
+    "tag-1%/frames/15",
+    "tag-3%/published/25",
+    "print-3%/frames/15",
+    "print-4%/frames/15",
+    "print+4%/frames/15",
+    "focal-0.5%/frames/15",
+    "focal-1%/frames/15",
+    "centre-5px/frames/15",
+    "stereo-0.2deg/frames/15",
+    "window-5-7/frames/15",
+    "water-10mm/published/25",
+    "jump-3mm/published/25",
+    "move-deleted/published/25",
+    "radius-in-metres/published/10",
+)
+"""The cells of the table in docs: what each error costs where constants are taken as exact."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """What to simulate."""
+
+    kind: str
+    noise: str
+    pairs: int
+    two_sided: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind}/{self.noise}/{self.pairs}{'/two-sided' if self.two_sided else ''}"
+
+    @property
+    def limit_mm(self) -> float:
+        return ROWS[self.kind].limit_mm if self.kind in ROWS else LIMIT_MM
+
+
+def parsed(name: str) -> Cell:
+    """A cell by its name.
+
+    Raises:
+        SystemExit: it is none.
+    """
+    kind, _, rest = name.partition("/")
+    parts = rest.split("/")
+    known = kind in ("as-declared", "drawn", "drawn-poses", "careful") or kind in ROWS or kind[3:] in NAMES
+    good = len(parts) in (2, 3) and parts[0] in NOISES and parts[1].isdigit() and parts[2:] in ([], ["two-sided"])
+    if not known or not good:
+        raise SystemExit(f"--cells: {name} is no cell; --list names them")
+    return Cell(kind, parts[0], int(parts[1]), len(parts) == 3)
+
+
+def all_cells() -> list[str]:
+    """Names of all cells of alternating sweeps, and of the drawn ones two-sided."""
+    kinds = ["as-declared", "drawn", "drawn-poses", "careful", *(f"3s-{name}" for name in NAMES), *ROWS]
+    names = [f"{kind}/{noise}/{pairs}" for kind in kinds for noise in NOISES for pairs in PAIRS]
+    return names + [f"drawn/{noise}/{pairs}/two-sided" for noise in NOISES for pairs in PAIRS]
+
+
+def configuration(cell: Cell, seed: int, systematic: Systematic) -> SimulationConfig:
+    """The simulation of a session of a cell."""
+    rng = np.random.default_rng([zlib.crc32(cell.kind.encode()), seed])
+    config = replace(
+        FIRST_HIT,
+        pairs=cell.pairs,
+        tracks_heard=0,
+        tracks_silent=0,
+        noise=NOISES[cell.noise],
+        sweep=Sweep.TWO_SIDED if cell.two_sided else Sweep.ALTERNATING,
+        systematic=systematic,
+    )
+    per_pm = replace(config, beam_offset_mm=config.noise.beam_offset_mm, edge_jitter_rad=config.noise.window_rad)
+    # The truth is drawn from the defaults whatever the session says of itself.
+    sigmas = Systematic().sigmas(config.probe.sensitivity.edge_sigma_rad, config.noise.marker_bias_mm)
+    if cell.kind == "as-declared":
+        return config
+    if cell.kind in ("drawn", "drawn-poses"):
+        return replace(per_pm, deviations=drawn_deviations(sigmas, rng), camera_declared=cell.kind == "drawn")
+    if cell.kind == "careful":
+        signs = rng.choice([-1.0, 1.0], len(CAREFUL))
+        off = {name: float(sign * value) for (name, value), sign in zip(CAREFUL.items(), signs, strict=True)}
+        return replace(per_pm, deviations=deviations_of(off), camera_declared=True)
+    sign = float(rng.choice([-1.0, 1.0]))
+    if cell.kind.startswith("3s-"):
+        constant = NAMES[cell.kind[3:]]
+        through_camera = constant in list(Constant)[CAMERA]
+        value = 3.0 * sign * float(sigmas[constant])
+        return replace(config, deviations={constant: value}, camera_declared=through_camera)
+    row = ROWS[cell.kind]
+    off = {name: value * (sign if row.either else 1.0) for name, value in row.off.items()}
+    return replace(config, deviations=deviations_of(off), camera_declared=row.camera, **row.changes)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One session. ``epochs`` found, ``places`` that the camera had; errors in mm, infinite where there is no estimate.
+
+    ``worst`` and ``bound`` at the worst target, ``true2`` and ``predicted2`` mean squares, ``seen`` at the worst target
+    against where the scanner shows it.
+    """
+
+    cell: str
+    seed: int
+    verdict: str
+    epochs: int
+    places: int
+    worst: float
+    bound: float
+    targets_in: float
+    in_region: bool
+    true2: float
+    predicted2: float
+    seen: float
+    seconds: float
+    reasons: tuple[str, ...]
+
+
+_NORMAL = np.random.default_rng(0).standard_normal((2000, 3))
+
+
+def run(job: tuple[Cell, int, Systematic]) -> Outcome:
+    """Simulate and solve one session."""
+    cell, seed, systematic = job
+    warnings.simplefilter("ignore")
+    simulated = simulate(configuration(cell, seed, systematic), seed)
+    simulated = replace(simulated, events=[*simulated.events, *simulated.checks])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session"
+        write_session(simulated, path)
+        (path / "ground_truth.yaml").unlink()
+        start = time.process_time()
+        report = fgreg.solve(path, fgreg.SolveConfig(limit_mm=cell.limit_mm))
+        seconds = time.process_time() - start
+    return outcome(cell, seed, simulated, report, seconds)
+
+
+def outcome(cell: Cell, seed: int, simulated: SimulatedSession, report: fgreg.SolveReport, seconds: float) -> Outcome:
+    """The figures of a solved session, against the camera as it is at its end."""
+    estimate, targets = report.estimate, report.session.model.targets_mm
+    epoch, truth = estimate.epochs[-1], simulated.scene.trus_T_camera[-1]
+    head = (cell.name, seed, estimate.verdict.value, len(estimate.epochs), len(simulated.scene.trus_T_camera))
+    if epoch.trus_T_camera is None or epoch.covariance is None:
+        return Outcome(*head, *(math.inf,) * 2, 0.0, False, *(math.inf,) * 3, seconds, estimate.reasons)
+    error = tre_mm(epoch.trus_T_camera, truth, targets)
+    jacobian = target_jacobians(epoch.trus_T_camera, targets)
+    covariance = jacobian @ epoch.covariance @ np.swapaxes(jacobian, 1, 2)
+    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(3))
+    quantile = np.quantile(np.linalg.norm(np.einsum("nij,sj->nsi", root, _NORMAL), axis=-1), 0.95, axis=1)
+    step = inverse(epoch.trus_T_camera) @ truth
+    xi = np.concatenate([log_so3(step[:3, :3]), step[:3, 3]])
+    return Outcome(
+        *head,
+        worst=float(error.max()),
+        bound=math.inf if epoch.predicted_tre is None else epoch.predicted_tre.worst_mm,
+        targets_in=float(np.mean(error <= quantile)),
+        in_region=bool(xi @ np.linalg.solve(epoch.covariance, xi) <= CHI2_6),
+        true2=float(np.mean(error**2)),
+        predicted2=float(np.mean(np.trace(covariance, axis1=1, axis2=2))),
+        seen=float(np.linalg.norm(seen_error(simulated.config, epoch.trus_T_camera, truth, targets), axis=1).max()),
+        seconds=seconds,
+        reasons=estimate.reasons,
+    )
+
+
+def seen_error(
+    config: SimulationConfig, trus_T_camera: FloatArray, truth: FloatArray, targets_mm: FloatArray
+) -> FloatArray:
+    """(n, 3) where the registration has the targets as the camera sees them, less where the scanner shows them."""
+    scan = config.array.plane_angle_rad(targets_mm)
+    x, r = config.array.x_mm(targets_mm, scan), config.array.range_mm(targets_mm, scan)
+    shown = map_by_declared(config.probe, scan, x, r)
+    return transform_points(trus_T_camera, transform_points(inverse(truth), targets_mm)) - shown
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A number with its standard error."""
+
+    value: float
+    error: float
+
+    def text(self, percent: bool) -> str:
+        scale, digits = (100.0, 1) if percent else (1.0, 2)
+        return f"{scale * self.value:.{digits}f} +- {scale * self.error:.{digits}f}{' %' if percent else ''}"
+
+
+def share(flags: FloatArray) -> Figure:
+    """Of flags, or the mean of shares."""
+    n = max(len(flags), 1)
+    return Figure(float(flags.mean()) if len(flags) else math.nan, float(flags.std()) / math.sqrt(n))
+
+
+def rms(values: FloatArray) -> Figure:
+    """Root mean square; of finite values."""
+    squares = np.square(values[np.isfinite(values)])
+    if not len(squares):
+        return Figure(math.nan, math.nan)
+    root = math.sqrt(float(squares.mean()))
+    return Figure(root, float(squares.std()) / math.sqrt(len(squares)) / (2.0 * max(root, 1e-12)))
+
+
+HOLDING = ("holds", "targets", "region")
+VERDICTS = ("ok", "warning", "refused", "split", "unseen")
+FAILING = ("ok_beyond", "ok_twice", "ok_far", "denied")
+"""Shares of sessions (of targets: the mean over sessions), as the head of this file describes them."""
+
+
+def figures(outcomes: list[Outcome], limit_mm: float) -> dict[str, Figure]:
+    """All figures of some sessions of a cell."""
+    worst, bound = np.array([o.worst for o in outcomes]), np.array([o.bound for o in outcomes])
+    verdict = np.array([o.verdict for o in outcomes])
+    ok, beyond = verdict == "ok", worst > bound
+    true2, predicted2 = np.array([o.true2 for o in outcomes]), np.array([o.predicted2 for o in outcomes])
+    finite = np.isfinite(true2) & np.isfinite(predicted2)
+    ratio = math.sqrt(predicted2[finite].mean() / true2[finite].mean()) if finite.any() else math.nan
+    # The predictions hardly vary beside the errors.
+    spread = float(true2[finite].std()) / max(true2[finite].mean(), 1e-12) if finite.any() else math.nan
+    out = {
+        "true_rms": rms(worst),
+        "true_95": Figure(float(np.quantile(worst, 0.95)), _quantile_error(worst)),
+        "bound": rms(bound),
+        "seen_rms": rms(np.array([o.seen for o in outcomes])),
+        "predicted_over_true": Figure(ratio, 0.5 * ratio * spread / math.sqrt(max(finite.sum(), 1))),
+        "seconds": Figure(float(np.median([o.seconds for o in outcomes])), 0.0),
+    }
+    flags = (
+        ~beyond,
+        np.array([o.targets_in for o in outcomes]),
+        np.array([o.in_region for o in outcomes]),
+        ok,
+        verdict == "warning",
+        verdict == "refused",
+        np.array([o.epochs > o.places for o in outcomes]),
+        np.array([o.epochs < o.places and o.verdict != "refused" for o in outcomes]),
+        ok & beyond,
+        ok & (worst > 2.0 * bound),
+        ok & beyond & (worst > LIMIT_MM),
+        ~ok & (bound <= limit_mm),
+    )
+    out |= {
+        name: share(flag.astype(np.float64)) for name, flag in zip(HOLDING + VERDICTS + FAILING, flags, strict=True)
+    }
+    return out
+
+
+def _quantile_error(values: FloatArray) -> float:
+    """Half the distance of the order statistics one standard deviation of the rank to either side of the 95 %."""
+    n = len(values)
+    step = math.sqrt(0.95 * 0.05 / n)
+    low, high = np.quantile(values, [max(0.95 - step, 0.0), min(0.95 + step, 1.0)])
+    return float(0.5 * (high - low)) if math.isfinite(high) else math.inf
+
+
+def missed(cell: Cell, all_of: dict[str, Figure], quarters: list[dict[str, Figure]]) -> list[str]:
+    """Aims that a cell misses, by the figures as they are (with their standard errors beside)."""
+    value = {name: figure.value for name, figure in all_of.items()}
+    out = []
+    if cell.kind in ("drawn", "drawn-poses", "as-declared"):
+        out += [name for name in ("targets", "region") if not 0.93 <= value[name] <= 0.97]
+        for k, quarter in enumerate(quarters):
+            bad = [name for name in ("targets", "region") if not 0.90 <= quarter[name].value <= 0.98]
+            out += [f"{name} in quarter {k + 1}" for name in bad]
+        out += [] if abs(value["predicted_over_true"] - 1.0) <= 0.05 else ["predicted over true"]
+        out += [] if value["denied"] <= 0.03 else ["denied"]
+        out += [] if value["split"] <= 0.01 else ["split"]
+    elif cell.kind.startswith("3s-"):
+        out += [] if value["ok_beyond"] <= 0.20 else ["ok beyond the bound"]
+        out += [] if value["ok_twice"] <= 0.005 else ["ok beyond twice the bound"]
+    elif cell.kind in ROWS:
+        row = ROWS[cell.kind]
+        most = 25.0 if cell.kind.endswith("checks") and cell.noise == "published" else row.most
+        name = "ok_far" if row.far else "ok_beyond"
+        out += [] if 100.0 * value[name] <= most else [f"{name} at most {most:g} %"]
+        out += [] if value["unseen"] == 0.0 else ["unseen moves"]
+    return out
+
+
+def report(cell: Cell, outcomes: list[Outcome], reasons: bool) -> dict[str, object]:
+    """Print a cell; its figures as a document."""
+    total = figures(outcomes, cell.limit_mm)
+    order = np.argsort([o.bound for o in outcomes], kind="stable")
+    quarters = [
+        figures([outcomes[i] for i in part], cell.limit_mm) for part in np.array_split(order, 4) if len(outcomes) >= 8
+    ]
+    wrong = missed(cell, total, quarters)
+    print(f"{cell.name}: {len(outcomes)} sessions{', misses ' + ', '.join(wrong) if wrong else ''}")
+    mm = ("true_rms", "true_95", "bound", "seen_rms", "predicted_over_true")
+    print("   mm   " + ", ".join(f"{name} {total[name].text(percent=False)}" for name in mm))
+    for head, shares in (("in", HOLDING), ("are", VERDICTS), ("not", FAILING)):
+        print(f"   {head:5s}" + ", ".join(f"{name} {total[name].text(percent=True)}" for name in shares))
+    for k, quarter in enumerate(quarters):
+        shown = [f"bound {quarter['bound'].value:.2f} true {quarter['true_rms'].value:.2f}"]
+        shown += [f"{name} {quarter[name].text(percent=True)}" for name in (*HOLDING, "ok")]
+        print(f"   {k + 1}/4  " + ", ".join(shown))
+    print(f"   {total['seconds'].value:.3f} s of processor time a session (median)", flush=True)
+    if reasons:
+        count: dict[str, int] = {}
+        for text in (" ".join(r.split()[:9]) for o in outcomes for r in o.reasons):
+            count[text] = count.get(text, 0) + 1
+        for text, n in sorted(count.items(), key=lambda item: -item[1])[:8]:
+            print(f"   {n:5d} x {text}")
+    return {
+        "cell": cell.name,
+        "sessions": len(outcomes),
+        "missed": wrong,
+        **{name: asdict(figure) for name, figure in total.items()},
+        "quarters": [{name: asdict(figure) for name, figure in quarter.items()} for quarter in quarters],
+    }
+
+
+def earlier(path: Path | None) -> dict[tuple[str, int], Outcome]:
+    """Outcomes of an earlier run, by cell and seed; a last line that was cut short is left out."""
+    found: dict[tuple[str, int], Outcome] = {}
+    if path is None or not path.exists():
+        return found
+    for line in path.read_text().splitlines():
+        try:
+            entry = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        found[entry["cell"], entry["seed"]] = Outcome(**{**entry, "reasons": tuple(entry["reasons"])})
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sessions", type=int, default=100, help="per cell")
+    parser.add_argument("--seed", type=int, default=0, help="number of the first session")
+    parser.add_argument("--cells", nargs="+", default=["table"], help="names, patterns with *, or `table`")
+    parser.add_argument("--list", action="store_true", help="print the names of all cells and end")
+    parser.add_argument("--systematic-none", action="store_true", help="sessions that say `systematic: none`")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--out", type=Path, help="each session's outcome, one JSON line each; those there are not repeated"
+    )
+    parser.add_argument("--reasons", action="store_true", help="print how often each reason of a verdict was given")
+    parser.add_argument("--json", action="store_true", help="print one JSON document at the end")
+    args = parser.parse_args()
+    if args.list:
+        print(*all_cells(), sep="\n")
+        return
+    names: dict[str, None] = {}
+    for wanted in args.cells:
+        found = TABLE if wanted == "table" else fnmatch.filter(all_cells(), wanted) if "*" in wanted else [wanted]
+        names |= dict.fromkeys(found)
+    cells = [parsed(name) for name in names]
+    systematic = NONE if args.systematic_none else Systematic()
+    done = earlier(args.out)
+    seeds = range(args.seed, args.seed + args.sessions)
+    documents = []
+    with ProcessPoolExecutor(args.jobs) as pool:
+        for cell in cells:
+            begin = time.perf_counter()
+            missing = [seed for seed in seeds if (cell.name, seed) not in done]
+            running = [pool.submit(run, (cell, seed, systematic)) for seed in missing]
+            for count, future in enumerate(as_completed(running), 1):
+                one = future.result()
+                done[one.cell, one.seed] = one
+                if args.out is not None:
+                    with args.out.open("a") as out:
+                        out.write(json.dumps(asdict(one)) + "\n")
+                if count % max(len(missing) // 10, 1) == 0:
+                    passed = time.perf_counter() - begin
+                    print(f"{cell.name}: {count} of {len(missing)}, {passed:.0f} s", file=sys.stderr, flush=True)
+            documents.append(report(cell, [done[cell.name, seed] for seed in seeds], args.reasons))
+    if args.json:
+        print(json.dumps(documents, indent=2))
+
+
+if __name__ == "__main__":
+    main()
