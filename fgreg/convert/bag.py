@@ -276,17 +276,17 @@ class _Join:
             return {"scan_deg": self._scan(t)}
         return {"trus": self._trus(look_s, look, mark)}
 
-    def _trus(self, t: float, look: _Look, told: Document) -> Document:
+    def _trus(self, t: float, look: _Look, mark: Document) -> Document:
         trus: Document = {"scan_deg": self._scan(t)}
         if look.position_mm is not None:
             trus |= {"x_mm": look.position_mm[0], "range_mm": look.position_mm[1]}
         if look.frame is not None:
             trus["frame"] = self._name("frame", look.frame, ".npy")
-        return trus | {key: told[key] for key in _OF_LOOK if key in told}
+        return trus | {key: mark[key] for key in _OF_LOOK if key in mark}
 
-    def _pair(self, t: float, look: _Look, told: Document) -> Document:
-        marker, trus = self._marker(t), self._trus(t, look, told)
-        rest = {key: value for key, value in told.items() if key not in (*_OF_LOOK, "type", "t")}
+    def _pair(self, t: float, look: _Look, mark: Document) -> Document:
+        marker, trus = self._marker(t), self._trus(t, look, mark)
+        rest = {key: value for key, value in mark.items() if key not in (*_OF_LOOK, "type", "t")}
         return {"type": "pair", "t": t, **rest, "marker": marker, "trus": trus}
 
     def _marker(self, t: float) -> Document:

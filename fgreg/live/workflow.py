@@ -49,9 +49,9 @@ CHECK_S = 0.3
 """Time between two such detections."""
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
-"""The operator is told what is missing after a wait of this long."""
+"""Wait after which the operator gets a message about what is missing."""
 MISSED = 8
-"""The operator is told after this many pulses in a row without a PM where the registration expects one."""
+"""Number of consecutive pulses without a PM, where one is expected, after which the operator gets a message."""
 
 
 def _why(registration: RegistrationState) -> str:

@@ -21,7 +21,6 @@ from fgreg.schema.kinds import (
     IntegerPair,
     Number,
     Numbers,
-    OneOf,
 )
 from fgreg.schema.matrices import Covariance, Transform
 from fgreg.schema.problems import FieldError, shown
@@ -79,7 +78,7 @@ class TrusRecord:
         Key(
             "+1 or -1 where the stage was stepping that way (device angle increasing or decreasing by `step_deg`) and "
             "stopped at the first angle at which the PM was detected",
-            OneOf((0, 1, -1)),
+            Integer(allowed=(0, 1, -1)),
             brief=True,
         ),
     ] = 0

@@ -28,7 +28,6 @@ from fgreg.schema.kinds import (
     Number,
     Numbers,
     NumberTuple,
-    OneOf,
     Text,
     in_radians,
     points,
@@ -200,7 +199,10 @@ class StageModel:
     ] = (math.radians(-60.0), math.radians(60.0))
     direction: Annotated[
         int,
-        Key("-1: the device's positive turn is the other way; +1 turns the plane from +z towards +y", OneOf((1, -1))),
+        Key(
+            "-1: the device's positive turn is the other way; +1 turns the plane from +z towards +y",
+            Integer(allowed=(1, -1)),
+        ),
     ] = 1
     zero_device_rad: Annotated[
         float, Key("device angle at which the plane points along +z", in_radians(SCAN_DEG), name="zero_deg")

@@ -128,13 +128,14 @@ class Figure(Number):
 
 @dataclass(frozen=True, slots=True)
 class Integer(Kind):
-    """An integer in [low, high]; 3.0 is not one."""
+    """An integer in [low, high], or one of ``allowed`` where given; 3.0 is not one."""
 
-    low: int
-    high: int
+    low: int = 0
+    high: int = 0
+    allowed: tuple[int, ...] = ()
 
     def read(self, value: object, _folder: Path | None = None, /) -> int:
-        if type(value) is not int or not self.low <= value <= self.high:
+        if type(value) is not int or not (value in self.allowed if self.allowed else self.low <= value <= self.high):
             raise FieldError.of(shown(value), self.expected)
         return value
 
@@ -143,32 +144,10 @@ class Integer(Kind):
 
     @property
     def expected(self) -> str:
-        return f"an integer from {self.low} to {self.high}"
+        return " or ".join(map(str, self.allowed)) or f"an integer from {self.low} to {self.high}"
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
-        return {"type": "integer", "minimum": self.low, "maximum": self.high}
-
-
-@dataclass(frozen=True, slots=True)
-class OneOf(Kind):
-    """One of a few integers."""
-
-    allowed: tuple[int, ...]
-
-    def read(self, value: object, _folder: Path | None = None, /) -> int:
-        if type(value) is not int or value not in self.allowed:
-            raise FieldError.of(shown(value), self.expected)
-        return value
-
-    def write(self, value: Any, _folder: Path | None = None, /) -> int:
-        return int(value)
-
-    @property
-    def expected(self) -> str:
-        return " or ".join(str(entry) for entry in self.allowed)
-
-    def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
-        return {"enum": list(self.allowed)}
+        return {"enum": [*self.allowed]} if self.allowed else _integer_schema(self.low, self.high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +281,7 @@ class IntegerPair(Kind):
         return self.what
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
-        return list_schema({"type": "integer", "minimum": self.low, "maximum": self.high}, 2, 2)
+        return list_schema(_integer_schema(self.low, self.high), 2, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,6 +375,10 @@ def points(each: Numbers) -> Kind:
 def in_radians(degrees: Number) -> Number:
     """The same interval in degrees in the file, read as radians."""
     return replace(degrees, degrees=True)
+
+
+def _integer_schema(low: int, high: int) -> JsonSchema:
+    return {"type": "integer", "minimum": low, "maximum": high}
 
 
 def list_schema(items: JsonSchema, least: int, most: int | None) -> JsonSchema:

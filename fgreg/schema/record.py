@@ -3,7 +3,7 @@
     @dataclass(frozen=True, slots=True)
     class StageModel:
         step_rad: Annotated[float, Key("sweep increment", Number(0.0, 180.0, above=True, unit="deg", degrees=True))]
-        direction: Annotated[int, Key("-1 where the device turns the other way", OneOf((1, -1)))] = 1
+        direction: Annotated[int, Key("-1 where the device turns the other way", Integer(allowed=(1, -1)))] = 1
 
 reads ``{step_deg: 2.0}``. A field without a :class:`Key` is not in the file: who reads gives its value. Rules between
 fields are checked where the object is made: ``__post_init__`` raises :class:`FieldError` with the key's name. Those

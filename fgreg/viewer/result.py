@@ -248,7 +248,7 @@ class ResultDrawing:
             limits = [scene.CHI2_95_2] * 2
             self.rec.series("plots/nis/limit_95", (first[0], last[0]), (first[1], last[1]), limits)
 
-    def _static(self, judge: Callable[..., None]) -> None:
+    def _static(self, log: Callable[..., None]) -> None:
         if self.truth is not None and self.truth.trus_p_pm_mm:
             known = np.array(list(self.truth.trus_p_pm_mm.values()))
             self.rec.static("world/truth/pms", shapes.small_points(known, shapes.TRUTH, 2.5))
@@ -256,12 +256,12 @@ class ResultDrawing:
         if self.estimate.laser is not None:
             fibre = np.array([np.zeros(3), self.estimate.laser.marker_T_laser[:3, 3]])
             self.rec.static("world/camera/marker/fibre", shapes.strips([fibre], shapes.MARKER, 1.0))
-        judge("summary", rr.TextDocument(page, media_type="text/markdown"))
+        log("summary", rr.TextDocument(page, media_type="text/markdown"))
         if self.estimate.verdict is Verdict.REFUSED:
             points = self.eye_points()
             above = (points.min(axis=0) + points.max(axis=0)) / 2.0
             above[2] = points[:, 2].max() + 5.0
-            judge("world/verdict", shapes.point(above, shapes.REFUSED, 9.0, "REFUSED: do not use"))
+            log("world/verdict", shapes.point(above, shapes.REFUSED, 9.0, "REFUSED: do not use"))
 
     def _camera_errors(self) -> list[tuple[float, float]]:
         """Per epoch with a known truth: error of the camera, mm and rad."""
