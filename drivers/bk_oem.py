@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from fgreg.drivers.base import BmodeSource, DriverContext
     from fgreg.drivers.options import BkOptions
 
-PORT = 7915
 START, END, ESCAPE = b"\x01", b"\x04", b"\x1b"
 ESCAPED = {bytes([byte]): ESCAPE + bytes([byte ^ 0xFF]) for byte in (0x01, 0x04, 0x1B)}
 INVERTED = np.array([pair[1] for pair in ESCAPED.values()], dtype=np.uint8)

@@ -26,8 +26,6 @@ from fgreg.drivers.tcp_link import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import FloatArray
 
-PORT = 18944
-"""Default port of 3D Slicer and PLUS."""
 NAME_BYTES = 20
 MAX_BODY_BYTES = 32 << 20
 """Largest message taken: 128 elements of 60,000 samples in floats, a volume of 256 x 256 x 256 bytes."""

@@ -23,7 +23,6 @@ from fgreg.camera_moves.whitened import (
     whiten,
 )
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.pm_selection import select_pms
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import contributions, refine
 from fgreg.graph.shared_state import SharedState, make_state
@@ -31,6 +30,7 @@ from fgreg.graph.split_points import default_scales
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.outliers import pm_degrees_of_freedom, pm_limits
 from fgreg.registration.register import pack_session
+from pm_selection import select_pms
 from tests.camera_move_cases import move_case
 from tests.forward import make_measurements
 

@@ -26,7 +26,6 @@ from functools import partial
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, inverse
-from fgreg.graph.pm_selection import select_pms
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import log_posterior, refine
 from fgreg.graph.shared_state import make_state
@@ -37,6 +36,7 @@ from fgreg.online.events import DetectedMove
 from fgreg.online.recorded_moves import events_in_order
 from fgreg.registration.register import pack_session
 from move_streams import CONFIG, shift_of, two_epochs
+from pm_selection import select_pms
 from study_junk import KINDS, spoil
 from tests.forward import Truth, make_measurements
 

@@ -78,7 +78,6 @@ class _Frames:
         self._names = {
             role: (mapping.fields[role],) if role in mapping.fields else _DEFAULTS[role] for role in _DEFAULTS
         }
-        self._mapped = mapping.fields
         self.images: dict[str, npt.NDArray[Any]] = {}
         fields = [fields for fields in sequence.frames if fields]
         for role, name in mapping.fields.items():

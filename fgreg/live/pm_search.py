@@ -30,7 +30,6 @@ class PmSearch:
         held: ``camera_T_marker`` (4, 4) at the beginning.
         cold: whether the search covers the whole field, without a prediction.
         threshold: least amplitude of a detection.
-        started_s: host time of the beginning.
         looks: pulses with a detection.
         wants_pulses: whether the next pulse counts, because the stage stands at its goal.
     """
@@ -39,7 +38,6 @@ class PmSearch:
     held: FloatArray
     cold: bool
     threshold: float
-    started_s: float
     looks: list[LocatedPulse]
     wants_pulses: bool = False
     _goal: Turn | None = None

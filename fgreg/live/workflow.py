@@ -289,7 +289,7 @@ class Workflow:
                 prediction = Prediction(at, sigma)
         stands = min(max(stage.scan_rad, low), high)
         planner = SearchPlanner(self._detection_model, low, high, stands, prediction)
-        return PmSearch(planner, held, prediction is None, self._settings.hearing_threshold, inputs.now_s, [])
+        return PmSearch(planner, held, prediction is None, self._settings.hearing_threshold, [])
 
     def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
         self._search, self._done_at, self._waits_s = None, search.held, now_s
