@@ -119,6 +119,7 @@ def test_one_print_of_another_size_is_named_alone() -> None:
         (found,) = conditions(measured(off_by(constant, -10.0), 2))
         assert name in found.text
         assert other not in found.text
+        assert "stereo calibration" not in found.text
 
 
 def test_a_print_far_off_is_refused() -> None:

@@ -10,7 +10,7 @@ STEREO_TRANSLATION, ``scale`` CAMERA_SCALE, D the lens' distortion. The pose's t
 along the camera's axes, moves it to (Exp(w) R, t + n). With J and C the derivatives of all corners by the twist and by
 the constants c, W a weight (inverse covariance) and r observed less predicted corners at the fitted pose:
 
-    twist(c) = -(J' W J)^-1 J' W C c,   information = C' W (C - J (J' W J)^-1 J' W C),   pull = (C - J ...)' W r
+    twist(c) = -(J' W J)^-1 J' W C c,   L = C - J (J' W J)^-1 J' W C,   information = L' W L,   pull = L' W r
 
 Corners are in ideal pixels: without distortion, counted from the principal point (fgreg.detection.camera).
 """

@@ -118,7 +118,7 @@ def print_sizes(corners: CornerInformation, sigmas: FloatArray) -> tuple[PrintSi
         k = columns[place]
         sigma = math.sqrt(covariance[place, place])
         if corners.information[k, k] > 0.0 and sigma < 0.5:
-            out.append(PrintSize(constant, 1.0 - c[place], sigma, float(sigmas[k])))
+            out.append(PrintSize(constant, 1.0 - float(c[place]), sigma, float(sigmas[k])))
     return tuple(out)
 
 
@@ -157,24 +157,20 @@ def _print_condition(
     if _p_value(c, covariance, sigmas[columns]) >= ALARM_P:
         return []
     z = np.abs(c) / np.sqrt(np.diag(covariance) + sigmas[columns] ** 2)
-    named = z >= min(NAMED_Z, z.max())
-    said = []
-    for size, is_named in zip(sizes, named, strict=True):
-        if is_named:
-            what, key = next((what, key) for constant, what, key in _PRINTS if constant is size.constant)
-            way = "smaller" if size.ratio > 1.0 else "larger"
-            said.append(
-                f"the {what} {100.0 * abs(size.ratio - 1.0):.1f} +- {100.0 * size.sigma:.1f} % {way} than {key}"
-            )
-    which = " and ".join(what for constant, what, _ in _PRINTS if constant in [s.constant for s in sizes])
-    error = max(abs(size.ratio - 1.0) for size, is_named in zip(sizes, named, strict=True) if is_named) * max(
-        (float(np.linalg.norm(p, axis=1).max()) for p in camera_p), default=0.0
-    )
-    text = (
-        f"the stereo views measure {' and '.join(said)}{_meaning(error)}: measure the printed {which}, or the stereo "
-        "calibration's scale is wrong"
-    )
-    return [Condition(_severity(error, config), text)]
+    named = [size for size, far in zip(sizes, z >= min(NAMED_Z, z.max()), strict=True) if far]
+    words = {constant: (what, key) for constant, what, key in _PRINTS}
+    said, which = [], []
+    for size in named:
+        what, key = words[size.constant]
+        way = "smaller" if size.ratio > 1.0 else "larger"
+        said.append(f"the {what} {100.0 * abs(size.ratio - 1.0):.1f} +- {100.0 * size.sigma:.1f} % {way} than {key}")
+        which.append(what)
+    farthest_mm = max((float(np.linalg.norm(p, axis=1).max()) for p in camera_p), default=0.0)
+    error = max(abs(size.ratio - 1.0) for size in named) * farthest_mm
+    # A wrong baseline makes all prints look wrong alike.
+    other = ", or the stereo calibration's scale is wrong" if len(named) == len(sizes) else ""
+    text = f"the stereo views measure {' and '.join(said)}{_meaning(error)}: measure the printed {' and '.join(which)}"
+    return [Condition(_severity(error, config), text + other)]
 
 
 def _group_condition(
