@@ -71,6 +71,7 @@ def test_constants_are_off_as_the_cell_says() -> None:
     assert drawn.shape == (300, COUNT)
     np.testing.assert_allclose(drawn[:, Constant.RADIUS].std(), 0.2, rtol=0.15)
     assert CONFIGURATION(PARSED("drawn/frames/15"), 0, Systematic()).camera_declared
+    assert CONFIGURATION(PARSED("print-3%/raw/15"), 0, Systematic()).frames
     for bad in ("radius/frames/15", "drawn/frames", "drawn/loud/15", "drawn/frames/15/three-sided"):
         with pytest.raises(SystemExit, match="no cell"):
             PARSED(bad)

@@ -9,7 +9,8 @@ cell is KIND/NOISE/PAIRS or KIND/NOISE/PAIRS/two-sided.
          careful      the constants of a careful lab, each at its magnitude with a random sign, and the same per PM
          3s-NAME      one constant off by three of its standard deviations, either sign (NAME: a key of `systematic`)
          else         one thing wrong, by far; --list has them all
-  noise  frames       what detection in clean frames leaves of the marker; published: noise of poses as published
+  noise  frames       what detection in clean frames leaves of the marker; published: noise of poses as published; raw:
+                      frames are rendered and detected (a minute a session), all that deviates in what they show
   pairs  first-hit pairs from alternating sides; two-sided: each PM heard from both sides
 
 Printed for each cell: true error at the worst target (RMS and 95 % over sessions), bound (95 % error that the result
@@ -49,13 +50,13 @@ import numpy as np
 
 import fgreg
 from fgreg.geometry.target_error import target_jacobians, tre_mm
-from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
-from fgreg.model.session_model import NoiseModel
+from fgreg.geometry.transforms import FloatArray, as_float_array, inverse, log_so3, transform_points
+from fgreg.model.session_model import NoiseModel, StereoRig
 from fgreg.model.systematic import CAMERA, NONE, Constant, Systematic
 from fgreg.simulation.array import map_by_declared
-from fgreg.simulation.config import SimulationConfig, Sweep
+from fgreg.simulation.config import SimulationConfig, Sweep, default_rig
 from fgreg.simulation.deviations import NAMES, deviations_of, drawn_deviations
-from fgreg.simulation.presets import FIRST_HIT
+from fgreg.simulation.presets import FIRST_HIT, PHANTOM
 from fgreg.simulation.simulate import SimulatedSession, simulate
 from fgreg.simulation.write import write_session
 
@@ -66,6 +67,7 @@ NOISES = {
     "frames": NoiseModel((0.001, 0.001, 0.002), (5e-5, 5e-5, 5e-5), 0.0, (0.3, 0.3, 0.1), 0.26, 0.17),
     "published": NoiseModel(marker_bias_mm=0.1),
 }
+RAW = "raw"
 PAIRS = (10, 15, 25)
 CAREFUL = {
     "radius_mm": 0.2,
@@ -109,6 +111,13 @@ def _off(camera: bool = False, most: float = 20.0, far: bool = False, **off: flo
     return Row(off, {}, camera, either=True, most=most, far=far)
 
 
+def _without_distortion() -> StereoRig:
+    rig = default_rig()
+    assert rig.right is not None
+    left, right = (replace(camera, distortion=as_float_array(np.zeros(5))) for camera in (rig.left, rig.right))
+    return replace(rig, left=left, right=right)
+
+
 ROWS: dict[str, Row] = {
     "radius-1mm": _off(radius_mm=1.0),
     "range-1mm": _off(range_offset_mm=1.0),
@@ -126,6 +135,7 @@ ROWS: dict[str, Row] = {
     "focal-0.5%": Row({"focal[0]": 0.005, "focal[1]": 0.005}, {}, camera=True, either=True),
     "focal-1%": Row({"focal[0]": 0.01, "focal[1]": 0.01}, {}, camera=True, either=True),
     "centre-5px": Row({f"principal_point_px[{i}]": 5.0 for i in range(4)}, {}, camera=True, either=True),
+    "no-distortion": Row({}, {"declared_camera": _without_distortion()}, camera=True, most=2.0, far=True),
     "stereo-0.2deg": Row({"stereo_rotation_deg[1]": 0.2}, {}, camera=True, either=True),
     "window-5-7": _off(window_centre_deg=1.0),
     "water-10mm": Row({}, {"water_mm": 10.0}, far=True, most=100.0),
@@ -188,7 +198,9 @@ def parsed(name: str) -> Cell:
     kind, _, rest = name.partition("/")
     parts = rest.split("/")
     known = kind in ("as-declared", "drawn", "drawn-poses", "careful") or kind in ROWS or kind[3:] in NAMES
-    good = len(parts) in (2, 3) and parts[0] in NOISES and parts[1].isdigit() and parts[2:] in ([], ["two-sided"])
+    good = (
+        len(parts) in (2, 3) and parts[0] in (*NOISES, RAW) and parts[1].isdigit() and parts[2:] in ([], ["two-sided"])
+    )
     if not known or not good:
         raise SystemExit(f"--cells: {name} is no cell; --list names them")
     return Cell(kind, parts[0], int(parts[1]), len(parts) == 3)
@@ -198,18 +210,21 @@ def all_cells() -> list[str]:
     """Names of all cells of alternating sweeps, and of the drawn ones two-sided."""
     kinds = ["as-declared", "drawn", "drawn-poses", "careful", *(f"3s-{name}" for name in NAMES), *ROWS]
     names = [f"{kind}/{noise}/{pairs}" for kind in kinds for noise in NOISES for pairs in PAIRS]
-    return names + [f"drawn/{noise}/{pairs}/two-sided" for noise in NOISES for pairs in PAIRS]
+    names += [f"drawn/{noise}/{pairs}/two-sided" for noise in NOISES for pairs in PAIRS]
+    return names + [
+        f"{kind}/raw/15" for kind in ("as-declared", "drawn", *(k for k, row in ROWS.items() if row.camera))
+    ]
 
 
 def configuration(cell: Cell, seed: int, systematic: Systematic) -> SimulationConfig:
     """The simulation of a session of a cell."""
     rng = np.random.default_rng([zlib.crc32(cell.kind.encode()), seed])
     config = replace(
-        FIRST_HIT,
+        PHANTOM if cell.noise == RAW else FIRST_HIT,
         pairs=cell.pairs,
         tracks_heard=0,
         tracks_silent=0,
-        noise=NOISES[cell.noise],
+        noise=NOISES.get(cell.noise, PHANTOM.noise),
         sweep=Sweep.TWO_SIDED if cell.two_sided else Sweep.ALTERNATING,
         systematic=systematic,
     )
