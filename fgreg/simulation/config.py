@@ -25,8 +25,9 @@ from fgreg.model.session_model import (
     TagModel,
 )
 from fgreg.model.systematic import Constant, Systematic
-from fgreg.simulation.acoustics import Artefact, Elevation, Pulse
+from fgreg.simulation.acoustics import Elevation, Pulse
 from fgreg.simulation.array import TrueArray
+from fgreg.simulation.disturbances import Disturbances
 from fgreg.simulation.render import Optics
 
 
@@ -111,11 +112,11 @@ class SimulationConfig:
         stage_slip_rad, stage_slip_at: the plane stays behind the reading by this angle, for good, after this share of
             the PMs.
         camera_move_mm: the camera moves by this in a random direction, without a turn; else turns and shifts are drawn.
-        artefacts: what every record of the probe holds besides the source.
         declared_noise: the session's ``noise`` block; the true one (``noise``) where None.
         declared_camera: the session's camera; the true one (``camera``, but for ``deviations``) where None.
         declared: values that the session has instead of the true ones, by key: ``{"probe.radius_mm": 0.01}``.
         systematic: what the session says of its constants' standard deviations.
+        disturbances: what spoils the images.
 
     Geometry:
         pm_x_mm, pm_angle_rad, pm_depth_mm: half extent along the axis and in stage angle, span of depths from the
@@ -194,11 +195,11 @@ class SimulationConfig:
     marker: MarkerModel = field(default_factory=lambda: MarkerModel("DICT_4X4_50", (TagModel(0, 25.0),)))
     board: BoardModel = field(default_factory=lambda: BoardModel(9, 6, 9.0, CharucoModel("DICT_5X5_100", 6.5)))
     optics: Optics = field(default_factory=Optics)
+    disturbances: Disturbances = field(default_factory=Disturbances)
     pulse: Pulse = field(default_factory=Pulse)
     elevation: Elevation = field(default_factory=Elevation)
     snr_db: float = 15.0
     samples: int = 1200
-    artefacts: tuple[Artefact, ...] = ()
     targets_mm: FloatArray | None = None
 
     def __post_init__(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -11,6 +12,8 @@ from fgreg.geometry.transforms import FloatArray, make_transform, transform_poin
 from fgreg.model.session_model import CameraModel
 from fgreg.simulation.acoustics import Hearing, quantised, simulate_channels
 from fgreg.simulation.config import SimulationConfig
+from fgreg.simulation.disturbances import Disturbances, SpoiltView
+from fgreg.simulation.lens import project_points
 from fgreg.simulation.misreading import true_board, true_marker, true_rig, view_shift_mm
 from fgreg.simulation.render import UInt8Image, render_frame
 from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Surface, TagSurface
@@ -82,7 +85,21 @@ class ShotPicture:
             np.random.default_rng((*self.noise_seed, stream)),
             config.optics,
             background.seen_from(camera_T_left),
+            self._spoilt(config, camera, camera_T_left, stream),
         )
+
+    def _spoilt(
+        self, config: SimulationConfig, camera: CameraModel, camera_T_left: FloatArray, stream: int
+    ) -> SpoiltView | None:
+        if config.disturbances == Disturbances():
+            return None
+        tag, optics = config.marker.tags[0], config.optics
+        camera_p = transform_points(camera_T_left @ self.camera_T_marker, tag.marker_p_corners_mm)
+        corners = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]], dtype=np.float32)
+        image_from_tag = cv2.getPerspectiveTransform(corners, project_points(camera, camera_p).astype(np.float32))
+        nearness = optics.reference_mm / float(np.linalg.norm(camera_p.mean(axis=0)))
+        white = optics.white_level * nearness**optics.distance_exponent
+        return SpoiltView(config.disturbances, np.asarray(image_from_tag), stream == 1, self.noise_seed, white)
 
 
 def _tissue(config: SimulationConfig, camera_T_trus: FloatArray, seed: int) -> tuple[Background, list[Surface]]:
@@ -140,6 +157,5 @@ class LookPicture:
             hearing=Hearing(elevation=config.elevation),
             half_width_rad=self.half_width_rad,
             array=config.array,
-            artefacts=config.artefacts,
         )
         return quantised(channels[::-1] if config.reversed_elements else channels)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel
+from fgreg.simulation.disturbances import SpoiltView
 from fgreg.simulation.lens import project_points, undistorted_rays
 from fgreg.simulation.surfaces import Background, Sheet, Surface
 from fgreg.simulation.textures import BLACK, WHITE, Float32Array
@@ -68,6 +69,7 @@ def render_frame(
     rng: np.random.Generator,
     optics: Optics | None = None,
     background: Background | None = None,
+    spoilt: SpoiltView | None = None,
 ) -> UInt8Image:
     """One 8-bit grey image, (h, w).
 
@@ -77,6 +79,7 @@ def render_frame(
         rng: for the sensor noise.
         optics: light, lens and sensor.
         background: behind all surfaces; black where absent.
+        spoilt: what spoils this picture.
     """
     optics = optics or Optics()
     rays = _rays(camera.image_size, camera.matrix.tobytes(), camera.distortion.tobytes())
@@ -88,10 +91,17 @@ def render_frame(
     sheets.sort(key=_distance, reverse=True)
     for sheet in sheets:
         _paint(image, sheet, camera, rays, optics)
+    if spoilt is not None:
+        image = spoilt.light(image)
     image = _blurred(image, optics.blur_px)
+    if spoilt is not None:
+        image = spoilt.recorded(image)
     sigma = np.sqrt(np.maximum(image, 0.0) * np.float32(optics.shot_noise) + np.float32(optics.read_noise**2))
+    if spoilt is not None:
+        sigma *= np.float32(spoilt.what.noise_gain)
     image += sigma * rng.standard_normal(image.shape, dtype=np.float32)
-    return np.asarray(np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8))
+    picture = np.asarray(np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8))
+    return picture if spoilt is None else spoilt.compressed(picture)
 
 
 @lru_cache(maxsize=8)
