@@ -38,10 +38,10 @@ def test_step_model_jacobian_against_differences() -> None:
     rng = np.random.default_rng(0)
     zeros = np.zeros((2, 50))
     band = _Band(rng.uniform(-4, 4, (2, 50)), rng.uniform(-1, 1, (2, 50)), zeros, np.ones((2, 50), dtype=bool))
-    x = np.array([[0.3, -0.2, 0.1, 20, 3, 150, -5, 0.003], [-0.3, 0.2, -0.3, 10, 1, 100, 5, -0.004]])
+    x = np.array([[0.3, -0.2, 0.1, 20, 3, 150, -5, 0.003, -0.03], [-0.3, 0.2, -0.3, 10, 1, 100, 5, -0.004, 0.02]])
     _, jacobian = _step_model(band, x)
-    for k in range(8):
-        d = np.zeros(8)
+    for k in range(9):
+        d = np.zeros(9)
         d[k] = 1e-5
         numeric = (_step_model(band, x + d)[0] - _step_model(band, x - d)[0]) / 2e-5
         assert np.abs(numeric - jacobian[:, k]).max() < 1e-7 * max(1.0, np.abs(numeric).max())
@@ -55,7 +55,7 @@ def test_step_model_is_the_blur_of_a_step_under_sloping_light() -> None:
     d = np.array([-2.0, -0.5, 0.0, 0.7, 3.0])
     expected = [np.sum(scene * np.exp(-0.5 * ((v - e) / s) ** 2)) * (v[1] - v[0]) / (s * np.sqrt(2 * np.pi)) for e in d]
     band = _Band(d[None], np.zeros((1, 5)), np.zeros((1, 5)), np.ones((1, 5), dtype=bool))
-    model, _ = _step_model(band, np.array([[0.0, 0.0, np.log(s), b, 0.0, w, 0.0, g]]))
+    model, _ = _step_model(band, np.array([[0.0, 0.0, np.log(s), b, 0.0, w, 0.0, g, 0.0]]))
     assert model[0] == pytest.approx(expected, abs=1e-3)
 
 
@@ -81,12 +81,12 @@ def test_subpixel_refinement_pulls_corners_inwards_where_edges_do_not() -> None:
 
 
 def test_covariance_predicts_the_scatter_of_an_edge() -> None:
-    start, end = CORNERS[:1], CORNERS[1:2]
+    start, end = CORNERS, np.roll(CORNERS, -1, axis=0)
     clean = square_image(CORNERS, 1.0)
     rng = np.random.default_rng(4)
     lines, covariances = [], []
     for _ in range(60):
-        fit = fit_edges(PLAIN, as_bytes(clean + 3.0 * rng.normal(size=clean.shape)), start, end, np.array([25.0]))
+        fit = fit_edges(PLAIN, as_bytes(clean + 3.0 * rng.normal(size=clean.shape)), start, end, np.full(4, 25.0))
         assert fit.good[0]
         lines.append(fit.line[0])
         covariances.append(fit.covariance[0])

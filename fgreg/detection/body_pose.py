@@ -26,6 +26,8 @@ from fgreg.model.systematic import Constant
 VIEW_NAMES = ("left", "right")
 MAX_RMS_PX = 4.0
 """RMS residual above which the corners do not fit the modelled body."""
+MIN_NUMBERS = 8
+"""Coordinates that have to be seen: four corners over all views, or as many sides."""
 OTHER_POSE_RAD = 0.02
 """Minima whose rotations differ by less are the same pose."""
 AMBIGUITY_SIGMA_PX = 0.15
@@ -41,11 +43,6 @@ Odds of 2.7e5 to 1."""
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Angle (rad) between the rotations of two poses (4, 4)."""
     return float(np.arccos(np.clip(0.5 * (np.sum(a[:3, :3] * b[:3, :3]) - 1.0), -1.0, 1.0)))
-
-
-def rms_px(residual_px: FloatArray) -> float:
-    """Root mean square length of residuals (n, 2)."""
-    return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1))))
 
 
 def _ranked_hypotheses(corners: CornerSet) -> list[FloatArray]:
@@ -143,7 +140,8 @@ def without_strays(corners: CornerSet, names: list[str]) -> tuple[CornerSet, lis
 def _agreement(corners: CornerSet, camera_T_body: FloatArray) -> tuple[FloatArray, float]:
     """RMS (px) of each group at a pose, and the sum of the capped RMS: small where many groups agree."""
     residual, _, in_front = corner_residuals(corners, camera_T_body)
-    rms = np.array([rms_px(residual[corners.group == g]) for g in np.unique(corners.group)])
+    each = [corners.group == g for g in np.unique(corners.group)]
+    rms = np.array([corners.subset(chosen).rms_px(residual[chosen]) for chosen in each])
     return rms, float(np.minimum(rms, STRAY_START_PX).sum()) if in_front else np.inf
 
 
@@ -155,8 +153,9 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Consta
         left_out: messages about dropped corners, copied to the result.
         size: the constant that scales the body.
     """
-    if len(corners.view) < 4:
-        return NotFound(f"{what}: only {len(corners.view)} corners seen, at least 4 are needed")
+    numbers = corners.numbers
+    if numbers < MIN_NUMBERS:
+        return NotFound(f"{what}: only {numbers // 2} corners seen, at least 4 are needed")
     # Hypotheses are compared at a noise that covers model errors. The chosen one is then fitted at the stated noise.
     hypotheses = best_poses(corners.with_excess(AMBIGUITY_SIGMA_PX**2))
     chosen = fit_with_excess(corners, hypotheses[0].camera_T_body) if hypotheses else None
@@ -164,16 +163,16 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Consta
         return NotFound(f"{what}: no pose fits the corners seen")
     stated = corners.covariance
     corners, best = chosen
-    rms = rms_px(best.residual_px)
+    rms = corners.rms_px(best.residual_px)
     views = tuple(VIEW_NAMES[v] for v in np.unique(corners.view))
     if rms > MAX_RMS_PX:
         cause = "the two views or the model" if len(views) == 2 else "the model"
         return NotFound(f"{what}: corners {rms:.1f} px off the best pose; {cause} cannot be right")
-    dof = 2 * len(corners.view) - 6
+    dof = numbers - 6
     ratio = np.inf
     if len(hypotheses) == 2:
         first, second = hypotheses
-        ratio = rms_px(second.residual_px) / max(rms_px(first.residual_px), 1e-9)
+        ratio = corners.rms_px(second.residual_px) / max(corners.rms_px(first.residual_px), 1e-9)
         if second.cost - first.cost < AMBIGUITY_CHI2 * max(1.0, first.cost / max(dof, 1)):
             kind = "ambiguous single view" if len(views) == 1 else "ambiguous"
             apart = np.degrees(angle_between(first.camera_T_body, second.camera_T_body))
@@ -187,7 +186,6 @@ def choose_pose(corners: CornerSet, what: str, left_out: list[str], size: Consta
         corners=len(corners.view),
         views=views,
         rms_px=rms,
-        residual_sum_px2=float(np.sum(best.residual_px**2)),
         second_ratio=float(ratio),
         left_out=tuple(left_out),
         dependence=_dependence(corners, stated, best, size),

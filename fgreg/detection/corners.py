@@ -5,7 +5,8 @@ image (+0.1 to 0.2 mm of depth for a 30 mm tag), because one quadrant is black a
 of lines fitted to the four edges have no such bias: see edges.py. Two corners that share an edge also share its
 error, so the covariance is kept per square, (8, 8), not per corner.
 
-Where an edge is too short or too faint, its corners fall back to sub-pixel refinement with a larger sigma.
+Where an edge is too short or too faint, its corners fall back to sub-pixel refinement with a larger sigma. Where one
+side of a corner is hidden, the corner is a point of the other side with a sigma along that side that says nothing.
 """
 
 from __future__ import annotations
@@ -25,16 +26,19 @@ CORNER_FLOOR_PX = 0.003
 """Added to the sigma of corners from edges: independent errors that remain after averaging along an edge."""
 FALLBACK_SIGMA_PX = 0.3
 """Sigma of a corner from sub-pixel refinement of a small or low-contrast square."""
-COMMON_PX, COMMON_FALLBACK_PX = 0.0025, 0.1
+COMMON_PX, COMMON_FALLBACK_PX = 0.002, 0.1
 """Sigma of a corner error that is the same in both views and so does not show in the residuals (pixel grid, print).
-The value for corners from edges holds for edges of COMMON_LENGTH_PX; see _with_common."""
+The value for corners from edges holds for edges of COMMON_LENGTH_PX and a blur of 1 px; see _with_common."""
 COMMON_LENGTH_PX = 200.0
-OUTWARD_PX, OUTWARD_FALLBACK_PX = 0.002, 0.1
-"""Sigma of an outward error common to all corners of all squares (bias of the method). It makes the depth too small."""
+OUTWARD_PX, OUTWARD_FALLBACK_PX = 0.0015, 0.1
+"""Sigma of an outward error common to all corners of all squares (bias of the method). It makes the depth too small.
+From edges it is this at a blur of 1 px and grows with the blur's variance: the shape of the blur is known in part."""
 BORDER_MARGIN_PX = 7.0
 """Corners nearer to the image's border than this are used only if they come from edges."""
 MAX_FALLBACK_EDGE_PX = 60.0
 """Longer edges can always be fitted. If the fit fails, the detector found something other than the outline."""
+LOOSE_PX = 20.0
+"""Sigma along the other side of a corner of which only one side was found: that side counts, the corner does not."""
 MIN_EDGE_PX = 12.0
 """Corners of shorter edges come from sub-pixel refinement."""
 
@@ -47,7 +51,7 @@ class SquareCorners:
         ideal_px: (n, 4, 2), order as given.
         covariance: (n, 8, 8) px^2 over (x0, y0, x1, ...), at unit corner noise scale.
         found: (n, 4) which corners may be used.
-        from_edges: (n, 4) whether a corner is an intersection of edges, else sub-pixel refinement.
+        from_edges: (n, 4) whether a corner comes from edges (both, or one), else from sub-pixel refinement.
         common_px: (n, 4) sigma of the corner error that is the same in both views.
         outward_px: (n, 4, 2) one sigma of the outward error common to all squares.
     """
@@ -130,7 +134,7 @@ def square_corners(
 
     usable = np.flatnonzero(np.isfinite(ideal).all(axis=(1, 2)) & (sides.min(axis=1) >= MIN_EDGE_PX))
     if not edges or usable.size == 0:
-        return _with_common(ideal, covariance, found, from_edges, sides)
+        return _with_common(ideal, covariance, found, from_edges, sides, np.ones(n))
 
     start = ideal[usable].reshape(-1, 2)
     end = np.roll(ideal[usable], -1, axis=1).reshape(-1, 2)
@@ -141,11 +145,15 @@ def square_corners(
     # A sub-pixel corner is used only on small squares whose outline separates dark from light.
     step = (fit.step > MIN_CONTRAST).reshape(-1, 4)
     found[usable] &= step & np.roll(step, 1, axis=1) & (sides[usable].min(axis=1) < MAX_FALLBACK_EDGE_PX)[:, None]
+    # A side that was not found is replaced by its starting line with a sigma that says nothing.
+    line[~good] = 0.0
+    line_covariance[~good] = LOOSE_PX**2 * np.eye(2)
     for row, k in enumerate(usable.tolist()):
         jacobian = np.zeros((8, 8))
         for c in range(4):
             e, g = (c - 1) % 4, c  # the edges that end and start at this corner
-            if not (good[row, e] and good[row, g]):
+            sides_found = int(good[row, e]) + int(good[row, g])
+            if sides_found < 2 and (found[k, c] or not good[row].any()):
                 continue
             # n' (x - middle) = o + m * d' (x - middle) / half, for both edges
             rows = np.stack([normal[row, i] - line[row, i, 1] / half[row, i] * direction[row, i] for i in (e, g)])
@@ -170,16 +178,23 @@ def square_corners(
     for k, c in np.argwhere(found & ~from_edges).tolist():
         inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal[k, c]))
         covariance[k, 2 * c : 2 * c + 2, 2 * c : 2 * c + 2] = FALLBACK_SIGMA_PX**2 * inverse @ inverse.T
-    return _with_common(ideal, covariance, found, from_edges, sides)
+    blur2 = np.ones(n)
+    blur2[usable] = np.square(fit.blur_px).reshape(-1, 4).mean(axis=1)
+    return _with_common(ideal, covariance, found, from_edges, sides, blur2)
 
 
 def _with_common(
-    ideal: FloatArray, covariance: FloatArray, found: BoolArray, from_edges: BoolArray, sides_px: FloatArray
+    ideal: FloatArray,
+    covariance: FloatArray,
+    found: BoolArray,
+    from_edges: BoolArray,
+    sides_px: FloatArray,
+    blur2: FloatArray,
 ) -> SquareCorners:
     """Add the common errors. They are larger for short edges, which average over fewer pixels."""
     from_edge = COMMON_PX * np.sqrt(COMMON_LENGTH_PX / np.maximum(sides_px.min(axis=1), 1.0))
-    common = np.where(from_edges, from_edge[:, None], COMMON_FALLBACK_PX)
+    common = np.where(from_edges, (from_edge * np.sqrt(blur2))[:, None], COMMON_FALLBACK_PX)
     arm = ideal - ideal.mean(axis=1, keepdims=True)
     arm /= np.maximum(np.linalg.norm(arm, axis=2, keepdims=True), 1e-9)
-    outward = arm * np.where(from_edges, OUTWARD_PX, OUTWARD_FALLBACK_PX)[..., None]
+    outward = arm * np.where(from_edges, OUTWARD_PX * blur2[:, None], OUTWARD_FALLBACK_PX)[..., None]
     return SquareCorners(ideal, covariance, found, from_edges, common, outward)

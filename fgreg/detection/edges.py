@@ -2,12 +2,15 @@
 
 An edge between a dark and a light surface is fitted to the pixels near it as a blurred step,
 
-    I = (1 + g e) (B + (W - B) Phi(e / s)) + g s (W - B) phi(e / s),   e = d - o - m u,  B = b0 + b1 u,  W = w0 + w1 u,
+    I = (1 + g e) (B + (W - B) P(t)) + g s (W - B) phi(t),   P(t) = Phi(t) - c He3(t) phi(t),   t = e / s,
+    e = d - o - m u,  B = b0 + b1 u,  W = w0 + w1 u,
 
 with Phi, phi the normal distribution and density, d the distance of a pixel from the starting line (towards the light
-side), u in [-1, 1] the position along it, and g the fall-off of light across the edge: the Gaussian blur of a step in
-albedo under light that varies linearly. o, m, s, the levels and g are found by damped Gauss-Newton for all edges at
-once. Symmetric blur does not bias o and m, nor does light that falls off along or across the edge (without g the bias
+side), u in [-1, 1] the position along it, and g the fall-off of light across the edge: the blur of a step in albedo
+under light that varies linearly. c is the blur's kurtosis over 24, He3(t) = t^3 - 3 t (Gram-Charlier series): 0 for a
+Gaussian, -0.042 for a defocused disc, -0.05 for motion. Without c, g takes its place and moves o: by 0.1 px for a disc
+of 4 px, outwards at every edge. o, m, s, the levels, g and c are found by damped Gauss-Newton for all edges at once.
+Symmetric blur does not bias o and m, nor does light that falls off along or across the edge (without g the bias
 is 0.005 px, the same in both views). No pixel is interpolated, so the noise is independent and the normal equations
 give the covariance.
 
@@ -46,8 +49,18 @@ LOG_BLUR_SIGMA = 0.7
 """Prior sigma of log s about the starting blur: a step as sharp as a pixel does not determine it."""
 FALL_OFF_SIGMA = 0.004
 """Prior sigma of g, per px: light changes by about half over a hundred pixels."""
-PARAMETERS = 8
-REWEIGH_AT = 2
+FALL_OFF_COMMON_SIGMA = 0.0001
+"""The same about the value from the first pass, which opposite edges of a square share."""
+KURTOSIS_SIGMA, MAX_KURTOSIS = 0.03, 0.08
+"""Prior sigma and largest size of c."""
+PARAMETERS = 9
+STEEP = 0.3
+"""Pixels at which the model is at least this steep, as a share of its steepest, tell its misfit."""
+MEDIAN_SIGMAS = 0.6745
+"""Median of the size of a normally distributed residual, in standard deviations."""
+BINS, CLEAN_SHARE = 40, 0.75
+"""Parts along an edge, and the mean weight of a part's pixels below which all of them are left out."""
+REWEIGH_AT = 4
 """First iteration that down-weights outlier pixels."""
 
 
@@ -162,48 +175,55 @@ def _joined(parts: list[tuple[FloatArray, FloatArray, Image]]) -> _Band:
 
 
 def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Grey levels (n, p) of parameters (n, 8) = (o, m, log s, b0, b1, w0, w1, g), and their Jacobian (n, 8, p)."""
+    """Grey levels (n, p) of parameters (n, 9) = (o, m, log s, b0, b1, w0, w1, g, c), and their Jacobian (n, 9, p)."""
     u = band.u
     blur = np.exp(x[:, 2])[:, None]
-    fall = x[:, 7:8]
+    fall, kurtosis = x[:, 7:8], x[:, 8:9]
     e = band.d - x[:, :1] - x[:, 1:2] * u
     t = e / blur
-    phi = np.exp(-0.5 * t * t) * (1.0 / np.sqrt(2.0 * np.pi))
-    big_phi = ndtr(t)
+    t2 = t * t
+    phi = np.exp(-0.5 * t2) * (1.0 / np.sqrt(2.0 * np.pi))
+    he3_phi = t * (t2 - 3.0) * phi
+    profile = ndtr(t) - kurtosis * he3_phi
+    slope = phi * (1.0 + kurtosis * (t2 * (t2 - 6.0) + 3.0))  # of the profile
     light = 1.0 + fall * e
     # Shares of the two levels: they add up to the light that falls on the pixel.
-    high = light * big_phi + fall * blur * phi
+    high = light * profile + fall * blur * phi
     low = light - high
     dark = x[:, 3:4] + x[:, 4:5] * u
     step = x[:, 5:6] + x[:, 6:7] * u - dark
     jacobian = np.empty((len(u), PARAMETERS, u.shape[1]))
-    # d high / d e = fall Phi + light phi / s - fall t phi;  d high / d log s = -phi t light + fall s phi (1 + t^2)
-    by_e = fall * dark + step * (fall * big_phi + phi * (light / blur - fall * t))
+    # d high / d e = fall P + light P' / s - fall t phi;  d high / d log s = -P' t light + fall s phi (1 + t^2)
+    by_e = fall * dark + step * (fall * profile + slope * light / blur - fall * t * phi)
     jacobian[:, 0] = -by_e
     jacobian[:, 1] = -by_e * u
-    jacobian[:, 2] = step * phi * (fall * blur * (1.0 + t * t) - light * t)
+    jacobian[:, 2] = step * (fall * blur * phi * (1.0 + t2) - light * t * slope)
     jacobian[:, 3] = low
     jacobian[:, 4] = low * u
     jacobian[:, 5] = high
     jacobian[:, 6] = high * u
-    jacobian[:, 7] = e * dark + step * (e * big_phi + blur * phi)
+    jacobian[:, 7] = e * dark + step * (e * profile + blur * phi)
+    jacobian[:, 8] = -step * light * he3_phi
     return dark * light + step * high, jacobian
 
 
 def _fit_band(
-    band: _Band, start: FloatArray, iterations: int, tolerance_px: float
+    band: _Band, start: FloatArray, iterations: int, tolerance_px: float, fall_off_sigma: float, near: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(parameters (n, 8), inverse normal matrix (n, 8, 8), pixel noise sigma (n,)), by Levenberg-Marquardt."""
+    """(parameters (n, 9), inverse normal matrix (n, 9, 9), pixel noise sigma (n,)), by Levenberg-Marquardt."""
     x = start.copy()
     contrast = np.maximum(np.abs(x[:, 5] - x[:, 3]), MIN_CONTRAST)
     # Priors: inverse variances about the start.
     prior = np.zeros_like(x)
     prior[:, 2] = LOG_BLUR_SIGMA**-2
     prior[:, 4] = prior[:, 6] = (LEVEL_SLOPE_SIGMA * contrast) ** -2.0
-    prior[:, 7] = FALL_OFF_SIGMA**-2
-    centre = np.where(np.arange(PARAMETERS) == 2, x, 0.0)
+    prior[:, 7] = fall_off_sigma**-2
+    prior[:, 8] = KURTOSIS_SIGMA**-2
+    centre = np.where(np.isin(np.arange(PARAMETERS), (2, 7)), x, 0.0)
     diagonal = np.arange(PARAMETERS)
 
+    bins = np.clip((0.5 * BINS * (band.u + 1.0)).astype(np.intp), 0, BINS - 1) + BINS * np.arange(len(x))[:, None]
+    bins[~band.used] = BINS * len(x)
     weight = band.used.astype(np.float64)
     sigma = 0.1 * contrast
     damping = np.full(len(x), 1e-3)
@@ -211,11 +231,13 @@ def _fit_band(
     residual = band.grey - grey
     cost = np.full(len(x), np.inf)
     for iteration in range(iterations):
-        if iteration in (0, REWEIGH_AT, iterations - 2):
-            if iteration > 0:
+        if iteration == 0 or near or iteration >= REWEIGH_AT:
+            if iteration > 0 or near:
                 # Down-weight outlier pixels (a speck, a glint).
-                sigma = _spread(residual, np.minimum(weight, 9.0 * sigma[:, None] ** 2 / (residual**2 + 1e-12)), weight)
+                sigma = _typical(residual, band.used, jacobian[:, 0])
                 weight = band.used / (1.0 + np.square(np.square(residual / (4.0 * sigma[:, None]))))
+                if near:
+                    weight *= _clean_bins(weight, bins)
             cost = np.sum(weight * residual**2, axis=1) / sigma**2 + np.sum(prior * (x - centre) ** 2, axis=1)
         jw = jacobian * (weight / sigma[:, None] ** 2)[:, None]
         normal = jw @ np.swapaxes(jacobian, 1, 2)
@@ -228,6 +250,7 @@ def _fit_band(
         step[:, 2] = np.clip(step[:, 2], -0.5, 0.5)
         y = x + step
         y[:, 2] = np.clip(y[:, 2], np.log(0.2), np.log(2.0 * MAX_BLUR_PX))
+        y[:, 8] = np.clip(y[:, 8], -MAX_KURTOSIS, MAX_KURTOSIS)
         new_grey, new_jacobian = _step_model(band, y)
         new_residual = band.grey - new_grey
         new_cost = np.sum(weight * new_residual**2, axis=1) / sigma**2 + np.sum(prior * (y - centre) ** 2, axis=1)
@@ -238,12 +261,27 @@ def _fit_band(
         else:
             x[better], cost[better] = y[better], new_cost[better]
             residual[better], jacobian[better] = new_residual[better], new_jacobian[better]
-        if iteration > REWEIGH_AT and np.abs(step[:, :2]).max() < tolerance_px:
+        if iteration > (0 if near else REWEIGH_AT) and np.abs(step[:, :2]).max() < tolerance_px:
             break
     sigma = _spread(residual, weight, weight)
     normal = (jacobian * (weight / sigma[:, None] ** 2)[:, None]) @ np.swapaxes(jacobian, 1, 2)
     normal[:, diagonal, diagonal] += prior + 1e-9
     return x, np.asarray(np.linalg.inv(normal), dtype=np.float64), sigma
+
+
+def _clean_bins(weight: FloatArray, bins: IntArray) -> BoolArray:
+    """Whether a pixel (n, p) lies where the whole width of the edge is as modelled: a spot spoils what is across it."""
+    total = np.bincount(bins.ravel(), weight.ravel(), minlength=bins.max() + 1)
+    count = np.bincount(bins.ravel(), minlength=bins.max() + 1)
+    return np.asarray((total >= CLEAN_SHARE * count)[bins])
+
+
+def _typical(residual: FloatArray, used: BoolArray, by_offset: FloatArray) -> FloatArray:
+    """Standard deviation (n,) of the pixels about the model where it falls or rises, half of which may be outliers."""
+    size = np.abs(by_offset)
+    chosen = used & (size > STEEP * (size * used).max(axis=1, keepdims=True))
+    out = [np.median(np.abs(row[steep])) if steep.any() else 0.0 for row, steep in zip(residual, chosen, strict=True)]
+    return np.maximum(np.array(out) / MEDIAN_SIGMAS, 0.3)
 
 
 def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> FloatArray:
@@ -272,30 +310,33 @@ def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> Fl
     x[:, 2] = np.log(blur_px)
     for k, side in ((3, -1.0), (5, 1.0)):
         share = band.used & (side * band.d > 0.5 * half_width[:, None])
-        x[:, k] = np.sum(share * band.grey, axis=1) / np.maximum(share.sum(axis=1), 1)
+        x[:, k] = [
+            np.median(grey[chosen]) if chosen.any() else 0.0 for grey, chosen in zip(band.grey, share, strict=True)
+        ]
     return x
 
 
 def _locate(
     camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray, widest_px: float
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """First pass: (parameters (n, 8), whether an edge is near (n,), light less dark level about the start (n,))."""
+    """First pass: (parameters (n, 9), whether an edge is near (n,), light less dark level about the start (n,))."""
     half_width = np.clip(0.55 * cell_px, 2.0, widest_px)
     trim = np.clip(0.12 * np.linalg.norm(end - start, axis=1), 2.0, 12.0)
     band = _band(camera, image, start, end, half_width, trim, 40)
     guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 0.3 * widest_px))
-    x, _, _ = _fit_band(band, guess, 10, 0.02)
+    x, _, _ = _fit_band(band, guess, 10, 0.02, FALL_OFF_SIGMA, near=False)
     near = (np.abs(x[:, 0]) + np.abs(x[:, 1]) < half_width) & (x[:, 5] - x[:, 3] > MIN_CONTRAST)
     near &= np.exp(x[:, 2]) < MAX_BLUR_PX
     return np.where(near[:, None], x, guess), near, guess[:, 5] - guess[:, 3]
 
 
 def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray) -> EdgeFit:
-    """Find the edges near starting segments, dark on the right of their direction as drawn (y down).
+    """Find the sides of black squares near starting segments, dark on the right of their direction as drawn (y down).
 
     Args:
         image: (h, w) uint8.
-        start, end: (n, 2) ideal px, within about half of ``cell_px`` (and 15 px) of the true corners.
+        start, end: (n, 2) ideal px, the four sides of a square in turn, within about half of ``cell_px`` (and 15 px) of
+            the true corners.
         cell_px: (n,) width of the dark band along the edge: limits the pixels used on either side.
     """
     length = np.linalg.norm(end - start, axis=1)
@@ -314,12 +355,15 @@ def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatAr
     start2 = start + (x[:, 0] - x[:, 1])[:, None] * normal
     end2 = end + (x[:, 0] + x[:, 1])[:, None] * normal
     blur = np.exp(x[:, 2])
-    half_width2 = np.clip(3.5 * blur + 1.5, 2.0, np.maximum(np.minimum(0.7 * cell_px, 14.0), 2.0))
+    # Not so wide that the next cell's blur reaches in.
+    half_width2 = np.clip(3.0 * blur + 1.5, 2.0, np.clip(cell_px - 3.5 * blur, 2.0, 14.0))
     trim2 = np.clip(3.0 * blur + 1.0, 2.0, 0.25 * length)
     band = _band(camera, image, start2, end2, half_width2, trim2, MAX_ROWS)
-    x[:, [0, 1, 7]] = 0.0
+    # Opposite edges look opposite ways: what their g have in common is a misfit of the blur, not light.
+    x[:, 7] = 0.5 * (x[:, 7] - x[:, 7].reshape(-1, 2, 2)[:, ::-1].ravel())
+    x[:, [0, 1, 8]] = 0.0
     x[:, 2] = np.log(np.clip(blur, 0.4, MAX_BLUR_PX))
-    x, inverse_normal, sigma = _fit_band(band, x, 8, 1e-3)
+    x, inverse_normal, sigma = _fit_band(band, x, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True)
 
     # Back to the starting segments' frame: they differ by the small rotation of the first pass.
     middle, direction, _, half_length = segment_frames(start, end)

@@ -18,6 +18,7 @@ from fgreg.detection.corners import grey, square_corners
 from fgreg.detection.edges import Image
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import MarkerFit, NotFound
+from fgreg.detection.spoilt_tags import find_spoilt_tags
 from fgreg.detection.tags import FoundTag, find_tags, tag_cells
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig
@@ -72,10 +73,7 @@ def _tags_in(picture: Image, marker: MarkerModel, view: str, near: Window | None
     """The body's tags in the whole image or within ``near``, and messages about what was left out."""
     large = len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX
     if near is not None:
-        left, right, top, bottom = near
-        found = find_tags(np.ascontiguousarray(picture[top:bottom, left:right]), marker.dictionary, half=large)
-        corner = np.array([left, top], dtype=np.float64)
-        return _own_tags([FoundTag(tag.id, tag.corners_px + corner) for tag in found], marker, view)
+        return _own_tags(_moved(find_tags(_part(picture, near), marker.dictionary, half=large), near), marker, view)
     tags: list[FoundTag] = []
     left_out: list[str] = []
     if large:
@@ -85,6 +83,24 @@ def _tags_in(picture: Image, marker: MarkerModel, view: str, near: Window | None
     if not tags and not left_out:
         tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, view)
     return tags, left_out
+
+
+def _spoilt_tags_in(picture: Image, marker: MarkerModel, near: Window | None) -> list[FoundTag]:
+    ids = frozenset(tag.id for tag in marker.tags)
+    if near is None:
+        return find_spoilt_tags(picture, marker.dictionary, ids)
+    return _moved(find_spoilt_tags(_part(picture, near), marker.dictionary, ids), near)
+
+
+def _part(picture: Image, window: Window) -> Image:
+    left, right, top, bottom = window
+    return np.ascontiguousarray(picture[top:bottom, left:right])
+
+
+def _moved(tags: list[FoundTag], window: Window) -> list[FoundTag]:
+    """Tags found in a part of an image, in the whole image's pixels."""
+    corner = np.array([window[0], window[2]], dtype=np.float64)
+    return [FoundTag(tag.id, tag.corners_px + corner) for tag in tags]
 
 
 def view_corners(
@@ -99,20 +115,50 @@ def view_corners(
 ) -> ViewCorners:
     """The body's corners in one view, ``view`` 0 (left) or 1 (right); ``near``: search only there."""
     picture = grey(image)
+
+    def refined(tags: list[FoundTag]) -> list[CornerSet]:
+        return _corner_sets(tags, picture, camera, view, view_T_camera, marker, edges)
+
     tags, left_out = _tags_in(picture, marker, VIEW_NAMES[view], near)
+    sets = refined(tags)
+    if not left_out and all(corners.numbers < 6 for corners in sets):
+        # Not one tag of which three sides are seen: lines may show more than the outlines that were found.
+        spoilt = _spoilt_tags_in(picture, marker, near)
+        shown = refined(spoilt)
+        if sum(corners.numbers for corners in shown) > sum(corners.numbers for corners in sets):
+            tags, sets = spoilt, shown
+    used = [(tag.id, corners) for tag, corners in zip(tags, sets, strict=True) if len(corners.view)]
+    left_out += [
+        f"tag {tag.id} cut by the border of the {VIEW_NAMES[view]} view"
+        for tag, corners in zip(tags, sets, strict=True)
+        if not len(corners.view)
+    ]
+    outlines = np.concatenate([tag.corners_px for tag in tags]) if tags else np.empty((0, 2))
+    return ViewCorners(
+        join([corners for _, corners in used]) if used else None, tuple(i for i, _ in used), tuple(left_out), outlines
+    )
+
+
+def _corner_sets(
+    tags: list[FoundTag],
+    picture: Image,
+    camera: CameraModel,
+    view: int,
+    view_T_camera: FloatArray,
+    marker: MarkerModel,
+    edges: bool,
+) -> list[CornerSet]:
+    """The refined corners of each tag; none where the image's border cuts all of them."""
     if not tags:
-        return ViewCorners(None, (), tuple(left_out), np.empty((0, 2)))
+        return []
     cells = tag_cells(marker.dictionary)
     squares = square_corners(camera, picture, np.stack([tag.corners_px for tag in tags]), cells, edges=edges)
     models = {tag.id: tag for tag in marker.tags}
-    parts, ids = [], []
+    sets = []
     for k, tag in enumerate(tags):
         keep = squares.found[k]
-        if not keep.any():
-            left_out.append(f"tag {tag.id} cut by the border of the {VIEW_NAMES[view]} view")
-            continue
         both, count = np.repeat(keep, 2), int(keep.sum())
-        parts.append(
+        sets.append(
             CornerSet(
                 models[tag.id].marker_p_corners_mm[keep],
                 squares.ideal_px[k][keep],
@@ -126,9 +172,7 @@ def view_corners(
                 ideal_by_lens(camera, squares.ideal_px[k][keep]),
             )
         )
-        ids.append(tag.id)
-    outlines = np.concatenate([tag.corners_px for tag in tags])
-    return ViewCorners(join(parts) if parts else None, tuple(ids), tuple(left_out), outlines)
+    return sets
 
 
 def detect_marker(

@@ -26,6 +26,8 @@ from fgreg.geometry.transforms import (
 )
 
 ITERATIONS = 25
+SEEN_PX = 2.0
+"""A corner with a much larger sigma in some direction was not seen in that direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +74,24 @@ class CornerSet:
             self.by_lens[keep],
         )
 
+    def shares(self) -> FloatArray:
+        """(n, 2, 2) how much a corner is known, by direction: 1 where it was seen, 0 along a side of which it is just
+        some point."""
+        n = len(self.view)
+        blocks = self.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+        return np.asarray(SEEN_PX**2 * np.linalg.inv(blocks + SEEN_PX**2 * np.eye(2)))
+
+    @property
+    def numbers(self) -> int:
+        """Number of coordinates that were seen: two per corner, one where only one of its sides was."""
+        return round(float(np.trace(self.shares(), axis1=1, axis2=2).sum()))
+
+    def rms_px(self, residual_px: FloatArray) -> float:
+        """Root mean square length of residuals (n, 2), as far as they were seen."""
+        shares = self.shares()
+        square = np.einsum("ni,nij,nj->", residual_px, shares, residual_px)
+        return float(np.sqrt(2.0 * square / max(float(np.trace(shares, axis1=1, axis2=2).sum()), 1e-9)))
+
     def with_excess(self, variance_px2: float) -> CornerSet:
         """The same corners with this independent variance added to each coordinate."""
         return replace(self, covariance=self.covariance + variance_px2 * np.eye(len(self.covariance)))
@@ -110,7 +130,7 @@ class PoseFit:
     Attributes:
         camera_T_body: (4, 4).
         information: (6, 6) over the right tangent at unit corner noise scale.
-        cost: whitened sum of squares, chi-square with 2n - 6 degrees of freedom at unit scale.
+        cost: whitened sum of squares, chi-square with ``numbers`` - 6 degrees of freedom at unit scale.
         residual_px: (n, 2) predicted less observed, ideal px.
     """
 
@@ -206,7 +226,7 @@ def fit_with_excess(corners: CornerSet, start: FloatArray) -> tuple[CornerSet, P
         the corners with the covariance used, and the fit; None where there is no minimum in front of the camera.
     """
     fit = fit_pose(corners, start)
-    dof = 2 * len(corners.view) - 6
+    dof = corners.numbers - 6
     if fit is None or dof <= 0:
         return None if fit is None else (corners, fit)
     allowed = dof * (1.0 + 3.0 * np.sqrt(2.0 / dof))

@@ -38,7 +38,6 @@ class RigidFit:
         corners: number of corners over all views.
         views: names of the views used.
         rms_px: root mean square distance of predicted from observed corners, undistorted pixels.
-        residual_sum_px2: sum of those squared distances.
         second_ratio: RMS of the second planar hypothesis over that of this one; infinite where there is no second.
         left_out: tags or corners that were seen but not used, with the reason.
         dependence: of the pose on the rig's constants.
@@ -52,7 +51,6 @@ class RigidFit:
     corners: int
     views: tuple[str, ...]
     rms_px: float
-    residual_sum_px2: float
     second_ratio: float
     left_out: tuple[str, ...]
     dependence: CameraDependence
@@ -119,16 +117,6 @@ def board_corner_dependence(fit: BoardFit, column: int, row: int) -> CameraDepen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OtherWave:
-    """A later wave in the frame of a find: x and range, covariance (2, 2) mm^2 and statistic as of :class:`PaFind`."""
-
-    x_mm: float
-    range_mm: float
-    covariance: FloatArray
-    statistic: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PaFind:
     """One photoacoustic source found in one frame.
 
@@ -146,8 +134,6 @@ class PaFind:
         sound_speed_ratio_sigma: its standard deviation.
         elements_used: number of elements that received the source and entered the fit; None for images.
         statistic, threshold: the detection statistic (log likelihood ratio) and its threshold.
-        others: later waves in the same frame, the strongest first: reflections, or the source after all where the
-            first wave has another cause.
     """
 
     x_mm: float
@@ -160,7 +146,6 @@ class PaFind:
     elements_used: int | None
     statistic: float
     threshold: float
-    others: tuple[OtherWave, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
