@@ -267,14 +267,55 @@ class Innovations:
     aim: FloatArray
 
 
-def innovations(parts: Parts, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Innovations:
+def innovations(problem: PackedProblem, parts: Parts, pm_inlier: BoolArray, aim_inlier: BoolArray) -> Innovations:
     """Innovations of all shots at the optimum of the inliers (one hypothesis), in closed form.
 
     Let H be the total Hessian. Without an inlier of cost c, gradient g, Hessian A the cost of the rest has its optimum
     g' (H - A)^-1 g lower, so the innovation is c + g' (H - A)^-1 g. That of an outlier is c - g' (H + A)^-1 g.
     """
     hessian = _hessian_of(parts, pm_inlier, aim_inlier)
-    return Innovations(_innovation(parts.pm, hessian, pm_inlier), _innovation(parts.aim, hessian, aim_inlier))
+    return Innovations(
+        _innovation_by_epoch(problem, parts.pm, hessian, pm_inlier), _innovation(parts.aim, hessian, aim_inlier)
+    )
+
+
+def _innovation_by_epoch(
+    problem: PackedProblem, part: Contributions, hessian: FloatArray, kept: BoolArray
+) -> FloatArray:
+    """:func:`_innovation` of PMs (J,). The registrations of other epochs, which a PM does not observe, are eliminated
+    from the Hessian once for each epoch, so that each PM has a small system."""
+    epochs, size = problem.columns.epochs, len(hessian)
+    if epochs == 1:
+        return _innovation(part, hessian, kept)
+    epoch_of = np.zeros(len(problem.pms), dtype=np.int64)
+    epoch_of[problem.beam_pm] = problem.beam_epoch
+    single = np.bincount(problem.beam_pm, problem.beam_epoch != epoch_of[problem.beam_pm], len(epoch_of)) == 0
+    out = np.empty(len(kept))
+    for epoch in range(epochs):
+        mine = single & (epoch_of == epoch)
+        if not mine.any():
+            continue
+        stay = np.r_[6 * epoch : 6 * epoch + 6, 6 * epochs : size]
+        own = Contributions(
+            part.cost[:, mine], part.gradient[:, mine][..., stay], part.hessian[:, mine][..., stay, :][..., stay]
+        )
+        out[mine] = _innovation(own, _without_others(hessian, stay), kept[mine])
+    if not single.all():
+        rest = ~single
+        own = Contributions(part.cost[:, rest], part.gradient[:, rest], part.hessian[:, rest])
+        out[rest] = _innovation(own, hessian, kept[rest])
+    return out
+
+
+def _without_others(hessian: FloatArray, stay: IntArray) -> FloatArray:
+    """Schur complement: the Hessian of the variables ``stay``, the others eliminated."""
+    others = np.setdiff1d(np.arange(len(hessian)), stay)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian)[others], 1e-30))
+    block = hessian[np.ix_(others, others)] * scale * scale[:, None]
+    across = hessian[np.ix_(others, stay)] * scale[:, None]
+    back = np.linalg.pinv(block, rcond=UNKNOWN, hermitian=True)
+    reduced = hessian[np.ix_(stay, stay)] - across.T @ back @ across
+    return np.asarray(0.5 * (reduced + reduced.T))
 
 
 def _innovation(part: Contributions, hessian: FloatArray, kept: BoolArray) -> FloatArray:
@@ -314,7 +355,7 @@ def innovations_at(
     ``private``: the private variables there; they are optimised where None.
     """
     parts = _settled_parts(problem, state) if private is None else contributions(problem, state, private)
-    return innovations(parts, pm_inlier, aim_inlier)
+    return innovations(problem, parts, pm_inlier, aim_inlier)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -369,7 +410,7 @@ def select_inliers(
     for _ in range(SETTLE_ROUNDS):
         loss = partial(_fixed, pm_inlier=pm_inlier, aim_inlier=aim_inlier)
         state = optimize(problem, state, max_iterations=MAX_STEPS, tolerance=TOLERANCE, loss=loss).state
-        found = innovations(_settled_parts(problem, state), pm_inlier, aim_inlier)
+        found = innovations(problem, _settled_parts(problem, state), pm_inlier, aim_inlier)
         beyond = beyond_limit(problem, found, pm_inlier)
         pm_next = ~beyond.pm & (pm_inlier | np.isfinite(found.pm))
         aim_next = ~beyond.aim & (aim_inlier | np.isfinite(found.aim)) if select_aims else aim_inlier
