@@ -12,12 +12,11 @@ from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate, refine
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.register import pack_session, register
-from fgreg.smoother.shared_variables import Quadratic
 from tests.forward import Truth, make_measurements, random_marker_T_laser, random_trus_T_camera
 
 CONFIG = SolveConfig()

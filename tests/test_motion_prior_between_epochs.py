@@ -11,6 +11,7 @@ from fgreg.camera_moves.detector import LoopClosure
 from fgreg.camera_moves.loop_closure import back_to
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, inverse, make_transform
+from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -19,7 +20,7 @@ from fgreg.online.recorded_moves import events_in_order, find_epochs, split_epoc
 from fgreg.registration.register import register
 from fgreg.registration.solve import distance_to_explicit
 from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
-from tests.online_streams import batch, first, restored, sigmas_apart
+from tests.online_streams import batch, events, first, restored, sigmas_apart
 
 AWAY = make_transform(np.eye(3), np.array([12.0, -9.0, 5.0]))
 CONFIG = SolveConfig()
@@ -110,3 +111,23 @@ def test_the_engine_closes_the_loop_and_the_batch_does_too() -> None:
     found = find_epochs(measurements, model, CONFIG)
     assert [(b.epoch, b.to, b.t) for b in found.loop_closures] == [(back.epoch, back.to, back.t)]
     assert split_epochs(measurements, found.moves, found.loop_closures).epochs[2].after == 0
+
+
+def test_a_motion_from_an_ambiguous_epoch_leads_to_an_ambiguous_one_until_its_own_pairs_decide() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(6), pairs=22, epochs=2, known_motion=True)
+    three = [pair.pm for pair in measurements.pairs if pair.epoch == 0][:3]  # they fit each of several minima exactly
+    pairs = tuple(pair for pair in measurements.pairs if pair.epoch == 1 or pair.pm in three)
+    engine = OnlineRegistration(model, find_moves=False)
+    opened = []
+    for event in events(replace(measurements, pairs=pairs)):
+        estimate = engine.add(event)
+        if estimate.epoch == 1:
+            opened.append(engine.state.is_open)
+            if engine.state.is_open:
+                assert estimate.verdict is Verdict.REFUSED
+    assert opened[:2] == [True, True]  # just moved; one pair
+    assert not opened[-1]
+    again = OnlineRegistration(model, find_moves=False)
+    restored(again, replace(measurements, pairs=pairs[:4]))
+    assert again.state.is_open
+    assert again.estimate.verdict is Verdict.REFUSED

@@ -136,7 +136,7 @@ def test_between_full_solves_the_report_keeps_the_posteriors_shift_and_width() -
     assert window is not None
     taken = first(measurements, 10)
     solution = solve(taken, [], model, SolveConfig())
-    report = result_of(FullSolveCase(0, 0, taken, None, None), taken, solution).report
+    report = result_of(FullSolveCase(0, 0, taken), taken, solution).report
     registration = solution.registration
     assert registration is not None
     assert report is not None

@@ -14,9 +14,9 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.graph.expectation_propagation import propagate, settle
-from fgreg.graph.packing import Anchor, PackedProblem
+from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_solver import Optimum, optimize
-from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.graph.shared_state import SharedState, gaussian_prior, make_state
 from fgreg.model.estimate import TrackEstimate
 from fgreg.model.measurements import EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
@@ -77,7 +77,7 @@ def _from_looks(query: Track, solved: Solved) -> tuple[float, float, float]:
     if problem.columns.size != len(solved.posterior.covariance):
         raise ValueError("the session's variables are not those of its configuration")
     # The priors on the shared variables are in the session's estimate already.
-    anchor = Anchor(solved.posterior.mean, np.asarray(np.linalg.inv(solved.posterior.covariance)))
+    anchor = gaussian_prior(solved.posterior.mean, solved.posterior.covariance)
     problem = replace(problem, anchor=anchor, prior_information=np.zeros(problem.columns.size))
     optimum = optimize(problem, solved.posterior.mean)
     settled = settle(problem, optimum.state, optimum.evaluation, settled=1e-4)

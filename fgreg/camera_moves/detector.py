@@ -34,13 +34,13 @@ from fgreg.camera_moves.whitened import POSE, gaussian_of, linearise, settled_pr
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_graph import Contributions, contributions
+from fgreg.graph.shared_state import Quadratic
 from fgreg.graph.split_points import GATE, log_move_odds, logsumexp
 from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.outliers import pm_limits
 from fgreg.registration.register import SoundSpeedPrior, pack_session
-from fgreg.smoother.shared_variables import Quadratic
 
 MIN_KNOWN = 6
 """PMs needed for a registration: with fewer on both sides of a split point a move cannot be tested there."""

@@ -162,7 +162,7 @@ def _new_sites(
     # The half width's error shifts a first hit's interval, which the site follows by its gain. In the window-only case
     # it moves the two ends apart, which is added to the softness here.
     edge = problem.columns.edge
-    held = problem.prior_information[edge] + (0.0 if problem.anchor is None else problem.anchor.information[edge, edge])
+    held = problem.prior_information[edge] + (0.0 if problem.anchor is None else problem.anchor.hessian[edge, edge])
     edge_variance = 1.0 / held
     soft = np.sqrt(windows.soft_rad**2 + np.where(problem.looks.edge_gain == 0.0, edge_variance, 0.0))
     low, high = windows.low_rad - cavity, windows.high_rad - cavity

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic
 from fgreg.model.measurements import (
     FLOOR_MM,
     POSE_FLOOR,
@@ -83,16 +83,10 @@ class EpochLink:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Anchor:
-    """A Gaussian prior of all shared variables: about a state (one hypothesis), information (D, D) of steps from it."""
-
-    state: SharedState
-    information: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PackedProblem:
     """All measurements of a session as arrays; indices say which PM and epoch each belongs to.
+
+    ``anchor``: a Gaussian prior of all shared variables.
 
     ``log_outlier`` (J,): where each PM may be an inlier or an outlier, the log density of an outlier over that of an
     inlier at its best.
@@ -114,7 +108,7 @@ class PackedProblem:
     prior_information: FloatArray
     shapes: RotationShapes | None = None
     sound_speed_mean: float = 1.0
-    anchor: Anchor | None = None
+    anchor: Quadratic | None = None
     log_outlier: FloatArray | None = None
 
 
@@ -300,8 +294,8 @@ def only_aims(problem: PackedProblem) -> PackedProblem:
     )
 
 
-def without_aims(problem: PackedProblem, anchor: Anchor) -> PackedProblem:
-    """The problem with a Gaussian of the shared variables in place of its calibration shots."""
+def without_aims(problem: PackedProblem, anchor: Quadratic) -> PackedProblem:
+    """The problem with a Gaussian prior of the shared variables in place of its calibration shots (and other prior)."""
     aims = problem.aims
     return replace(
         problem,

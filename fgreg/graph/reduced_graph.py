@@ -458,8 +458,8 @@ def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
         residual, _ = _link_residual(link, state)
         cost = cost + np.sum(residual * (residual @ link.information), axis=1)
     if problem.anchor is not None:
-        step = step_between(problem.anchor.state, state, problem.columns)
-        cost = cost + np.sum(step * (step @ problem.anchor.information), axis=1)
+        anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
+        cost = cost + anchor.cost + np.sum(step * (2.0 * anchor.gradient + step @ anchor.hessian), axis=1)
     return np.asarray(cost)
 
 
@@ -475,8 +475,9 @@ def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray
         hessian[:, columns[:, None], columns] += transposed(jacobian) @ weighted
         gradient[:, columns] += times(transposed(weighted), residual)
     if problem.anchor is not None:
-        hessian += problem.anchor.information
-        gradient += step_between(problem.anchor.state, state, problem.columns) @ problem.anchor.information
+        anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
+        hessian += anchor.hessian
+        gradient += anchor.gradient + step @ anchor.hessian
 
 
 def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:

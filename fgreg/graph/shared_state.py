@@ -119,3 +119,47 @@ def step_between(first: SharedState, second: SharedState, columns: Columns) -> F
     if columns.radius is not None:
         out[:, columns.radius] = second.radius_mm - first.radius_mm
     return out
+
+
+def chart_turn(step: FloatArray) -> FloatArray:
+    """(D, D) derivative of ``step_between(a, b.retract(d))`` by d, where b is ``step`` (D,) from a, of one epoch."""
+    turn = np.eye(len(step))
+    x, y, z = (0.5 * step[:3]).tolist()
+    turn[0, 1], turn[0, 2], turn[1, 2] = -z, y, -x
+    turn[1, 0], turn[2, 0], turn[2, 1] = z, -y, x
+    turn[3:6, 3:6] = exp_so3(step[:3])
+    return turn
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quadratic:
+    """The cost ``c + 2 g' d + d' H d`` (chi square) of steps ``d`` from a state of one hypothesis.
+
+    Attributes:
+        state: where it is linearised. cost: c. gradient: (D,), hessian: (D, D), of half the cost.
+    """
+
+    state: SharedState
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+
+    def at(self, state: SharedState, columns: Columns) -> Quadratic:
+        """The same quadratic about another state near by; of one epoch, or of no registration."""
+        step = step_between(self.state, state, columns)[0]
+        pull = self.hessian @ step
+        turn = chart_turn(step)
+        gradient = turn.T @ (self.gradient + pull)
+        cost = self.cost + float(step @ (2.0 * self.gradient + pull))
+        return Quadratic(state, cost, gradient, turn.T @ self.hessian @ turn)
+
+    def plus(self, other: Quadratic) -> Quadratic:
+        """Sum of two quadratics about the same state."""
+        return Quadratic(
+            self.state, self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian
+        )
+
+
+def gaussian_prior(state: SharedState, covariance: FloatArray) -> Quadratic:
+    """The prior of a Gaussian about a state (one hypothesis) with a covariance (D, D)."""
+    return Quadratic(state, 0.0, np.zeros(len(covariance)), np.asarray(np.linalg.inv(covariance)))

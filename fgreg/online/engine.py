@@ -24,6 +24,7 @@ from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
 from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, make_transform, rotation_to_direction
+from fgreg.graph.shared_state import Quadratic, gaussian_prior
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
@@ -36,14 +37,15 @@ from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
+from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
 from fgreg.registration.multistart import EpochSearch, Minimum
 from fgreg.registration.register import SoundSpeedPrior
-from fgreg.registration.solve import Solution, solve
+from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
-from fgreg.smoother.shared_variables import Quadratic
-from fgreg.smoother.state import Epoch, State, looks_by_pm, make_setting
-from fgreg.smoother.updates import FIRST_PAIRS, with_aim, with_motion, with_move, with_pair
+from fgreg.smoother.marginal_prior import has_moved
+from fgreg.smoother.state import Epoch, State, finished_prior, looks_by_pm, make_setting
+from fgreg.smoother.updates import FIRST_PAIRS, finished_prior_at_start, with_aim, with_motion, with_move, with_pair
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
@@ -103,6 +105,9 @@ class OnlineRegistration:
         self._serial = 0  # changes with the measurements and their epochs
         self._division = 0  # changes with the division of the pairs into epochs
         self._asked = 0  # division of the submitted case
+        self._solved = 0  # number of the first epochs that have been through the full solve
+        self._reports: tuple[EpochReport, ...] = ()  # of these epochs
+        self._finished_prior: Quadratic | None = None  # from the earlier epochs, in the full solve of the current one
         self._solve_wanted = self._move_wanted = self._move_untested = False
         self._misplaced: frozenset[int] = frozenset()
         self._restoring = False
@@ -158,6 +163,8 @@ class OnlineRegistration:
         self._serial += 1
         if state.epoch != before.epoch:
             self._divided(by_tags=found is not None)
+        elif state.now.start is not before.now.start:
+            self._finished_prior = None  # it is without the motion that is known now
         if isinstance(found, TagsMoved):
             self._note_move(before, state.now.first, found.since_t, event.t, None)
         elif isinstance(event, CameraMoved) and event.detected and event.since_t is not None:
@@ -207,7 +214,9 @@ class OnlineRegistration:
     def _divided(self, *, by_tags: bool = False) -> None:
         """Note that the division of the pairs into epochs has changed: results of earlier cases are invalid."""
         self._division += 1
-        self._misplaced = frozenset()
+        self._misplaced, self._finished_prior = frozenset(), None
+        if self._state.epoch_pairs:  # the epoch before has other pairs now
+            self._solved = min(self._solved, self._state.epoch - 1)
         if not by_tags:
             self._tags = TagMonitor()
 
@@ -287,26 +296,45 @@ class OnlineRegistration:
                 move = self._move_case()
             except Exception as error:  # the pair is taken in without the test
                 self._move_failure = f"{type(error).__name__}: {error}"
-        measurements = state.measurements() if self._solve_wanted and self._solvable else None
-        if self._solve_wanted and not self._solvable and state.epoch_pairs:
-            why = f"{state.epoch_pms} pairs are too few for a registration: take at least {self._config.min_pairs}"
-            self._state = replace(state, why_none=why)
-            self._estimate = self._estimated(self._state, self._estimate.t)
-        if move is None and measurements is None:
-            return None
-        return FullSolveCase(self._serial, state.epoch, measurements, self._known(), move)
+        if not self._solve_wanted:
+            return None if move is None else FullSolveCase(self._serial, state.epoch, None, move=move)
+        finished = self._finished()
+        measurements = self._state.measurements()
+        if finished is None:
+            return FullSolveCase(self._serial, state.epoch, measurements, self._known(), move=move)
+        return FullSolveCase(
+            self._serial,
+            state.epoch,
+            last_epoch(measurements),
+            finished=finished,
+            before=self._reports[: state.epoch],
+            first=state.now.first,
+            move=move,
+        )
 
-    @property
-    def _solvable(self) -> bool:
-        """Whether the current epoch can have a registration."""
-        return self._state.active_window is not None or self._state.epoch_pms >= LEAST_PMS
+    def _finished(self) -> FinishedEpochs | None:
+        """The earlier epochs as a prior, at the first pairs of an epoch; None where everything has to be solved."""
+        state = self._state
+        early = state.epoch_pairs <= FIRST_PAIRS or state.epoch_pms <= FIRST_PMS
+        if not early or not state.epoch or self._solved < state.epoch:
+            return None
+        try:
+            prior = self._finished_prior = self._finished_prior or finished_prior_at_start(state, self._setting)
+        except ArithmeticError:
+            return None
+        if prior is None:
+            return None
+        if state.finished is None:
+            self._state = replace(state, finished=prior)
+        old = state.epochs[state.now.start.old(state.epoch)]
+        return FinishedEpochs(prior, is_open=old.is_open and has_registration(prior))
 
     def _known(self) -> dict[int, EpochSearch]:
-        """Minima of earlier epochs, which are not searched again."""
+        """Minima of earlier epochs that are not ambiguous, which are not searched again."""
         out = {}
         for k, epoch in enumerate(self._state.epochs[:-1]):
             mine = [shot for shot in self._state.shots if shot.pair.epoch == k]
-            if epoch.state is not None and len({shot.label for shot in mine}) >= LEAST_PMS:
+            if epoch.state is not None and not epoch.is_open and len({shot.label for shot in mine}) >= LEAST_PMS:
                 clean = all(shot.inlier for shot in mine)
                 out[k] = EpochSearch((Minimum(0.0, epoch.state),), None, clean=clean)
         return out
@@ -334,8 +362,7 @@ class OnlineRegistration:
         for k, epoch in enumerate(state.epochs[:to]):
             pms = {shot.label for shot in state.shots if shot.pair.epoch == k}
             if epoch.state is not None and epoch.covariance is not None and len(pms) >= MIN_EARLIER:
-                information = np.asarray(np.linalg.inv(epoch.covariance))
-                out[k] = Quadratic(epoch.state, 0.0, np.zeros(len(information)), information)
+                out[k] = gaussian_prior(epoch.state, epoch.covariance)
         return out
 
     def _take_over(self, found: FullSolveResult) -> None:
@@ -352,6 +379,13 @@ class OnlineRegistration:
                 # Pairs that came before the first registration have not been tested for a move yet.
                 self._move_wanted, self._move_untested = self._move_wanted or self._move_untested, False
                 self._misplaced = misplaced_pms(self._state, self._setting)
+                self._solved, self._reports = found.epoch + 1, () if found.report is None else found.report.epochs
+                prior, here = self._finished_prior, self._state.active_window
+                if not found.initial.first:
+                    self._finished_prior = None  # the earlier epochs were solved, too
+                elif prior and here and found.initial.fits and has_moved(prior, here.state, self._setting.empty):
+                    self._finished_prior = finished_prior(self._state, here.state, self._setting).finished
+                    self._solve_wanted = True
             elif found.why_none:
                 self._state = replace(self._state, active_window=None, why_none=found.why_none)
             self._estimate = self._estimated(self._state, self._estimate.t)
@@ -373,7 +407,7 @@ class OnlineRegistration:
     def _close_loop(self, found: LoopClosure, t: float) -> None:
         """Close a loop: the earlier epoch's registration becomes a prior of the current epoch."""
         before, report = self._state, self._report
-        self._report = None  # it was of another registration
+        self._report = self._finished_prior = None  # they were of another registration
         try:
             state = with_motion(before, back_to(before.now.start, found.to), self._setting)
             state = replace(state, nis=before.nis, used=before.used)
@@ -420,12 +454,12 @@ class OnlineRegistration:
             self._solver.failure = f"{type(error).__name__}: {error}"
             self._estimate = self._estimated(self._state, self._estimate.t)
         self._move_wanted = self._find_moves and bool(self._state.epoch_pairs)
-        self._solve_wanted = not self._solvable  # the case then gives the reason why there is no registration
+        self._solve_wanted = self._state.active_window is None  # for the reason why there is no registration
         self._solve(self._t)
 
     def _solve_all(self) -> None:
         """Run the full solve of everything in this process."""
-        case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements(), None, None)
+        case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements())
         self._take_over(full_solve(case, self._model, self._config, self._prior, verdicts=self._verdicts))
 
     def _close_loops_again(self) -> bool:
@@ -503,7 +537,7 @@ class OnlineRegistration:
         """The full solve of everything, taken over as by :meth:`settle`."""
         measurements = self.measurements()
         solution = solve(measurements, [], self._model, self._config, sound_speed_prior=self._prior)
-        case = FullSolveCase(self._serial, self._state.epoch, measurements, None, None)
+        case = FullSolveCase(self._serial, self._state.epoch, measurements)
         self._solver.failure = ""
         self._solve_wanted = False
         self._take_over(result_of(case, measurements, solution))

@@ -21,10 +21,11 @@ from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
+from fgreg.registration.epochs import FinishedEpochs
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import pose_tangent
 from fgreg.registration.register import Registration, SoundSpeedPrior, register
-from fgreg.registration.solve import Solution, solve
+from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import Initial, initial_of
 
 
@@ -34,16 +35,22 @@ class FullSolveCase:
 
     Attributes:
         serial: number of this version of the measurements. epoch: the current one.
-        measurements: everything that was taken in; None where only a camera move is looked for.
+        measurements: everything that was taken in; with ``finished`` the last epoch's pairs only. None where only a
+            camera move is looked for.
         known: minima of earlier epochs, which are not searched for again.
+        finished: earlier epochs as a prior: only the current epoch is solved. before: what was reported of them.
+        first: place of the first of the pairs in the session's order.
         move: for the camera-move test; None where none is looked for.
     """
 
     serial: int
     epoch: int
     measurements: Measurements | None
-    known: Mapping[int, EpochSearch] | None
-    move: MoveCase | None
+    known: Mapping[int, EpochSearch] | None = None
+    finished: FinishedEpochs | None = None
+    before: tuple[EpochReport, ...] = ()
+    first: int = 0
+    move: MoveCase | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +63,8 @@ class Report:
         trus_T_camera, covariance, predicted_tre: as the solve reports them; None where it has no registration.
         shift: (6,) from the optimum to the reported registration, in units of the optimum's Gaussian (its Cholesky
             factor). root, optimum_root: (6, 6) Cholesky factors of the reported covariance and of the optimum's.
-        surface: tissue surface that the PMs trace; None where they trace none.
+        surface: tissue surface that the PMs trace; None where they trace none, or are of the current epoch only.
+        epochs: reports of all epochs.
     """
 
     serial: int
@@ -71,6 +79,7 @@ class Report:
     root: FloatArray | None
     optimum_root: FloatArray | None
     surface: TissueSurface | None = None
+    epochs: tuple[EpochReport, ...] = ()
 
     def applied(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The posterior's covariance, and the tangent from optimum to mean, for an optimum of this covariance (6, 6).
@@ -142,17 +151,26 @@ def _solved(
         return FullSolveResult(case.serial, case.epoch)
     if not verdicts:
         try:
-            found = register(case.measurements, model, config, sound_speed, case.known)
+            found = register(case.measurements, model, config, sound_speed, case.known, case.finished)
         except EstimationError as error:
             return FullSolveResult(case.serial, case.epoch, why_none=str(error))
         return _registered(case, case.measurements, found, None)
-    solution = solve(case.measurements, [], model, config, sound_speed_prior=sound_speed, known=case.known)
+    solution = solve(
+        case.measurements,
+        [],
+        model,
+        config,
+        sound_speed_prior=sound_speed,
+        known=case.known,
+        finished=case.finished,
+        before=case.before,
+    )
     return result_of(case, case.measurements, solution)
 
 
 def result_of(case: FullSolveCase, measurements: Measurements, solution: Solution) -> FullSolveResult:
     """The result of a case, from its batch solve."""
-    report = _report(solution, case.serial, case.epoch)
+    report = _report(solution, case)
     if solution.registration is None:
         return FullSolveResult(case.serial, case.epoch, why_none=solution.reasons[-1], report=report)
     return _registered(case, measurements, solution.registration, report)
@@ -161,7 +179,7 @@ def result_of(case: FullSolveCase, measurements: Measurements, solution: Solutio
 def _registered(
     case: FullSolveCase, measurements: Measurements, found: Registration, report: Report | None
 ) -> FullSolveResult:
-    initial = initial_of(found, measurements, case.epoch)
+    initial = initial_of(found, measurements, case.first)
     return FullSolveResult(case.serial, case.epoch, initial=initial, report=report)
 
 
@@ -170,7 +188,8 @@ def _plain(values: FloatArray | None) -> FloatArray | None:
     return None if values is None else np.array(values, dtype=np.float64, order="C")
 
 
-def _report(solution: Solution, serial: int, epoch: int) -> Report:
+def _report(solution: Solution, case: FullSolveCase) -> Report:
+    epoch, alone = case.epoch, case.finished is not None
     data = solution.epochs[epoch]
     pose, covariance, registration = _plain(data.trus_T_camera), _plain(data.covariance), solution.registration
     shift = root = optimum_root = None
@@ -182,7 +201,7 @@ def _report(solution: Solution, serial: int, epoch: int) -> Report:
         optimum = registration.optimum.state.trus_T_camera(place)[0]
         shift = np.asarray(np.linalg.solve(optimum_root, pose_tangent(optimum, pose)))
     return Report(
-        serial,
+        case.serial,
         epoch,
         data.pairs,
         max(data.verdict, solution.verdict, key=lambda v: v.severity),
@@ -193,5 +212,6 @@ def _report(solution: Solution, serial: int, epoch: int) -> Report:
         shift,
         root,
         optimum_root,
-        None if solution.snapshot is None else solution.snapshot.surface,
+        None if solution.snapshot is None or alone else solution.snapshot.surface,
+        solution.reports,
     )

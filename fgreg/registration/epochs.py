@@ -2,10 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import numpy as np
+
+from fgreg.graph.shared_state import Quadratic
 from fgreg.model.measurements import EpochStart, Measurements
 from fgreg.registration.multistart import EpochSearch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedEpochs:
+    """The epochs before the last one, where only the last one is solved.
+
+    Attributes:
+        prior: of the last epoch's shared variables, from the earlier epochs' pairs and a measured motion (without the
+            aims, and the priors of the configuration).
+        is_open: whether the epoch from which a measured motion leads to the last one is ambiguous.
+    """
+
+    prior: Quadratic
+    is_open: bool
+
+
+def has_registration(prior: Quadratic) -> bool:
+    """Whether a prior of one epoch's shared variables has information on its registration, from a measured motion."""
+    return bool((np.diag(prior.hessian)[:6] > 0.0).all())
+
+
+def last_epoch(measurements: Measurements) -> Measurements:
+    """The aims, and the pairs of the last epoch; the epochs keep their numbers, without the motions."""
+    last = len(measurements.epochs) - 1
+    pairs = tuple(pair for pair in measurements.pairs if pair.epoch == last)
+    return Measurements(measurements.aims, pairs, tuple(EpochStart(start.t) for start in measurements.epochs))
 
 
 def solvable_epochs(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:

@@ -109,9 +109,19 @@ def log_outlier(problem: PackedProblem, pm_inlier: BoolArray) -> FloatArray:
     return np.asarray(log - np.log(windows.high_rad - windows.low_rad)[first])
 
 
+def free_variables(problem: PackedProblem) -> int:
+    """Number of the shared variables, less the number of equations that are their priors."""
+    known = int(np.sum(problem.prior_information > 0)) + 6 * len(problem.links)
+    if problem.anchor is not None:
+        hessian = problem.anchor.hessian
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+        known += int(np.linalg.matrix_rank(hessian * scale * scale[:, None], tol=UNKNOWN, hermitian=True))
+    return problem.columns.size - known
+
+
 def plausible_cost(problem: PackedProblem) -> float:
     """Chi square of all shots beyond which they do not fit together, whatever their innovations."""
-    unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
+    unknowns = free_variables(problem)
     seen = unknowns if len(problem.pms) else 4  # aims alone determine the beam only
     equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
     return float(chdtri(max(equations - seen, 1), IMPLAUSIBLE_P))
@@ -216,7 +226,7 @@ def graduated(
 
 
 def graduated_or_near(problem: PackedProblem, state: SharedState, *, robust_aims: bool = False) -> RobustOptimum:
-    """The better of :func:`graduated` and a descent on the truncated cost alone, from one start.
+    """The better of :func:`graduated` and a descent on the truncated cost alone, from S starts.
 
     From a good start the wide losses may lead into another minimum.
     """

@@ -17,11 +17,11 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.columns import Columns
-from fgreg.graph.packing import Anchor, PackedProblem, only_aims, without_aims
+from fgreg.graph.packing import PackedProblem, only_aims, without_aims
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_graph import evaluate, log_posterior, refine
 from fgreg.graph.reduced_solver import Optimum
-from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.shared_state import Quadratic, SharedState, step_between
 from fgreg.graph.split_points import logsumexp
 from fgreg.model.estimate import PredictedTre
 
@@ -141,13 +141,14 @@ def light(mode: Mode) -> Mode:
     In the beam's chart their cost is almost quadratic. At few pairs this saves most of the time of a sample.
     """
     problem, at = mode.problem, mode.optimum.evaluation
-    if not len(problem.aims.rotation) or problem.anchor is not None:
+    if not len(problem.aims.rotation):
         return mode
     aims = only_aims(problem)
     private = replace(at.private, trus_p_pm=at.private.trus_p_pm[:, :0], beam_error=at.private.beam_error[:, :0])
     there = evaluate(aims, mode.optimum.state, private)
-    centre = -np.linalg.pinv(there.hessian[0], rcond=1e-12, hermitian=True) @ there.gradient[0]
-    anchor = Anchor(mode.optimum.state.retract(centre[None], problem.columns), there.hessian[0])
+    anchor = Quadratic(mode.optimum.state, float(there.cost[0]), there.gradient[0], there.hessian[0])
+    if problem.anchor is not None:
+        anchor = anchor.plus(problem.anchor.at(anchor.state, problem.columns))
     lighter = without_aims(problem, anchor)
     private = replace(at.private, aim_error=at.private.aim_error[:, :0], aim_shift=at.private.aim_shift[:, :0])
     evaluation = replace(at, private=private)

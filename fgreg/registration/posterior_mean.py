@@ -127,6 +127,10 @@ def sound_speed_from_residuals(registration: Registration) -> Estimated:
     For a registration in which it is not a variable: one Gauss-Newton step from its optimum with the ratio added.
     """
     free = pack(registration.measurements, registration.model, sound_speed_sigma=FREE_SOUND_SPEED)
+    prior = registration.problem.anchor
+    if prior is not None:  # the ratio, which is the last variable, is not in it
+        gradient, hessian = np.pad(prior.gradient, (0, 1)), np.pad(prior.hessian, ((0, 1), (0, 1)))
+        free = replace(free, anchor=replace(prior, gradient=gradient, hessian=hessian))
     optimum, column = registration.optimum, free.columns.sound_speed
     at = evaluate(free, optimum.state, optimum.evaluation.private)
     inverse = inverse_hessian(at.hessian[0])

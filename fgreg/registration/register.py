@@ -19,11 +19,18 @@ from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
-from fgreg.graph.shared_state import SharedState, make_state, nominal_frame
+from fgreg.graph.shared_state import Quadratic, SharedState, make_state, nominal_frame, stack_states
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.epochs import epoch_chains, restrict_epochs, solvable_epochs
+from fgreg.registration.epochs import (
+    FinishedEpochs,
+    epoch_chains,
+    has_registration,
+    last_epoch,
+    restrict_epochs,
+    solvable_epochs,
+)
 from fgreg.registration.multistart import (
     MIN_INLIER_AIMS,
     MIN_INLIER_PMS,
@@ -46,6 +53,9 @@ from fgreg.registration.outliers import (
     predicted_pms,
     select_inliers,
 )
+
+SAME_CHI2 = 1e-3
+"""Chi squares that differ by less are the same: three PMs fit each of their minima exactly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +117,11 @@ class Registration:
 Pack = Callable[[Measurements], PackedProblem]
 
 
+def too_few_text(pms: int, config: SolveConfig) -> str:
+    """Why an epoch of so few PMs has no registration."""
+    return f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
+
+
 def joint_start(
     measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
 ) -> SharedState:
@@ -150,26 +165,44 @@ def _best_start(
     chosen: dict[int, Minimum],
     solvable: list[int],
     model: SessionModel,
-    config: SolveConfig,
+    packed: Pack,
+    finished: FinishedEpochs | None,
+    *,
+    clean: bool,
 ) -> SharedState:
-    """The better of two starts.
+    """The better of two starts; both where not every PM fitted in the searches (``clean``).
 
     Either each epoch starts from its own minimum, or the epochs that measured motions link start from the one with
-    most pairs. The start that leads to the lower cost is returned.
+    most pairs, and a single epoch from its prior. The start that leads to the lower cost is better.
     """
-    own = joint_start(measurements, chosen, solvable, model)
-    count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
-    leaders: dict[int, Minimum] = {}
-    for chain in epoch_chains(measurements, solvable):
-        among = [k for k in chain if k in chosen]
-        best = max(among, key=lambda k: count[k])
-        leaders[best] = chosen[best]
-    if len(leaders) == len(chosen):
-        return own
-    carried = joint_start(measurements, leaders, solvable, model)
-    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
-    found = [optimize(problem, start, max_iterations=30) for start in (own, carried)]
+    if finished is not None:
+        starts = _starts_of_prior(finished.prior, next(iter(chosen.values()), None))
+    else:
+        starts = [joint_start(measurements, chosen, solvable, model)]
+        count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
+        leaders: dict[int, Minimum] = {}
+        for chain in epoch_chains(measurements, solvable):
+            among = [k for k in chain if k in chosen]
+            best = max(among, key=lambda k: count[k])
+            leaders[best] = chosen[best]
+        if len(leaders) < len(chosen):
+            starts.append(joint_start(measurements, leaders, solvable, model))
+    if len(starts) == 1:
+        return starts[0]
+    if not clean:
+        return stack_states(starts)
+    problem = packed(restrict_epochs(measurements, solvable))
+    found = [optimize(problem, start, max_iterations=30) for start in starts]
     return min(found, key=lambda optimum: float(optimum.evaluation.cost[0])).state
+
+
+def _starts_of_prior(prior: Quadratic, chosen: Minimum | None) -> list[SharedState]:
+    """Starts of one epoch with a prior: from its own minimum, and from where a measured motion leads."""
+    starts = [prior.state] if has_registration(prior) else []
+    if chosen is not None:
+        pose = chosen.state
+        starts.insert(0, replace(prior.state, rotation=pose.rotation, translation_mm=pose.translation_mm))
+    return starts
 
 
 def _open_minima(
@@ -180,8 +213,10 @@ def _open_minima(
     start: SharedState,
     model: SessionModel,
     config: SolveConfig,
+    packed: Pack,
+    finished: FinishedEpochs | None,
 ) -> tuple[SharedState, set[int]]:
-    """Choose between ambiguous minima of an epoch with the data of all epochs.
+    """Choose between ambiguous minima of an epoch with the data of all epochs (or the prior that they are).
 
     Together the epochs determine the beam and the window's edge better than the aims alone. A measured motion excludes
     minima that are far from where it leads.
@@ -189,9 +224,9 @@ def _open_minima(
     Returns:
         the start, and the epochs that stay ambiguous.
     """
-    if len(solvable) < 2 or not is_open:
+    if (len(solvable) < 2 and finished is None) or not is_open:
         return start, is_open
-    problem = pack_session(restrict_epochs(measurements, solvable), model, config)
+    problem = packed(restrict_epochs(measurements, solvable))
     left = set(is_open)
     for epoch in sorted(is_open):
         search, place = searches[epoch], solvable.index(epoch)
@@ -205,9 +240,9 @@ def _open_minima(
         translation[:, place] = [pose[:3, 3] for pose in poses]
         found = optimize(problem, replace(many, rotation=rotation, translation_mm=translation), max_iterations=30)
         cost = np.where(np.isfinite(found.evaluation.cost), found.evaluation.cost, np.inf)
-        best = int(np.argmin(cost))
-        if not np.isfinite(cost[best]):
+        if not np.isfinite(cost.min()):
             continue
+        best = int(np.argmax(cost < cost.min() + SAME_CHI2))  # of equal ones that of the start, whatever rounds
         start, ends = found.state.take([best]), found.state.trus_T_camera(place)
         near = np.flatnonzero(cost - cost[best] < config.second_minimum_chi2)
         if all(targets_moved(ends[best], ends[i], model.targets_mm) <= SAME_MINIMUM_MM for i in near):
@@ -312,7 +347,7 @@ def _solve_jointly(
     Args:
         measurements: of the epochs to be solved.
         packed: packs measurements as arrays.
-        start: one hypothesis.
+        start: one hypothesis; several where not ``clean``.
         aim_inlier: (A,) aims that fit in the calibration without pairs.
         clean: whether every PM fitted in the searches of the epochs.
 
@@ -363,6 +398,7 @@ def register(
     config: SolveConfig,
     sound_speed: SoundSpeedPrior | None = None,
     searched: Mapping[int, EpochSearch] | None = None,
+    finished: FinishedEpochs | None = None,
 ) -> Registration:
     """Calibrate and register: the joint optimum over all epochs that can be solved.
 
@@ -371,10 +407,13 @@ def register(
         model, config: of the session.
         sound_speed: prior of the ratio where it is estimated; the configuration's prior where None.
         searched: search results of epochs that are not searched again.
+        finished: earlier epochs as a prior; only the last epoch is solved then.
 
     Raises:
         EstimationError: no beam to start from, or no epoch with three PMs.
     """
+    if finished is not None:
+        measurements = last_epoch(measurements)
     beam = calibrate_beam(measurements, model)
     trusted = _keep(measurements, (), np.zeros(0, dtype=bool), beam.aim_inlier).aims
     fitting = replace(measurements, aims=trusted)
@@ -384,6 +423,10 @@ def register(
         for k in range(len(measurements.epochs))
     )
     solvable = solvable_epochs(measurements, searches)
+    if finished is not None and not solvable:
+        if not has_registration(finished.prior):
+            raise EstimationError(too_few_text(len({pair.pm for pair in measurements.pairs}), config))
+        solvable = [len(measurements.epochs) - 1]
     if not solvable:
         counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
         raise EstimationError(
@@ -392,17 +435,22 @@ def register(
         )
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}
     chosen = {k: minimum for k, (minimum, _) in choices.items()}
-    start = _best_start(measurements, chosen, solvable, model, config)
-    is_open = {k for k, (_, undecided) in choices.items() if undecided}
-    start, is_open = _open_minima(fitting, searches, is_open, solvable, start, model, config)
     clean = all(search.clean for search in searches)
 
     def packed(of: Measurements) -> PackedProblem:
-        return pack_session(of, model, config, sound_speed)
+        problem = pack_session(of, model, config, sound_speed)
+        return problem if finished is None else replace(problem, anchor=finished.prior)
 
     epochs = restrict_epochs(measurements, solvable)
+    start = _best_start(measurements, chosen, solvable, model, packed, finished, clean=clean)
+    is_open = {k for k, (_, undecided) in choices.items() if undecided}
+    start, is_open = _open_minima(fitting, searches, is_open, solvable, start, model, config, packed, finished)
+    # A motion leads from each minimum of an ambiguous epoch to one of the epoch after it.
+    for chain in epoch_chains(measurements, solvable):
+        if is_open.intersection(chain) or (finished is not None and finished.is_open):
+            is_open.update(k for k in chain if k not in chosen)
     kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
-    if _points_backwards(optimum):
+    if finished is None and _points_backwards(optimum):
         # The given nominal beam points backwards and no aim shows it: +z points towards the spots.
         start = _turned(optimum.state, model)
         kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,9 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
 from fgreg.registration.camera_conditions import camera_conditions
+from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
 from fgreg.registration.multistart import EpochSearch
+from fgreg.registration.outliers import free_variables
 from fgreg.registration.posterior import Posterior, predicted_tre
 from fgreg.registration.posterior_mean import (
     estimated_radius,
@@ -38,7 +40,7 @@ from fgreg.registration.posterior_mean import (
     sound_speed_from_residuals,
 )
 from fgreg.registration.readout import read_aims, read_laser, read_pairs
-from fgreg.registration.register import Registration, SoundSpeedPrior, register
+from fgreg.registration.register import Registration, SoundSpeedPrior, register, too_few_text
 from fgreg.registration.verdict import (
     SURE_OF_AIMS,
     SURE_OF_PAIRS,
@@ -71,11 +73,20 @@ AGREEMENT_SIGMA = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class EpochReport:
+    """What a solve says of one epoch: the estimate, and the conditions that it missed."""
+
+    estimate: EpochEstimate
+    conditions: tuple[Condition, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """The estimate for a session's measurements: everything but the session's name.
 
     ``pairs``, ``tracks`` and ``aims`` are in the order of the measurements and queries. ``registration``, ``posterior``
-    and ``snapshot`` (which answers tracking queries) are None where nothing could be computed.
+    and ``snapshot`` (which answers tracking queries) are None where nothing could be computed. ``reports``: of the
+    epochs; those of the solve as a whole are with the last one.
     """
 
     verdict: Verdict
@@ -88,6 +99,7 @@ class Solution:
     registration: Registration | None = None
     posterior: Posterior | None = None
     snapshot: Snapshot | None = None
+    reports: tuple[EpochReport, ...] = ()
 
     def as_session(self, name: str) -> SessionEstimate:
         """The estimate as files and reports have it."""
@@ -104,6 +116,8 @@ def solve(
     conditions: Sequence[Condition] = (),
     sound_speed_prior: SoundSpeedPrior | None = None,
     known: Mapping[int, EpochSearch] | None = None,
+    finished: FinishedEpochs | None = None,
+    before: Sequence[EpochReport] = (),
 ) -> Solution:
     """Calibrate, register, decide on the verdict, and answer the tracking queries from the whole session.
 
@@ -115,9 +129,13 @@ def solve(
         conditions: of the detection, added to those found here.
         sound_speed_prior: prior of the sound speed ratio, where the configuration makes it a variable.
         known: search results of epochs that are not searched again.
+        finished: earlier epochs as a prior; only the last epoch is solved then, and only its pairs are in the solution.
+        before: reports of the finished epochs.
     """
+    if finished is not None:
+        measurements = last_epoch(measurements)
     try:
-        registration = register(measurements, model, config, sound_speed_prior, known)
+        registration = register(measurements, model, config, sound_speed_prior, known, finished)
     except EstimationError as error:
         seen = camera_conditions(measurements, model, config)
         return _no_solution(measurements, tracks, [*conditions, *seen, Condition(Verdict.REFUSED, str(error))])
@@ -137,7 +155,10 @@ def solve(
         *_variable_conditions(centred, sound_speed_prior, config),
     ]
     steady = {k: _move_odds(registration, place) for place, k in enumerate(registration.epochs)}
-    epochs, found = _epoch_verdicts(measurements, centred, posterior, pairs, model, config, common, steady)
+    reports = _epoch_verdicts(measurements, centred, posterior, pairs, model, config, common, steady, before)
+    epochs, several = tuple(report.estimate for report in reports), len(reports) > 1
+    found = [f"epoch {k}: {c.text}" if several else c.text for k, of in enumerate(reports) for c in of.conditions]
+    reports = (*reports[:-1], replace(reports[-1], conditions=(*common, *reports[-1].conditions)))
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
     # The camera is in the last epoch; an earlier epoch that failed gives only a warning.
@@ -146,7 +167,7 @@ def solve(
         verdict = Verdict.WARNING
     return Solution(
         verdict=verdict,
-        reasons=tuple(condition.text for condition in [*common, *found]),
+        reasons=(*(condition.text for condition in common), *found),
         laser=readout.laser,
         epochs=epochs,
         pairs=pairs,
@@ -155,6 +176,7 @@ def solve(
         registration=registration,
         posterior=posterior,
         snapshot=snapshot,
+        reports=reports,
     )
 
 
@@ -183,7 +205,7 @@ def _common_conditions(
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
     shots, inlier_aims = registration.shots, len(registration.measurements.aims)
     equations = 2 * inlier_aims + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
-    unknowns = problem.columns.size - int(np.sum(problem.prior_information > 0)) - 6 * len(problem.links)
+    unknowns = free_variables(problem)
     lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
     lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]
     found = [*consistency(cost, equations - unknowns), *beam_sides(np.array(lambdas))]
@@ -206,7 +228,8 @@ def _common_conditions(
         found.extend(sound_speed_condition(asked.value, asked.sigma))
     if found and verdict_of(found) is Verdict.REFUSED:
         return found  # inconsistent data cannot test whether the two forms of the graph agree
-    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None:  # the explicit graph has no radius variable
+    # The explicit graph has no radius variable, and no prior of finished epochs.
+    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None and problem.anchor is None:
         found.extend(_agreement(registration))
     return found
 
@@ -281,42 +304,38 @@ def _epoch_verdicts(
     config: SolveConfig,
     common: Sequence[Condition],
     steady: Mapping[int, Sequence[Condition]],
-) -> tuple[tuple[EpochEstimate, ...], list[Condition]]:
-    """Each epoch with its verdict, and its conditions (with the epoch's number where there are several epochs).
+    before: Sequence[EpochReport],
+) -> tuple[EpochReport, ...]:
+    """Each epoch with its verdict and conditions.
 
-    ``steady``: camera-move conditions of each epoch, tested at the optimum.
+    ``steady``: camera-move conditions of each epoch, tested at the optimum. ``before``: reports of the first epochs,
+    which were not solved.
     """
-    several = len(measurements.epochs) > 1
-    out: list[EpochEstimate] = []
-    reasons: list[Condition] = []
+    out = list(before)
     state = registration.optimum.state
-    for k, start in enumerate(measurements.epochs):
+    for k, start in enumerate(measurements.epochs[len(out) :], len(out)):
         count = sum(pair.epoch == k and pair.used for pair in pairs)
         pms = len({pair.pm for pair in measurements.pairs if pair.epoch == k})
         if k not in registration.epochs:
-            text = f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
-            found = [Condition(Verdict.REFUSED, text)]
-            out.append(EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None))
+            found = [Condition(Verdict.REFUSED, too_few_text(pms, config))]
+            estimate = EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None)
         else:
             place = registration.epochs.index(k)
             found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
             tre = predicted_tre(posterior, place, model.targets_mm)
             found.extend(accuracy(tre, config, causes_of_error(registration, place, model.targets_mm)))
             block = slice(6 * place, 6 * place + 6)
-            out.append(
-                EpochEstimate(
-                    index=k,
-                    start_s=start.t,
-                    trus_T_camera=state.trus_T_camera(place)[0],
-                    covariance=posterior.covariance[block, block],
-                    pairs=count,
-                    verdict=verdict_of([*common, *found]),
-                    predicted_tre=tre,
-                )
+            estimate = EpochEstimate(
+                index=k,
+                start_s=start.t,
+                trus_T_camera=state.trus_T_camera(place)[0],
+                covariance=posterior.covariance[block, block],
+                pairs=count,
+                verdict=verdict_of([*common, *found]),
+                predicted_tre=tre,
             )
-        name = f"epoch {k}: " if several else ""
-        reasons.extend(Condition(condition.verdict, name + condition.text) for condition in found)
-    return tuple(out), reasons
+        out.append(EpochReport(estimate, tuple(found)))
+    return tuple(out)
 
 
 def _epoch_conditions(
@@ -329,7 +348,9 @@ def _epoch_conditions(
     place, state = registration.epochs.index(epoch), registration.optimum.state
     mine = [pair for pair in registration.measurements.pairs if pair.epoch == place]
     search = registration.searches[epoch]
-    linked = any(place in (link.old, link.new) for link in registration.problem.links)
+    problem = registration.problem
+    linked = any(place in (link.old, link.new) for link in problem.links)
+    linked = linked or (problem.anchor is not None and has_registration(problem.anchor))
     found = ambiguity(
         search,
         len({pair.pm for pair in mine}),

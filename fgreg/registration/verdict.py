@@ -76,6 +76,9 @@ def ambiguity(
 ) -> list[Condition]:
     """Second minima, too few pairs, and the mirrored hypothesis, of one epoch."""
     found = []
+    if is_open and not search.minima:
+        text = "the measured motion starts from an ambiguous registration: take more pairs"
+        found.append(Condition(Verdict.REFUSED, text))
     if is_open and len(search.minima) > 1:
         gap = search.minima[1].cost - search.minima[0].cost
         found.append(

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Measurements
 from fgreg.registration.register import Registration
 from fgreg.smoother.innovation import sigma_distance
 from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare
 from fgreg.smoother.marginal_prior import one_epoch
-from fgreg.smoother.shared_variables import Layout, Quadratic
-from fgreg.smoother.state import Setting, Shot, State, carried_prior, looks_by_pm, own_prior, total_prior
+from fgreg.smoother.shared_variables import Layout
+from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, looks_by_pm, own_prior, total_prior
 from fgreg.smoother.updates import LEAVE, MOST, settled, with_aim, with_pair
 
 SAME_SIGMA = 0.02
@@ -23,26 +23,33 @@ SAME_SIGMA = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Initial:
-    """Result of a registration of all measurements up to an event.
+    """Result of a registration of all measurements up to an event, or of the current epoch's.
 
     Attributes:
         epochs: numbers of the solved ones.
         state: their registrations with the common variables (one hypothesis); covariance: (D, D).
-        labels, inlier: of all pairs, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
-        is_open: whether the current epoch is ambiguous: two minima fit equally well.
+        first: place of the first pair in the session's order; not 0 where earlier epochs were a prior, and stay.
+        labels, inlier: of the pairs from there on, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
+        ambiguous: epochs that are: two minima fit equally well.
+        fits: whether every inlier is within its limit; there may be too few to leave one out.
     """
 
     epochs: tuple[int, ...]
     state: SharedState
     covariance: FloatArray
+    first: int
     labels: tuple[int, ...]
     inlier: tuple[bool, ...]
     aim_inlier: tuple[bool, ...]
-    is_open: bool
+    ambiguous: tuple[int, ...]
+    fits: bool
 
 
-def initial_of(found: Registration, measurements: Measurements, epoch: int) -> Initial:
-    """The part of a registration that the incremental estimate needs; ``epoch`` is the current one."""
+def initial_of(found: Registration, measurements: Measurements, first: int = 0) -> Initial:
+    """The part of a registration that the incremental estimate needs.
+
+    ``measurements``: what was registered. ``first``: place of their first pair.
+    """
     shots = found.shots
     look_pm = iter(shots.problem.look_pm.tolist())
     labels, inlier = [], []
@@ -54,10 +61,12 @@ def initial_of(found: Registration, measurements: Measurements, epoch: int) -> I
         found.epochs,
         found.optimum.state,
         found.covariance,
+        first,
         tuple(labels),
         tuple(inlier),
         tuple(bool(kept) for kept in shots.aim_inlier),
-        epoch in found.ambiguous,
+        found.ambiguous,
+        not (shots.pm_beyond_limit & shots.pm_inlier).any(),
     )
 
 
@@ -66,9 +75,10 @@ def initialised(state: State, found: Initial, setting: Setting) -> State:
 
     The state is unchanged where inliers and estimate are the same.
     """
-    count, aims = len(found.labels), len(found.aim_inlier)
+    count, aims = found.first + len(found.labels), len(found.aim_inlier)
     if count == len(state.shots) and aims == len(state.aims) and _is_same(state, found, setting):
-        return replace(state, is_open=found.is_open)
+        epochs = enumerate(state.epochs)
+        return replace(state, epochs=tuple(replace(e, is_open=_is_open(k, e, found)) for k, e in epochs))
     later, later_aims = state.shots[count:], state.aims[aims:]
     nis = state.nis
     state = _taken_over(replace(state, shots=state.shots[:count], aims=state.aims[:aims]), found, setting)
@@ -84,12 +94,17 @@ def _is_same(state: State, found: Initial, setting: Setting) -> bool:
     active, layout = state.active_window, state.layout
     if active is None or layout is None or state.epoch not in found.epochs:
         return False
-    mine = tuple((shot.label, shot.inlier) for shot in state.shots)
+    mine = tuple((shot.label, shot.inlier) for shot in state.shots[found.first :])
     if mine != tuple(zip(found.labels, found.inlier, strict=True)) or state.aim_inlier != found.aim_inlier:
         return False
     there = _here(found, state)
     there = layout.in_chart(there)
     return sigma_distance(there, active.state, active.covariance, setting.columns) < SAME_SIGMA
+
+
+def _is_open(k: int, epoch: Epoch, found: Initial) -> bool:
+    """Whether an epoch is ambiguous after a registration: unchanged where it was not solved but a prior."""
+    return k in found.ambiguous if k in found.epochs or not found.first else epoch.is_open
 
 
 def _here(found: Initial, state: State) -> SharedState:
@@ -100,35 +115,36 @@ def _here(found: Initial, state: State) -> SharedState:
 def _taken_over(state: State, found: Initial, setting: Setting) -> State:
     """The state at a registration of exactly its measurements."""
     layout = Layout(setting.columns, found.state.marker_T_nominal[0].copy())
-    shots = tuple(
+    solved = tuple(
         Shot(shot.pair, label, inlier)
-        for shot, label, inlier in zip(state.shots, found.labels, found.inlier, strict=True)
+        for shot, label, inlier in zip(state.shots[found.first :], found.labels, found.inlier, strict=True)
     )
     epochs = list(state.epochs)
     common = slice(6 * len(found.epochs), None)
     for k, epoch in enumerate(epochs):
         if k not in found.epochs:
-            epochs[k] = replace(epoch, state=None, covariance=None)
+            if not found.first or k == state.epoch:
+                epochs[k] = replace(epoch, state=None, covariance=None, is_open=False)
             continue
         place = found.epochs.index(k)
         columns = np.r_[6 * place : 6 * place + 6, np.arange(len(found.covariance))[common]]
         covariance = found.covariance[np.ix_(columns, columns)]
-        epochs[k] = replace(epoch, state=one_epoch(found.state, place), covariance=covariance)
+        is_open = _is_open(k, epoch, found)
+        epochs[k] = replace(epoch, state=one_epoch(found.state, place), covariance=covariance, is_open=is_open)
     state = replace(
         state,
         epochs=tuple(epochs),
         aim_inlier=found.aim_inlier,
-        shots=shots,
+        shots=state.shots[: found.first] + solved,
         layout=layout,
         active_window=None,
-        is_open=found.is_open,
+        finished=state.finished if found.first else None,
         why_none="",
     )
     if state.epoch not in found.epochs:
         return replace(state, why_none="its pairs do not determine it: take more pairs")
     here = _here(found, state)
-    state, carried = carried_prior(state, here, setting)
-    state = replace(state, carried=carried)
+    state = carried_prior(state, here, setting)
     looks = looks_by_pm([shot for shot in state.current if shot.inlier])
     labels = [label for _, label in looks]
     recent = labels if len(labels) < MOST else labels[-LEAVE:]
@@ -146,7 +162,8 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
     # Among few pairs that contradict each other full Gauss-Newton steps diverge from the optimum that damped steps
     # found. The optimum is used: all pairs are marginalised there, and the active window starts empty.
     older = frozenset(shot.label for shot in state.current if shot.inlier)
-    covariance = state.now.covariance
+    carried, covariance = state.carried, state.now.covariance
+    assert carried is not None
     assert covariance is not None
     information = _inverse(covariance)
     rest = Quadratic(here, 0.0, -carried.gradient, information - carried.hessian)

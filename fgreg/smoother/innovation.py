@@ -14,7 +14,7 @@ from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import DIVERGED_MM, Parts, contributions, refine
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements
 from fgreg.registration.outliers import (
     AIM_LIMIT,
@@ -24,7 +24,7 @@ from fgreg.registration.outliers import (
     outlier_p,
 )
 from fgreg.smoother.isam_window import ActiveWindow, Prepared
-from fgreg.smoother.shared_variables import Quadratic, small_step
+from fgreg.smoother.shared_variables import small_step
 from fgreg.smoother.state import Setting, State, pairs_of_epoch
 
 PRIVATE_ROUNDS = 3

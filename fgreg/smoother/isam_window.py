@@ -26,11 +26,11 @@ from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import Variable, make_ordering
 from fgreg.graph.gtsam_values import beam_of_chart
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
 from fgreg.model.sensitivity import arc_of_rotation, sensitivity_priors
 from fgreg.model.session_model import SessionModel
-from fgreg.smoother.shared_variables import Layout, Quadratic, finite, marginal_prior_factor, number_at
+from fgreg.smoother.shared_variables import Layout, finite, marginal_prior_factor, number_at
 
 THRESHOLDS: dict[Variable, tuple[float, ...]] = {
     Variable.trus_T_camera: (6e-4, 6e-4, 6e-4, 0.06, 0.06, 0.06),

@@ -14,9 +14,9 @@ from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import EpochStart
-from fgreg.smoother.shared_variables import Quadratic, small_step
+from fgreg.smoother.shared_variables import small_step
 
 PRIVATE_ROUNDS = 3
 EARLIER_ROUNDS = 8

@@ -1,8 +1,7 @@
 """The shared variables of one camera epoch: GTSAM's variables, the reduced problem's state, and quadratics on them.
 
-A quadratic is the cost ``c + 2 g' d + d' H d`` (chi square) of steps ``d`` from a state, as
-:meth:`fgreg.graph.shared_state.SharedState.retract` takes them: 6 of ``trus_T_camera``, 4 of the beam's chart, the
-window's edge, then the marker bias and the sound speed ratio where they are variables.
+Their steps are those of :meth:`fgreg.graph.shared_state.SharedState.retract`: 6 of ``trus_T_camera``, 4 of the beam's
+chart, the window's edge, then the marker bias and the sound speed ratio where they are variables.
 """
 
 from __future__ import annotations
@@ -16,42 +15,17 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from fgreg.factors.adapter import Residual, custom_factor
-from fgreg.geometry.transforms import FloatArray, exp_so3, hat, log_so3
+from fgreg.geometry.transforms import FloatArray, hat, log_so3
 from fgreg.graph.columns import Columns
 from fgreg.graph.gtsam_graph import Variable
 from fgreg.graph.gtsam_values import laser_chart
-from fgreg.graph.shared_state import SharedState, nominal_frame, step_between
+from fgreg.graph.shared_state import Quadratic, SharedState, nominal_frame
 
 POSE = slice(0, 6)
 LEAST_PIVOT = 1e-4
 """Smallest pivot of a correlation matrix's Cholesky factor with which the factor is used."""
 LEAST_CORRELATION = 1e-12
 """Eigenvalue of a correlation matrix below which a direction counts as not observed."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Quadratic:
-    """Cost, gradient (D,) and Hessian (D, D), of half the cost, about a state of one hypothesis and one epoch."""
-
-    state: SharedState
-    cost: float
-    gradient: FloatArray
-    hessian: FloatArray
-
-    def at(self, state: SharedState, columns: Columns) -> Quadratic:
-        """The same quadratic about another state near by."""
-        step = step_between(self.state, state, columns)[0]
-        pull = self.hessian @ step
-        turn = chart_turn(step)
-        gradient = turn.T @ (self.gradient + pull)
-        cost = self.cost + float(step @ (2.0 * self.gradient + pull))
-        return Quadratic(state, cost, gradient, turn.T @ self.hessian @ turn)
-
-    def plus(self, other: Quadratic) -> Quadratic:
-        """Sum of two quadratics about the same state."""
-        return Quadratic(
-            self.state, self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian
-        )
 
 
 def small_step(first: SharedState, second: SharedState, columns: Columns) -> FloatArray:
@@ -69,16 +43,6 @@ def small_step(first: SharedState, second: SharedState, columns: Columns) -> Flo
     if columns.sound_speed is not None:
         out[columns.sound_speed] = second.sound_speed_ratio[0] - first.sound_speed_ratio[0]
     return out
-
-
-def chart_turn(step: FloatArray) -> FloatArray:
-    """(D, D) derivative of ``step_between(a, b.retract(d))`` by d, where b is ``step`` (D,) from a."""
-    turn = np.eye(len(step))
-    x, y, z = (0.5 * step[:3]).tolist()
-    turn[0, 1], turn[0, 2], turn[1, 2] = -z, y, -x
-    turn[1, 0], turn[2, 0], turn[2, 1] = z, -y, x
-    turn[3:6, 3:6] = exp_so3(step[:3])
-    return turn
 
 
 def square_root(hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,15 +13,15 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import restrict_epochs
 from fgreg.registration.register import SoundSpeedPrior, pack_session
 from fgreg.smoother.isam_window import ActiveWindow
-from fgreg.smoother.marginal_prior import marginal_prior, one_epoch, with_registrations
-from fgreg.smoother.shared_variables import Layout, Quadratic
+from fgreg.smoother.marginal_prior import has_moved, marginal_prior, one_epoch, with_registrations
+from fgreg.smoother.shared_variables import Layout
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,12 +88,14 @@ class Epoch:
         first: place of its first pair in the session's order.
         state: its last estimated registration with the common variables; None where it was never registered.
         covariance: (D, D) there.
+        is_open: whether the registration is ambiguous: two minima fit equally well.
     """
 
     start: EpochStart
     first: int
     state: SharedState | None = None
     covariance: FloatArray | None = None
+    is_open: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,12 +108,12 @@ class State:
         shots: pairs, in the session's order.
         layout: None until a first registration.
         active_window: None where the current epoch has no registration (yet).
-        carried: prior on the current epoch's shared variables from the aims, the earlier epochs and the priors of the
-            configuration; older: from the epoch's own pairs that have left the active window. Their sum is the marginal
-            prior of the active window.
+        finished: prior on the current epoch's shared variables from the pairs of the earlier epochs and the measured
+            motions between epochs; None where it was not made, or nothing is known of earlier epochs.
+        carried: ``finished``, with the aims and the priors of the configuration; older: from the epoch's own pairs that
+            have left the active window. Their sum is the marginal prior of the active window.
         marginalised: labels of the PMs in ``older``.
         why_none: why there is no registration, where there is none.
-        is_open: whether the registration is ambiguous: two minima fit equally well.
         nis, used: of the last event, where it was a pair.
     """
 
@@ -121,11 +123,11 @@ class State:
     shots: tuple[Shot, ...] = ()
     layout: Layout | None = None
     active_window: ActiveWindow | None = None
+    finished: Quadratic | None = None
     carried: Quadratic | None = None
     older: Quadratic | None = None
     marginalised: frozenset[int] = frozenset()
     why_none: str = "take pairs"
-    is_open: bool = False
     nis: float | None = None
     used: bool = False
 
@@ -138,6 +140,11 @@ class State:
     def now(self) -> Epoch:
         """The current epoch."""
         return self.epochs[-1]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the current epoch's registration is ambiguous."""
+        return self.now.is_open
 
     @property
     def current(self) -> tuple[Shot, ...]:
@@ -200,32 +207,51 @@ def own_prior(state: State, labels: frozenset[int], at: SharedState, setting: Se
     return marginal_prior(problem, at)[0]
 
 
-def carried_prior(state: State, at: SharedState, setting: Setting) -> tuple[State, Quadratic]:
-    """The prior on the current epoch's shared variables from the aims, the earlier epochs and the configuration.
+def finished_prior(state: State, at: SharedState, setting: Setting) -> State:
+    """The state with the prior on the current epoch's shared variables from the earlier epochs that are registered.
+
+    The earlier registrations are estimated again. A prior that was made before is kept while the estimate stays near
+    its linearisation point.
 
     Args:
         state: ``layout`` has to be that of ``at``.
         at: shared variables of the current epoch (one hypothesis).
 
-    Returns:
-        the state with the earlier registrations estimated again, and the prior about ``at``.
-
     Raises:
         ArithmeticError: a number is not finite.
     """
-    now = state.epoch
+    now, before = state.epoch, state.finished
+    same_chart = before is not None and np.array_equal(before.state.marker_T_nominal, at.marker_T_nominal)
+    if before is not None and same_chart and not has_moved(before, at, setting.empty):
+        return state
     known = [k for k, epoch in enumerate(state.epochs[:-1]) if epoch.state is not None]
+    if not known:
+        return replace(state, finished=None)
     shots = [shot for shot in state.shots[: state.now.first] if shot.inlier and shot.pair.epoch in known]
     numbers = {key: number for number, key in enumerate(looks_by_pm(shots))}
-    aims = tuple(aim for aim, inlier in zip(state.aims, state.aim_inlier, strict=True) if inlier)
     starts = tuple(epoch.start for epoch in state.epochs)
-    problem = setting.pack(restrict_epochs(Measurements(aims, numbered(shots, numbers), starts), [*known, now]))
+    problem = setting.pack(restrict_epochs(Measurements((), numbered(shots, numbers), starts), [*known, now]))
+    problem = replace(problem, prior_information=np.zeros_like(problem.prior_information))
     each = [found for k in known if (found := state.epochs[k].state) is not None]
     prior, settled = marginal_prior(problem, with_registrations(at, [*each, at]))
     epochs = list(state.epochs)
     for place, k in enumerate(known):
         epochs[k] = replace(epochs[k], state=one_epoch(settled, place))
-    return replace(state, epochs=tuple(epochs)), prior
+    return replace(state, epochs=tuple(epochs), finished=prior)
+
+
+def carried_prior(state: State, at: SharedState, setting: Setting) -> State:
+    """The state with the prior ``carried`` about ``at`` (arguments as of :func:`finished_prior`).
+
+    Raises:
+        ArithmeticError: a number is not finite.
+    """
+    state = finished_prior(state, at, setting)
+    aims = tuple(aim for aim, inlier in zip(state.aims, state.aim_inlier, strict=True) if inlier)
+    carried, _ = marginal_prior(setting.pack(Measurements(aims, (), (EpochStart(0.0),))), at)
+    if state.finished is not None:
+        carried = carried.plus(state.finished.at(at, setting.columns))
+    return replace(state, carried=carried)
 
 
 def total_prior(state: State, at: SharedState, setting: Setting) -> Quadratic:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Pair
 from fgreg.smoother.innovation import aim_fits, innovation, limit_of, sigma_distance
 from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare, updated
 from fgreg.smoother.marginal_prior import carried_over, has_moved
 from fgreg.smoother.shared_variables import Layout
-from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, own_prior, total_prior
+from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, finished_prior, own_prior, total_prior
 
 MOST, LEAVE = 32, 16
 """Largest number of PMs in the active window, and how many of the oldest leave it together when it is full."""
@@ -127,8 +127,7 @@ def _relinearised(state: State, at: SharedState, setting: Setting) -> tuple[Stat
     """The state with those parts of its marginal prior linearised again whose linearisation point is too far away."""
     again = False
     if state.carried is not None and has_moved(state.carried, at, setting.empty):
-        state, carried = carried_prior(state, at, setting)
-        state, again = replace(state, carried=carried), True
+        state, again = carried_prior(state, at, setting), True
     if state.older is not None and has_moved(state.older, at, setting.empty):
         state, again = replace(state, older=own_prior(state, state.marginalised, at, setting)), True
     return state, again
@@ -142,8 +141,7 @@ def with_aim(state: State, aim: Aim, setting: Setting) -> State:
     state = replace(state, aims=aims, aim_inlier=inlier, nis=None, used=False)
     if active is None or layout is None or not fits:
         return state
-    state, carried = carried_prior(state, active.state, setting)
-    state = replace(state, carried=carried)
+    state = carried_prior(state, active.state, setting)
     change = Change(prior=total_prior(state, active.state, setting))
     return settled(state, active, layout, change, setting)
 
@@ -170,11 +168,11 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
         epochs=(*state.epochs[:-1], ended, Epoch(start, first)),
         shots=tuple(shots),
         active_window=None,
+        finished=None,
         carried=None,
         older=None,
         marginalised=frozenset(),
         why_none="the camera has moved: take pairs",
-        is_open=False,
         nis=None,
         used=False,
     )
@@ -188,19 +186,18 @@ def with_motion_prior(state: State, setting: Setting) -> State:
     the motion does not determine.
     """
     start, layout = state.now.start, state.layout
-    before = state.epochs[start.old(state.epoch)].state if start.motion_known and state.epoch else None
-    if before is None or layout is None:
+    old = state.epochs[start.old(state.epoch)] if start.motion_known and state.epoch else None
+    if old is None or old.state is None or layout is None:
         return state
-    at = carried_over(before, start)
+    at = carried_over(old.state, start)
     try:
-        state, carried = carried_prior(state, at, setting)
-        active = open_active_window((), carried, layout, state.epoch)
+        found = carried_prior(state, at, setting)
+        active = open_active_window((), total_prior(found, at, setting), layout, state.epoch)
     except ArithmeticError:  # the move is taken in all the same
         return state
-    now = replace(state.now, state=active.state, covariance=active.covariance)
-    return replace(
-        state, carried=carried, active_window=active, epochs=(*state.epochs[:-1], now), why_none="", is_open=False
-    )
+    # The motion leads from each of the old epoch's minima to one of this epoch.
+    now = replace(found.now, state=active.state, covariance=active.covariance, is_open=old.is_open)
+    return replace(found, active_window=active, epochs=(*found.epochs[:-1], now), why_none="")
 
 
 def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
@@ -209,10 +206,26 @@ def with_motion(state: State, start: EpochStart, setting: Setting) -> State:
     The motion is not used where the epoch that it is counted from has no registration.
     """
     now = replace(state.now, start=start)
-    state = replace(state, epochs=(*state.epochs[:-1], now), nis=None, used=False)
+    state = replace(state, epochs=(*state.epochs[:-1], now), finished=None, nis=None, used=False)
     active, layout = state.active_window, state.layout
     if active is None or layout is None:
         return state if state.epoch_pairs else with_motion_prior(state, setting)
-    state, carried = carried_prior(state, active.state, setting)
-    state = replace(state, carried=carried)
+    state = carried_prior(state, active.state, setting)
     return settled(state, active, layout, Change(prior=total_prior(state, active.state, setting)), setting)
+
+
+def finished_prior_at_start(state: State, setting: Setting) -> Quadratic | None:
+    """The prior from the earlier epochs, linearised where the current epoch began, whatever its own pairs say.
+
+    None where no earlier epoch is registered.
+
+    Raises:
+        ArithmeticError: a number is not finite.
+    """
+    start, old = state.now.start, state.epochs[state.now.start.old(state.epoch)]
+    known = next((epoch.state for epoch in reversed(state.epochs[:-1]) if epoch.state is not None), None)
+    if known is None or state.layout is None:
+        return None
+    if start.motion_known and old.state is not None:
+        known = carried_over(old.state, start)
+    return finished_prior(replace(state, finished=None), known, setting).finished

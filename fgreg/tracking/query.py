@@ -15,10 +15,10 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, exp_so3, parent_from_right_covariance
 from fgreg.graph.expectation_propagation import inverse_hessian, settle
-from fgreg.graph.packing import Anchor, PackedProblem, pack_pairs
+from fgreg.graph.packing import PackedProblem, pack_pairs
 from fgreg.graph.reduced_blocks import initial_private, times
 from fgreg.graph.reduced_graph import evaluate, refine
-from fgreg.graph.shared_state import SharedState
+from fgreg.graph.shared_state import SharedState, gaussian_prior
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import POSE_FLOOR, MarkerObservation, Pair, Track, usable_covariance
 from fgreg.model.sensitivity import wrap_angle
@@ -116,7 +116,7 @@ def _one_pm(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> tuple[Pac
         shapes=snapshot.window_shape,
         amplitude_sigma=snapshot.amplitude_sigma,
     )
-    return replace(problem, anchor=Anchor(state, np.asarray(np.linalg.inv(covariance)))), state
+    return replace(problem, anchor=gaussian_prior(state, covariance)), state
 
 
 def _from_surface(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Placed | str:
