@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 import fgreg.smoother.updates as updates_module
+from fgreg.camera_moves.detector import LoopClosure
 from fgreg.errors import EventRefused, JournalError
 from fgreg.geometry.transforms import make_transform
-from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent, RefusedEvent
+from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, LoopClosed, OnlineEvent
 from fgreg.online.live_session import LiveSession
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.session_reader import check_session, read_session
@@ -62,6 +63,11 @@ def _in_two_epochs(*, known_motion: bool, after: int) -> Stream:
     return model, list(events(first(measurements, 12 + after)))
 
 
+def _just_moved() -> Stream:
+    model, stream = _in_two_epochs(known_motion=True, after=1)
+    return model, stream[:-1]
+
+
 def _too_few() -> Stream:
     model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=2)
     return model, list(events(measurements))
@@ -82,7 +88,8 @@ STREAMS = {
     "a fifth outliers": _with_outliers,
     "looks at one PM, one of them an outlier": _looked_at_twice,
     "two epochs, motion measured": lambda: _in_two_epochs(known_motion=True, after=12),
-    "a motion just measured": lambda: _in_two_epochs(known_motion=True, after=1),
+    "a motion just measured": _just_moved,
+    "one pair after a measured motion": lambda: _in_two_epochs(known_motion=True, after=1),
     "two epochs, motion unknown": lambda: _in_two_epochs(known_motion=False, after=10),
     "one pair after a move": lambda: _in_two_epochs(known_motion=False, after=1),
     "too few pairs": _too_few,
@@ -93,10 +100,12 @@ STREAMS = {
 
 def _lived(model: SessionModel, stream: list[OnlineEvent]) -> tuple[OnlineRegistration, list[OnlineEvent]]:
     """An engine that took in one event after the other, and what a session that it records has then."""
-    engine, record = OnlineRegistration(model, verdicts=False), list[OnlineEvent]()
+    engine, record, closed = OnlineRegistration(model, verdicts=False), list[OnlineEvent](), 0
     for event in stream:
         epoch, estimate = engine.estimate.epoch, engine.add(event)
         record.append(event)
+        record.extend(LoopClosed(event.t, back.epoch, back.to) for back in engine.loop_closures[closed:])
+        closed = len(engine.loop_closures)
         if estimate.epoch > epoch and not isinstance(event, CameraMoved):
             record.append(CameraMoved(event.t, detected=True, since_t=engine.moves[-1].since_t))
     return engine, record
@@ -134,6 +143,17 @@ def test_a_thousand_pairs_in_seven_epochs_are_opened_again() -> None:
     assert not any(engine.inliers[5:100:10])
     assert sum(engine.inliers) > 980
     assert engine.add(replace(measurements.pairs[-1], t=engine.estimate.t + 1.0, pm=2000)).used
+
+
+def test_a_note_that_only_looks_like_a_loop_closure_changes_nothing() -> None:
+    text = DetectedLoopClosure(1, 0, 5.0, 9.0).text
+    assert LoopClosed.of_note(5.0, text) == LoopClosed(5.0, 1, 0)
+    assert LoopClosed.of_note(5.0, text + "!") is None
+    model, stream = _plain()
+    engine = OnlineRegistration(model, verdicts=False)
+    engine.add(stream[0])
+    with pytest.raises(EventRefused, match="closes a loop"):
+        engine.add(LoopClosed(stream[0].t, 1, 0))
 
 
 # --- sessions ---------------------------------------------------------------------------------------------------------
@@ -235,3 +255,30 @@ def test_with_its_verdict_it_is_what_it_was(pose_session: Path) -> None:
     assert sigmas_between(found, expected) < SIGMAS
     with LiveSession.open(folder), pytest.raises(JournalError, match="another program is recording"):
         LiveSession.open(folder)
+
+
+def test_a_loop_closure_is_noted_and_there_when_the_session_is_opened_again(pose_session: Path) -> None:
+    folder, events = _emptied(pose_session)
+    pairs = [event for event in events if isinstance(event, PairEvent)]
+    moved = CameraMovedEvent(pairs[8].t, 0)
+    with LiveSession.open(folder, make_engine=_engine) as live:
+        for event in events:
+            if event is pairs[8]:
+                live.add(moved)
+            live.add(event)
+            if event is pairs[10]:
+                break
+        assert isinstance(live.engine, OnlineRegistration)
+        live.engine._close_loop(LoopClosure(1, 0, 9.0), event.t)
+        expected = live.refresh()
+    assert expected is not None
+    notes = [event.text for event in read_session(folder).events if isinstance(event, NoteEvent)]
+    assert notes == [DetectedLoopClosure(1, 0, 0.0, None).text]
+    for _ in range(2):  # opened again and again: noted once
+        with LiveSession.open(folder, make_engine=_engine) as live:
+            assert isinstance(live.engine, OnlineRegistration)
+            assert [(back.epoch, back.to) for back in live.engine.loop_closures] == [(1, 0)]
+            assert live.engine.measurements().epochs[1].after == 0
+            assert live.estimate is not None
+            assert sigmas_between(live.estimate, expected) < SIGMAS
+    assert sum(isinstance(event, NoteEvent) for event in read_session(folder).events) == 1

@@ -285,7 +285,7 @@ class StageEvent:
 
 @dataclass(frozen=True, slots=True)
 class NoteEvent:
-    """A note by the operator; it has no effect on the estimate."""
+    """A note by the operator, or of a loop closure by the program (fgreg.online.events); others have no effect."""
 
     t: Seconds
     line: int

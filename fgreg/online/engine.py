@@ -19,7 +19,7 @@ from types import TracebackType
 
 import numpy as np
 
-from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase, find_camera_move
+from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase
 from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
 from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
 from fgreg.errors import EventRefused
@@ -32,7 +32,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.event_checks import check
-from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent, StaticTags
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, LoopClosed, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
@@ -55,8 +55,6 @@ FIRST_PMS = 8
 """Up to this number of PMs of an epoch the full solve runs at each pair."""
 LATER_PAIRS = (12, 15, 20, 25, 30, 40, 60, 80)
 """Numbers of pairs at which the full solve runs later; after the last one it runs whenever the pairs have doubled."""
-LOOP_PMS = (MOST_LOOKS, 18, 10)
-"""Numbers of PMs at which a loop closure of the recorded session is looked for when it is opened again."""
 MOST_LOSSES = 3
 """Times that a case is submitted again after its worker process has ended, until the next event."""
 MOST_ROUNDS = 4
@@ -169,6 +167,8 @@ class OnlineRegistration:
             self._note_move(before, state.now.first, found.since_t, event.t, None)
         elif isinstance(event, CameraMoved) and event.detected and event.since_t is not None:
             self._note_move(before, state.now.first, event.since_t, event.t, None, recorded=True)
+        elif isinstance(event, LoopClosed):
+            self._loop_closures.append(DetectedLoopClosure(event.epoch, event.to, event.t, None))
         self._want(event, found, misplaced)
         self._solve(event.t)
         if isinstance(event, Pair) and state is not self._state and self._state.shots:
@@ -201,6 +201,10 @@ class OnlineRegistration:
         if isinstance(found, TagsAtRest):
             start = EpochStart(state.now.start.t, found.camera_new_T_camera_old, found.covariance)
             return with_motion(state, start, setting)
+        if isinstance(event, LoopClosed):
+            if not self._restoring or event.epoch != state.epoch or not event.to < event.epoch:
+                raise EventRefused(f"it closes a loop from epoch {event.epoch} to {event.to} in epoch {state.epoch}")
+            return with_motion(state, back_to(state.now.start, event.to), setting)
         return replace(state, nis=None, used=False)
 
     def _pairs_since(self, t: float) -> int:
@@ -436,8 +440,8 @@ class OnlineRegistration:
     def restoring(self) -> Iterator[None]:
         """While events of a recorded session are taken in again: everything is estimated once, at the end.
 
-        Camera moves that were detected are among the recorded events. Loops are closed again. New moves are looked for
-        in the current epoch only.
+        Camera moves and loop closures that were detected are among the recorded events. New ones are looked for in the
+        current epoch only.
         """
         self._restoring = True
         try:
@@ -448,40 +452,17 @@ class OnlineRegistration:
             return
         try:
             self._solve_all()
-            if self._find_moves and self._close_loops_again():
-                self._solve_all()
         except Exception as error:  # the events are taken in; the next event requests the full solve again
             self._solver.failure = f"{type(error).__name__}: {error}"
             self._estimate = self._estimated(self._state, self._estimate.t)
         self._move_wanted = self._find_moves and bool(self._state.epoch_pairs)
-        self._solve_wanted = self._state.active_window is None  # for the reason why there is no registration
+        self._solve_wanted = False
         self._solve(self._t)
 
     def _solve_all(self) -> None:
         """Run the full solve of everything in this process."""
         case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements())
         self._take_over(full_solve(case, self._model, self._config, self._prior, verdicts=self._verdicts))
-
-    def _close_loops_again(self) -> bool:
-        """Close the loops that were closed during the session, of which there are no events; whether there are any."""
-        state, before = self._state, len(self._loop_closures)
-        for epoch in range(1, len(state.epochs)):
-            earlier = self._earlier(epoch)
-            shots = [shot for shot in state.shots if shot.pair.epoch == epoch][:MOST_LOOKS]
-            pms = [tuple(shots[place].pair for place in places) for places in looks_by_pm(shots).values()]
-            for size in sorted({min(count, len(pms)) for count in LOOP_PMS}, reverse=True) if earlier else ():
-                inlier = np.ones(size, dtype=bool)
-                case = MoveCase(epoch, tuple(pms[:size]), tuple(range(size)), inlier, None, earlier)
-                found = find_camera_move(case, self._model, self._config, self._prior)
-                if isinstance(found, LoopClosure):
-                    epochs = list(self._state.epochs)
-                    epochs[epoch] = replace(epochs[epoch], start=back_to(epochs[epoch].start, found.to))
-                    self._state = replace(self._state, epochs=tuple(epochs), active_window=None)
-                    self._loop_closures.append(
-                        DetectedLoopClosure(epoch, found.to, pms[size - 1][0].t, found.log_bayes)
-                    )
-                    break
-        return len(self._loop_closures) > before
 
     # --- estimate ---------------------------------------------------------------------------------------------------
 

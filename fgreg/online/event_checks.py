@@ -9,7 +9,7 @@ import numpy as np
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, is_rigid
 from fgreg.model.measurements import Aim, MarkerObservation, Pair
-from fgreg.online.events import CameraMoved, OnlineEvent, StaticTags
+from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
 
 INT64 = 2**63
 
@@ -22,7 +22,7 @@ def check(event: OnlineEvent, after: float) -> None:
     Raises:
         EventRefused: with the first fault found.
     """
-    if not isinstance(event, Aim | Pair | CameraMoved | StaticTags):
+    if not isinstance(event, Aim | Pair | CameraMoved | StaticTags | LoopClosed):
         raise EventRefused(f"a {type(event).__name__} is not an event of a registration")
     if not math.isfinite(event.t):
         raise EventRefused(f"its time is {event.t}, expected a number")
@@ -53,7 +53,7 @@ def check(event: OnlineEvent, after: float) -> None:
             _transform("camera_new_T_camera_old", event.camera_new_T_camera_old)
         if event.covariance is not None:
             _covariance("covariance of the motion", event.covariance, 6)
-    else:
+    elif isinstance(event, StaticTags):
         for tag, pose in event.camera_T_tag.items():
             _transform(f"camera_T_tag of tag {tag}", pose)
             if tag not in event.covariance:

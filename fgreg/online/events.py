@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.measurements import Aim, Pair
+
+LOOP_TEXT = "in epoch {} the camera is back where it was in epoch {}: that registration is used"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +29,26 @@ class CameraMoved:
     covariance: FloatArray | None = None
     detected: bool = False
     since_t: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosed:
+    """A loop closure that was detected when the session was recorded; taken in only when it is opened again.
+
+    Attributes:
+        t: when it was recorded.
+        epoch: number of the epoch in which the camera is back. to: of the earlier one.
+    """
+
+    t: float
+    epoch: int
+    to: int
+
+    @classmethod
+    def of_note(cls, t: float, text: str) -> LoopClosed | None:
+        """The loop closure that a recorded note of time ``t`` says, in the words of :class:`DetectedLoopClosure`."""
+        found = re.fullmatch(LOOP_TEXT.format("([0-9]{1,9})", "([0-9]{1,9})"), text)
+        return None if found is None else cls(t, int(found[1]), int(found[2]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,18 +100,19 @@ class DetectedLoopClosure:
 
     Attributes:
         epoch: number of the epoch in which it is back. to: of the earlier one.
-        t: of the pair at which it was detected. log_bayes: of the same place against elsewhere.
+        t: of the pair at which it was detected. log_bayes: of the same place against elsewhere; None where it was
+            detected when the session was recorded.
     """
 
     epoch: int
     to: int
     t: float
-    log_bayes: float
+    log_bayes: float | None
 
     @property
     def text(self) -> str:
-        """Sentence for the user."""
-        return f"in epoch {self.epoch} the camera is back where it was in epoch {self.to}: that registration is used"
+        """Sentence for the user, and for the session's record (:meth:`LoopClosed.of_note`)."""
+        return LOOP_TEXT.format(self.epoch, self.to)
 
 
-OnlineEvent = Aim | Pair | CameraMoved | StaticTags
+OnlineEvent = Aim | Pair | CameraMoved | StaticTags | LoopClosed

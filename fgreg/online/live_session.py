@@ -35,7 +35,7 @@ from fgreg.online.checks import CheckPoints
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
+from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.event_writer import event_document, type_of, writable
@@ -149,6 +149,7 @@ class LiveSession:
         """Start with an engine that has taken in nothing yet."""
         self._checks = CheckPoints(self.config.limit_mm)
         self._engine, self._feed = engine, EpochFeed(engine, self._checks)
+        self._closures = 0  # loop closures that are recorded
         self._extractor = MeasurementExtractor(self.journal.model)
 
     @property
@@ -377,6 +378,10 @@ class LiveSession:
                 check = check_measurement(event, self._feed.epoch, self.journal.model)
                 if isinstance(check, Check):
                     self._checks.add(check)
+            elif isinstance(event, NoteEvent) and (closed := LoopClosed.of_note(event.t, event.text)) is not None:
+                with contextlib.suppress(EventRefused):  # a note that only looks like one
+                    self._engine.add(closed)
+                    self._closures += 1
         except (EventRefused, InputError) as error:
             reason = error.reason if isinstance(error, EventRefused) else str(error)
             self._refuse(event, event.line, reason)
@@ -388,12 +393,18 @@ class LiveSession:
             self._estimate = estimate
 
     def _record_moves(self) -> None:
-        """Moves that the engine found out by itself become events: the epochs are then the same for every reader."""
+        """Moves that the engine found out by itself become events: the epochs are then the same for every reader.
+
+        Its loop closures become notes, which it takes in when the session is opened again.
+        """
         count, self._feed.noticed = self._feed.noticed, 0
+        closures, before = self._engine.loop_closures, self._closures
         t = self.journal.last_t
-        if not count or t is None:
+        if t is None:
             return
-        for start in self._feed.starts()[-count:]:
+        self._closures = len(closures)
+        self._unwritten.extend(NoteEvent(t, 0, closure.text) for closure in closures[before:])
+        for start in self._feed.starts()[-count:] if count else ():
             moved = CameraMovedEvent(
                 t, 0, start.camera_new_T_camera_old, start.covariance, detected=True, since_t=min(t, start.t)
             )
