@@ -105,6 +105,7 @@ class OnlineRegistration:
         self._asked = 0  # division of the submitted case
         self._solved = 0  # number of the first epochs that have been through the full solve
         self._reports: tuple[EpochReport, ...] = ()  # of these epochs
+        self._misfit = 0  # the current epoch, where its PMs did not all fit with the earlier epochs as a prior
         self._finished_prior: Quadratic | None = None  # from the earlier epochs, in the full solve of the current one
         self._solve_wanted = self._move_wanted = self._move_untested = False
         self._misplaced: frozenset[int] = frozenset()
@@ -280,6 +281,10 @@ class OnlineRegistration:
         if self._asked != self._division or found.epoch != self._state.epoch:
             self._solve_wanted = True
             return True
+        if found.initial is not None and found.initial.first and not found.initial.fits:
+            # Where some are outliers, or would be among more, the earlier epochs decide together with this one.
+            self._misfit, self._solve_wanted = found.epoch, True
+            return True
         t = self._t if t is None else t
         if found.move_failure is not None:
             self._move_failure = found.move_failure
@@ -320,7 +325,7 @@ class OnlineRegistration:
         """The earlier epochs as a prior, at the first pairs of an epoch; None where everything has to be solved."""
         state = self._state
         early = state.epoch_pairs <= FIRST_PAIRS or state.epoch_pms <= FIRST_PMS
-        if not early or not state.epoch or self._solved < state.epoch:
+        if not early or not state.epoch or self._solved < state.epoch or self._misfit == state.epoch:
             return None
         try:
             prior = self._finished_prior = self._finished_prior or finished_prior_at_start(state, self._setting)
@@ -387,7 +392,7 @@ class OnlineRegistration:
                 prior, here = self._finished_prior, self._state.active_window
                 if not found.initial.first:
                     self._finished_prior = None  # the earlier epochs were solved, too
-                elif prior and here and found.initial.fits and has_moved(prior, here.state, self._setting.empty):
+                elif prior and here and has_moved(prior, here.state, self._setting.empty):
                     self._finished_prior = finished_prior(self._state, here.state, self._setting).finished
                     self._solve_wanted = True
             elif found.why_none:

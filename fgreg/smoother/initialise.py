@@ -31,7 +31,7 @@ class Initial:
         first: place of the first pair in the session's order; not 0 where earlier epochs were a prior, and stay.
         labels, inlier: of the pairs from there on, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
         ambiguous: epochs that are: two minima fit equally well.
-        fits: whether every inlier is within its limit; there may be too few to leave one out.
+        fits: whether every PM is an inlier within its limit.
     """
 
     epochs: tuple[int, ...]
@@ -66,7 +66,7 @@ def initial_of(found: Registration, measurements: Measurements, first: int = 0) 
         tuple(inlier),
         tuple(bool(kept) for kept in shots.aim_inlier),
         found.ambiguous,
-        not (shots.pm_beyond_limit & shots.pm_inlier).any(),
+        bool(shots.pm_inlier.all() and not shots.pm_beyond_limit.any()),
     )
 
 
