@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from fgreg.errors import InputError
 from fgreg.model.plausible import RADIUS, WINDOW, implausible_setup
 from fgreg.model.session_model import SESSION
 from fgreg.session.session_reader import check_session, read_session
@@ -64,6 +65,19 @@ def test_each_kind_of_value(path: str, value: Any, words: str) -> None:
     doubts = implausible_setup(SESSION.read(setup))
     assert len(doubts) == 1, doubts
     assert words in doubts[0]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("probe.pitch_mm", 0.00043, "expected a number >= 0.001 and <= 100 mm (in metres it would be 0.43 mm)"),
+        ("probe.channels.sampling_mhz", 40_000_000, "(in Hz it would be 40 MHz)"),
+    ],
+)
+def test_an_error_names_the_likely_unit_too(tmp_path: Path, path: str, value: Any, words: str) -> None:
+    with pytest.raises(InputError) as found:
+        read_session(session_files.write(tmp_path, changed(path, value)))
+    assert words in str(found.value)
 
 
 def test_other_errors_do_not_hide_a_doubt(tmp_path: Path) -> None:

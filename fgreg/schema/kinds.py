@@ -22,6 +22,8 @@ MAX_TRANSLATION_MM = 2000.0
 
 _UNBOUNDED, FINITE = 1e12, 1e100
 """Bounds that exclude only impossible numbers; the second is for entries of a matrix."""
+_OTHER_UNITS = {"mm": ("metres", 1000.0), "MHz": ("Hz", 1e-6)}
+"""Units that people use instead, with the factor to the one that is expected."""
 
 JsonSchema = dict[str, Any]
 
@@ -86,9 +88,17 @@ class Number(Kind):
             return False
         return (self.low < value if self.above else self.low <= value) and value <= self.high
 
+    def _in_other_unit(self, value: object) -> str:
+        """What a value outside the interval would be in the unit that people use instead, where that is inside."""
+        other, factor = _OTHER_UNITS.get(self.unit, ("", 1.0))
+        if not other or not Number().has(value):
+            return ""
+        number = float(value) * factor  # type: ignore[arg-type]
+        return f" (in {other} it would be {number:.4g} {self.unit})" if self.has(number) else ""
+
     def read(self, value: object, _folder: Path | None = None, /) -> float:
         if not self.has(value):
-            raise FieldError.of(shown(value), self.expected)
+            raise FieldError.of(shown(value), self.expected + self._in_other_unit(value))
         number = float(value)  # type: ignore[arg-type]
         return math.radians(number) if self.degrees else number
 
