@@ -43,10 +43,12 @@ __all__ = [  # noqa: F405
     "TrackEvent",
     "TrusRecord",
     "Verdict",
+    "VerifyReport",
     "read_session",
     "replay",
     "solve",
     "solve_measurements",
+    "verify",
 ]
 
 

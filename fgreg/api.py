@@ -38,6 +38,8 @@ from fgreg.online.live_session import LiveSession as LiveSession
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.pipeline.solve import SolveReport as SolveReport
 from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.pipeline.verify import VerifyReport as VerifyReport
+from fgreg.pipeline.verify import verify_session
 from fgreg.registration.checks import with_checks
 from fgreg.registration.solve import solve as solve_batch
 from fgreg.session.session_reader import Session as Session
@@ -89,6 +91,20 @@ def replay(
     """
     request = ReplayRequest(Path(session), _path(out), _path(rrd), redetect=redetect)
     return replay_session(request, config).solved
+
+
+def verify(session: str | Path, new: str | Path, config: SolveConfig | None = None) -> VerifyReport:
+    """Whether a session's finished registration is still valid, by new shots, as ``fgreg verify`` does.
+
+    Args:
+        session: its folder, with ``result.yaml``.
+        new: a session's folder, or a file of JSON lines with ``pair`` events; nothing is added to the registration.
+        config: as it was solved with.
+
+    Raises:
+        InputError: bad input, or no registration that may be used.
+    """
+    return verify_session(Path(session), Path(new), config)
 
 
 def solve_measurements(

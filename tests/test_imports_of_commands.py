@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from fgreg.pipeline.solve import SolveRequest, solve_session
+
 SLOW = ("cv2", "rerun", "matplotlib", "scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.ndimage")
 """Libraries that take 50 ms and more, and that few commands use."""
 SOLVER = ("scipy", "gtsam", "poselib", "fgreg.registration.register", "fgreg.graph", "fgreg.factors")
@@ -25,6 +27,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "solve POSES": ("scipy.linalg", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve POSES --quiet": ("rich", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve FRAMES": (*SLOW[1:], *OTHER_COMMANDS, *DRAWING, *PROCESSES),
+    "verify POSES NEW": (*SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "replay POSES": (*SLOW, *DETECTORS, "fgreg.simulation", "fgreg.evaluation", "fgreg.convert"),
     "evaluate POSES --jobs 1 --folds 0 --subsets 0 --no-leave-one-out": (
         *SLOW,
@@ -54,6 +57,11 @@ def test_a_command_loads_nothing_that_it_does_not_use(
     places = {"POSES": str(pose_session), "OUT": str(tmp_path / "out")}
     if "FRAMES" in command:
         places["FRAMES"] = str(request.getfixturevalue("raw_session"))
+    if "NEW" in command:
+        solve_session(SolveRequest(pose_session))
+        lines = (pose_session / "events.jsonl").read_text().splitlines()
+        places["NEW"] = str(tmp_path / "new.jsonl")
+        (tmp_path / "new.jsonl").write_text(next(line for line in lines if '"pair"' in line) + "\n")
     words = [places.get(word, word) for word in command.split()]
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, *words], check=False, capture_output=True, text=True, timeout=120

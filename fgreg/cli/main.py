@@ -25,6 +25,7 @@ from fgreg.cli.live import add_live
 from fgreg.cli.options import EstimateOption, LimitOption, solve_config
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
+from fgreg.cli.verify import add_verify
 from fgreg.errors import FgregError, InputError
 from fgreg.version import __version__
 from fgreg.workers.threads import one_thread_each
@@ -332,6 +333,7 @@ def simulate(
 add_commands(app, _progress)
 add_live(app, _summary_extras)
 add_replay(app, _summary_extras)
+add_verify(app, _progress)
 add_convert(app)
 add_devices(app)
 add_schema(app)

@@ -103,8 +103,11 @@ def print_summary(
     model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras, console: Console | None = None
 ) -> None:
     """Print the summary; in colour on a terminal, plain 80 columns elsewhere."""
-    console = console or Console(highlight=False, emoji=False)
-    summary = render_summary(model, estimate, extra)
+    print_plain(render_summary(model, estimate, extra), console or Console(highlight=False, emoji=False))
+
+
+def print_plain(summary: RenderableType, console: Console) -> None:
+    """Print; in colour on a terminal, plain 80 columns without trailing blanks elsewhere."""
     if console.is_terminal:
         console.print(summary, crop=False)
         return
@@ -118,7 +121,7 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
     """The summary as one rich renderable; print it with ``crop=False`` so that long paths stay whole."""
     truth = extra.truth or TruthFigures()
     parts: list[RenderableType] = [_verdict(estimate)]
-    parts += [_bullet(reason) for reason in estimate.reasons]
+    parts += [bullet(reason) for reason in estimate.reasons]
     for epoch in estimate.epochs:
         refused = Verdict.REFUSED in (estimate.verdict, epoch.verdict)
         parts += ["", *_epoch(epoch, model, truth, several=len(estimate.epochs) > 1, refused=refused)]
@@ -141,22 +144,22 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
 # ---- pieces ----
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """Text from a file without control characters."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def _verdict(estimate: SessionEstimate) -> Text:
     word = Text(f" {estimate.verdict.value.upper()} ", style=f"{STYLES[estimate.verdict]} reverse")
-    return Text.assemble(word, " ", (_clean(estimate.session), "bold"), f": {MEANINGS[estimate.verdict]}")
+    return Text.assemble(word, " ", (clean(estimate.session), "bold"), f": {MEANINGS[estimate.verdict]}")
 
 
-def _bullet(text: str) -> RenderableType:
+def bullet(text: str) -> RenderableType:
     """A list entry whose further lines stand under its first word."""
     grid = Table.grid(padding=(0, 1, 0, 0))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold")
-    grid.add_row("  -", Text(_clean(text)))
+    grid.add_row("  -", Text(clean(text)))
     return grid
 
 
@@ -282,7 +285,7 @@ def _pairs(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras)
         )
     yield Padding(table, (0, 0, 0, 2))
     yield from (
-        _bullet(f"PM {pairs[position].pm}, {pairs[position].t:.1f} s, not used: {pairs[position].reason}")
+        bullet(f"PM {pairs[position].pm}, {pairs[position].t:.1f} s, not used: {pairs[position].reason}")
         for position in shown
         if not pairs[position].used
     )
@@ -324,7 +327,7 @@ def _tracks(estimate: SessionEstimate, truth: TruthFigures) -> Iterator[Renderab
     yield Padding(table, (0, 0, 0, 2))
     if len(tracks) > MOST_ROWS:
         yield f"  and {len(tracks) - MOST_ROWS} more"
-    yield from (_bullet(f"{track.t:.1f} s: {track.reason}") for track in tracks[:MOST_ROWS] if track.stage_rad is None)
+    yield from (bullet(f"{track.t:.1f} s: {track.reason}") for track in tracks[:MOST_ROWS] if track.stage_rad is None)
 
 
 def _checks(estimate: SessionEstimate) -> Iterator[RenderableType]:
@@ -349,7 +352,7 @@ def _checks(estimate: SessionEstimate) -> Iterator[RenderableType]:
     yield Padding(table, (0, 0, 0, 2))
     if len(compared) > MOST_ROWS:
         yield f"  and {len(compared) - MOST_ROWS} more"
-    yield from (_bullet(f"{check.t:.1f} s, not compared: {check.reason}") for check in checks if check.error_mm is None)
+    yield from (bullet(f"{check.t:.1f} s, not compared: {check.reason}") for check in checks if check.error_mm is None)
 
 
 def _assumptions(estimate: SessionEstimate) -> Iterator[RenderableType]:
@@ -357,7 +360,7 @@ def _assumptions(estimate: SessionEstimate) -> Iterator[RenderableType]:
     for assumption in estimate.assumptions:
         count = len(assumption.checks)
         covered = f"covered by {count} check{'s' if count > 1 else ''}" if count else "no check covers it"
-        yield _bullet(f"{assumption.text} ({covered})")
+        yield bullet(f"{assumption.text} ({covered})")
 
 
 def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
@@ -370,7 +373,7 @@ def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
             f", spot to beam {math.sqrt(float(np.mean(np.square(residuals)))):.2f} mm rms, {max(residuals):.2f} worst"
         )
     yield text
-    yield from (_bullet(f"{aim.t:.1f} s, not used: {aim.reason}") for aim in aims if not aim.used)
+    yield from (bullet(f"{aim.t:.1f} s, not used: {aim.reason}") for aim in aims if not aim.used)
 
 
 def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:
@@ -385,9 +388,9 @@ def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:
     # Paths are not wrapped, so that they can be copied.
     for title, path in (("Result", extra.result), ("Recording", extra.rrd)):
         if path is not None:
-            yield Text(f"{title:<9}  {_clean(str(path))}", no_wrap=True, overflow="ignore")
+            yield Text(f"{title:<9}  {clean(str(path))}", no_wrap=True, overflow="ignore")
     if extra.rrd is not None:
-        yield Text(f"           (open it with: rerun {_clean(str(extra.rrd))})", no_wrap=True, overflow="ignore")
+        yield Text(f"           (open it with: rerun {clean(str(extra.rrd))})", no_wrap=True, overflow="ignore")
 
 
 # ---- plain data ----

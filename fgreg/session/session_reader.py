@@ -63,6 +63,22 @@ def read_session(folder: str | Path) -> Session:
     return Session(folder, setup.model, tuple(log.events), tuple(_warnings(setup, log)))
 
 
+def read_more_events(path: Path, session_folder: Path) -> tuple[Event, ...]:
+    """Events in a file of their own, JSON lines as ``events.jsonl``, for the set-up of a session.
+
+    Frames are named relative to the file's folder.
+
+    Raises:
+        InputError: the first problem of the session's set-up or of the file.
+    """
+    problems: list[InputError] = []
+    setup = read_setup(load_yaml(session_folder / SETUP_FILE, SETUP_FILE), SETUP_FILE, session_folder.name, problems)
+    log = read_events(path, path.name, path.resolve().parent, setup, problems)
+    if problems:
+        raise problems[0]
+    return tuple(log.events)
+
+
 def check_session(folder: Path) -> tuple[list[InputError], list[str]]:
     """Check a session, its ground truth where there is one, and the headers of all frames that events name.
 

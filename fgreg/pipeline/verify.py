@@ -1,0 +1,163 @@
+"""Verifies a finished registration with new shots: the steps of ``fgreg verify``.
+
+read the result -> solve its session again, for the joint covariance of registration and beam -> read the new shots,
+detect in their frames -> compare. Nothing is added to the registration, and nothing is written.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgreg.camera_moves.validity import Validity, Verification, verify
+from fgreg.detection.events_to_measurements import extract_measurements
+from fgreg.errors import InputError
+from fgreg.geometry.target_error import tre_mm
+from fgreg.model.estimate import EpochEstimate, Verdict
+from fgreg.model.events import CameraMovedEvent, Event, PairEvent, refused_lines
+from fgreg.model.measurements import Pair
+from fgreg.model.session_model import SESSION, SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.pipeline.solve import RESULT_FILE, Progress, detection_conditions, sound_speed_prior, with_moves
+from fgreg.registration.register import SoundSpeedPrior
+from fgreg.registration.solve import solve
+from fgreg.session.result_file import read_result
+from fgreg.session.session_reader import Session, read_more_events, read_session
+from fgreg.tracking.snapshot import Snapshot
+
+SAME_MM = 0.2
+"""Distance at the targets between the result and what its session gives now up to which they are the same."""
+SAME_RIG = ("probe", "stage", "camera", "marker")
+"""Sections of session.yaml that a new session shares with the registered one."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnusedShot:
+    """A new pair that is not usable, and why."""
+
+    t: float
+    pm: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class VerifyReport:
+    """Result of a verification.
+
+    Attributes:
+        session: name of the registered session. new: as given.
+        verification: verdict, odds and shots.
+        unused: new pairs in whose frames marker or PM was not found.
+        elapsed_s: time of it all.
+    """
+
+    session: str
+    new: Path
+    verification: Verification
+    unused: tuple[UnusedShot, ...]
+    elapsed_s: float
+
+
+def verify_session(
+    folder: Path, new: Path, config: SolveConfig | None = None, progress: Progress | None = None
+) -> VerifyReport:
+    """Verify a session's registration, of its last camera epoch, with new shots.
+
+    Args:
+        folder: the session, with its ``result.yaml``.
+        new: a session's folder, or a file of JSON lines with one or more ``pair`` events.
+        config: as it was solved with.
+        progress: called after each frame.
+
+    Raises:
+        InputError: bad input, or no registration that may be used.
+    """
+    start = time.perf_counter()
+    config = config or SolveConfig()
+    result_path = folder / RESULT_FILE
+    session = read_session(folder)
+    if not result_path.exists():
+        raise InputError(str(result_path), "nothing", f"a finished registration: run fgreg solve {folder}")
+    result = read_result(result_path)
+    if result.verdict is Verdict.REFUSED or not result.epochs:
+        raise InputError(str(result_path), "a refused registration", "one that may be used")
+    events, model = _new_events(new, session)
+    snapshot, prior = _solved_again(session, result.epochs, config, progress)
+    epoch = snapshot.epoch(result.epochs[-1].index)
+    if epoch is None:
+        raise AssertionError("the registration of the last epoch was compared")
+    pairs, unused = _new_pairs(events, model, progress)
+    moved = next((event for event in events if isinstance(event, CameraMovedEvent)), None)
+    if moved is not None:
+        text = f"{new} reports a camera move at {moved.t:.1f} s: register again"
+        found = Verification(Validity.MOVED, text, np.inf, 0.0, ())
+    else:
+        found = verify(pairs, snapshot, epoch, session.model, config, prior)
+    return VerifyReport(session.model.name, new, found, unused, time.perf_counter() - start)
+
+
+def _new_events(new: Path, session: Session) -> tuple[tuple[Event, ...], SessionModel]:
+    """The new events that were not refused, and the set-up to measure them by."""
+    model = session.model
+    if new.is_dir():
+        other = read_session(new)
+        ours, theirs = SESSION.write(model), SESSION.write(other.model)
+        for section in SAME_RIG:
+            if ours.get(section) != theirs.get(section):
+                where = f"{new / 'session.yaml'}: {section}"
+                raise InputError(
+                    where, "other values", f"those of {session.folder / 'session.yaml'}: one and the same rig"
+                )
+        events, model = other.events, other.model
+    else:
+        events = read_more_events(new, session.folder)
+    refused = refused_lines(events)
+    events = tuple(event for event in events if event.line not in refused)
+    if not any(isinstance(event, PairEvent | CameraMovedEvent) for event in events):
+        raise InputError(str(new), "no pair event", "at least one pair: a shot with its look")
+    return events, model
+
+
+def _new_pairs(
+    events: Sequence[Event], model: SessionModel, progress: Progress | None
+) -> tuple[tuple[Pair, ...], tuple[UnusedShot, ...]]:
+    shots = [event for event in events if isinstance(event, PairEvent)]
+    extracted = extract_measurements(
+        shots, model, progress=None if progress is None else lambda done, total: progress("new frames", done, total)
+    )
+    unused = tuple(UnusedShot(shots[i].t, shots[i].pm, reason) for i, reason in sorted(extracted.unused.items()))
+    return extracted.measurements.pairs, unused
+
+
+def _solved_again(
+    session: Session, epochs: Sequence[EpochEstimate], config: SolveConfig, progress: Progress | None
+) -> tuple[Snapshot, SoundSpeedPrior | None]:
+    """The snapshot of the session solved again; its last registration is that of the result.
+
+    Raises:
+        InputError: it is not.
+    """
+    extracted = extract_measurements(
+        session.events,
+        session.model,
+        progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
+    )
+    prior = sound_speed_prior(extracted, config)
+    if len(epochs) != len(extracted.measurements.epochs):
+        from fgreg.online.recorded_moves import find_epochs  # loads the online engine
+
+        extracted = with_moves(extracted, find_epochs(extracted.measurements, session.model, config, prior))
+    conditions = detection_conditions(extracted, config)
+    solution = solve(extracted.measurements, (), session.model, config, conditions, prior)
+    wanted = "that of the session as it is now: solve it again (with the same options here and there)"
+    there, now = epochs[-1].trus_T_camera, solution.epochs[-1].trus_T_camera
+    if there is None or now is None or solution.snapshot is None or len(epochs) != len(solution.epochs):
+        raise InputError(str(session.folder / RESULT_FILE), "another registration", wanted)
+    apart_mm = float(tre_mm(now, there, session.model.targets_mm).max())
+    if apart_mm > SAME_MM:
+        raise InputError(str(session.folder / RESULT_FILE), f"a registration {apart_mm:.2f} mm away", wanted)
+    return solution.snapshot, prior
