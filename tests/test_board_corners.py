@@ -10,7 +10,7 @@ import pytest
 from fgreg.detection.board import detect_board, find_board_corners, order_corners
 from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner, board_covariance
-from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
+from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform, transform_points
 from fgreg.model.session_model import BoardModel, CharucoModel, StereoRig
 from fgreg.simulation.surfaces import BoardSurface, PatchSurface
 from tests.marker_scene import LEFT, RIG, Frame, frames_of, left_pixels, pose_error, rotation_error_deg
@@ -156,6 +156,42 @@ def test_charuco_partly_covered_is_still_found() -> None:
     assert rotation_error_deg(true, fit.camera_T_board) < 0.05
     covered, _ = board_corner(fit, 2, 2, pool_corner_noise([fit.pose]))
     assert np.linalg.norm(covered - transform_points(true, np.array([20.0, 20.0, 0.0]))) < 0.05
+
+
+@pytest.mark.parametrize("turn", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)])
+def test_views_that_disagree_are_weighed_not_thrown_away(turn: tuple[float, float, float]) -> None:
+    # 0.2 deg in the stereo rotation are 4 px at every corner of the right view.
+    assert RIG.right_T_left is not None
+    error = make_transform(exp_so3(np.radians(0.2) * np.array(turn)), np.zeros(3))
+    rig = StereoRig(RIG.left, RIG.right, as_float_array(RIG.right_T_left @ error, 4, 4))
+    for roll_deg in (0.0, 37.0, 80.0):
+        true = board_pose(CHARUCO, roll_deg)
+        fit = detect_board(*frames_of([BoardSurface(CHARUCO, true)], far_mm=260.0), rig, CHARUCO)
+        assert isinstance(fit, BoardFit), fit
+        assert fit.pose.corners == 108
+        assert fit.pose.left_out == ()
+        assert rotation_error_deg(true, fit.camera_T_board) < 0.3
+
+
+@pytest.mark.parametrize("printed_legacy", [False, True])
+def test_legacy_pattern_is_found_where_declared_and_hinted_at_where_not(printed_legacy: bool) -> None:
+    boards = [BoardModel(8, 7, 9.0, CharucoModel("DICT_5X5_100", 6.0, legacy)) for legacy in (False, True)]
+    printed, other = boards[printed_legacy], boards[not printed_legacy]
+    true = board_pose(printed, 10.0)
+    left, _ = frames_of([BoardSurface(printed, true)], far_mm=260.0)
+    fit = detect_board(left, None, RIG, printed)
+    assert isinstance(fit, BoardFit)
+    assert rotation_error_deg(true, fit.camera_T_board) < 0.05
+    assert np.linalg.norm(fit.camera_T_board[:3, 3] - true[:3, 3]) < 0.05
+    undeclared = detect_board(left, None, RIG, other)
+    assert isinstance(undeclared, NotFound)
+    assert undeclared.reason.endswith(f"board.charuco.legacy: {str(printed_legacy).lower()}")
+    # With an odd number of rows of squares the two are the same.
+    odd = BoardModel(8, 6, 9.0, CharucoModel("DICT_5X5_100", 6.0, printed_legacy))
+    image, _ = frames_of([BoardSurface(odd, board_pose(odd, 10.0))], far_mm=260.0)
+    for legacy in (False, True):
+        same = BoardModel(8, 6, 9.0, CharucoModel("DICT_5X5_100", 6.0, legacy))
+        assert isinstance(detect_board(image, None, RIG, same), BoardFit)
 
 
 def test_board_in_one_view_or_none() -> None:

@@ -3,12 +3,14 @@
 Corner [column, row] of a plain chessboard: [0, 0] is the inner corner at a black corner square such that, seen from
 the front with that square at the top left, columns run right and rows run down. On a board whose columns + rows is
 even half a turn gives the same picture, so it is refused. A ChArUco board names its corners itself
-(row * columns + column, OpenCV's pattern since 4.6).
+(row * columns + column), in OpenCV's pattern since 4.6 or the legacy one.
 
 Board frame: origin at corner [0, 0], x along the columns, y down the rows, z away from the viewer.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -102,8 +104,8 @@ def _spacing_px(corners_px: FloatArray, ids: IntArray, board: BoardModel) -> flo
     return float(gaps.min()) if gaps.size else 0.0
 
 
-def _find_charuco(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray] | None:
-    """Corners (n, 2) px and their ids (n,); None where the board is not found."""
+def _find_charuco(image: Image, board: BoardModel, legacy: bool) -> tuple[FloatArray, IntArray] | None:
+    """Corners (n, 2) px and their ids (n,) of a board of one of the patterns; None where the board is not found."""
     assert board.charuco is not None
     pattern = cv2.aruco.CharucoBoard(
         (board.columns + 1, board.rows + 1),
@@ -111,7 +113,7 @@ def _find_charuco(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray
         board.charuco.marker_mm,
         dictionary_named(board.charuco.dictionary),
     )
-    pattern.setLegacyPattern(False)
+    pattern.setLegacyPattern(legacy)
     detector = cv2.aruco.CharucoDetector(pattern, cv2.aruco.CharucoParameters(), detector_parameters())
     pad = BORDER_PX
     padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=255)
@@ -139,7 +141,7 @@ def find_board_corners(image: Image, board: BoardModel) -> tuple[FloatArray, Int
         ids = np.arange(board.rows * board.columns, dtype=np.int64)
         reach = 0.4 * _spacing_px(corners, ids, board)
     else:
-        found = _find_charuco(image, board)
+        found = _find_charuco(image, board, board.charuco.legacy)
         if found is None:
             return None
         corners, ids = found
@@ -184,12 +186,30 @@ def _view_corners(
 
 
 def _strays(corners: CornerSet) -> BoolArray:
-    """(n,) outliers: corners far from the pose of the majority (a glint, a finger, a misread marker)."""
-    fit = robust_pose(corners)
-    if fit is None:
-        return np.zeros(len(corners.view), dtype=bool)
-    size = np.linalg.norm(fit.residual_px, axis=1)
-    return np.asarray(size > max(6.0 * float(np.median(size)), 0.5))
+    """(n,) outliers: corners far from the pose of the majority of their view (a glint, a finger, a misread marker).
+
+    Each view has its own pose here: where the views disagree (an error of the stereo calibration) none of them has
+    outliers, and the joint pose weighs all.
+    """
+    stray = np.zeros(len(corners.view), dtype=bool)
+    for view in np.unique(corners.view):
+        chosen = corners.view == view
+        fit = robust_pose(corners.subset(chosen))
+        if fit is not None:
+            size = np.linalg.norm(fit.residual_px, axis=1)
+            stray[chosen] = size > max(6.0 * float(np.median(size)), 0.5)
+    return stray
+
+
+def _pattern_hint(images: Sequence[npt.NDArray[np.generic] | None], board: BoardModel) -> str:
+    """What to declare where one of the images shows the board in the other ChArUco pattern; else nothing."""
+    if board.charuco is None or board.rows % 2 == 0:  # the patterns differ where the rows of squares are even
+        return ""
+    other = not board.charuco.legacy
+    if all(image is None or _find_charuco(grey(image), board, other) is None for image in images):
+        return ""
+    version = "before" if other else "since"
+    return f"; it looks like the pattern of OpenCV {version} 4.6: board.charuco.legacy: {str(other).lower()}"
 
 
 def detect_board(
@@ -219,7 +239,7 @@ def detect_board(
         parts += [] if corners is None else [corners]
     where = " or ".join(name for name, image in zip(VIEW_NAMES, (left, right), strict=True) if image is not None)
     if not parts:
-        return NotFound(f"board: not found in the {where} view")
+        return NotFound(f"board: not found in the {where} view{_pattern_hint([left, right], board)}")
     everything = join(parts)
     if len(everything.view) < MIN_CORNERS:
         return NotFound(f"board: only {len(everything.view)} corners seen in the {where} view")

@@ -346,10 +346,14 @@ class MarkerModel:
 
 @dataclass(frozen=True, slots=True)
 class CharucoModel:
-    """The markers of a ChArUco board: OpenCV dictionary and marker edge (mm)."""
+    """The markers of a ChArUco board: OpenCV dictionary, marker edge (mm), and the pattern.
+
+    The legacy pattern differs where the rows of squares are even: its top left square is white.
+    """
 
     dictionary: Annotated[str, Key("OpenCV's name of it", DICTIONARY)]
     marker_mm: Annotated[float, Key("outer edge of a marker's black border", POSITIVE_MM)]
+    legacy: Annotated[bool, Key("the pattern of OpenCV before 4.6", brief=True)] = False
 
 
 @dataclass(frozen=True, slots=True)

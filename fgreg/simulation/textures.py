@@ -105,7 +105,9 @@ def board_texture(board: BoardModel, margin_squares: float = 0.5) -> CellTexture
     inner corner [0, 0] is at (2 square, 2 square).
     """
     rows, columns = board.rows + 1, board.columns + 1
-    black = (np.add.outer(np.arange(rows), np.arange(columns)) % 2) == 0
+    # Black at the top left, but for the pattern of OpenCV before 4.6 with an even number of rows.
+    first = int(board.charuco is not None and board.charuco.legacy and rows % 2 == 0)
+    black = (np.add.outer(np.arange(rows), np.arange(columns)) % 2) == first
     modules = 0
     inset_mm = module_mm = board.square_mm
     if board.charuco is not None:
@@ -116,7 +118,7 @@ def board_texture(board: BoardModel, margin_squares: float = 0.5) -> CellTexture
     table = np.full((rows + 2, columns + 2, states, states), WHITE, dtype=np.uint8)
     table[1:-1, 1:-1][black] = BLACK
     if board.charuco is not None:
-        # Markers are in the white squares, numbered along the rows (OpenCV's current, non-legacy pattern).
+        # Markers are in the white squares, numbered along the rows.
         for tag_id, (row, column) in enumerate(np.argwhere(~black)):
             table[row + 1, column + 1, 1:-1, 1:-1] = tag_modules(board.charuco.dictionary, tag_id)
     start = (1.0 - margin_squares) * board.square_mm
