@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from fgreg.detection.corners import grey
+from fgreg.detection.frame_files import png_bytes, read_picture, to_display
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import dictionary_named, find_tags
@@ -91,6 +95,23 @@ def test_colour_and_deep_images_give_the_same_pose(pair: tuple[Frame, Frame]) ->
     assert isinstance(colour, MarkerFit)
     assert np.abs(colour.camera_T_marker - grey.camera_T_marker).max() < 1e-9
     assert_right(detect_marker(pair[0].astype(np.uint16) * 16, None, RIG, ONE_TAG), TRUE)
+
+
+def test_a_12_bit_picture_is_read_with_its_full_depth(tmp_path: Path, pair: tuple[Frame, Frame]) -> None:
+    noise = np.random.default_rng(0).normal(size=pair[0].shape)
+    deep = np.rint(pair[0] * 16.0 + 4.0 * noise).clip(0, 4095).astype(np.uint16)
+    path = tmp_path / "deep.png"
+    path.write_bytes(png_bytes(deep))
+    read = read_picture(path)
+    assert read is not None
+    assert read.dtype == np.uint16
+    assert np.array_equal(read, deep)
+    levels = grey(read)
+    assert len(np.unique(levels)) > 1000
+    assert levels.max() == pytest.approx(255.0)
+    assert_right(detect_marker(read, None, RIG, ONE_TAG), TRUE)
+    assert to_display(read).dtype == np.uint8
+    assert to_display(read).max() == 255
 
 
 @pytest.mark.parametrize(

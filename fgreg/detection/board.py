@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, robust_pose
 from fgreg.detection.camera import focal_px, ideal_by_lens, ideal_from_pixels, pixel_by_ideal_jacobian
-from fgreg.detection.corners import grey, refine_subpixel
-from fgreg.detection.edges import MIN_CONTRAST, Image
+from fgreg.detection.corners import eight_bit, grey, refine_subpixel
+from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import BoardFit, NotFound
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
@@ -130,18 +130,19 @@ def _find_charuco(image: Image, board: BoardModel, legacy: bool) -> tuple[FloatA
     return None
 
 
-def find_board_corners(image: Image, board: BoardModel) -> tuple[FloatArray, IntArray] | None:
+def find_board_corners(image: GreyImage, board: BoardModel) -> tuple[FloatArray, IntArray] | None:
     """Refined corners (n, 2) px and their ids (row * columns + column); None where the board is not found."""
     ids: IntArray
+    whole_levels = eight_bit(image)
     if board.charuco is None:
-        grid = _find_chessboard(image, board)
-        corners = None if grid is None else order_corners(image, grid, board)
+        grid = _find_chessboard(whole_levels, board)
+        corners = None if grid is None else order_corners(whole_levels, grid, board)
         if corners is None:
             return None
         ids = np.arange(board.rows * board.columns, dtype=np.int64)
         reach = 0.4 * _spacing_px(corners, ids, board)
     else:
-        found = _find_charuco(image, board, board.charuco.legacy)
+        found = _find_charuco(whole_levels, board, board.charuco.legacy)
         if found is None:
             return None
         corners, ids = found
@@ -206,7 +207,7 @@ def _pattern_hint(images: Sequence[npt.NDArray[np.generic] | None], board: Board
     if board.charuco is None or board.rows % 2 == 0:  # the patterns differ where the rows of squares are even
         return ""
     other = not board.charuco.legacy
-    if all(image is None or _find_charuco(grey(image), board, other) is None for image in images):
+    if all(image is None or _find_charuco(eight_bit(grey(image)), board, other) is None for image in images):
         return ""
     version = "before" if other else "since"
     return f"; it looks like the pattern of OpenCV {version} 4.6: board.charuco.legacy: {str(other).lower()}"

@@ -12,13 +12,14 @@ side of a corner is hidden, the corner is a point of the other side with a sigma
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.camera import ideal_from_pixels, pixel_by_ideal_jacobian
-from fgreg.detection.edges import MIN_CONTRAST, Image, fit_edges, segment_frames
+from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image, fit_edges, segment_frames
 from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.session_model import CameraModel
 
@@ -64,8 +65,8 @@ class SquareCorners:
     outward_px: FloatArray
 
 
-def grey(image: npt.NDArray[np.generic]) -> Image:
-    """(h, w) uint8 of a grey or BGR(A) image of 8 or 16 bits.
+def grey(image: npt.NDArray[np.generic]) -> GreyImage:
+    """(h, w) of a grey or BGR(A) image of 8 or 16 bits; of 16 bits with all their depth.
 
     Raises:
         ValueError: not an image of one of these kinds.
@@ -74,19 +75,24 @@ def grey(image: npt.NDArray[np.generic]) -> Image:
         image = image[..., 0]
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)) or 0 in image.shape:
         raise ValueError(f"image of shape {image.shape}, expected (h, w), (h, w, 3) or (h, w, 4)")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"image of type {image.dtype}, expected uint8 or uint16")
+    picture: npt.NDArray[Any] = np.ascontiguousarray(image)
     if image.dtype == np.uint16:
         # 10 and 12 bit images are stored in 16 bits: scale by the largest value.
-        image = (image.astype(np.float32) * (255.0 / max(int(image.max()), 1))).astype(np.uint8)
-    if image.dtype != np.uint8:
-        raise ValueError(f"image of type {image.dtype}, expected uint8 or uint16")
-    picture = np.ascontiguousarray(image, dtype=np.uint8)
+        picture = picture.astype(np.float32) * np.float32(255.0 / max(int(picture.max()), 1))
     if picture.ndim == 3:
         code = cv2.COLOR_BGR2GRAY if picture.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
-        picture = np.asarray(cv2.cvtColor(picture, code), dtype=np.uint8)
+        picture = np.asarray(cv2.cvtColor(picture, code))
     return picture
 
 
-def refine_subpixel(image: Image, corners_px: FloatArray, half_window_px: int) -> FloatArray:
+def eight_bit(image: GreyImage) -> Image:
+    """The image in whole grey levels, for OpenCV's detectors."""
+    return np.asarray(image if image.dtype == np.uint8 else np.rint(image), dtype=np.uint8)
+
+
+def refine_subpixel(image: GreyImage, corners_px: FloatArray, half_window_px: int) -> FloatArray:
     """OpenCV's sub-pixel refinement of corners (n, 2); a corner that left its window keeps its start."""
     height, width = image.shape
     inside = ((corners_px >= 0.0) & (corners_px <= np.array([width, height]) - 1.0)).all(axis=1)
@@ -103,12 +109,12 @@ def refine_subpixel(image: Image, corners_px: FloatArray, half_window_px: int) -
 
 
 def square_corners(
-    camera: CameraModel, image: Image, corners_px: FloatArray, cells: int, *, edges: bool = True
+    camera: CameraModel, image: GreyImage, corners_px: FloatArray, cells: int, *, edges: bool = True
 ) -> SquareCorners:
     """Refine the outer corners of black squares.
 
     Args:
-        image: (h, w) uint8.
+        image: (h, w).
         corners_px: (n, 4, 2) from a detector, clockwise as seen.
         cells: squares along the side, border included: the black border is one cell wide.
         edges: False uses sub-pixel refinement only (for comparison).

@@ -34,6 +34,8 @@ from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.session_model import CameraModel
 
 Image = npt.NDArray[np.uint8]
+GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
+"""Grey levels from 0 to 255, with fractions where the picture has more than 8 bits."""
 
 MAX_ROWS = 112
 """Largest number of pixel rows used across an edge; longer edges are sampled evenly."""
@@ -108,7 +110,7 @@ def segment_frames(start: FloatArray, end: FloatArray) -> tuple[FloatArray, Floa
 
 def _band(
     camera: CameraModel,
-    image: Image,
+    image: GreyImage,
     start: FloatArray,
     end: FloatArray,
     half_width: FloatArray,
@@ -164,7 +166,7 @@ def _band(
     return _joined(parts)
 
 
-def _joined(parts: list[tuple[FloatArray, FloatArray, Image]]) -> _Band:
+def _joined(parts: list[tuple[FloatArray, FloatArray, GreyImage]]) -> _Band:
     """The pixels (d, u, grey) of each edge as rows of one array, padded to the longest row."""
     shape = len(parts), max(1, *(len(d) for d, _, _ in parts)) if parts else 1
     band = _Band(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool))
@@ -317,7 +319,7 @@ def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> Fl
 
 
 def _locate(
-    camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray, widest_px: float
+    camera: CameraModel, image: GreyImage, start: FloatArray, end: FloatArray, cell_px: FloatArray, widest_px: float
 ) -> tuple[FloatArray, BoolArray, FloatArray]:
     """First pass: (parameters (n, 9), whether an edge is near (n,), light less dark level about the start (n,))."""
     half_width = np.clip(0.55 * cell_px, 2.0, widest_px)
@@ -330,11 +332,13 @@ def _locate(
     return np.where(near[:, None], x, guess), near, guess[:, 5] - guess[:, 3]
 
 
-def fit_edges(camera: CameraModel, image: Image, start: FloatArray, end: FloatArray, cell_px: FloatArray) -> EdgeFit:
+def fit_edges(
+    camera: CameraModel, image: GreyImage, start: FloatArray, end: FloatArray, cell_px: FloatArray
+) -> EdgeFit:
     """Find the sides of black squares near starting segments, dark on the right of their direction as drawn (y down).
 
     Args:
-        image: (h, w) uint8.
+        image: (h, w).
         start, end: (n, 2) ideal px, the four sides of a square in turn, within about half of ``cell_px`` (and 15 px) of
             the true corners.
         cell_px: (n,) width of the dark band along the edge: limits the pixels used on either side.

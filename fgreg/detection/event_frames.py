@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.board import detect_board
-from fgreg.detection.frame_files import read_array, read_picture
+from fgreg.detection.frame_files import Picture, read_array, read_picture
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import FrameResults
@@ -38,10 +38,9 @@ from fgreg.session.frame_files import check_camera_frame, check_trus_frame
 
 Progress = Callable[[int, int], None]
 """Called with (frames done, total frames)."""
-Image = npt.NDArray[np.uint8]
 
 
-def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Image:
+def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Picture:
     """Read an endoscope frame that an event names.
 
     Raises:
@@ -69,7 +68,7 @@ def load_trus_frame(path: Path, line: int, key: str, model: SessionModel) -> npt
     return frame
 
 
-def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Image, Image | None]:
+def marker_pictures(record: MarkerRecord, line: int, rig: StereoRig) -> tuple[Picture, Picture | None]:
     """Left and right frame of a shot; the right one only where the rig has a right camera."""
     if record.left is None:
         raise AssertionError("no frames to load")

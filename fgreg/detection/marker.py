@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, without_strays
 from fgreg.detection.camera import focal_px, ideal_by_lens
-from fgreg.detection.corners import grey, square_corners
-from fgreg.detection.edges import Image
+from fgreg.detection.corners import eight_bit, grey, square_corners
+from fgreg.detection.edges import GreyImage, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.spoilt_tags import find_spoilt_tags
@@ -115,15 +115,16 @@ def view_corners(
 ) -> ViewCorners:
     """The body's corners in one view, ``view`` 0 (left) or 1 (right); ``near``: search only there."""
     picture = grey(image)
+    whole_levels = eight_bit(picture)
 
     def refined(tags: list[FoundTag]) -> list[CornerSet]:
         return _corner_sets(tags, picture, camera, view, view_T_camera, marker, edges)
 
-    tags, left_out = _tags_in(picture, marker, VIEW_NAMES[view], near)
+    tags, left_out = _tags_in(whole_levels, marker, VIEW_NAMES[view], near)
     sets = refined(tags)
     if not left_out and all(corners.numbers < 6 for corners in sets):
         # Not one tag of which three sides are seen: lines may show more than the outlines that were found.
-        spoilt = _spoilt_tags_in(picture, marker, near)
+        spoilt = _spoilt_tags_in(whole_levels, marker, near)
         shown = refined(spoilt)
         if sum(corners.numbers for corners in shown) > sum(corners.numbers for corners in sets):
             tags, sets = spoilt, shown
@@ -141,7 +142,7 @@ def view_corners(
 
 def _corner_sets(
     tags: list[FoundTag],
-    picture: Image,
+    picture: GreyImage,
     camera: CameraModel,
     view: int,
     view_T_camera: FloatArray,

@@ -326,6 +326,7 @@ def show_frames(
     if isinstance(viewer, NullViewer):
         return  # spares reading the frames again
     from fgreg.detection.event_frames import load_trus_frame, marker_pictures
+    from fgreg.detection.frame_files import to_display
 
     model = session.model
     kind: ShotKind = "aim" if isinstance(event, AimEvent) else "pair" if isinstance(event, PairEvent) else "track"
@@ -335,8 +336,8 @@ def show_frames(
             event.t,
             kind,
             shot,
-            left,
-            right,
+            to_display(left),
+            None if right is None else to_display(right),
             _outlines(extracted, index, model),
             _corner(extracted, index, event, model),
         )
