@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import CAMERA, COUNT, Constant
 from fgreg.geometry.transforms import (
     FloatArray,
     as_float_array,
@@ -23,6 +24,7 @@ from fgreg.geometry.transforms import (
 )
 from fgreg.model.measurements import (
     Aim,
+    CameraDependence,
     EpochStart,
     Look,
     MarkerObservation,
@@ -38,6 +40,7 @@ from fgreg.model.session_model import (
     StageModel,
     default_targets_mm,
 )
+from fgreg.model.systematic import EXACT, Systematic
 
 MOTION_SIGMA = (0.002, 0.002, 0.002, 0.3, 0.3, 0.3)
 """Of a known camera motion (rad, mm), right tangent of ``camera_new_T_camera_old``."""
@@ -87,6 +90,7 @@ def make_session(
     edge_sigma_deg: float = 0.3,
     step_deg: float = 2.0,
     curve: bool = False,
+    systematic: Systematic = EXACT,
 ) -> SessionModel:
     """A session with the defaults of the session format, and no camera, marker or board models.
 
@@ -113,6 +117,50 @@ def make_session(
         stage=StageModel(step_rad=math.radians(step_deg), limits_device_rad=(math.radians(-60), math.radians(60))),
         noise=noise_model or NoiseModel(),
         targets_mm=default_targets_mm(radius_mm),
+        systematic=systematic,
+    )
+
+
+def true_constants(truth: Truth) -> FloatArray:
+    """(COUNT,) the rig's constants of a simulated session, true less declared."""
+    constants = np.zeros(COUNT)
+    constants[Constant.WINDOW_EDGE] = truth.window_edge_rad
+    constants[Constant.SOUND_SPEED] = truth.sound_speed_ratio - 1.0
+    constants[Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1] = truth.marker_bias_mm
+    return constants
+
+
+def off_by(**constants: float) -> list[float]:
+    """(COUNT,) all constants as declared but for those named."""
+    out = [0.0] * COUNT
+    for name, value in constants.items():
+        out[Constant[name]] = value
+    return out
+
+
+def with_dependences(measurements: Measurements, seed: int) -> Measurements:
+    """The measurements with markers and spots that depend on the camera's constants, at random, as pictures' do."""
+    rng = np.random.default_rng(seed)
+
+    def dependence(size: int) -> CameraDependence:
+        count = CAMERA.stop - CAMERA.start
+        # 1 % or 1 px moves some hundredths of a radian, or a millimetre.
+        gain = rng.normal(size=(size, count))
+        if size == 6:
+            gain[:3] *= 0.02
+        gain[:, : Constant.CAMERA_SCALE - CAMERA.start] = 0.0
+        root = rng.normal(size=(2, count)) * 20.0
+        return CameraDependence(gain, root.T @ root, root.T @ rng.normal(size=2))
+
+    seen: dict[int, MarkerObservation] = {}
+
+    def marker(of: MarkerObservation) -> MarkerObservation:
+        return seen.setdefault(of.id, replace(of, dependence=dependence(6)))
+
+    return replace(
+        measurements,
+        aims=tuple(replace(aim, marker=marker(aim.marker), dependence=dependence(3)) for aim in measurements.aims),
+        pairs=tuple(replace(pair, marker=marker(pair.marker)) for pair in measurements.pairs),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform
 from fgreg.graph.gtsam_graph import ExplicitGraph, GraphOptions, build_graph
 from fgreg.graph.gtsam_values import SharedValues, laser_chart
-from tests.forward import Truth, make_measurements, make_session
+from tests.forward import Truth, make_measurements, make_session, true_constants
 
 CASES: dict[str, dict[str, Any]] = {
     "first hit": {},
@@ -41,9 +41,7 @@ def make_case(
     shared = SharedValues(
         trus_T_camera=truth.trus_T_camera,
         marker_laser=laser_chart(truth.marker_T_laser, nominal)[0],
-        window_edge_rad=truth.window_edge_rad,
-        marker_bias_mm=truth.marker_bias_mm,
-        sound_speed_ratio=truth.sound_speed_ratio,
+        constants=true_constants(truth),
     )
     return explicit, shared, truth
 

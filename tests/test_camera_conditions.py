@@ -15,13 +15,14 @@ import yaml
 from fgreg.detection.body_pose import choose_pose
 from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.detection.results import RigidFit
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, rotation_to_direction
 from fgreg.model.camera_dependence import CONSTANTS, column, corner_dependence
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.model.systematic import CAMERA, EXACT, NONE, Constant
+from fgreg.model.systematic import EXACT, NONE
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.registration.camera_conditions import PrintSize, camera_conditions, corner_information, print_sizes
 from fgreg.registration.verdict import Condition, verdict_of

@@ -11,6 +11,7 @@ from fgreg.detection.body_pose import choose_pose
 from fgreg.detection.camera import focal_px, ideal_by_lens, ideal_from_pixels, pixels_from_normalized
 from fgreg.detection.pose_least_squares import CornerSet
 from fgreg.detection.results import RigidFit
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform
 from fgreg.model.camera_dependence import (
     CONSTANTS,
@@ -22,7 +23,7 @@ from fgreg.model.camera_dependence import (
     plausible_share,
 )
 from fgreg.model.session_model import BoardModel, CameraModel, SessionModel, StereoRig
-from fgreg.model.systematic import CAMERA, Constant, Systematic
+from fgreg.model.systematic import Systematic
 from tests.forward import make_session
 from tests.marker_scene import LEFT, ONE_TAG, RIG, RIGHT, RIGHT_T_LEFT, facing_pose
 

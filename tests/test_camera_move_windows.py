@@ -46,7 +46,7 @@ def _session(
     model, measurements, truth = make_measurements(
         np.random.default_rng(seed), aims=0, pairs=pairs, first_hit=first_hit, looks_per_pm=looks
     )
-    state = make_state(truth.trus_T_camera[0][None, None], truth.marker_T_laser, model.probe.radius_mm)
+    state = make_state(truth.trus_T_camera[0][None, None], truth.marker_T_laser)
     return pack_session(measurements, model, config), state
 
 

@@ -32,7 +32,7 @@ def test_errors_of_many_solves_come_close_to_it() -> None:
         model, measurements, truth = make_measurements(np.random.default_rng(seed), pairs=15)
         covariance = truth_covariance(measurements, model, _full(truth))
         bounds.append(np.mean(expected_tre_mm(covariance[:6, :6], truth.trus_T_camera[0], model.targets_mm) ** 2))
-        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
         found = optimize(pack(measurements, model), start).state.trus_T_camera()[0]
         errors.append(np.mean(tre_mm(found, truth.trus_T_camera[0], model.targets_mm) ** 2))
     ratio = np.sqrt(np.mean(errors) / np.mean(bounds))

@@ -67,7 +67,7 @@ def test_summed_aims_have_the_information_of_single_ones(bias: float) -> None:
     session = make_session(noise_model=NoiseModel(marker_bias_mm=bias))
     model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=8, session=session)
     problem = pack(measurements, model, shapes=True)
-    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0))
+    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser))
     covariance = np.linalg.inv(found.evaluation.hessian[0])
     mode = Mode(problem, found, covariance)
     step = np.random.default_rng(1).standard_normal((60, len(covariance))) @ np.linalg.cholesky(covariance).T

@@ -16,7 +16,7 @@ def test_equal_hypotheses_count_once_and_ones_that_are_not_finite_end_the_search
     model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=6)
     problem = pack(measurements, model)
     pose = np.asarray(truth.trus_T_camera[0])[None, None]
-    state = make_state(np.repeat(pose, 4, axis=0), truth.marker_T_laser, model.probe.radius_mm)
+    state = make_state(np.repeat(pose, 4, axis=0), truth.marker_T_laser)
     state = replace(state, translation_mm=state.translation_mm + np.array([0.0, 0.0, 40.0, 0.0])[:, None, None])
     nominal = state.marker_T_nominal.copy()
     nominal[3] = np.nan

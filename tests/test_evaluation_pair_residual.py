@@ -65,12 +65,12 @@ def test_agrees_with_a_dense_search() -> None:
 
 def test_a_rolled_registration_reads_small_residuals_where_the_error_is_large() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=40, noise=False)
-    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
-    assert pair_residuals(state, (0,), measurements.pairs).max() < 1e-6
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
+    assert pair_residuals(state, (0,), measurements.pairs, 10.0).max() < 1e-6
     roll = make_transform(exp_so3(np.array([math.radians(20.0), 0.0, 0.0])), np.zeros(3))
     rolled_T = roll @ truth.trus_T_camera[0]
     rolled = replace(state, rotation=rolled_T[None, None, :3, :3], translation_mm=rolled_T[None, None, :3, 3])
-    residual = pair_residuals(rolled, (0,), measurements.pairs)
+    residual = pair_residuals(rolled, (0,), measurements.pairs, 10.0)
     error = tre_mm(rolled_T, truth.trus_T_camera[0], model.targets_mm)
     assert error.mean() > 12.0
     assert residual.mean() < 0.1 * error.mean()

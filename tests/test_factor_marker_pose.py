@@ -9,12 +9,24 @@ import numpy as np
 import pytest
 
 from fgreg.factors.marker_pose import marker_pose_factor, residual
+from fgreg.factors.rig import AS_DECLARED, RigKey
+from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
 from fgreg.model.measurements import default_marker_covariance
 from fgreg.model.session_model import NoiseModel
 from tests.numerical import jacobian_mismatch, random_pose, whitened_error
 
-POSE, BIAS = range(2)
+POSE, RIG = range(2)
+BIAS = (Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
+BIAS_GAIN = np.zeros((6, COUNT))
+BIAS_GAIN[3:, BIAS] = -np.eye(3)
+
+
+def biased(bias_mm: list[float]) -> list[float]:
+    """All constants as declared but for the marker's bias."""
+    out = list(AS_DECLARED)
+    out[BIAS[0] : BIAS[-1] + 1] = bias_mm
+    return out
 
 
 def random_covariance(rng: np.random.Generator) -> FloatArray:
@@ -22,8 +34,8 @@ def random_covariance(rng: np.random.Generator) -> FloatArray:
     return np.asarray(root @ root.T + np.diag([1e-5] * 3 + [1e-3] * 3))
 
 
-@pytest.mark.parametrize("with_bias", [False, True])
-def test_jacobians(with_bias: bool) -> None:
+@pytest.mark.parametrize("with_rig", [False, True])
+def test_jacobians(with_rig: bool) -> None:
     rng = np.random.default_rng(51)
     for _ in range(100):
         pose = random_pose(rng)
@@ -31,10 +43,12 @@ def test_jacobians(with_bias: bool) -> None:
         observed = pose.retract(np.concatenate([rng.uniform(-0.9, 0.9, 3), rng.uniform(-10, 10, 3)]))
         values = gtsam.Values()
         values.insert(POSE, pose)
-        values.insert(BIAS, rng.uniform(-3, 3, 3))
-        factor = marker_pose_factor(POSE, observed.matrix(), random_covariance(rng), BIAS if with_bias else None)
+        values.insert(RIG, rng.uniform(-0.2, 0.2, COUNT))
+        gain = rng.normal(size=(6, COUNT)) * np.array([0.3] * 3 + [3.0] * 3)[:, None]
+        rig = RigKey(RIG, tuple(range(COUNT))) if with_rig else None
+        factor = marker_pose_factor(POSE, observed.matrix(), random_covariance(rng), gain, rig)
         mismatch = jacobian_mismatch(factor, values)
-        assert set(mismatch) == ({POSE, BIAS} if with_bias else {POSE})
+        assert set(mismatch) == ({POSE, RIG} if with_rig else {POSE})
         assert max(mismatch.values()) < 1e-8, mismatch
 
 
@@ -46,7 +60,7 @@ def test_native_prior_is_the_same_as_the_residual_without_bias() -> None:
         values = gtsam.Values()
         values.insert(POSE, pose)
         native = marker_pose_factor(POSE, observed.matrix(), np.eye(6))
-        error, jacobians = residual(pose, (0.0, 0.0, 0.0), observed)
+        error, jacobians = residual(pose, AS_DECLARED, observed, BIAS_GAIN)
         np.testing.assert_allclose(native.unwhitenedError(values), error, atol=1e-12)
         np.testing.assert_allclose(native.linearize(values).jacobian()[0], np.array(jacobians[0]), atol=1e-9)
 
@@ -55,7 +69,7 @@ def test_zero_at_truth() -> None:
     rng = np.random.default_rng(53)
     pose, bias = random_pose(rng), rng.uniform(-2, 2, 3)
     observed = gtsam.Pose3(pose.rotation(), pose.translation() + bias)  # observed = true + bias
-    error, _ = residual(pose, bias.tolist(), observed)
+    error, _ = residual(pose, biased(bias.tolist()), observed, BIAS_GAIN)
     assert np.abs(error).max() < 1e-12
 
 
@@ -65,7 +79,7 @@ def test_by_hand() -> None:
     quarter = exp_so3(np.array([0.0, 0.0, math.pi / 2]))
     pose = gtsam.Pose3(make_transform(quarter, np.array([5.0, 0.0, 80.0])))
     observed = gtsam.Pose3(make_transform(quarter, np.array([5.0, 3.0, 80.0])))
-    error, _ = residual(pose, (0.0, 1.0, 0.0), observed)
+    error, _ = residual(pose, biased([0.0, 1.0, 0.0]), observed, BIAS_GAIN)
     np.testing.assert_allclose(error, [0.0, 0.0, 0.0, -2.0, 0.0, 0.0], atol=1e-13)
 
 
@@ -96,7 +110,8 @@ def test_normalised_error_of_simulated_detections_is_one(with_bias: bool) -> Non
         covariance = default_marker_covariance(observed, noise)
         values = gtsam.Values()
         values.insert(POSE, gtsam.Pose3(pose))
-        values.insert(BIAS, bias)
-        e = whitened_error(marker_pose_factor(POSE, observed, covariance, BIAS if with_bias else None), values)
+        values.insert(RIG, bias)
+        rig = RigKey(RIG, BIAS) if with_bias else None
+        e = whitened_error(marker_pose_factor(POSE, observed, covariance, BIAS_GAIN, rig), values)
         total += np.outer(e, e)
     np.testing.assert_allclose(total / n, np.eye(6), atol=5.0 * math.sqrt(2.0 / n))

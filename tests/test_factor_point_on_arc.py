@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from fgreg.factors.point_on_arc import point_on_arc_factor, residual
+from fgreg.factors.rig import AS_DECLARED, RigKey
 from fgreg.geometry.transforms import FloatArray
-from tests.forward import make_measurements
+from tests.forward import make_measurements, off_by
 from tests.numerical import jacobian_mismatch, whitened_error
 
-POINT, THETA, RATIO = range(3)
+POINT, THETA, RIG = range(3)
 RADIUS = 10.0
 
 
@@ -21,7 +22,7 @@ def random_state(rng: np.random.Generator) -> gtsam.Values:
     values = gtsam.Values()
     values.insertPoint3(POINT, rng.uniform(-60, 60, 3))
     values.insert(THETA, float(rng.uniform(-4, 4)))
-    values.insert(RATIO, float(rng.uniform(0.9, 1.1)))
+    values.insert(RIG, rng.uniform(-0.1, 0.1, 11))
     return values
 
 
@@ -30,8 +31,8 @@ def random_covariance(rng: np.random.Generator) -> FloatArray:
     return np.asarray(root @ root.T + 0.01 * np.eye(2))
 
 
-@pytest.mark.parametrize("with_ratio", [False, True])
-def test_jacobians(with_ratio: bool) -> None:
+@pytest.mark.parametrize("with_rig", [False, True])
+def test_jacobians(with_rig: bool) -> None:
     rng = np.random.default_rng(21)
     for _ in range(100):
         values = random_state(rng)
@@ -43,10 +44,11 @@ def test_jacobians(with_ratio: bool) -> None:
             float(rng.uniform(5, 80)),
             random_covariance(rng),
             RADIUS,
-            RATIO if with_ratio else None,
+            RigKey(RIG, tuple(range(11))) if with_rig else None,
+            int(rng.choice([-1, 1])),
         )
         mismatch = jacobian_mismatch(factor, values)
-        assert set(mismatch) == ({0, 1, 2} if with_ratio else {0, 1})
+        assert set(mismatch) == ({0, 1, 2} if with_rig else {0, 1})
         assert max(mismatch.values()) < 1e-8, mismatch
 
 
@@ -57,9 +59,9 @@ def test_zero_at_truth(ratio: float) -> None:
     )
     for index, pair in enumerate(measurements.pairs):
         look = pair.look
-        element = (look.x_mm, RADIUS * math.sin(look.scan_rad), RADIUS * math.cos(look.scan_rad))
         p = truth.trus_p_pm_mm[pair.pm].tolist()
-        error, _ = residual(p, truth.theta_rad[index], ratio, element, look.range_mm)
+        constants = off_by(SOUND_SPEED=ratio - 1.0)
+        error, _ = residual(p, truth.theta_rad[index], constants, look.scan_rad, look.x_mm, look.range_mm, RADIUS)
         assert np.abs(error).max() < 1e-12
 
 
@@ -67,12 +69,12 @@ def test_by_hand() -> None:
     # Stage at 0, so the element is at (4, 0, 10). theta with sine 0.6, cosine 0.8: 30 mm on is (4, 18, 34).
     theta = math.asin(0.6)
     # A PM at (5, 20, 34), 2 mm further along y: radially 2 * 0.6, tangentially 2 * 0.8.
-    error, jacobians = residual((5.0, 20.0, 34.0), theta, 1.0, (4.0, 0.0, 10.0), 30.0)
+    error, jacobians = residual((5.0, 20.0, 34.0), theta, AS_DECLARED, 0.0, 4.0, 30.0, RADIUS)
     np.testing.assert_allclose(error, [1.0, 1.2, 1.6], atol=1e-13)
     # Turning theta on takes the axes along: the radial error falls off by the tangential part, and back.
     np.testing.assert_allclose(jacobians[1], [[0.0], [1.6], [-31.2]], atol=1e-13)
     # 1 % more sound speed puts the arc 0.3 mm further out.
-    slower, _ = residual((5.0, 20.0, 34.0), theta, 1.01, (4.0, 0.0, 10.0), 30.0)
+    slower, _ = residual((5.0, 20.0, 34.0), theta, off_by(SOUND_SPEED=0.01), 0.0, 4.0, 30.0, RADIUS)
     np.testing.assert_allclose(np.subtract(slower, error), [0.0, -0.3, 0.0], atol=1e-13)
 
 
@@ -104,6 +106,6 @@ def test_noise_of_the_stage_reading_is_negligible_across_the_arc() -> None:
     for scan in (0.0, math.radians(0.1)):
         element = (0.0, RADIUS * math.sin(scan), RADIUS * math.cos(scan))
         theta = math.atan2(point[1] - element[1], point[2] - element[2])
-        misses.append(residual(point, theta, 1.0, element, 30.0, want_jacobians=False)[0])
+        misses.append(residual(point, theta, AS_DECLARED, scan, 0.0, 30.0, RADIUS, want_jacobians=False)[0])
     assert abs(RADIUS * math.radians(0.1)) < 0.02
     assert abs(misses[1][1] - misses[0][1]) < 0.003  # against a range sigma of 0.2

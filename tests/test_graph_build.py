@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from fgreg.errors import EstimationError
+from fgreg.geometry.rig import Constant
 from fgreg.graph.gtsam_graph import GraphOptions, Variable, build_graph
 from fgreg.graph.gtsam_values import SharedValues, beam_of_chart, laser_chart
 from fgreg.model.session_model import NoiseModel
+from fgreg.model.systematic import EXACT
 from graph_optimum import initial_values, read_estimate
 from tests.forward import make_measurements, make_session, random_marker_T_laser, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal
@@ -39,7 +41,7 @@ def test_variables_of_a_plain_session() -> None:
         "trus_p_pm": 5,
         "camera_p_spot": 7,
         "theta": 5,
-        "window_edge": 1,
+        "rig": 1,
     }
     # Per aim: marker pose, point on line, spot. Per pair: marker pose, point on line, point on arc, window. An edge.
     assert explicit.graph.size() == 3 * 7 + 4 * 5 + 1
@@ -54,7 +56,7 @@ def test_keys_are_named_after_the_design() -> None:
 def test_looks_with_one_marker_observation_share_its_pose_once() -> None:
     explicit, _, _ = make_case(2, noise=True, aims=0, pairs=4, looks_per_pm=3, share_marker=True)
     assert counts(list(explicit.graph.keyVector())) == {
-        "trus_T_camera": 1, "marker_laser": 1, "window_edge": 1,
+        "trus_T_camera": 1, "marker_laser": 1, "rig": 1,
         "camera_T_marker": 4, "lam": 4, "trus_p_pm": 4, "theta": 12,
     }  # fmt: skip
     assert explicit.graph.size() == 4 * 2 + 12 * 2 + 1
@@ -63,7 +65,7 @@ def test_looks_with_one_marker_observation_share_its_pose_once() -> None:
 def test_looks_with_markers_of_their_own_share_the_point_only() -> None:
     explicit, _, _ = make_case(2, noise=True, aims=0, pairs=4, looks_per_pm=3)
     assert counts(list(explicit.graph.keyVector())) == {
-        "trus_T_camera": 1, "marker_laser": 1, "window_edge": 1,
+        "trus_T_camera": 1, "marker_laser": 1, "rig": 1,
         "camera_T_marker": 12, "lam": 12, "trus_p_pm": 4, "theta": 12,
     }  # fmt: skip
 
@@ -95,25 +97,23 @@ def test_private_variables_are_eliminated_first_and_all_are(case: str) -> None:
     assert sorted(order) == sorted(explicit.graph.keyVector())
     assert sorted(order) == sorted(initial_values(explicit, shared).keys())
     names = {variable_name(key).split("[")[0] for key in explicit.shared}
-    assert names <= {"trus_T_camera", "marker_laser", "window_edge", "marker_bias", "sound_speed_ratio"}
+    assert names <= {"trus_T_camera", "marker_laser", "rig"}
 
 
-def test_window_edge_only_where_a_sweep_depends_on_it() -> None:
-    explicit, _, _ = make_case(5, noise=True, first_hit=False)
-    assert explicit.keys.window_edge is None
-    assert make_case(5, noise=True)[0].keys.window_edge is not None
-    exact, _, _ = make_case(5, noise=True, session=make_session(edge_sigma_deg=0.0))
-    assert exact.keys.window_edge is None
-
-
-def test_marker_bias_and_sound_speed_only_where_asked_for() -> None:
-    explicit, _, _ = make_case(6, noise=True)
-    assert explicit.keys.marker_bias is None
-    assert explicit.keys.sound_speed_ratio is None
-    biased, _, _ = make_case(6, noise=True, session=with_noise(make_session(), marker_bias_mm=0.5))
-    assert biased.keys.marker_bias in biased.graph.keyVector()
-    slow, _, _ = make_case(6, noise=True, options={"sound_speed_sigma": 0.01})
-    assert slow.keys.sound_speed_ratio in slow.graph.keyVector()
+def test_only_constants_that_are_not_exact_are_variables() -> None:
+    bias = (Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
+    for session, constants in (
+        (make_session(), ()),
+        (with_noise(make_session(), marker_bias_mm=0.5), bias),
+        (
+            make_session(systematic=replace(EXACT, sound_speed=0.01, radius_mm=0.2)),
+            (Constant.RADIUS, Constant.SOUND_SPEED),
+        ),
+    ):
+        explicit, _, _ = make_case(6, noise=True, session=session)
+        assert explicit.keys.rig is not None
+        assert explicit.keys.rig.constants == (Constant.WINDOW_EDGE, *constants)
+        assert explicit.keys.rig.key in explicit.graph.keyVector()
 
 
 def test_an_epoch_without_pairs_is_held_by_the_wide_motion_or_left_out() -> None:
@@ -165,8 +165,9 @@ def test_a_known_bias_is_taken_off_the_starting_poses() -> None:
     session = with_noise(make_session(), marker_bias_mm=0.5)
     explicit, shared, _ = make_case(11, noise=True, session=session)
     start = read_estimate(explicit, initial_values(explicit, shared), shared)
+    bias = shared.constants[Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
     for pair, pose in zip(explicit.measurements.pairs, start.pair_camera_T_marker, strict=True):
-        np.testing.assert_allclose(pair.marker.camera_T_marker[:3, 3] - pose[:3, 3], shared.marker_bias_mm, atol=1e-12)
+        np.testing.assert_allclose(pair.marker.camera_T_marker[:3, 3] - pose[:3, 3], bias, atol=1e-12)
 
 
 def test_chart_of_a_beam_is_the_same_line() -> None:

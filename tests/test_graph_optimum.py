@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -11,10 +12,12 @@ import pytest
 from scipy.linalg import logm
 
 from fgreg.factors.adapter import FactorError
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.gtsam_graph import ExplicitGraph
 from fgreg.graph.gtsam_values import SharedValues, beam_of_chart, laser_chart
 from fgreg.model.session_model import NoiseModel
+from fgreg.model.systematic import EXACT, Systematic
 from graph_optimum import GraphEstimate, initial_values, made_consistent, optimize, read_estimate
 from tests.forward import hear, make_session, with_noise
 from tests.graph_cases import CASES, make_case, off_nominal, perturbed, pose_error
@@ -22,7 +25,8 @@ from tests.graph_cases import CASES, make_case, off_nominal, perturbed, pose_err
 FULL_CASES = {
     **CASES,
     "marker bias": {"session": with_noise(make_session(), marker_bias_mm=0.5)},
-    "sound speed": {"options": {"sound_speed_sigma": 0.01}},
+    "sound speed": {"session": make_session(systematic=replace(EXACT, sound_speed=0.01))},
+    "all constants": {"session": make_session(systematic=Systematic())},
     "nearly no noise": {
         "session": make_session(noise_model=NoiseModel((0.0,) * 3, (0.0,) * 3, 0.0, (0.0,) * 3, 0.0, 0.0, 0.0))
     },
@@ -52,9 +56,7 @@ def test_recovers_the_truth_from_a_perturbed_start(case: str, seed: int) -> None
         assert np.abs(error[:3]).max() < 1e-2 * close
         assert np.abs(error[3:]).max() < close
     np.testing.assert_allclose(estimate.shared.marker_laser, shared.marker_laser, atol=close)
-    assert abs(estimate.shared.window_edge_rad) < 0.01 * close
-    np.testing.assert_allclose(estimate.shared.marker_bias_mm, 0.0, atol=close)
-    assert estimate.shared.sound_speed_ratio == pytest.approx(1.0, abs=close)
+    np.testing.assert_allclose(estimate.shared.constants, 0.0, atol=close)
     for pm, point in truth.trus_p_pm_mm.items():
         np.testing.assert_allclose(estimate.trus_p_pm_mm[pm], point, atol=close)
     _, offset = laser_chart(truth.marker_T_laser, off_nominal(truth))
@@ -118,7 +120,7 @@ def independent_chi2(explicit: ExplicitGraph, estimate: GraphEstimate) -> float:
 
     def marker_term(observed: FloatArray, covariance: FloatArray, pose: FloatArray) -> float:
         unbiased = np.array(observed)
-        unbiased[:3, 3] -= shared.marker_bias_mm
+        unbiased[:3, 3] -= shared.constants[Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
         log = logm(inverse(unbiased) @ pose).real
         e = np.array([log[2, 1], log[0, 2], log[1, 0], *log[:3, 3]])
         return float(e @ np.linalg.solve(covariance, e))
@@ -128,8 +130,8 @@ def independent_chi2(explicit: ExplicitGraph, estimate: GraphEstimate) -> float:
         return float(np.sum((beam[:3] - point) ** 2)) / 1e-6
 
     total = 0.0
-    if any(pair.look.sweep for pair in measurements.pairs):
-        total += (shared.window_edge_rad / session.probe.sensitivity.edge_sigma_rad) ** 2
+    edge_rad = shared.constants[Constant.WINDOW_EDGE]
+    total += (edge_rad / session.probe.sensitivity.edge_sigma_rad) ** 2
     for index, aim in enumerate(measurements.aims):
         pose, spot = estimate.aim_camera_T_marker[index], estimate.camera_p_spot_mm[index]
         total += marker_term(aim.marker.camera_T_marker, aim.marker.covariance, pose)
@@ -154,7 +156,7 @@ def independent_chi2(explicit: ExplicitGraph, estimate: GraphEstimate) -> float:
         total += float(off @ np.linalg.solve(look.covariance, off))
         half_width = math.radians(6.0)
         if look.sweep:
-            centre = look.sweep * (half_width + shared.window_edge_rad - session.stage.step_rad / 2.0)
+            centre = look.sweep * (half_width + edge_rad - session.stage.step_rad / 2.0)
             sigma = math.hypot(session.stage.step_rad / math.sqrt(12.0), look.scan_sigma_rad)
         else:
             centre, sigma = 0.0, math.hypot(half_width / math.sqrt(3.0), look.scan_sigma_rad)
@@ -185,7 +187,7 @@ def test_nothing_near_the_optimum_costs_less() -> None:
     best = read_estimate(explicit, optimum.values, shared).shared
     rng = np.random.default_rng(80)
     for _ in range(5):
-        near = SharedValues(best.trus_T_camera, best.marker_laser + 0.02 * rng.normal(size=4), best.window_edge_rad)
+        near = SharedValues(best.trus_T_camera, best.marker_laser + 0.02 * rng.normal(size=4), best.constants)
         values = made_consistent(explicit, initial_values(explicit, near))
         assert explicit.graph.error(values) > optimum.cost
 

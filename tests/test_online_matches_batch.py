@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import gaussian_quantile_mm
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.estimate import Verdict
@@ -82,8 +83,8 @@ def test_sound_speed_as_a_variable_is_followed() -> None:
     found = register(measurements, model, config)
     assert sigmas_apart(found, estimate) < 0.05
     assert engine.state.active_window is not None
-    ratio = float(engine.state.active_window.state.sound_speed_ratio[0])
-    assert ratio == pytest.approx(float(found.optimum.state.sound_speed_ratio[0]), abs=1e-4)
+    ratio = float(engine.state.active_window.state.constant(Constant.SOUND_SPEED)[0])
+    assert ratio == pytest.approx(float(found.optimum.state.constant(Constant.SOUND_SPEED)[0]), abs=1e-4)
     assert ratio != 1.0
 
 

@@ -17,10 +17,11 @@ from fgreg.graph.reduced_graph import Costs, Weights, contributions, evaluate, l
 from fgreg.graph.reduced_solver import Optimum, distinct, optimize
 from fgreg.graph.shared_state import SharedState, make_state, stack_states, step_between
 from fgreg.model.session_model import NoiseModel
+from fgreg.model.systematic import Systematic
 from graph_covariance import GraphCovariance
 from graph_optimum import GraphOptimum, initial_values, read_shared
 from graph_optimum import optimize as optimize_graph
-from tests.forward import make_measurements, make_session
+from tests.forward import make_measurements, make_session, with_dependences
 
 CASES: dict[str, dict[str, Any]] = {
     "first hit": {"pairs": 12},
@@ -35,7 +36,7 @@ CASES: dict[str, dict[str, Any]] = {
 def _both(case: str) -> tuple[PackedProblem, Optimum, ExplicitGraph, GraphOptimum, SharedValues]:
     model, measurements, truth = make_measurements(np.random.default_rng(4), **CASES[case])
     problem = pack(measurements, model)
-    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     found = optimize(problem, start, tolerance=1e-12)
     options = GraphOptions(marker_T_nominal=truth.marker_T_laser, unknown_motion_sigma=None)
     explicit = build_graph(measurements, model, options)
@@ -51,9 +52,7 @@ def test_optimum_is_that_of_the_explicit_graph(case: str) -> None:
     assert reference.converged
     assert found.evaluation.cost[0] == pytest.approx(2.0 * reference.cost, rel=1e-5)
     epochs = problem.columns.epochs
-    other = make_state(
-        np.stack(there.trus_T_camera)[None], found.state.marker_T_nominal, problem.radius_mm, there.marker_laser[None]
-    )
+    other = make_state(np.stack(there.trus_T_camera)[None], found.state.marker_T_nominal, there.marker_laser[None])
     poses = step_between(found.state, other, problem.columns)[0, : 6 * epochs]
     step = np.concatenate([poses, there.marker_laser - found.state.beam[0]])
     size = len(step)
@@ -86,11 +85,11 @@ def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:
         looks_per_pm=2,
         epochs=2,
         known_motion=True,
-        session=make_session(noise_model=NoiseModel(marker_bias_mm=0.1)),
+        session=make_session(noise_model=NoiseModel(marker_bias_mm=0.1), systematic=Systematic()),
     )
-    problem = pack(measurements, model, sound_speed_sigma=0.01, radius_sigma_mm=0.3)
+    problem = pack(with_dependences(measurements, 5), model)
     size = problem.columns.size
-    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     state = state.retract(np.random.default_rng(1).normal(size=(1, size)) * 0.01, problem.columns)
     private = initial_private(problem, state)
     for _ in range(12):
@@ -110,7 +109,7 @@ def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:
 def test_contributions_of_pms_sum_to_the_whole() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=9, looks_per_pm=2)
     problem = pack(measurements, model)
-    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0))
+    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser))
     parts = contributions(problem, found.state, found.evaluation.private)
     alone = pack(replace(measurements, pairs=()), model)
     # Evaluated at the same shared state: what the pairs add is the whole less what aims and priors say.
@@ -133,7 +132,7 @@ def _aims_only(alone: PackedProblem, found: Optimum) -> Any:
 def test_hypotheses_side_by_side_do_not_touch_each_other() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(5), pairs=7)
     problem = pack(measurements, model)
-    good = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
+    good = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     steps: FloatArray = np.random.default_rng(6).normal(size=(3, problem.columns.size)) * 0.02
     many = good.take([0, 0, 0]).retract(steps, problem.columns)
     together = log_posterior(problem, many, initial_private(problem, many))
@@ -145,7 +144,7 @@ def test_hypotheses_side_by_side_do_not_touch_each_other() -> None:
 def test_hypotheses_that_have_come_together_go_on_as_one() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(7), pairs=8)
     problem = pack(measurements, model)
-    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0))
+    found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser))
     root = np.linalg.cholesky(np.linalg.inv(found.evaluation.hessian[0]))
     steps: FloatArray = np.array([0.0, 0.3, 20.0, 0.2])[:, None] * root[:, [0, 0, 0, 3]].T
     many = found.state.take([0, 0, 0, 0]).retract(steps, problem.columns)
@@ -159,7 +158,7 @@ def test_hypotheses_that_have_come_together_go_on_as_one() -> None:
 def test_a_hypothesis_that_cannot_reach_the_wanted_cost_is_dropped() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(8), pairs=10)
     problem = pack(measurements, model)
-    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     start = start.retract(np.full((1, problem.columns.size), 0.02), problem.columns)
     free = optimize(problem, start)
     least = float(free.evaluation.cost[0])
@@ -173,7 +172,7 @@ def test_a_hypothesis_that_cannot_reach_the_wanted_cost_is_dropped() -> None:
 def test_a_loss_weighs_as_shots_left_out_do() -> None:
     model, measurements, truth = make_measurements(np.random.default_rng(9), pairs=9, looks_per_pm=2)
     problem = pack(measurements, model)
-    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, 10.0)
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     private = private_at(problem, state)
     kept = np.arange(9) != 4
 

@@ -35,7 +35,7 @@ def test_no_better_minimum_near_the_truth(pairs: int) -> None:
     for seed in range(8):
         model, measurements, truth = make_measurements(np.random.default_rng(seed), pairs=pairs)
         search = search_epoch(measurements, model, calibrate_beam(measurements, model).frames, 0)
-        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
         from_truth = optimize(pack(measurements, model), start)
         assert search.minima[0].cost <= from_truth.evaluation.cost[0] + 0.01, seed
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgreg.model.systematic import COUNT, Constant, Systematic
+from fgreg.geometry.rig import COUNT, Constant
+from fgreg.model.systematic import Systematic
 
 STUDY = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "study_systematics.py"))
 CONFIGURATION, PARSED = STUDY["configuration"], STUDY["parsed"]

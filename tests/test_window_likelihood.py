@@ -34,7 +34,7 @@ def _case(name: str, pairs: int = 6, seed: int = 3) -> tuple[PackedProblem, Opti
         np.random.default_rng(seed), pairs=pairs, session=session, **CASES[name]
     )
     problem = pack(measurements, model, shapes=True)
-    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     return problem, optimize(problem, start)
 
 
@@ -126,7 +126,7 @@ def test_without_noise_the_sites_leave_the_optimum_alone() -> None:
             np.random.default_rng(8), pairs=9, first_hit=first_hit, noise=False
         )
         problem = pack(measurements, model, shapes=True)
-        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
         settled = propagate(problem, optimize(problem, start))
         assert settled is not None
         np.testing.assert_allclose(settled[1].state.trus_T_camera()[0], truth.trus_T_camera[0], atol=0.02)
@@ -143,7 +143,7 @@ def test_windows_as_intervals_tell_the_roll_better_than_gaussians() -> None:
             np.random.default_rng(50 + seed), pairs=25, first_hit=False, session=session
         )
         problem = pack(measurements, model, shapes=True)
-        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+        start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
         found = optimize(problem, start)
         settled = propagate(problem, found)
         assert settled is not None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import COUNT
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
@@ -92,9 +93,7 @@ def plain_snapshot(model: SessionModel, surface: TissueSurface | None = None) ->
         marker_T_nominal=np.eye(4),
         beam=np.zeros(4),
         origin_shift_mm=0.0,
-        edge_rad=0.0,
-        bias_mm=np.zeros(3),
-        sound_speed_ratio=1.0,
+        constants=np.zeros(COUNT),
         radius_mm=model.probe.radius_mm,
         sensitivity=model.probe.sensitivity,
         stage=model.stage,

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.graph.expectation_propagation import propagate, settle
-from fgreg.graph.packing import PackedProblem
+from fgreg.graph.packing import ConstantsPrior, PackedProblem
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, gaussian_prior, make_state
 from fgreg.model.estimate import TrackEstimate
@@ -78,7 +79,7 @@ def _from_looks(query: Track, solved: Solved) -> tuple[float, float, float]:
         raise ValueError("the session's variables are not those of its configuration")
     # The priors on the shared variables are in the session's estimate already.
     anchor = gaussian_prior(solved.posterior.mean, solved.posterior.covariance)
-    problem = replace(problem, anchor=anchor, prior_information=np.zeros(problem.columns.size))
+    problem = replace(problem, anchor=anchor, prior=ConstantsPrior.none(problem.columns))
     optimum = optimize(problem, solved.posterior.mean)
     settled = settle(problem, optimum.state, optimum.evaluation, settled=1e-4)
     if settled is not None:
@@ -116,7 +117,7 @@ class SessionOptimum:
 def optimum_of(measurements: Measurements, model: SessionModel, truth: Truth) -> SessionOptimum:
     """The optimum that is found from the truth."""
     problem = pack_session(measurements, model, SolveConfig())
-    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    start = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     found = propagate(problem, optimize(problem, start))
     assert found is not None
     problem, optimum = found
@@ -152,7 +153,8 @@ def _beam_in_trus(query: Track, state: SharedState, epoch: int, error: FloatArra
     """Origin (S, 3) and direction (S, 3) of the query's beam for marker errors (S, 6) along the camera's axes."""
     marker = query.marker.camera_T_marker
     rotation = exp_so3(error[:, :3]) @ marker[:3, :3]
-    camera_p = np.einsum("sij,sj->si", rotation, state.beam_origin()) + marker[:3, 3] + error[:, 3:] - state.bias_mm
+    camera_p = np.einsum("sij,sj->si", rotation, state.beam_origin()) + marker[:3, 3] + error[:, 3:]
+    camera_p = camera_p - state.constants[:, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
     camera_d = np.einsum("sij,sj->si", rotation, state.beam_direction())
     trus_R_camera = state.rotation[:, epoch]
     origin = np.einsum("sij,sj->si", trus_R_camera, camera_p) + state.translation_mm[:, epoch]

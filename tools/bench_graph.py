@@ -20,6 +20,9 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
+from fgreg.factors.rig import RigKey
+from fgreg.geometry.rig import COUNT, Constant
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from fgreg.factors.epoch_change import epoch_change_factor
@@ -56,16 +59,19 @@ def bench_factors(repeats: int) -> None:
     values.insert(3, 40.0)
     values.insertPoint3(4, np.array([3.0, 10.0, 35.0]))
     values.insert(5, 0.3)
-    values.insert(6, 0.001)
-    values.insert(7, np.zeros(3))
+    values.insert(6, np.array([0.001, 0.0, 0.0, 0.0]))
     nominal = np.eye(4)
+    bias = (Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
+    rig = RigKey(6, (Constant.WINDOW_EDGE, *bias))
+    gain = np.zeros((6, COUNT))
+    gain[3:, bias] = -np.eye(3)
     factors: dict[str, gtsam.NonlinearFactor] = {
         "point on line (pair)": point_on_line_factor(0, 1, 2, 3, 4, nominal),
         "point on line (aim)": aim_point_on_line_factor(1, 2, 3, 4, nominal),
         "point on arc": point_on_arc_factor(4, 5, 0.2, 3.0, 30.0, np.diag([0.09, 0.04]), 10.0),
-        "sensitivity prior": sensitivity_prior_factor(5, 0.2, 30.0, 10.0, math.radians(5.0), 1.0, 0.01, 6),
+        "sensitivity prior": sensitivity_prior_factor(5, 0.2, 30.0, 10.0, math.radians(5.0), 1.0, 0.01, rig, 1),
         "marker pose (native)": marker_pose_factor(1, pose, np.eye(6)),
-        "marker pose with bias": marker_pose_factor(1, pose, np.eye(6), 7),
+        "marker pose with bias": marker_pose_factor(1, pose, np.eye(6), gain, rig),
         "epoch change (native)": epoch_change_factor(0, 1, np.eye(4), np.eye(6)),
     }
     print(f"{'factor':<24}{'error us':>10}{'linearize us':>14}")

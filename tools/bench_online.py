@@ -24,6 +24,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from fgreg.geometry.rig import COUNT
+from fgreg.graph.columns import make_columns
+from fgreg.graph.packing import least_sigmas
 from fgreg.model.measurements import Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -147,7 +150,7 @@ def bench_native(pairs: int) -> None:
     of 3 rows are linear (the wrapper has no native factor on those keys), there is no marginal prior, and no pair is
     prepared, tested or reported.
     """
-    rng, isam = np.random.default_rng(0), empty_isam()
+    rng, isam = np.random.default_rng(0), empty_isam(make_columns(1, least_sigmas(np.zeros(COUNT))))
     pose, beam, edge = gtsam.symbol("T", 0), gtsam.symbol("B", 0), gtsam.symbol("W", 0)
     unit = {n: gtsam.noiseModel.Unit.Create(n) for n in (1, 4, 6)}
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

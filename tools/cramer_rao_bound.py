@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array, inverse, transform_points
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
@@ -97,10 +98,9 @@ def _truth_information(measurements: Measurements, model: SessionModel, truth: F
     )
     problem = pack(replace(measurements, aims=aims, pairs=pairs), model)
     epochs = len(measurements.epochs)
-    state = make_state(np.stack(truth.trus_T_camera[:epochs])[None], truth.marker_T_laser, model.probe.radius_mm)
-    state = replace(state, edge_rad=np.array([truth.window_edge_rad]))
-    if problem.columns.bias is not None:
-        state = replace(state, bias_mm=bias[None])
+    state = make_state(np.stack(truth.trus_T_camera[:epochs])[None], truth.marker_T_laser)
+    state.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad
+    state.constants[:, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1] = bias
     points = np.array([truth.trus_p_pm_mm[pm] for pm in problem.pms], dtype=np.float64).reshape(1, -1, 3)
     private = replace(initial_private(problem, state), trus_p_pm=points)
     return evaluate(problem, state, private).hessian[0], problem.columns.beam

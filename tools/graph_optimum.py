@@ -22,13 +22,14 @@ import numpy as np
 
 from fgreg.factors.adapter import FactorError
 from fgreg.factors.point_on_line import aim_residual, residual
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import ExplicitGraph, ShotKeys, Variable
 from fgreg.graph.gtsam_values import (
     PrivateValues,
     SharedValues,
     beam_of_chart,
-    bearing_from_element,
+    bearing_from_array,
     linear_step,
     values_at,
 )
@@ -195,10 +196,11 @@ def _meeting_point(
 ) -> FloatArray:
     """The point midway between a line and a look's arc, at the arc angle where distance and prior together fit best."""
     z = np.linspace(-_START_SPAN, _START_SPAN, _START_STEPS)
-    rotation = prior.centre_rad + prior.edge_gain * shared.window_edge_rad + z * prior.sigma_rad
-    reach = shared.sound_speed_ratio * look.range_mm
+    rotation = prior.centre_rad + prior.edge_gain * shared.constants[Constant.WINDOW_EDGE] + z * prior.sigma_rad
+    ratio = 1.0 + float(shared.constants[Constant.SOUND_SPEED])
+    reach = ratio * look.range_mm
     theta = look.scan_rad + arc_of_rotation(rotation, reach, session.probe.radius_mm)
-    points = _arc_points(look, theta, session, shared.sound_speed_ratio)
+    points = _arc_points(look, theta, session, ratio)
     feet = origin + ((points - origin) @ direction)[:, None] * direction
     best = int(np.argmin(np.sum((points - feet) ** 2, axis=1) / _START_SIGMA_MM**2 + z * z))
     return np.asarray(0.5 * (points[best] + feet[best]))
@@ -218,7 +220,7 @@ def initial_values(explicit: ExplicitGraph, shared: SharedValues) -> gtsam.Value
 
     def unbiased(observed: Iterable[FloatArray]) -> FloatArray:
         poses = np.array([*observed], dtype=np.float64).reshape(-1, 4, 4)
-        poses[:, :3, 3] -= shared.marker_bias_mm
+        poses[:, :3, 3] -= shared.constants[Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
         return poses
 
     markers = unbiased(measurements.pairs[shot.pair].marker.camera_T_marker for shot in keys.shots)
@@ -270,9 +272,10 @@ def made_consistent(explicit: ExplicitGraph, values: gtsam.Values) -> gtsam.Valu
             shift = trus_T_camera.rotation().matrix().T @ miss
             out.update(shot.camera_T_marker, gtsam.Pose3(pose.rotation(), pose.translation() - shift))
     radius = explicit.session.probe.radius_mm
+    constants = None if keys.rig is None else np.array(keys.rig.read(values))
     for index, pair in enumerate(explicit.measurements.pairs):
         point = points[keys.trus_p_pm[pair.pm]]
-        out.update(keys.theta[index], bearing_from_element(point, pair.look, radius))
+        out.update(keys.theta[index], bearing_from_array(point, pair.look, radius, constants))
     return out
 
 
@@ -303,11 +306,7 @@ def read_shared(explicit: ExplicitGraph, values: gtsam.Values, default: SharedVa
         marker_laser=(
             values.atVector(keys.marker_laser) if keys.marker_laser in explicit.shared else default.marker_laser
         ),
-        window_edge_rad=(default.window_edge_rad if keys.window_edge is None else values.atDouble(keys.window_edge)),
-        marker_bias_mm=default.marker_bias_mm if keys.marker_bias is None else values.atVector(keys.marker_bias),
-        sound_speed_ratio=(
-            default.sound_speed_ratio if keys.sound_speed_ratio is None else values.atDouble(keys.sound_speed_ratio)
-        ),
+        constants=default.constants if keys.rig is None else np.array(keys.rig.read(values)),
     )
 
 

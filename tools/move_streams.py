@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform
 from fgreg.graph.reduced_blocks import initial_private
@@ -106,8 +107,8 @@ def ideal_covariance(
     """
     problem = pack_session(measurements, model, replace(CONFIG, window_shape=False))
     poses = np.stack([truth.trus_T_camera[0] for truth in truths])
-    state = make_state(poses[None], truths[0].marker_T_laser, model.probe.radius_mm)
-    state = replace(state, edge_rad=np.array([truths[0].window_edge_rad]))
+    state = make_state(poses[None], truths[0].marker_T_laser)
+    state.constants[:, Constant.WINDOW_EDGE] = truths[0].window_edge_rad
     private = initial_private(problem, state)
     for _ in range(4):
         _, private = refine(problem, state, private)

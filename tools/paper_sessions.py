@@ -23,7 +23,7 @@ from fgreg.geometry.target_error import expected_tre_mm, tre_mm
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, make_transform, transform_points
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_solver import optimize
-from fgreg.graph.shared_state import make_state, nominal_frame
+from fgreg.graph.shared_state import Quadratic, SharedState, make_state, nominal_frame
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.sensitivity import rotation_of_arc
 from fgreg.model.session_model import SessionModel
@@ -218,7 +218,7 @@ def registration(job: Job) -> dict[Any, Row]:
             states = [found.optimum.state, *(minimum.state for minimum in found.searches[0].minima)]
             best = min(states, key=lambda state: float(np.mean(sim.tre(state.trus_T_camera()[0]) ** 2)))
             row["best"] = sim.tre(best.trus_T_camera()[0])
-            row["best_residual"] = pair_residuals(best, (0,), held.measurements.pairs)
+            row["best_residual"] = pair_residuals(best, (0,), held.measurements.pairs, held.model.probe.radius_mm)
             row["ambiguous"] = bool(found.ambiguous)
             if job.gaussian:
                 row["optimum_tre"] = sim.tre(found.optimum.state.trus_T_camera()[0])
@@ -282,6 +282,11 @@ def tracking(job: Job) -> dict[Any, Row]:
     return {job.key: {"track": np.array(errors)}}
 
 
+def held_prior(state: SharedState, information: FloatArray) -> Quadratic:
+    """A prior that holds the shared variables with information (D,) at a state."""
+    return Quadratic(state, 0.0, np.zeros(len(information)), np.diag(information))
+
+
 def same_cost(sim: Sim, direction: FloatArray, origin: FloatArray) -> tuple[PackedProblem, FloatArray]:
     """The published cost as a reduced problem: beam fixed, equal weights, theta' free; and the beam's frame."""
     problem = pack(replace(sim.measurements, aims=()), sim.model)
@@ -290,13 +295,13 @@ def same_cost(sim: Sim, direction: FloatArray, origin: FloatArray) -> tuple[Pack
     covariance[:, 3:, 3:] = np.eye(3)
     weight = np.zeros_like(looks.weight)
     weight[:, 0, 0] = weight[:, 1, 1] = 1e6
-    information = np.array(problem.prior_information)
-    information[columns.beam :] = 1e12
+    held = np.zeros(columns.size)
+    held[columns.beam :] = 1e12
     problem = replace(
         problem,
         beams=replace(problem.beams, covariance=covariance),
         looks=replace(looks, weight=weight, centre_rad=np.zeros_like(looks.centre_rad)),
-        prior_information=information,
+        anchor=held_prior(make_state(np.eye(4)[None, None], nominal_frame(origin, direction)), held),
     )
     return problem, nominal_frame(origin, direction)
 
@@ -318,7 +323,7 @@ def timing(job: Job) -> dict[Any, Row]:
     problem, frame = same_cost(sim, direction, origin)
     for iterations in (4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256, 1000):
         start = time.process_time()
-        found = optimize(problem, make_state(guess[None, None], frame, data.radius_mm), max_iterations=iterations)
+        found = optimize(problem, make_state(guess[None, None], frame), max_iterations=iterations)
         row["same_s"] = time.process_time() - start
         row["same_cost"] = float(found.evaluation.cost[0]) / len(data.x_mm)
         if row["same_cost"] <= a.cost_mm2 * (1.0 + 1e-9):
@@ -326,12 +331,12 @@ def timing(job: Job) -> dict[Any, Row]:
     # fgreg's own cost, from the same guess; and that cost at (a)'s registration, all else at its conditional optimum.
     own = pack(sim.measurements, sim.model)
     start = time.process_time()
-    found = optimize(own, make_state(guess[None, None], frame, data.radius_mm))
+    found = optimize(own, make_state(guess[None, None], frame))
     row["own_s"], row["own_cost"] = time.process_time() - start, float(found.evaluation.cost[0])
-    held = np.array(own.prior_information)
+    held = np.zeros(own.columns.size)
     held[:6] = 1e12
-    at_a = make_state(a.trus_T_camera[None, None], frame, data.radius_mm)
-    row["a_own_cost"] = float(optimize(replace(own, prior_information=held), at_a).evaluation.cost[0])
+    at_a = make_state(a.trus_T_camera[None, None], frame)
+    row["a_own_cost"] = float(optimize(replace(own, anchor=held_prior(at_a, held)), at_a).evaluation.cost[0])
     row["own_tre"], row["a_tre"] = sim.tre(found.state.trus_T_camera()[0]), sim.tre(a.trus_T_camera)
     start = time.process_time()
     register(sim.measurements, sim.model, SETTINGS)

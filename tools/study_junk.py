@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, transform_points
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
@@ -80,8 +81,8 @@ def spoil_aim(aim: Aim) -> Aim:
 def truth_state_cost(measurements: Measurements, model: SessionModel, truth: Truth) -> FloatArray:
     """(J,) squared misfit of each PM at the true registration and beam."""
     problem = pack(measurements, model)
-    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
-    state = replace(state, edge_rad=np.array([truth.window_edge_rad]))
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
+    state.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad
     private = initial_private(problem, state)
     for _ in range(4):
         _, private = refine(problem, state, private)

@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.graph.shared_state import make_state
 from fgreg.model.measurements import Measurements, Pair, Track
@@ -104,8 +105,8 @@ def _tracked(pairs: int, seed: int, taken: dict[str, object]) -> Row:
     )
     found = solved(measurements, model)
     state, covariance = found.registration.optimum.state, found.registration.covariance
-    there = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
-    there = replace(there, edge_rad=np.array([truth.window_edge_rad]))
+    there = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
+    there.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad
     session, exact = (
         make_snapshot(
             model,

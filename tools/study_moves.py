@@ -25,6 +25,7 @@ from functools import partial
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import log_posterior, refine
@@ -62,8 +63,8 @@ def ideal_ratios(
 ) -> FloatArray:
     """(n,) log likelihood ratio of each pair, new against old registration, all else known."""
     problem = replace(pack_session(replace(measurements, aims=()), model, CONFIG), anchor=None)
-    state = make_state(np.stack([old, new])[:, None], truth.marker_T_laser, model.probe.radius_mm)
-    state = replace(state, edge_rad=np.full(2, truth.window_edge_rad))
+    state = make_state(np.stack([old, new])[:, None], truth.marker_T_laser)
+    state.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad
     out = np.zeros(len(problem.pms))
     for j in range(len(out)):
         one = select_pms(problem, np.array([j]))

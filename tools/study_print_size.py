@@ -17,10 +17,10 @@ import numpy as np
 from fgreg.detection.board import detect_board
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import BoardFit, MarkerFit
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, make_transform
 from fgreg.model.camera_dependence import column
 from fgreg.model.session_model import BoardModel, CharucoModel, MarkerModel, TagModel
-from fgreg.model.systematic import Constant
 from fgreg.simulation.render import Optics, render_frame
 from fgreg.simulation.surfaces import Background, BoardSurface, Surface, TagSurface
 from study_marker import Images, margin_px, say, study_rig, tilted

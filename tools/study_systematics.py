@@ -49,10 +49,11 @@ from pathlib import Path
 import numpy as np
 
 import fgreg
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.target_error import target_jacobians, tre_mm
 from fgreg.geometry.transforms import FloatArray, as_float_array, inverse, log_so3, transform_points
 from fgreg.model.session_model import NoiseModel, StereoRig
-from fgreg.model.systematic import CAMERA, NONE, Constant, Systematic
+from fgreg.model.systematic import NONE, Systematic
 from fgreg.simulation.array import map_by_declared
 from fgreg.simulation.config import SimulationConfig, Sweep, default_rig
 from fgreg.simulation.deviations import NAMES, deviations_of, drawn_deviations

@@ -38,6 +38,7 @@ from pathlib import Path
 import numpy as np
 
 from fgreg.detection.events_to_measurements import extract_measurements
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import (
     FloatArray,
     as_float_array,
@@ -55,7 +56,6 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import MarkerObservation, Measurements
 from fgreg.model.session_model import NoiseModel, SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.model.systematic import Constant
 from fgreg.registration.solve import solve
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.session_reader import read_ground_truth, read_session
@@ -190,7 +190,7 @@ def bound_mm(measurements: Measurements, model: SessionModel, truth: GroundTruth
     if truth.marker_T_laser is None:
         raise SystemExit("no beam in the truth")
     problem = pack(measurements, model)
-    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser, model.probe.radius_mm)
+    state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     private = initial_private(problem, state)
     for _ in range(3):
         _, private = refine(problem, state, private)

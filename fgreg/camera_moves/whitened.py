@@ -13,11 +13,12 @@ import numpy as np
 
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.graph.columns import Columns
-from fgreg.graph.packing import PackedProblem
+from fgreg.graph.packing import PackedProblem, edge_sigma_rad
 from fgreg.graph.reduced_blocks import PrivateState, initial_private, look_block, times
 from fgreg.graph.reduced_graph import Contributions, contributions, evaluate, refine
 from fgreg.graph.shared_state import SharedState, step_between
 from fgreg.graph.window_likelihood import LEAST_PRECISION
+from fgreg.model.systematic import TEXTS
 from fgreg.registration.outliers import pm_degrees_of_freedom
 
 POSE = slice(0, 6)
@@ -100,10 +101,9 @@ def pivot_scale(columns: Columns) -> FloatArray:
     scale = np.full(columns.size, TYPICAL_RAD)
     scale[3:6] = TYPICAL_MM
     scale[columns.beam : columns.beam + 2] = TYPICAL_MM
-    if columns.bias is not None:
-        scale[columns.bias : columns.bias + 3] = TYPICAL_MM
-    if columns.radius is not None:
-        scale[columns.radius] = TYPICAL_MM
+    for place, constant in enumerate(columns.constants, columns.first_constant):
+        if TEXTS[constant].unit in ("mm", "px"):
+            scale[place] = TYPICAL_MM
     return scale
 
 
@@ -204,7 +204,7 @@ def _window_rows(
     if at is not None:
         mean = mean - np.sum(gain * at[:, None, :], axis=-1)
     windows = problem.shapes.windows
-    edge = float(problem.prior_information[problem.columns.edge]) ** -0.5
+    edge = edge_sigma_rad(problem)
     return WindowRows(
         there=there,
         mean=mean,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,15 @@ from fgreg.model.estimate import (
     EpochEstimate,
     LaserEstimate,
     PairEstimate,
+    PredictedPart,
+    PredictedTre,
     SessionEstimate,
     Timing,
     Verdict,
 )
 from fgreg.model.measurements import Look
 from fgreg.model.session_model import SessionModel
+from fgreg.registration.error_budget import largest_causes
 
 STYLES = {Verdict.OK: "bold green", Verdict.WARNING: "bold yellow", Verdict.REFUSED: "bold red"}
 MEANINGS = {
@@ -124,7 +127,17 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
     parts += [bullet(reason) for reason in estimate.reasons]
     for epoch in estimate.epochs:
         refused = Verdict.REFUSED in (estimate.verdict, epoch.verdict)
-        parts += ["", *_epoch(epoch, model, truth, several=len(estimate.epochs) > 1, refused=refused)]
+        parts += [
+            "",
+            *_epoch(
+                epoch,
+                model,
+                truth,
+                largest_causes(estimate.systematic),
+                several=len(estimate.epochs) > 1,
+                refused=refused,
+            ),
+        ]
     if estimate.laser is not None:
         parts += ["", *_laser(estimate.laser)]
     if estimate.pairs:
@@ -192,7 +205,7 @@ def _in_degrees(value_rad: float | None, decimals: int = 1) -> str:
 
 
 def _epoch(
-    epoch: EpochEstimate, model: SessionModel, truth: TruthFigures, *, several: bool, refused: bool
+    epoch: EpochEstimate, model: SessionModel, truth: TruthFigures, largest: str, *, several: bool, refused: bool
 ) -> Iterator[RenderableType]:
     where = f", camera epoch {epoch.index} (from {epoch.start_s:.1f} s)" if several else ""
     title = _heading(f"Registration trus_T_camera{where}, {epoch.pairs} pairs: ")
@@ -216,6 +229,12 @@ def _epoch(
     if tre is not None:
         figures = f"mean {_number(tre.mean_mm, 2)}, 95 % {_number(tre.p95_mm, 2)}, worst {_number(tre.worst_mm, 2)} mm"
         grid.add_row("  predicted TRE", f"{figures} over {len(model.targets_mm)} targets")
+        if tre.random is not None and tre.systematic is not None:
+            parts = f"random {_number(tre.random.worst_mm, 2)}, systematic {_number(tre.systematic.worst_mm, 2)}"
+            seen = "" if tre.seen is None else f"; against what the scanner shows {_number(tre.seen.worst_mm, 2)}"
+            grid.add_row("    worst", f"{parts} mm{seen} mm" if seen else f"{parts} mm")
+            if largest:
+                grid.add_row("    causes", f"{largest} (RMS, at the worst target)")
     mean, worst = _entry(truth.tre_mean_mm, epoch.index), _entry(truth.tre_worst_mm, epoch.index)
     if mean is not None or worst is not None:
         grid.add_row("  true TRE", f"mean {_number(mean, 2)}, worst {_number(worst, 2)} mm (against the ground truth)")
@@ -415,6 +434,9 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
             _pair_dict(pair, model, extra.looks[i] if i < len(extra.looks) else None)
             for i, pair in enumerate(estimate.pairs)
         ],
+        "systematic": [
+            {field.name: _plain_value(getattr(one, field.name)) for field in fields(one)} for one in estimate.systematic
+        ],
         "tracks": [
             {
                 "t": track.t,
@@ -486,8 +508,19 @@ def _epoch_dict(epoch: EpochEstimate) -> dict[str, Any]:
         "verdict": epoch.verdict.value,
         "predicted_tre_mm": None
         if tre is None
-        else {"mean": _plain(tre.mean_mm), "p95": _plain(tre.p95_mm), "worst": _plain(tre.worst_mm)},
+        else {
+            **_figures(tre),
+            **{name: _figures(part) for name in ("random", "systematic", "seen") if (part := getattr(tre, name))},
+        },
     }
+
+
+def _plain_value(value: str | float) -> str | float | None:
+    return value if isinstance(value, str) else _plain(value)
+
+
+def _figures(of: PredictedTre | PredictedPart) -> dict[str, Any]:
+    return {"mean": _plain(of.mean_mm), "p95": _plain(of.p95_mm), "worst": _plain(of.worst_mm)}
 
 
 def _pair_dict(pair: PairEstimate, model: SessionModel, look: Look | None) -> dict[str, Any]:

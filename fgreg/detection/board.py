@@ -23,9 +23,9 @@ from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import BoardFit, NotFound
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.session_model import BoardModel, CameraModel, StereoRig
-from fgreg.model.systematic import Constant
 
 CORNER_SIGMA_PX = 0.03
 """Sigma of a refined inner corner. Four squares meet there: the image is symmetric, so blur does not bias it."""

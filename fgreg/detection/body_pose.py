@@ -18,10 +18,10 @@ from fgreg.detection.pose_least_squares import (
     whitener,
 )
 from fgreg.detection.results import NotFound, RigidFit
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_dependence import corner_derivatives, fitted_dependence
 from fgreg.model.measurements import CameraDependence
-from fgreg.model.systematic import Constant
 
 VIEW_NAMES = ("left", "right")
 MAX_RMS_PX = 4.0

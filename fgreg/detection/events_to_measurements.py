@@ -25,7 +25,9 @@ from fgreg.detection.results import (
     board_corner_dependence,
     marker_covariance,
 )
+from fgreg.geometry.rig import CAMERA
 from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.camera_dependence import nominal_pose_dependence, nominal_spot_dependence
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
@@ -199,6 +201,7 @@ class _Builder:
         self.unused: dict[int, str] = {}
         self.ids: dict[object, int] = {}
         self.next_id = 0
+        self.camera_matters = bool(model.constant_sigmas[CAMERA].any())
 
     def add(self, index: int, event: Event, epoch: int) -> None:
         """Turn one event into a measurement, or store the reason why not."""
@@ -232,7 +235,8 @@ class _Builder:
                 looks.append(look)
         if isinstance(event, PairEvent):
             if looks:
-                self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0]))
+                offset_mm = self.model.noise_per_pm.beam_offset_mm
+                self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0], offset_mm))
                 self.pair_events.append(index)
             return
         if event.looks and not looks:
@@ -255,6 +259,7 @@ class _Builder:
             if record.camera_T_marker is None:
                 raise AssertionError("a marker is a pose or frames")
             transform = record.camera_T_marker
+            dependence = nominal_pose_dependence(self.model, transform) if self.camera_matters else None
             covariance = (
                 default_marker_covariance(transform, self.model.noise)
                 if record.covariance is None
@@ -272,7 +277,9 @@ class _Builder:
         it depends on the rig's constants."""
         laser = np.diag(np.square(self.model.noise.aim_mm))
         if event.camera_p_spot_mm is not None:
-            return event.camera_p_spot_mm, laser if event.covariance is None else event.covariance, None
+            spot = event.camera_p_spot_mm
+            dependence = nominal_spot_dependence(self.model, spot) if self.camera_matters else None
+            return spot, laser if event.covariance is None else event.covariance, dependence
         fit = self.found.boards[index]
         if isinstance(fit, NotFound):
             return fit.reason
@@ -304,6 +311,7 @@ class _Builder:
             covariance=as_float_array(covariance, 2, 2),
             sweep=stage.direction * record.sweep,
             amplitude=amplitude,
+            window_sigma_rad=self.model.noise_per_pm.window_rad,
         )
 
 

@@ -20,9 +20,9 @@ from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.spoilt_tags import find_spoilt_tags
 from fgreg.detection.tags import FoundTag, find_tags, tag_cells
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig
-from fgreg.model.systematic import Constant
 
 LARGE_WIDTH_PX = 1000
 """In images of at least this width a single tag is first searched at half resolution."""

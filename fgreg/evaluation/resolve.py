@@ -10,13 +10,14 @@ import numpy as np
 from fgreg.errors import EstimationError
 from fgreg.evaluation.case import Case, EvaluationConfig
 from fgreg.evaluation.pair_residual import line_to_arc
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import expected_tre_mm, tre_mm
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.packing import pack
+from fgreg.graph.packing import pack_more
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.model.measurements import Measurements, Pair
+from fgreg.model.measurements import Pair
 from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register
 
@@ -110,16 +111,21 @@ def resolve(case: Case, kept: Sequence[int], config: EvaluationConfig, held: Seq
     )
 
 
-def pair_residuals(state: SharedState, epochs: Sequence[int], pairs: Sequence[Pair]) -> FloatArray:
+def pair_residuals(
+    state: SharedState, epochs: Sequence[int], pairs: Sequence[Pair], declared_radius_mm: float
+) -> FloatArray:
     """Eq. 12 for pairs (n,): distances (mm) between beam and arc, lambda and theta' refitted.
 
     Args:
         state: the estimate (one hypothesis).
         epochs: epoch numbers of the pairs, in the order of the state's epochs.
         pairs: of those epochs.
+        declared_radius_mm: of the probe.
     """
+    ratio, offset = 1.0 + state.constants[0, Constant.SOUND_SPEED], state.constants[0, Constant.RANGE_OFFSET]
     marker = np.stack([pair.marker.camera_T_marker for pair in pairs])
-    camera_p = marker[:, :3, :3] @ state.beam_origin()[0] + marker[:, :3, 3] - state.bias_mm[0]
+    camera_p = marker[:, :3, :3] @ state.beam_origin()[0] + marker[:, :3, 3]
+    camera_p = camera_p - state.constants[0, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
     camera_d = marker[:, :3, :3] @ state.beam_direction()[0]
     epoch = np.array([list(epochs).index(pair.epoch) for pair in pairs])
     rotation, translation = state.rotation[0, epoch], state.translation_mm[0, epoch]
@@ -128,8 +134,8 @@ def pair_residuals(state: SharedState, epochs: Sequence[int], pairs: Sequence[Pa
         np.einsum("nij,nj->ni", rotation, camera_d),
         np.array([pair.look.scan_rad for pair in pairs]),
         np.array([pair.look.x_mm for pair in pairs]),
-        np.array([pair.look.range_mm for pair in pairs]) * float(state.sound_speed_ratio[0]),
-        float(state.radius_mm[0]),
+        np.array([pair.look.range_mm for pair in pairs]) * ratio + offset,
+        declared_radius_mm + float(state.constants[0, Constant.RADIUS]),
     )
     return found.distance_mm
 
@@ -145,9 +151,11 @@ def predict(registration: Registration, pairs: Sequence[Pair]) -> tuple[HeldOutP
     pairs = [pair for pair in pairs if pair.epoch in registration.epochs]
     if not pairs:
         return ()
-    residual = pair_residuals(registration.optimum.state, registration.epochs, pairs)
+    residual = pair_residuals(
+        registration.optimum.state, registration.epochs, pairs, registration.model.probe.radius_mm
+    )
     renumbered = tuple(replace(pair, epoch=registration.epochs.index(pair.epoch)) for pair in pairs)
-    problem = pack(Measurements((), renumbered, registration.measurements.epochs), registration.model)
+    problem = pack_more(renumbered, registration.model, registration.problem.columns)
     state = registration.optimum.state
     private = initial_private(problem, state)
     for _ in range(REFINEMENTS):

@@ -4,36 +4,56 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fgreg.geometry.rig import PROBE, Constant
+from fgreg.geometry.transforms import FloatArray
+
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Places of the shared variables in the vector of their perturbations; None for an absent one.
+    """Places of the shared variables in the vector of their perturbations.
 
-    Order: 6 per epoch (rotation rad, translation mm; right tangent), beam chart 4, window edge 1, then the optional
-    marker bias 3, sound speed ratio 1, probe radius 1.
+    Order: 6 per epoch (rotation rad, translation mm; right tangent), beam chart 4, then one for each of ``constants``,
+    the rig's constants that are variables, in ascending order.
     """
 
     epochs: int
-    bias: int | None
-    sound_speed: int | None
-    radius: int | None
-    size: int
+    constants: tuple[int, ...]
 
     @property
     def beam(self) -> int:
         return 6 * self.epochs
 
     @property
-    def edge(self) -> int:
+    def first_constant(self) -> int:
         return 6 * self.epochs + 4
 
+    @property
+    def size(self) -> int:
+        return self.first_constant + len(self.constants)
 
-def make_columns(epochs: int, *, bias: bool, sound_speed: bool, radius: bool) -> Columns:
-    """The columns for a number of epochs, with the optional variables that are asked for."""
-    size = 6 * epochs + 5
-    bias_at = size if bias else None
-    size += 3 * bias
-    sound_at = size if sound_speed else None
-    size += sound_speed
-    radius_at = size if radius else None
-    return Columns(epochs, bias_at, sound_at, radius_at, size + radius)
+    @property
+    def rig(self) -> slice:
+        """The columns of the constants."""
+        return slice(self.first_constant, self.size)
+
+    @property
+    def of_looks(self) -> tuple[int, ...]:
+        """The constants that looks depend on."""
+        return tuple(constant for constant in self.constants if constant < PROBE.stop)
+
+    @property
+    def of_camera(self) -> tuple[int, ...]:
+        """The constants that marker poses and spots depend on."""
+        return tuple(constant for constant in self.constants if constant >= PROBE.stop)
+
+    def at(self, constant: Constant) -> int | None:
+        """The column of a constant; None where it is not a variable."""
+        return self.first_constant + self.constants.index(constant) if constant in self.constants else None
+
+
+def make_columns(epochs: int, sigmas: FloatArray) -> Columns:
+    """The columns for a number of epochs and standard deviations (COUNT,) of the constants.
+
+    Constants of standard deviation 0 are no variables.
+    """
+    return Columns(epochs, tuple(index for index, sigma in enumerate(sigmas) if sigma > 0.0))

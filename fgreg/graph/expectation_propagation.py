@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.packing import PackedProblem, RotationShapes
+from fgreg.graph.packing import PackedProblem, RotationShapes, edge_sigma_rad
 from fgreg.graph.reduced_blocks import look_block, times
 from fgreg.graph.reduced_graph import Evaluation, evaluate
 from fgreg.graph.reduced_solver import Optimum, optimize
@@ -161,9 +161,7 @@ def _new_sites(
     windows = shapes.windows
     # The half width's error shifts a first hit's interval, which the site follows by its gain. In the window-only case
     # it moves the two ends apart, which is added to the softness here.
-    edge = problem.columns.edge
-    held = problem.prior_information[edge] + (0.0 if problem.anchor is None else problem.anchor.hessian[edge, edge])
-    edge_variance = 1.0 / held
+    edge_variance = edge_sigma_rad(problem) ** 2
     soft = np.sqrt(windows.soft_rad**2 + np.where(problem.looks.edge_gain == 0.0, edge_variance, 0.0))
     low, high = windows.low_rad - cavity, windows.high_rad - cavity
     slope, curvature = interval_moments(low, high, np.sqrt(soft**2 + 1.0 / q))

@@ -23,8 +23,12 @@ from fgreg.factors.epoch_change import epoch_change_factor
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
+from fgreg.factors.rig import RigKey, rig_prior_factor, spot_factor
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
+from fgreg.geometry.rig import CAMERA, COUNT
 from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.columns import make_columns
+from fgreg.graph.packing import ConstantsPrior, constants_prior, least_sigmas, line_sigma_mm, marker_gain
 from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Measurements, usable_covariance
 from fgreg.model.sensitivity import sensitivity_priors
 from fgreg.model.session_model import SessionModel
@@ -40,9 +44,7 @@ class Variable(Enum):
     camera_p_spot = "S"
     lam = "L"
     theta = "H"
-    sound_speed_ratio = "C"
-    window_edge = "W"
-    marker_bias = "O"
+    rig = "C"
 
     def key(self, index: int = 0) -> int:
         """The GTSAM key of the variable with this index."""
@@ -76,7 +78,7 @@ class GraphKeys:
     Attributes:
         trus_T_camera: one per epoch.
         marker_laser: the beam's chart.
-        window_edge, marker_bias, sound_speed_ratio: None where they are not variables.
+        rig: the constants that are variables; None where there are none.
         aims: one per aim.
         shots: one per PM and marker observation.
         pair_shot: per pair, its place in ``shots``.
@@ -86,9 +88,7 @@ class GraphKeys:
 
     trus_T_camera: tuple[int, ...]
     marker_laser: int
-    window_edge: int | None
-    marker_bias: int | None
-    sound_speed_ratio: int | None
+    rig: RigKey | None
     aims: tuple[AimKeys, ...]
     shots: tuple[ShotKeys, ...]
     pair_shot: tuple[int, ...]
@@ -97,9 +97,8 @@ class GraphKeys:
 
     @property
     def shared(self) -> tuple[int, ...]:
-        """The shared variables: ``trus_T_camera`` per epoch, ``marker_laser``, then the others that exist."""
-        others = (self.window_edge, self.marker_bias, self.sound_speed_ratio)
-        return (*self.trus_T_camera, self.marker_laser, *(key for key in others if key is not None))
+        """The shared variables: ``trus_T_camera`` per epoch, ``marker_laser``, then the rig where it is one."""
+        return (*self.trus_T_camera, self.marker_laser, *([] if self.rig is None else [self.rig.key]))
 
     @property
     def lam(self) -> tuple[int, ...]:
@@ -119,21 +118,27 @@ class GraphKeys:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """The rig's constants that are variables, in ascending order, and their prior."""
+
+    constants: tuple[int, ...]
+    prior: ConstantsPrior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class GraphOptions:
     """Options of the graph, in addition to the measurements.
 
     Attributes:
         marker_T_nominal: (4, 4) fixed frame of the beam's chart; None: the session's initial ``marker_T_laser``, else
             the marker's own frame. The beam has to be within some 60 deg of its z axis.
-        sound_speed_sigma: prior sigma of ``sound_speed_ratio``, None where it is not a variable.
-        sound_speed_mean: its prior mean.
+        rig: the constants that are variables, with their prior; None: those of the session.
         unknown_motion_sigma: sigmas (rad, mm) of an unknown camera motion, about no motion. They are too wide to matter
             where there are pairs, and keep an epoch without pairs from being singular. None: no factor.
     """
 
     marker_T_nominal: FloatArray | None = None
-    sound_speed_sigma: float | None = None
-    sound_speed_mean: float = 1.0
+    rig: Rig | None = None
     unknown_motion_sigma: tuple[float, float] | None = (3.0, 1000.0)
 
 
@@ -166,7 +171,7 @@ def make_ordering(keys: Sequence[int]) -> gtsam.Ordering:
     return ordering
 
 
-def _make_keys(measurements: Measurements, *, edge: bool, bias: bool, sound_speed: bool) -> GraphKeys:
+def _make_keys(measurements: Measurements, constants: tuple[int, ...]) -> GraphKeys:
     aims = tuple(
         AimKeys(Variable.camera_T_marker.key(i), Variable.lam.key(i), Variable.camera_p_spot.key(i))
         for i in range(len(measurements.aims))
@@ -189,9 +194,7 @@ def _make_keys(measurements: Measurements, *, edge: bool, bias: bool, sound_spee
     return GraphKeys(
         trus_T_camera=tuple(Variable.trus_T_camera.key(k) for k in range(len(measurements.epochs))),
         marker_laser=Variable.marker_laser.key(),
-        window_edge=Variable.window_edge.key() if edge else None,
-        marker_bias=Variable.marker_bias.key() if bias else None,
-        sound_speed_ratio=Variable.sound_speed_ratio.key() if sound_speed else None,
+        rig=RigKey(Variable.rig.key(), constants) if constants else None,
         aims=aims,
         shots=tuple(shots),
         pair_shot=tuple(pair_shot),
@@ -205,9 +208,6 @@ def build_graph(
 ) -> ExplicitGraph:
     """The graph of all measurements of a session.
 
-    ``marker_bias`` is a variable where the session's noise has one, ``window_edge`` where a sweep that stopped at its
-    first hit depends on it.
-
     Args:
         measurements: inliers only.
         session: probe, stage step and noise.
@@ -220,32 +220,42 @@ def build_graph(
     nominal = options.marker_T_nominal
     if nominal is None:
         nominal = session.initial_marker_T_laser if session.initial_marker_T_laser is not None else np.eye(4)
-    probe, noise = session.probe, session.noise
+    probe = session.probe
     looks = [pair.look for pair in measurements.pairs]
     priors = sensitivity_priors(looks, probe.sensitivity, session.stage.step_rad)
-    edge_sigma = probe.sensitivity.edge_sigma_rad
-    keys = _make_keys(
-        measurements,
-        edge=edge_sigma > 0.0 and bool((priors.edge_gain != 0.0).any()),
-        bias=noise.marker_bias_mm > 0.0,
-        sound_speed=options.sound_speed_sigma is not None,
-    )
+    rig = options.rig if options.rig is not None else _rig_of(measurements, session)
+    keys = _make_keys(measurements, rig.constants)
     graph = gtsam.NonlinearFactorGraph()
-    _add_shared_priors(graph, keys, session, options)
+    if keys.rig is not None:
+        graph.add(rig_prior_factor(keys.rig, rig.prior.mean, rig.prior.information))
     _add_epoch_changes(graph, keys, measurements, options)
     for aim, own in zip(measurements.aims, keys.aims, strict=True):
         covariance = usable_covariance(aim.marker.covariance, POSE_FLOOR)
-        graph.add(marker_pose_factor(own.camera_T_marker, aim.marker.camera_T_marker, covariance, keys.marker_bias))
+        gain = marker_gain(aim.marker)
+        graph.add(marker_pose_factor(own.camera_T_marker, aim.marker.camera_T_marker, covariance, gain, keys.rig))
         graph.add(aim_point_on_line_factor(own.camera_T_marker, keys.marker_laser, own.lam, own.camera_p_spot, nominal))
-        spot_noise = gtsam.noiseModel.Gaussian.Covariance(usable_covariance(aim.covariance, (FLOOR_MM,) * 3))
-        graph.add(gtsam.PriorFactorPoint3(own.camera_p_spot, aim.camera_p_spot_mm, spot_noise))
+        spot_covariance = usable_covariance(aim.covariance, (FLOOR_MM,) * 3)
+        if aim.dependence is not None and keys.rig is not None:
+            gain = np.zeros((3, COUNT))
+            gain[:, CAMERA] = aim.dependence.gain
+            graph.add(spot_factor(own.camera_p_spot, aim.camera_p_spot_mm, spot_covariance, gain, keys.rig))
+        else:
+            spot_noise = gtsam.noiseModel.Gaussian.Covariance(spot_covariance)
+            graph.add(gtsam.PriorFactorPoint3(own.camera_p_spot, aim.camera_p_spot_mm, spot_noise))
     for shot in keys.shots:
         marker = measurements.pairs[shot.pair].marker
         covariance = usable_covariance(marker.covariance, POSE_FLOOR)
-        graph.add(marker_pose_factor(shot.camera_T_marker, marker.camera_T_marker, covariance, keys.marker_bias))
+        gain = marker_gain(marker)
+        graph.add(marker_pose_factor(shot.camera_T_marker, marker.camera_T_marker, covariance, gain, keys.rig))
         graph.add(
             point_on_line_factor(
-                shot.trus_T_camera, shot.camera_T_marker, keys.marker_laser, shot.lam, shot.trus_p_pm, nominal
+                shot.trus_T_camera,
+                shot.camera_T_marker,
+                keys.marker_laser,
+                shot.lam,
+                shot.trus_p_pm,
+                nominal,
+                line_sigma_mm(measurements.pairs[shot.pair].beam_offset_mm),
             )
         )
     for index, look in enumerate(looks):
@@ -258,10 +268,10 @@ def build_graph(
                 look.range_mm,
                 usable_covariance(look.covariance, (FLOOR_MM,) * 2),
                 probe.radius_mm,
-                keys.sound_speed_ratio,
+                keys.rig,
+                look.sweep,
             )
         )
-        gain = float(priors.edge_gain[index])
         graph.add(
             sensitivity_prior_factor(
                 keys.theta[index],
@@ -269,10 +279,10 @@ def build_graph(
                 look.range_mm,
                 probe.radius_mm,
                 float(priors.centre_rad[index]),
-                gain,
+                float(priors.edge_gain[index]),
                 float(priors.sigma_rad[index]),
-                keys.window_edge if gain else None,
-                keys.sound_speed_ratio,
+                keys.rig,
+                look.sweep,
             )
         )
     there = set(graph.keyVector())
@@ -287,18 +297,10 @@ def build_graph(
     )
 
 
-def _add_shared_priors(
-    graph: gtsam.NonlinearFactorGraph, keys: GraphKeys, session: SessionModel, options: GraphOptions
-) -> None:
-    if keys.window_edge is not None:
-        edge_noise = gtsam.noiseModel.Isotropic.Sigma(1, session.probe.sensitivity.edge_sigma_rad)
-        graph.add(gtsam.PriorFactorDouble(keys.window_edge, 0.0, edge_noise))
-    if keys.marker_bias is not None:
-        bias_noise = gtsam.noiseModel.Isotropic.Sigma(3, session.noise.marker_bias_mm)
-        graph.add(gtsam.PriorFactorVector(keys.marker_bias, np.zeros(3), bias_noise))
-    if keys.sound_speed_ratio is not None and options.sound_speed_sigma is not None:
-        ratio_noise = gtsam.noiseModel.Isotropic.Sigma(1, options.sound_speed_sigma)
-        graph.add(gtsam.PriorFactorDouble(keys.sound_speed_ratio, options.sound_speed_mean, ratio_noise))
+def _rig_of(measurements: Measurements, session: SessionModel) -> Rig:
+    sigmas = least_sigmas(session.constant_sigmas)
+    columns = make_columns(len(measurements.epochs), sigmas)
+    return Rig(columns.constants, constants_prior(measurements, columns, sigmas, np.zeros(COUNT)))
 
 
 def _add_epoch_changes(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import ExplicitGraph
 from fgreg.model.measurements import Look
@@ -24,16 +25,12 @@ class SharedValues:
     Attributes:
         trus_T_camera: (4, 4) per epoch.
         marker_laser: (4,) chart (x mm, y mm, a, b) about the graph's nominal frame.
-        window_edge_rad: error of the known half width.
-        marker_bias_mm: (3,) camera axes.
-        sound_speed_ratio: true over assumed.
+        constants: (COUNT,) of the rig, true less declared.
     """
 
     trus_T_camera: tuple[FloatArray, ...]
     marker_laser: FloatArray
-    window_edge_rad: float = 0.0
-    marker_bias_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
-    sound_speed_ratio: float = 1.0
+    constants: FloatArray = field(default_factory=lambda: np.zeros(COUNT))
 
 
 def laser_chart(marker_T_laser: FloatArray, marker_T_nominal: FloatArray) -> tuple[FloatArray, float]:
@@ -98,12 +95,8 @@ def values_at(explicit: ExplicitGraph, shared: SharedValues, private: PrivateVal
             values.insert(key, gtsam.Pose3(trus_T_camera))
     if keys.marker_laser in explicit.shared:
         values.insert(keys.marker_laser, np.array(shared.marker_laser, dtype=np.float64))
-    if keys.window_edge is not None:
-        values.insert(keys.window_edge, float(shared.window_edge_rad))
-    if keys.marker_bias is not None:
-        values.insert(keys.marker_bias, np.array(shared.marker_bias_mm, dtype=np.float64))
-    if keys.sound_speed_ratio is not None:
-        values.insert(keys.sound_speed_ratio, float(shared.sound_speed_ratio))
+    if keys.rig is not None:
+        values.insert(keys.rig.key, np.asarray(shared.constants, dtype=np.float64)[list(keys.rig.constants)])
     marker_p, marker_d = beam_of_chart(shared.marker_laser, explicit.marker_T_nominal)
 
     def place(key: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -125,18 +118,31 @@ def values_at(explicit: ExplicitGraph, shared: SharedValues, private: PrivateVal
         values.insert(shot.lam, float(direction @ (camera_p - origin)))
     for index, pair in enumerate(measurements.pairs):
         point = points[keys.trus_p_pm[pair.pm]]
-        values.insert(keys.theta[index], bearing_from_element(point, pair.look, explicit.session.probe.radius_mm))
+        theta = bearing_from_array(point, pair.look, explicit.session.probe.radius_mm, shared.constants)
+        values.insert(keys.theta[index], theta)
     return values
 
 
-def bearing_from_element(trus_p: FloatArray, look: Look, radius_mm: float) -> float:
-    """Arc angle theta' (rad) of a point (3,), seen from the element at a look's stage angle.
+def bearing_from_array(trus_p: FloatArray, look: Look, radius_mm: float, constants: FloatArray | None = None) -> float:
+    """Arc angle theta' (rad) of a point (3,), seen from the array at a look's stage angle.
 
     The branch is that within half a turn of the stage angle.
+
+    Args:
+        trus_p: (3,) mm.
+        look: the look.
+        radius_mm: declared, of the probe.
+        constants: (COUNT,) of the rig; None: as declared.
     """
-    dy = float(trus_p[1]) - radius_mm * math.sin(look.scan_rad)
-    dz = float(trus_p[2]) - radius_mm * math.cos(look.scan_rad)
-    return look.scan_rad + math.remainder(math.atan2(dy, dz) - look.scan_rad, math.tau)
+    c = np.zeros(COUNT) if constants is None else constants
+    scan = look.scan_rad - look.sweep * float(c[Constant.BACKLASH])
+    x, y, z = (float(v) for v in trus_p)
+    across = math.cos(scan) * y - math.sin(scan) * z - float(c[Constant.ARRAY_OFFSET])
+    outwards = math.sin(scan) * y + math.cos(scan) * z - radius_mm - float(c[Constant.RADIUS])
+    steer = float(c[Constant.TILT_ELEVATION])
+    qy = across - outwards * steer - x * float(c[Constant.TILT_RADIAL])
+    qz = outwards + across * steer - x * float(c[Constant.TILT_IN_PLANE])
+    return scan + math.atan2(qy, qz)
 
 
 def newton_step(explicit: ExplicitGraph, values: gtsam.Values) -> gtsam.VectorValues | None:

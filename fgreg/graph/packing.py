@@ -7,17 +7,20 @@ problem perturbs the pose by a twist (w, n): the right tangent of GTSAM's Pose3,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import CAMERA, COUNT, Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import Quadratic
 from fgreg.model.measurements import (
     FLOOR_MM,
     POSE_FLOOR,
+    CameraDependence,
     EpochStart,
     MarkerObservation,
     Measurements,
@@ -27,27 +30,44 @@ from fgreg.model.measurements import (
 from fgreg.model.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
 from fgreg.model.session_model import SensitivityModel, SessionModel
 
+LEAST_EDGE_SIGMA_RAD = 1e-9
+"""The window's edge is always a variable."""
 LINE_SIGMA_MM = 1e-3
 """Sigma of point on line, which is an equality: it keeps the covariance invertible (as in the factors)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BeamArrays:
-    """Marker observations: rotation (n, 3, 3), translation (n, 3) mm, covariance (n, 6, 6) along the camera's axes."""
+    """Marker observations.
+
+    Attributes:
+        rotation: (n, 3, 3). translation_mm: (n, 3).
+        covariance: (n, 6, 6) along the camera's axes.
+        by_constants: (n, 6, C) twist by which errors of the constants of ``CAMERA`` move the pose, camera axes.
+        offset_mm: (n,) standard deviation of the spot beside the beam.
+    """
 
     rotation: FloatArray
     translation_mm: FloatArray
     covariance: FloatArray
+    by_constants: FloatArray
+    offset_mm: FloatArray
+
+    def none(self) -> BeamArrays:
+        """The same without observations."""
+        return BeamArrays(*(getattr(self, name)[:0] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LookArrays:
     """Looks: scan (L,) rad, x and range (L,) mm, weight (L, 3, 3) over (x, range, rotation), prior on the rotation.
 
-    The rotation offset's prior: ``rotation - centre - edge_gain * window_edge`` with sigma (in ``weight``).
+    The rotation offset's prior: ``rotation - centre - edge_gain * window_edge - window_centre`` with sigma (in
+    ``weight``). ``sweep`` (L,): +1, -1, or 0 where it is not known.
     """
 
     scan_rad: FloatArray
+    sweep: FloatArray
     x_mm: FloatArray
     range_mm: FloatArray
     weight: FloatArray
@@ -83,13 +103,28 @@ class EpochLink:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ConstantsPrior:
+    """Gaussian prior of the rig's constants that are variables: mean (K,), information (K, K)."""
+
+    mean: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def none(cls, columns: Columns) -> ConstantsPrior:
+        """No prior."""
+        count = len(columns.constants)
+        return cls(np.zeros(count), np.zeros((count, count)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PackedProblem:
     """All measurements of a session as arrays; indices say which PM and epoch each belongs to.
 
     ``anchor``: a Gaussian prior of all shared variables.
 
-    ``log_outlier`` (J,): where each PM may be an inlier or an outlier, the log density of an outlier over that of an
-    inlier at its best.
+    ``aim_spot_by_constants`` (A, 3, C): as ``BeamArrays.by_constants``, of the spots. ``prior``: of the constants that
+    are variables. ``log_outlier`` (J,): where each PM may be an inlier or an outlier, the log density of an outlier
+    over that of an inlier at its best.
     """
 
     columns: Columns
@@ -103,22 +138,103 @@ class PackedProblem:
     aims: BeamArrays
     aim_spot_mm: FloatArray
     aim_spot_covariance: FloatArray
+    aim_spot_by_constants: FloatArray
     links: tuple[EpochLink, ...]
     radius_mm: float
-    prior_information: FloatArray
+    prior: ConstantsPrior
     shapes: RotationShapes | None = None
-    sound_speed_mean: float = 1.0
     anchor: Quadratic | None = None
     log_outlier: FloatArray | None = None
 
 
-def _beam_arrays(markers: Sequence[MarkerObservation]) -> BeamArrays:
-    if not markers:
-        return BeamArrays(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)))
+_CAMERA_COUNT = CAMERA.stop - CAMERA.start
+
+
+def marker_gain(marker: MarkerObservation) -> FloatArray:
+    """(6, COUNT) twist by which errors of the constants move a marker's observation, camera axes."""
+    gain = np.zeros((6, COUNT))
+    if marker.dependence is not None:
+        gain[:, CAMERA] = marker.dependence.gain
+    gain[3:, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1] = -np.eye(3)  # the bias is measured less true
+    return gain
+
+
+def line_sigma_mm(beam_offset_mm: float) -> float:
+    """Sigma of point on line, each axis, for a spot that lies beside the beam."""
+    return math.hypot(LINE_SIGMA_MM, beam_offset_mm)
+
+
+def least_sigmas(sigmas: FloatArray) -> FloatArray:
+    """(COUNT,) standard deviations of the constants with that of the window's edge, which is always a variable."""
+    sigmas = np.array(sigmas, dtype=np.float64)
+    sigmas[Constant.WINDOW_EDGE] = max(sigmas[Constant.WINDOW_EDGE], LEAST_EDGE_SIGMA_RAD)
+    return sigmas
+
+
+def _beam_arrays(markers: Sequence[MarkerObservation], offset_mm: FloatArray) -> BeamArrays:
+    n = len(markers)
+    gain = np.zeros((n, 6, _CAMERA_COUNT))
+    if not n:
+        return BeamArrays(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 6, 6)), gain, offset_mm)
     transforms = np.stack([marker.camera_T_marker for marker in markers])
     covariance = usable_covariance(np.stack([marker.covariance for marker in markers]), POSE_FLOOR)
     rotation = np.ascontiguousarray(transforms[:, :3, :3])
-    return BeamArrays(rotation, transforms[:, :3, 3].copy(), parent_from_right_covariance(rotation, covariance))
+    for i, marker in enumerate(markers):
+        gain[i] = marker_gain(marker)[:, CAMERA]
+    spread = parent_from_right_covariance(rotation, covariance)
+    return BeamArrays(rotation, transforms[:, :3, 3].copy(), spread, gain, offset_mm)
+
+
+def constants_prior(
+    measurements: Measurements, columns: Columns, sigmas: FloatArray, mean: FloatArray
+) -> ConstantsPrior:
+    """Prior of the constants that are variables, from their standard deviations and from the cameras' pictures.
+
+    What the corners of tags and boards say about the camera's constants is the same in every shot of an observation,
+    and enters here, not shot by shot.
+
+    Args:
+        measurements: with the pictures' dependence, where there are pictures.
+        columns: which constants are variables.
+        sigmas, mean: (COUNT,) of all constants.
+    """
+    chosen = np.array(columns.constants, dtype=np.int64)
+    seen = camera_evidence(observed_dependences(measurements), columns)
+    information = np.diag(sigmas[chosen] ** -2.0) + seen.information
+    pull = mean[chosen] * sigmas[chosen] ** -2.0 + seen.information @ seen.mean
+    return ConstantsPrior(_mean(information, pull), information)
+
+
+def camera_evidence(dependences: Iterable[CameraDependence], columns: Columns) -> ConstantsPrior:
+    """What pictures of tags and boards say about the constants, without what is known of these otherwise."""
+    chosen = np.array(columns.constants, dtype=np.int64)
+    of_camera = np.flatnonzero(chosen >= CAMERA.start)
+    at = chosen[of_camera] - CAMERA.start
+    information, pull = np.zeros((len(chosen), len(chosen))), np.zeros(len(chosen))
+    for found in dependences:
+        information[np.ix_(of_camera, of_camera)] += found.information[np.ix_(at, at)]
+        pull[of_camera] += found.pull[at]
+    return ConstantsPrior(_mean(information, pull), information)
+
+
+def _mean(information: FloatArray, pull: FloatArray) -> FloatArray:
+    """Mean of a Gaussian from its information (K, K), which may be singular, and information times mean."""
+    if not pull.any():
+        return np.zeros(len(pull))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
+    return np.asarray(scale * (inverse @ (scale * pull)))
+
+
+def observed_dependences(measurements: Measurements) -> Iterator[CameraDependence]:
+    """What each picture of a tag or board says about the constants, once for each."""
+    once: dict[int, CameraDependence] = {}
+    markers = [aim.marker for aim in measurements.aims] + [pair.marker for pair in measurements.pairs]
+    for marker in markers:
+        if marker.dependence is not None:
+            once[marker.id] = marker.dependence
+    yield from once.values()
+    yield from (aim.dependence for aim in measurements.aims if aim.dependence is not None)
 
 
 def _links(epochs: Sequence[EpochStart]) -> tuple[EpochLink, ...]:
@@ -134,13 +250,23 @@ def _links(epochs: Sequence[EpochStart]) -> tuple[EpochLink, ...]:
     return tuple(links)
 
 
+SEARCHED = (Constant.WINDOW_EDGE, Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
+"""The constants that are variables while minima are searched: those that move the optimum most."""
+
+
+def search_sigmas(model: SessionModel) -> FloatArray:
+    """(COUNT,) standard deviations of the constants in the search for minima: all others count as exact there."""
+    sigmas = np.zeros(COUNT)
+    sigmas[list(SEARCHED)] = model.constant_sigmas[list(SEARCHED)]
+    return sigmas
+
+
 def pack(
     measurements: Measurements,
     model: SessionModel,
     *,
-    sound_speed_sigma: float | None = None,
-    sound_speed_mean: float = 1.0,
-    radius_sigma_mm: float | None = None,
+    sigmas: FloatArray | None = None,
+    mean: FloatArray | None = None,
     shapes: bool = False,
     amplitude_sigma: float = AMPLITUDE_SIGMA,
 ) -> PackedProblem:
@@ -149,27 +275,14 @@ def pack(
     Args:
         measurements: aims, pairs and epochs.
         model: the session's set-up.
-        sound_speed_sigma: prior sigma of the sound speed ratio; None: not estimated.
-        sound_speed_mean: its prior mean.
-        radius_sigma_mm: prior sigma of the probe's radius; None: not estimated.
+        sigmas: (COUNT,) prior standard deviations of the rig's constants; 0: no variable. None: the session's.
+        mean: (COUNT,) prior means; None: zero.
         shapes: keep the windows' own shapes, and the amplitudes, for the posterior, in addition to the Gaussian priors.
         amplitude_sigma: relative noise of amplitudes.
     """
     probe = model.probe
-    columns = make_columns(
-        len(measurements.epochs),
-        bias=model.noise.marker_bias_mm > 0,
-        sound_speed=sound_speed_sigma is not None,
-        radius=radius_sigma_mm is not None,
-    )
-    prior_information = np.zeros(columns.size)
-    prior_information[columns.edge] = max(probe.sensitivity.edge_sigma_rad, 1e-9) ** -2
-    if columns.bias is not None:
-        prior_information[columns.bias : columns.bias + 3] = model.noise.marker_bias_mm**-2
-    if columns.sound_speed is not None and sound_speed_sigma is not None:
-        prior_information[columns.sound_speed] = sound_speed_sigma**-2
-    if columns.radius is not None and radius_sigma_mm is not None:
-        prior_information[columns.radius] = radius_sigma_mm**-2
+    sigmas = least_sigmas(model.constant_sigmas if sigmas is None else sigmas)
+    columns = make_columns(len(measurements.epochs), sigmas)
     aims = measurements.aims
     alone = pack_pairs(
         measurements.pairs,
@@ -180,16 +293,33 @@ def pack(
         shapes=shapes,
         amplitude_sigma=amplitude_sigma,
     )
+    by_constants = np.zeros((len(aims), 3, _CAMERA_COUNT))
+    for i, aim in enumerate(aims):
+        if aim.dependence is not None:
+            by_constants[i] = aim.dependence.gain
     return replace(
         alone,
-        aims=_beam_arrays([aim.marker for aim in aims]),
+        aims=_beam_arrays([aim.marker for aim in aims], np.zeros(len(aims))),
         aim_spot_mm=np.array([aim.camera_p_spot_mm for aim in aims], dtype=np.float64).reshape(-1, 3),
         aim_spot_covariance=usable_covariance(
             np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3), (FLOOR_MM,) * 3
         ),
+        aim_spot_by_constants=by_constants,
         links=_links(measurements.epochs),
-        prior_information=prior_information,
-        sound_speed_mean=sound_speed_mean,
+        prior=constants_prior(measurements, columns, sigmas, np.zeros(COUNT) if mean is None else mean),
+    )
+
+
+def pack_more(pairs: Sequence[Pair], model: SessionModel, columns: Columns) -> PackedProblem:
+    """Pairs alone, with the columns of another problem of the session; windows as Gaussians."""
+    return pack_pairs(
+        pairs,
+        columns,
+        model.probe.sensitivity,
+        radius_mm=model.probe.radius_mm,
+        step_rad=model.stage.step_rad,
+        shapes=False,
+        amplitude_sigma=AMPLITUDE_SIGMA,
     )
 
 
@@ -224,23 +354,28 @@ def pack_pairs(
         pms=pms,
         beam_pm=np.array([pm_index[pair.pm] for pair in beam_pairs], dtype=np.int64),
         beam_epoch=np.array([pair.epoch for pair in beam_pairs], dtype=np.int64),
-        beams=_beam_arrays([pair.marker for pair in beam_pairs]),
+        beams=_beam_arrays(
+            [pair.marker for pair in beam_pairs],
+            np.array([pair.beam_offset_mm for pair in beam_pairs], dtype=np.float64),
+        ),
         look_pm=np.array([pm_index[pair.pm] for pair in pairs], dtype=np.int64),
         look_beam=np.array([beam_index[pair.pm, pair.marker.id] for pair in pairs], dtype=np.int64),
         looks=LookArrays(
             scan_rad=np.array([look.scan_rad for look in looks], dtype=np.float64),
+            sweep=np.array([look.sweep for look in looks], dtype=np.float64),
             x_mm=np.array([look.x_mm for look in looks], dtype=np.float64),
             range_mm=np.array([look.range_mm for look in looks], dtype=np.float64),
             weight=weight,
             centre_rad=priors.centre_rad,
             edge_gain=priors.edge_gain,
         ),
-        aims=_beam_arrays([]),
+        aims=_beam_arrays([], np.zeros(0)),
         aim_spot_mm=np.zeros((0, 3)),
         aim_spot_covariance=np.zeros((0, 3, 3)),
+        aim_spot_by_constants=np.zeros((0, 3, _CAMERA_COUNT)),
         links=(),
         radius_mm=radius_mm,
-        prior_information=np.zeros(columns.size),
+        prior=ConstantsPrior.none(columns),
         shapes=_rotation_shapes(pairs, pm_index, sensitivity, step_rad, amplitude_sigma) if shapes else None,
     )
 
@@ -273,21 +408,30 @@ def _rotation_shapes(
     )
 
 
+def edge_sigma_rad(problem: PackedProblem) -> float:
+    """Prior standard deviation of the window's edge, the other shared variables given."""
+    at, place = problem.columns.at(Constant.WINDOW_EDGE), problem.columns.constants.index(Constant.WINDOW_EDGE)
+    held = problem.prior.information[place, place]
+    if problem.anchor is not None:
+        held = held + problem.anchor.hessian[at, at]
+    return float(held**-0.5)
+
+
 def only_aims(problem: PackedProblem) -> PackedProblem:
     """The calibration shots alone: no pairs, no links, no priors."""
     none = np.zeros(0, dtype=np.int64)
-    looks, beams = problem.looks, problem.beams
+    looks = problem.looks
     return replace(
         problem,
         pms=(),
         beam_pm=none,
         beam_epoch=none,
-        beams=BeamArrays(beams.rotation[:0], beams.translation_mm[:0], beams.covariance[:0]),
+        beams=problem.beams.none(),
         look_pm=none,
         look_beam=none,
         looks=LookArrays(*(getattr(looks, name)[:0] for name in LookArrays.__slots__)),
         links=(),
-        prior_information=np.zeros_like(problem.prior_information),
+        prior=ConstantsPrior.none(problem.columns),
         shapes=None,
         anchor=None,
         log_outlier=None,
@@ -296,11 +440,11 @@ def only_aims(problem: PackedProblem) -> PackedProblem:
 
 def without_aims(problem: PackedProblem, anchor: Quadratic) -> PackedProblem:
     """The problem with a Gaussian prior of the shared variables in place of its calibration shots (and other prior)."""
-    aims = problem.aims
     return replace(
         problem,
-        aims=BeamArrays(aims.rotation[:0], aims.translation_mm[:0], aims.covariance[:0]),
+        aims=problem.aims.none(),
         aim_spot_mm=problem.aim_spot_mm[:0],
         aim_spot_covariance=problem.aim_spot_covariance[:0],
+        aim_spot_by_constants=problem.aim_spot_by_constants[:0],
         anchor=anchor,
     )

@@ -11,12 +11,15 @@ the marker's.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, make_transform
+from fgreg.graph.columns import Columns
 from fgreg.graph.packing import LINE_SIGMA_MM, BeamArrays, PackedProblem
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.sensitivity import arc_of_rotation
@@ -125,13 +128,15 @@ class Groups:
         return values if self.index is None else values[self.index]
 
 
-def moved_markers(beams: BeamArrays, error: FloatArray, bias_mm: FloatArray) -> FloatArray:
-    """(n, 4, 4) marker poses at errors (w, n) (n, 6) of their observations, one hypothesis, less the bias (3,).
+def moved_markers(beams: BeamArrays, error: FloatArray, constants: FloatArray) -> FloatArray:
+    """(n, 4, 4) marker poses, one hypothesis, at errors (w, n) (n, 6) of their observations and constants (COUNT,).
 
     The marker moves by Exp of a twist about its observed origin: t + n + w x n / 2 to second order.
     """
+    expected = beams.by_constants @ constants[CAMERA]
     turn, shift = error[:, :3], error[:, 3:]
-    translation = beams.translation_mm + shift + 0.5 * np.cross(turn, shift) - bias_mm
+    turn = turn + expected[:, :3]
+    translation = beams.translation_mm + expected[:, 3:] + shift + 0.5 * np.cross(turn, shift)
     return make_transform(exp_so3(turn) @ beams.rotation, translation)
 
 
@@ -139,14 +144,14 @@ def moved_markers(beams: BeamArrays, error: FloatArray, bias_mm: FloatArray) -> 
 class Chart:
     """The beams of S hypotheses: nominal frame as rotation (3, 3, S) and origin (3, S), (x, y) and (a, b) (2, S).
 
-    ``bias_mm`` (3, S): of the markers, camera axes.
+    ``constants`` (C, S): those of the camera.
     """
 
     rotation: FloatArray
     origin_mm: FloatArray
     offset_mm: FloatArray
     slope: FloatArray
-    bias_mm: FloatArray
+    constants: FloatArray
 
     @classmethod
     def of(cls, state: SharedState) -> Chart:
@@ -154,7 +159,7 @@ class Chart:
         frame = state.marker_T_nominal
         return cls(
             inner(frame[:, :3, :3]), inner(frame[:, :3, 3]), inner(state.beam[:, :2]), inner(state.beam[:, 2:]),
-            inner(state.bias_mm),
+            inner(state.constants[:, CAMERA]),
         )  # fmt: skip
 
 
@@ -165,12 +170,14 @@ class LineBlock:
     Attributes:
         rows: (n, 4, 2, S) the residual (mm, the marker's error linearised at zero) and its derivative by the point,
             camera axes.
+        by_turn: (n, 3, 2, S) derivative by the marker's turn w.
         covariance: (n, 3, S): entries 00, 01 and 11 of the covariance from the marker's pose, mm^2.
         spread: (n, 6, 2, S) the marker's covariance times the derivative by its error.
         laser_p: (n, 3, S) the point in the chart's nominal frame, mm.
     """
 
     rows: FloatArray
+    by_turn: FloatArray
     covariance: FloatArray
     spread: FloatArray
     laser_p: FloatArray
@@ -179,11 +186,14 @@ class LineBlock:
 def line_block(beams: BeamArrays, error: FloatArray, chart: Chart, camera_p: FloatArray) -> LineBlock:
     """Points (n, 3, S), camera axes, against beams of markers with errors (n, 6, S)."""
     n, count = len(error), camera_p.shape[-1]
-    shift, half_turn = error[:, 3:], _half_hat(error[:, :3])
+    expected = by_constants(beams.by_constants, chart)
+    turned = error[:, :3] + expected[:, :3]
+    shift, half_turn = error[:, 3:], _half_hat(turned)
     # The marker moves by Exp of a twist (w, n) about its observed origin: t + n + w x n / 2 to second order.
-    marker_t = beams.translation_mm[..., None] + shift + np.einsum("nijs,njs->nis", half_turn, shift) - chart.bias_mm
+    marker_t = beams.translation_mm[..., None] + shift + np.einsum("nijs,njs->nis", half_turn, shift)
+    marker_t = marker_t + expected[:, 3:]
     from_marker = camera_p - marker_t
-    turn = _exp(error[:, :3], half_turn)
+    turn = _exp(turned, half_turn)
     marker_p = transposed(beams.rotation) @ np.einsum("nijs,nis->njs", turn, from_marker) - chart.origin_mm[None]
     laser_p = np.einsum("ijs,nis->njs", chart.rotation, marker_p)
     across = chart.rotation[:, :2] - chart.rotation[:, 2:] * chart.slope
@@ -201,10 +211,16 @@ def line_block(beams: BeamArrays, error: FloatArray, chart: Chart, camera_p: Flo
     a, b = chart.slope
     for place, (i, j, floor) in enumerate(((0, 0, 1.0 + a * a), (0, 1, a * b), (1, 1, 1.0 + b * b))):
         np.einsum("nks,nks->ns", by_marker[:, :, i], spread[:, :, j], out=covariance[:, place])
-        covariance[:, place] += LINE_SIGMA_MM**2 * floor
+        covariance[:, place] += (LINE_SIGMA_MM**2 + beams.offset_mm[:, None] ** 2) * floor
     residual = laser_p[:, :2] - chart.offset_mm - laser_p[:, 2:] * chart.slope
     rows[:, 0] = residual - np.einsum("nkis,nks->nis", by_marker, error)
-    return LineBlock(rows, covariance, spread, laser_p)
+    return LineBlock(rows, by_marker[:, :3], covariance, spread, laser_p)
+
+
+def by_constants(gain: FloatArray, chart: Chart) -> FloatArray:
+    """(n, k, S) what the camera's constants change, from the derivatives (n, k, C)."""
+    n, k, count = gain.shape
+    return np.asarray((gain.reshape(n * k, count) @ chart.constants).reshape(n, k, chart.constants.shape[1]))
 
 
 def _half_hat(w: FloatArray) -> FloatArray:
@@ -278,56 +294,98 @@ class LookBlock:
 
 def look_block(problem: PackedProblem, state: SharedState, points: FloatArray) -> LookBlock:
     """Looks against the points (S, L, 3), TRUS mm."""
-    looks, columns = problem.looks, problem.columns
-    rows = look_rows(problem, state, inner(points))
-    whole = np.zeros((len(looks.scan_rad), 3, columns.size, state.count))
-    whole[:, :, look_columns(problem)] = rows[:, :, 4:]
+    columns, of_looks = problem.columns, problem.columns.of_looks
+    rows = look_rows(problem, state, inner(points), of_looks)
+    whole = np.zeros((len(problem.look_pm), 3, columns.size, state.count))
+    whole[:, :, look_columns(columns)] = rows[:, :, 4:]
     return LookBlock(outer(rows[:, :, 0]), outer(rows[:, :, 1:4]), outer(whole))
 
 
-def look_columns(problem: PackedProblem) -> list[int]:
-    """The shared variables that looks depend on besides their point: window edge, sound speed, radius."""
-    columns = problem.columns
-    return [at for at in (columns.edge, columns.sound_speed, columns.radius) if at is not None]
+def look_columns(columns: Columns) -> slice:
+    """The columns of the constants that looks depend on: the first ones of the rig's."""
+    return slice(columns.first_constant, columns.first_constant + len(columns.of_looks))
 
 
-def look_rows(problem: PackedProblem, state: SharedState, points: FloatArray) -> FloatArray:
+def look_rows(problem: PackedProblem, state: SharedState, points: FloatArray, wanted: Sequence[int] = ()) -> FloatArray:
     """Looks against points (L, 3, S), TRUS mm: (L, 3, 4 + K, S) over (x, range, rotation).
 
-    The residual, its derivatives by the point, and by the K variables of :func:`look_columns`.
+    The residual, its derivatives by the point, and by the K ``wanted`` constants. Axes of the array's frame: along the
+    array, tangential (towards larger stage angles), radial (docs/model.md, section 3).
     """
-    looks, columns = problem.looks, problem.columns
-    scan, heard_mm = looks.scan_rad[:, None], looks.range_mm[:, None]
-    radius = state.radius_mm
+    looks = problem.looks
+    c = inner(state.constants)
+    x, heard_mm = looks.x_mm[:, None], looks.range_mm[:, None]
+    scan = looks.scan_rad[:, None] - looks.sweep[:, None] * c[Constant.BACKLASH]
     sin_scan, cos_scan = np.sin(scan), np.cos(scan)
-    dy = points[:, 1] - radius * sin_scan
-    dz = points[:, 2] - radius * cos_scan
-    distance = np.maximum(np.sqrt(dy * dy + dz * dz), 1e-9)
-    sin_theta, cos_theta = dy / distance, dz / distance
-    sin_delta = sin_theta * cos_scan - cos_theta * sin_scan
-    cos_delta = cos_theta * cos_scan + sin_theta * sin_scan
-    heard = state.sound_speed_ratio * heard_mm
+    across = cos_scan * points[:, 1] - sin_scan * points[:, 2]
+    out_from_axis = sin_scan * points[:, 1] + cos_scan * points[:, 2]
+    radius = problem.radius_mm + c[Constant.RADIUS]
+    px, py, pz = points[:, 0], across - c[Constant.ARRAY_OFFSET], out_from_axis - radius
+    # The array's axes, to first order in its tilts.
+    in_plane, radial, steer = c[Constant.TILT_IN_PLANE], c[Constant.TILT_RADIAL], c[Constant.TILT_ELEVATION]
+    qx = px + py * radial + pz * in_plane
+    qy = py - pz * steer - px * radial
+    qz = pz - px * in_plane + py * steer
+    distance = np.maximum(np.sqrt(qy * qy + qz * qz), 1e-9)
+    sin_delta, cos_delta = qy / distance, qz / distance
+    heard = (1.0 + c[Constant.SOUND_SPEED]) * heard_mm + c[Constant.RANGE_OFFSET]
     towards = radius + heard * cos_delta
     rotation = np.arctan2(heard * sin_delta, towards)
     square = radius * (towards + heard * cos_delta) + heard * heard
     per_mm = heard * (heard + radius * cos_delta) / (square * distance)
 
-    out = np.zeros((len(looks.scan_rad), 3, 4 + len(look_columns(problem)), distance.shape[-1]))
-    out[:, 0, 0] = points[:, 0] - looks.x_mm[:, None]
+    out = np.zeros((len(looks.scan_rad), 3, 4 + len(wanted), distance.shape[-1]))
+    gain = looks.edge_gain[:, None]
+    out[:, 0, 0] = qx - (1.0 + c[Constant.PITCH]) * x
     out[:, 1, 0] = distance - heard
-    out[:, 2, 0] = rotation - looks.centre_rad[:, None] - looks.edge_gain[:, None] * state.edge_rad
-    out[:, 0, 1] = 1.0
-    out[:, 1, 2], out[:, 1, 3] = sin_theta, cos_theta
-    out[:, 2, 2], out[:, 2, 3] = per_mm * cos_theta, -per_mm * sin_theta
-    out[:, 2, 4] = -looks.edge_gain[:, None]
-    place = 5
-    if columns.sound_speed is not None:
-        out[:, 1, place], out[:, 2, place] = -heard_mm, radius * sin_delta / square * heard_mm
-        place += 1
-    if columns.radius is not None:
-        # Moving the elements outwards by dR moves the arc's centre along the plane: range and theta' both change.
-        out[:, 1, place], out[:, 2, place] = -cos_delta, per_mm * sin_delta - heard * sin_delta / square
+    out[:, 2, 0] = rotation - looks.centre_rad[:, None] - gain * c[Constant.WINDOW_EDGE] - c[Constant.WINDOW_CENTRE]
+    # Rows over the point in the array's frame, then over it in the stage's, then in TRUS.
+    by_y, by_z = per_mm * cos_delta, -per_mm * sin_delta
+    rows = (
+        (1.0, radial, in_plane),
+        (-(sin_delta * radial + cos_delta * in_plane), sin_delta + cos_delta * steer, cos_delta - sin_delta * steer),
+        (-(by_y * radial + by_z * in_plane), by_y + by_z * steer, by_z - by_y * steer),
+    )
+    for i, (first, second, third) in enumerate(rows):
+        out[:, i, 1] = first
+        out[:, i, 2] = second * cos_scan + third * sin_scan
+        out[:, i, 3] = third * cos_scan - second * sin_scan
+    by_heard = radius * sin_delta / square
+    for place, constant in enumerate(wanted, 4):
+        for i, (_, second, third) in enumerate(rows):
+            if constant == Constant.RADIUS:
+                out[:, i, place] = -third
+            elif constant == Constant.ARRAY_OFFSET:
+                out[:, i, place] = -second
+            elif constant == Constant.BACKLASH:
+                out[:, i, place] = looks.sweep[:, None] * (second * out_from_axis - third * across)
+        if constant == Constant.WINDOW_EDGE:
+            out[:, 2, place] = -gain
+        elif constant == Constant.WINDOW_CENTRE:
+            out[:, 2, place] = -1.0
+        elif constant == Constant.RADIUS:
+            out[:, 2, place] -= heard * sin_delta / square
+        elif constant == Constant.SOUND_SPEED:
+            out[:, 1, place], out[:, 2, place] = -heard_mm, by_heard * heard_mm
+        elif constant == Constant.RANGE_OFFSET:
+            out[:, 1, place], out[:, 2, place] = -1.0, by_heard
+        elif constant == Constant.PITCH:
+            out[:, 0, place] = -x
+        elif constant == Constant.TILT_IN_PLANE:
+            out[:, 0, place], out[:, 1, place], out[:, 2, place] = pz, -cos_delta * px, -by_z * px
+        elif constant == Constant.TILT_RADIAL:
+            out[:, 0, place], out[:, 1, place], out[:, 2, place] = py, -sin_delta * px, -by_y * px
+        elif constant == Constant.TILT_ELEVATION:
+            out[:, 1, place] = cos_delta * py - sin_delta * pz
+            out[:, 2, place] = by_z * py - by_y * pz
     return out
+
+
+def expected_rotation(problem: PackedProblem, state: SharedState) -> FloatArray:
+    """(S, L) centres of the looks' rotation priors, with the window's edge and centre as estimated."""
+    looks = problem.looks
+    edge, centre = state.constant(Constant.WINDOW_EDGE), state.constant(Constant.WINDOW_CENTRE)
+    return np.asarray(looks.centre_rad + looks.edge_gain * edge[:, None] + centre[:, None])
 
 
 def initial_private(problem: PackedProblem, state: SharedState) -> PrivateState:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, hat, log_so3
 from fgreg.graph.packing import BeamArrays, EpochLink, PackedProblem
 from fgreg.graph.reduced_blocks import (
@@ -31,6 +32,7 @@ from fgreg.graph.reduced_blocks import (
     PrivateState,
     Whitening,
     along_beam,
+    by_constants,
     cross,
     initial_private,
     inner,
@@ -89,8 +91,9 @@ class _System:
         line: (n, 4, 2, S) residual and derivative by the point, camera axes, of points ``camera_p`` (n, 3, S).
         laser_p: (n, 3, S) those points in the chart's nominal frame. whitening: of the lines.
         beam_by_point: (B, 3, 2, S) derivative by the PM, TRUS axes.
-        look: (L, 3, 4 + K, S) residual, derivatives by the PM and by the variables of ``look_columns``; ``look_raw``
-            the same in mm and rad.
+        by_turn: (n, 3, 2, S) derivative of the residuals by the markers' turns, mm per rad.
+        look: (L, 3, 4 + K, S) residual, derivatives by the PM and by the constants that looks depend on (K = 0 where
+            derivatives by shared variables are not wanted); ``look_raw`` the same in mm and rad.
         aim_residual_mm: (A, 2, S) in the chart's coordinates.
         point_step: (J, 3, S), point_covariance: (J, 3, 3, S).
         pm_cost: (J, S), aim_cost: (A, S), prior_cost: (S,).
@@ -99,6 +102,7 @@ class _System:
     beams: Groups
     looks: Groups
     line: FloatArray
+    by_turn: FloatArray
     camera_p: FloatArray
     laser_p: FloatArray
     whitening: Whitening
@@ -124,7 +128,7 @@ class _System:
         return np.asarray(self.pm_cost.sum(axis=0) + self.aim_cost.sum(axis=0) + self.prior_cost)
 
 
-def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -> _System:
+def _system(problem: PackedProblem, state: SharedState, private: PrivateState, *, derivatives: bool = False) -> _System:
     pms, count = len(problem.pms), len(problem.beam_pm)
     chart = Chart.of(state)
     beams, looks = Groups.of(problem.beam_pm, pms), Groups.of(problem.look_pm, pms)
@@ -141,15 +145,17 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
     # The error of an aim's measured spot is eliminated like the marker's error.
     by_spot = block.rows[count:, 1:]
     spot_spread = _times_each(problem.aim_spot_covariance, by_spot)
+    expected_shift = shift
     if len(shift):
-        block.rows[count:, 0] -= np.einsum("niks,nis->nks", by_spot, shift)
+        expected_shift = by_constants(problem.aim_spot_by_constants, chart)
+        block.rows[count:, 0] -= np.einsum("niks,nis->nks", by_spot, shift - expected_shift)
         for place, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
             block.covariance[count:, place] += np.einsum("nks,nks->ns", by_spot[:, :, i], spot_spread[:, :, j])
     whitening = Whitening.of(block.covariance)
     line = whitening.rows(block.rows)
     by_point = np.einsum("nijs,njks->niks", rotation, line[:count, 1:])
 
-    look_raw = look_rows(problem, state, looks.spread(points))
+    look_raw = look_rows(problem, state, looks.spread(points), problem.columns.of_looks if derivatives else ())
     look = _times_each(_look_root(problem.looks.weight), look_raw)
     look_by_point, look_residual = look[:, :, 1:4], look[:, :, 0]
 
@@ -172,12 +178,13 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState) -
         trus_p_pm=outer(points + point_step),
         beam_error=outer(error[:count]),
         aim_error=outer(error[count:]),
-        aim_shift=outer(-np.einsum("niks,nks->nis", spot_spread, back[count:])),
+        aim_shift=outer(expected_shift - np.einsum("niks,nks->nis", spot_spread, back[count:])),
     )
     return _System(
         beams=beams,
         looks=looks,
         line=line,
+        by_turn=block.by_turn,
         camera_p=camera_p,
         laser_p=block.laser_p,
         whitening=whitening,
@@ -258,7 +265,7 @@ def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> 
     offset = system.look_raw[:, 2, 0] + np.einsum("nis,nis->ns", by_point, system.looks.spread(system.point_step))
     spread = np.einsum("nijs,njs->nis", system.looks.spread(system.point_covariance), by_point)
     variance = np.einsum("nis,nis->ns", by_point, spread)
-    return log_shape_ratios(problem, state.edge_rad, offset.T, variance.T)
+    return log_shape_ratios(problem, state.constant(Constant.WINDOW_EDGE), offset.T, variance.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,11 +297,18 @@ def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _Sys
     chart[:, 0, 0] = chart[:, 1, 1] = -1.0
     chart[:, 2, 0] = chart[:, 3, 1] = -system.laser_p[:, 2]
     line[..., columns.beam : columns.beam + 4] = system.whitening.rows(chart).transpose(3, 0, 2, 1)
-    if columns.bias is not None:
-        line[..., columns.bias : columns.bias + 3] = by_camera.transpose(3, 0, 2, 1)
+    of_camera = columns.of_camera
+    if of_camera:
+        at = [constant - CAMERA.start for constant in of_camera]
+        gain = np.concatenate([problem.beams.by_constants, problem.aims.by_constants])[..., at]
+        turned, shifted = gain[:, :3].swapaxes(1, 2), gain[:, 3:].swapaxes(1, 2)
+        moved = system.whitening.rows(_times_each(turned, system.by_turn)) - _times_each(shifted, by_camera)
+        if lines > pms:
+            moved[pms:] += _times_each(problem.aim_spot_by_constants[..., at].swapaxes(1, 2), by_camera[pms:])
+        line[..., columns.size - len(of_camera) :] = moved.transpose(3, 0, 2, 1)
     h_ps = _summed(system.beams, outer(system.beam_by_point) @ line[:, :pms])
     by_look = np.einsum("nkis,nkjs->nijs", system.look[:, :, 1:4], system.look[:, :, 4:])
-    h_ps[..., look_columns(problem)] += outer(system.looks.sum(by_look))
+    h_ps[..., look_columns(columns)] += outer(system.looks.sum(by_look))
     return _SharedDerivatives(line, h_ps, -outer(system.point_covariance) @ h_ps)
 
 
@@ -329,17 +343,17 @@ class Parts:
 def contributions(problem: PackedProblem, state: SharedState, private: PrivateState) -> Parts:
     """The terms whose sum is :func:`evaluate`."""
     size, pms = problem.columns.size, len(problem.beam_pm)
-    system = _system(problem, state, private)
+    system = _system(problem, state, private, derivatives=True)
     by = _shared_derivatives(problem, state, system)
-    look, columns = system.look, np.array(look_columns(problem))
+    look, rig = system.look, look_columns(problem.columns)
     line_t, residual = transposed(by.line), outer(system.line[:, 0])
     line_hessian, line_gradient = line_t @ by.line, times(line_t, residual)
     hessian = _summed(system.beams, line_hessian[:, :pms]) + transposed(by.h_ps) @ by.point_gain
     gradient = _summed(system.beams, line_gradient[:, :pms]) + times(transposed(by.h_ps), outer(system.point_step))
     look_hessian = np.einsum("nkis,nkjs->nijs", look[:, :, 4:], look[:, :, 4:])
-    hessian[..., columns[:, None], columns] += outer(system.looks.sum(look_hessian))
+    hessian[..., rig, rig] += outer(system.looks.sum(look_hessian))
     look_gradient = np.einsum("nkis,nks->nis", look[:, :, 4:], look[:, :, 0])
-    gradient[..., columns] += outer(system.looks.sum(look_gradient))
+    gradient[..., rig] += outer(system.looks.sum(look_gradient))
     prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
     _add_priors(problem, state, prior_gradient, prior_hessian)
     return Parts(
@@ -399,20 +413,20 @@ def evaluate(
         private: linearisation point of the private variables; refined once here (returned in ``private``).
         loss: of each PM's and aim's chi square.
     """
-    system = _system(problem, state, private)
+    system = _system(problem, state, private, derivatives=True)
     by = _shared_derivatives(problem, state, system)
     weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(system.moved_mm)))
-    look, columns, pms = system.look, np.array(look_columns(problem)), len(problem.beam_pm)
+    look, rig, pms = system.look, look_columns(problem.columns), len(problem.beam_pm)
     line, h_ps, look_t = by.line, by.h_ps, look[:, :, 4:]
     if loss is not least_squares:
         line = line * np.concatenate([weights.pm[:, problem.beam_pm], weights.aim], axis=1)[..., None, None]
         h_ps = h_ps * weights.pm[..., None, None]
         look_t = look_t * inner(weights.pm)[problem.look_pm, None, None]
     hessian = _stacked(line, by.line) + _stacked(h_ps, by.point_gain)
-    hessian[:, columns[:, None], columns] += np.einsum("nkis,nkjs->sij", look_t, look[:, :, 4:])
+    hessian[:, rig, rig] += np.einsum("nkis,nkjs->sij", look_t, look[:, :, 4:])
     gradient = _stacked(line, outer(system.line[:, 0])[..., None])
     gradient = (gradient + _stacked(h_ps, outer(system.point_step)[..., None]))[..., 0]
-    gradient[:, columns] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
+    gradient[:, rig] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
     _add_priors(problem, state, gradient, hessian)
     lambda_mm = outer(along_beam(state, system.laser_p))
     return Evaluation(
@@ -439,21 +453,13 @@ def _stacked(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _prior_deviation(problem: PackedProblem, state: SharedState) -> FloatArray:
-    """(S, D) shared variables less their prior means, zero where there is no prior."""
-    columns = problem.columns
-    deviation = np.zeros((state.count, columns.size))
-    deviation[:, columns.edge] = state.edge_rad
-    if columns.bias is not None:
-        deviation[:, columns.bias : columns.bias + 3] = state.bias_mm
-    if columns.sound_speed is not None:
-        deviation[:, columns.sound_speed] = state.sound_speed_ratio - problem.sound_speed_mean
-    if columns.radius is not None:
-        deviation[:, columns.radius] = state.radius_mm - problem.radius_mm
-    return deviation
+    """(S, K) constants that are variables, less their prior means."""
+    return np.asarray(state.constants[:, problem.columns.constants] - problem.prior.mean)
 
 
 def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
-    cost = np.sum(problem.prior_information * _prior_deviation(problem, state) ** 2, axis=1)
+    deviation = _prior_deviation(problem, state)
+    cost = np.sum(deviation * (deviation @ problem.prior.information), axis=1)
     for link in problem.links:
         residual, _ = _link_residual(link, state)
         cost = cost + np.sum(residual * (residual @ link.information), axis=1)
@@ -465,9 +471,9 @@ def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
 
 def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray, hessian: FloatArray) -> None:
     """Gaussian priors of the shared variables and links between epochs, added in place."""
-    gradient += problem.prior_information * _prior_deviation(problem, state)
-    diagonal = np.arange(problem.columns.size)
-    hessian[:, diagonal, diagonal] += problem.prior_information
+    rig = problem.columns.rig
+    gradient[:, rig] += _prior_deviation(problem, state) @ problem.prior.information
+    hessian[:, rig, rig] += problem.prior.information
     for link in problem.links:
         residual, jacobian = _link_residual(link, state)
         weighted = link.information @ jacobian

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform, rotation_to_direction
 from fgreg.graph.columns import Columns
 
@@ -19,17 +20,14 @@ class SharedState:
         rotation, translation_mm: ``trus_T_camera`` of each epoch, (S, E, 3, 3) and (S, E, 3).
         marker_T_nominal: (S, 4, 4) fixed frame of the beam chart.
         beam: (S, 4) chart (x, y, a, b): origin R0 (x, y, 0) + p0, direction R0 normalise(a, b, 1).
-        edge_rad: (S,). bias_mm: (S, 3). sound_speed_ratio: (S,). radius_mm: (S,).
+        constants: (S, COUNT) the rig's constants, deviations from the declared values (fgreg.model.systematic).
     """
 
     rotation: FloatArray
     translation_mm: FloatArray
     marker_T_nominal: FloatArray
     beam: FloatArray
-    edge_rad: FloatArray
-    bias_mm: FloatArray
-    sound_speed_ratio: FloatArray
-    radius_mm: FloatArray
+    constants: FloatArray
 
     @property
     def count(self) -> int:
@@ -42,20 +40,19 @@ class SharedState:
     def retract(self, step: FloatArray, columns: Columns) -> SharedState:
         """Move by ``step`` (S, D): ``rotation * Exp(omega)``, ``translation + rotation v``, additive otherwise."""
         poses = step[:, : 6 * columns.epochs].reshape(-1, columns.epochs, 6)
-        moved = replace(
+        constants = self.constants.copy()
+        constants[:, columns.constants] += step[:, columns.rig]
+        return replace(
             self,
             rotation=self.rotation @ exp_so3(poses[..., :3]),
             translation_mm=self.translation_mm + (self.rotation @ poses[..., 3:, None])[..., 0],
             beam=self.beam + step[:, columns.beam : columns.beam + 4],
-            edge_rad=self.edge_rad + step[:, columns.edge],
+            constants=constants,
         )
-        if columns.bias is not None:
-            moved = replace(moved, bias_mm=self.bias_mm + step[:, columns.bias : columns.bias + 3])
-        if columns.sound_speed is not None:
-            moved = replace(moved, sound_speed_ratio=self.sound_speed_ratio + step[:, columns.sound_speed])
-        if columns.radius is not None:
-            moved = replace(moved, radius_mm=self.radius_mm + step[:, columns.radius])
-        return moved
+
+    def constant(self, which: Constant) -> FloatArray:
+        """(S,) one of the constants."""
+        return np.asarray(self.constants[:, which])
 
     def trus_T_camera(self, epoch: int = 0) -> FloatArray:
         """(S, 4, 4) registrations of one epoch."""
@@ -85,20 +82,15 @@ def nominal_frame(origin_mm: FloatArray, direction: FloatArray) -> FloatArray:
     return make_transform(rotation_to_direction(direction), origin_mm)
 
 
-def make_state(
-    trus_T_camera: FloatArray, marker_T_nominal: FloatArray, radius_mm: float, beam: FloatArray | None = None
-) -> SharedState:
-    """Hypotheses from registrations (S, E, 4, 4) and beams (S, 4, 4); the other variables at their prior means."""
+def make_state(trus_T_camera: FloatArray, marker_T_nominal: FloatArray, beam: FloatArray | None = None) -> SharedState:
+    """Hypotheses from registrations (S, E, 4, 4) and beams (S, 4, 4); the constants as declared."""
     count = len(trus_T_camera)
     return SharedState(
         rotation=np.array(trus_T_camera[..., :3, :3], dtype=np.float64),
         translation_mm=np.array(trus_T_camera[..., :3, 3], dtype=np.float64),
         marker_T_nominal=np.array(np.broadcast_to(marker_T_nominal, (count, 4, 4)), dtype=np.float64),
         beam=np.zeros((count, 4)) if beam is None else np.array(beam, dtype=np.float64),
-        edge_rad=np.zeros(count),
-        bias_mm=np.zeros((count, 3)),
-        sound_speed_ratio=np.ones(count),
-        radius_mm=np.full(count, float(radius_mm)),
+        constants=np.zeros((count, COUNT)),
     )
 
 
@@ -111,13 +103,7 @@ def step_between(first: SharedState, second: SharedState, columns: Columns) -> F
         shift = second.translation_mm[:, k] - first.translation_mm[:, k]
         out[:, 6 * k + 3 : 6 * k + 6] = (back @ shift[..., None])[..., 0]
     out[:, columns.beam : columns.beam + 4] = second.beam - first.beam
-    out[:, columns.edge] = second.edge_rad - first.edge_rad
-    if columns.bias is not None:
-        out[:, columns.bias : columns.bias + 3] = second.bias_mm - first.bias_mm
-    if columns.sound_speed is not None:
-        out[:, columns.sound_speed] = second.sound_speed_ratio - first.sound_speed_ratio
-    if columns.radius is not None:
-        out[:, columns.radius] = second.radius_mm - first.radius_mm
+    out[:, columns.rig] = (second.constants - first.constants)[:, columns.constants]
     return out
 
 
@@ -158,6 +144,18 @@ class Quadratic:
         return Quadratic(
             self.state, self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian
         )
+
+
+def in_columns(quadratic: Quadratic, columns: Columns, other: Columns) -> Quadratic:
+    """A quadratic over other columns of the same epochs: zero for constants that it does not have."""
+    places = [
+        *range(other.first_constant),
+        *(other.first_constant + other.constants.index(c) for c in columns.constants),
+    ]
+    gradient, hessian = np.zeros(other.size), np.zeros((other.size, other.size))
+    gradient[places] = quadratic.gradient
+    hessian[np.ix_(places, places)] = quadratic.hessian
+    return replace(quadratic, gradient=gradient, hessian=hessian)
 
 
 def gaussian_prior(state: SharedState, covariance: FloatArray) -> Quadratic:

@@ -21,6 +21,8 @@ _TRANSFORM = Transform(max_translation_mm=math.inf, decimals=(9, 6))
 _COUNT = Integer(0, 2**31 - 1)
 _SIZE = Number(ANY_SIZE.low, ANY_SIZE.high, decimals=6)
 _ANGLE = Number(ANY_SIZE.low, ANY_SIZE.high, degrees=True, decimals=6)
+_FINE = Number(ANY_SIZE.low, ANY_SIZE.high, decimals=9)
+_NOT_NEGATIVE_FINE = Number(0.0, ANY_SIZE.high, decimals=9)
 _NOT_NEGATIVE = Number(0.0, ANY_SIZE.high, decimals=6)
 _TRE = Figure(0.0, ANY_SIZE.high, decimals=6)
 
@@ -60,12 +62,40 @@ class LaserEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class PredictedPart:
+    """Figures of a predicted error, mm."""
+
+    mean_mm: Annotated[float, Key("average over targets of sqrt(E|e|^2)", _TRE, name="mean")]
+    p95_mm: Annotated[float, Key("average over targets of the 95 % quantile of |e|", _TRE, name="p95")]
+    worst_mm: Annotated[float, Key("the largest of those quantiles", _TRE, name="worst")]
+
+
+@dataclass(frozen=True, slots=True)
 class PredictedTre:
     """Predicted target registration error, mm, from the posterior at each target."""
 
     mean_mm: Annotated[float, Key("average over targets of sqrt(E|e|^2)", _TRE, name="mean")]
     p95_mm: Annotated[float, Key("average over targets of the 95 % quantile of |e|", _TRE, name="p95")]
     worst_mm: Annotated[float, Key("the largest of those quantiles", _TRE, name="worst")]
+    random: Annotated[PredictedPart | None, Key("the part that more shots reduce", brief=True)] = None
+    systematic: Annotated[PredictedPart | None, Key("the part of the rig's constants", brief=True)] = None
+    seen: Annotated[
+        PredictedPart | None,
+        Key("the same for a target that the scanner itself shows with its own systematic error", brief=True),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class SystematicEstimate:
+    """One of the rig's constants: what is known of it before and after the session, and what it does."""
+
+    name: Annotated[str, Key("key of `systematic`, with an index where it has several", Text())]
+    prior_sigma: Annotated[float, Key("standard deviation before the session, in the key's unit", _NOT_NEGATIVE_FINE)]
+    value: Annotated[float, Key("estimate of the true value less the declared one", _FINE)]
+    sigma: Annotated[float, Key("its standard deviation", _NOT_NEGATIVE_FINE)]
+    observed: Annotated[float, Key("share of the prior variance that was removed", Number(0.0, 1.0, decimals=4))]
+    score: Annotated[float, Key("standard normal where the declared value and its deviation are right", _SIZE)]
+    worst_target_mm: Annotated[float, Key("RMS error at the worst target that is due to it", _NOT_NEGATIVE)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,6 +283,10 @@ class SessionEstimate:
     ]
     tracks: Annotated[tuple[TrackEstimate, ...], Key("one per track event", ListOf(record(TrackEstimate), empty=True))]
     aims: tuple[AimEstimate, ...] = ()
+    systematic: Annotated[
+        tuple[SystematicEstimate, ...],
+        Key("the rig's constants that are variables", ListOf(record(SystematicEstimate), empty=True), brief=True),
+    ] = ()
     timing: Annotated[
         Timing | None, Key("of `fgreg replay` only; null where there was no such event", name="timing_ms")
     ] = None

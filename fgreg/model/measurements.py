@@ -69,6 +69,7 @@ class Look:
         sweep: +1 or -1 where the plane was stepping towards larger or smaller ``scan_rad`` and stopped at its first
             hit, else 0.
         amplitude: comparable within one PM only.
+        window_sigma_rad: standard deviation of the window's half width, from PM to PM.
     """
 
     scan_rad: float
@@ -78,6 +79,7 @@ class Look:
     covariance: FloatArray
     sweep: int = 0
     amplitude: float | None = None
+    window_sigma_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,13 +98,17 @@ class Aim:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """A registration shot: one look at PM ``pm`` with the marker pose of its beam, in camera epoch ``epoch``."""
+    """A registration shot: one look at PM ``pm`` with the marker pose of its beam, in camera epoch ``epoch``.
+
+    ``beam_offset_mm``: standard deviation of the sound's origin beside the beam, each axis.
+    """
 
     t: float
     pm: int
     epoch: int
     marker: MarkerObservation
     look: Look
+    beam_offset_mm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -97,7 +97,7 @@ def window_priors(
     Args:
         range_mm: (n,) observed ranges, the depths at which the window's half width w is taken.
         sweep: (n,) +1, -1 or 0.
-        scan_sigma_rad: (n,) of the stage reading, added in square.
+        scan_sigma_rad: (n,) of the stage reading and of the window from PM to PM, added in square.
         sensitivity: the window.
         step_rad: the sweep's increment.
     """
@@ -117,10 +117,15 @@ def sensitivity_priors(looks: Sequence[Look], sensitivity: SensitivityModel, ste
     return window_priors(
         [look.range_mm for look in looks],
         [look.sweep for look in looks],
-        [look.scan_sigma_rad for look in looks],
+        _end_sigmas(looks),
         sensitivity,
         step_rad,
     )
+
+
+def _end_sigmas(looks: Sequence[Look]) -> list[float]:
+    """Standard deviation (rad) of each look's window ends against the plane: stage reading, and from PM to PM."""
+    return [math.hypot(look.scan_sigma_rad, look.window_sigma_rad) for look in looks]
 
 
 def sensitivity_prior(look: Look, sensitivity: SensitivityModel, step_rad: float) -> SensitivityPrior:
@@ -161,7 +166,7 @@ def window_shapes(looks: Sequence[Look], sensitivity: SensitivityModel, step_rad
         high_rad=np.where(informed & (s < 0), -near, w),
         low_gain=np.where(informed, s, -1.0),
         high_gain=np.where(informed, s, 1.0),
-        soft_rad=np.maximum([look.scan_sigma_rad for look in looks], MIN_SOFTNESS_RAD).reshape(len(looks)),
+        soft_rad=np.maximum(_end_sigmas(looks), MIN_SOFTNESS_RAD).reshape(len(looks)),
     )
 
 

@@ -7,14 +7,14 @@ that names the key.
 
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray, as_float_array
-from fgreg.model.systematic import SYSTEMATIC, Systematic
+from fgreg.model.systematic import CAREFUL_LAB, SYSTEMATIC, Systematic
 from fgreg.schema.kinds import (
     COORDINATE_MM,
     NOISE_MM,
@@ -484,11 +484,16 @@ class SessionModel:
             default="those of a careful lab",
             brief=True,
         ),
-    ] = Systematic()  # noqa: RUF009 - frozen
+    ] = CAREFUL_LAB
 
     def __post_init__(self) -> None:
         if not len(self.targets_mm):
             object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
+
+    @property
+    def noise_per_pm(self) -> NoiseModel:
+        """The noise, without that from PM to PM where the session declares no systematic errors at all."""
+        return self.noise if self.systematic.declared else replace(self.noise, beam_offset_mm=0.0, window_rad=0.0)
 
     @property
     def constant_sigmas(self) -> FloatArray:

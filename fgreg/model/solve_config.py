@@ -49,7 +49,7 @@ class SolveConfig:
     amplitude_sigma: float = 0.05
     estimate_sound_speed: bool = False
     estimate_radius: bool = False
-    sound_speed_sigma: float = 0.01
+    sound_speed_sigma: float = 0.03
     radius_sigma_mm: float = 0.3
     posterior_effective: float = 300.0
     posterior_samples: int = 4500

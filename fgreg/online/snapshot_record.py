@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.geometry.rig import COUNT
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import SensitivityModel, SessionModel, StageModel
 from fgreg.model.tissue_surface import MOST_POINTS, TissueSurface
@@ -72,9 +73,7 @@ class Layout:
                 ("marker_T_nominal", "f8", (4, 4)),
                 ("beam", "f8", (4,)),
                 ("origin_shift_mm", "f8"),
-                ("edge_rad", "f8"),
-                ("bias_mm", "f8", (3,)),
-                ("sound_speed_ratio", "f8"),
+                ("constants", "f8", (COUNT,)),
                 ("radius_mm", "f8"),
                 ("places", "i8"),
                 ("axes", "f8", (3, 3)),
@@ -97,8 +96,8 @@ def layout_of(sensitivity: SensitivityModel, epochs: int = EPOCHS_KEPT) -> Layou
 
 
 _SURFACE = ("axes", "centre", "trend", "trend_covariance", "relief_mm", "inflation")
-_SCALARS = ("t", "pairs", "origin_shift_mm", "edge_rad", "sound_speed_ratio", "radius_mm")
-_ARRAYS = ("marker_T_nominal", "beam", "bias_mm")
+_SCALARS = ("t", "pairs", "origin_shift_mm", "radius_mm")
+_ARRAYS = ("marker_T_nominal", "beam", "constants")
 
 
 def encode_snapshot(snapshot: Snapshot, record: Record) -> None:
@@ -195,9 +194,7 @@ class SnapshotDecoder:
             marker_T_nominal=record["marker_T_nominal"],
             beam=record["beam"],
             origin_shift_mm=float(record["origin_shift_mm"]),
-            edge_rad=float(record["edge_rad"]),
-            bias_mm=record["bias_mm"],
-            sound_speed_ratio=float(record["sound_speed_ratio"]),
+            constants=record["constants"],
             radius_mm=float(record["radius_mm"]),
             sensitivity=sensitivity,
             stage=stage,

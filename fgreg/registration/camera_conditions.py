@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, inverse, transform_points
 from fgreg.model.camera_dependence import CONSTANTS, MODEL_PX, column, plausible_share
 from fgreg.model.estimate import Verdict
@@ -21,7 +22,7 @@ from fgreg.model.measurements import Aim, CameraDependence, Measurements, Pair
 from fgreg.model.plausible import implausible_measurements, implausible_setup
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.model.systematic import CAMERA, TEXTS, Constant, Systematic
+from fgreg.model.systematic import TEXTS, Systematic
 from fgreg.registration.verdict import Condition
 
 ALARM_P = 4.65e-4

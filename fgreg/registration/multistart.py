@@ -15,7 +15,7 @@ import numpy as np
 
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import BoolArray, FloatArray, inverse, transform_points
-from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.packing import PackedProblem, pack, search_sigmas
 from fgreg.graph.reduced_blocks import arc_points
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state, nominal_frame, stack_states
@@ -105,23 +105,23 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
         raise EstimationError("no aims and no initial.marker_T_laser: the beam has no start; take at least 6 aim shots")
     if not aims:
         return Calibration(tuple(candidates), everything)
-    alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model)
-    found = optimize(alone, _beam_states(candidates, model))
+    alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model, sigmas=search_sigmas(model))
+    found = optimize(alone, _beam_states(candidates))
     if len(aims) > MIN_INLIER_AIMS and not _is_clean(alone, found):
         candidates += [nominal_frame(origin, direction) for origin, direction in consensus_beams(aims)]
-        robust = graduated(alone, _beam_states(candidates, model), robust_aims=True)
+        robust = graduated(alone, _beam_states(candidates), robust_aims=True)
         none = np.zeros(0, dtype=bool)
         kept = select_inliers(alone, robust.state.take([0]), none, robust.aim_inlier[0]).aim_inlier
         if MIN_INLIER_AIMS <= kept.sum() < len(aims):
             fitting = tuple(aim for aim, keep in zip(aims, kept, strict=True) if keep)
-            alone = pack(Measurements(fitting, (), measurements.epochs[:1]), model)
-            found = optimize(alone, _beam_states(candidates, model))
+            alone = pack(Measurements(fitting, (), measurements.epochs[:1]), model, sigmas=search_sigmas(model))
+            found = optimize(alone, _beam_states(candidates))
             return Calibration(tuple(_beams(found)), kept)
     return Calibration(tuple(_beams(found)), everything)
 
 
-def _beam_states(frames: list[FloatArray], model: SessionModel) -> SharedState:
-    return make_state(np.tile(np.eye(4), (len(frames), 1, 1, 1)), np.array(frames), model.probe.radius_mm)
+def _beam_states(frames: list[FloatArray]) -> SharedState:
+    return make_state(np.tile(np.eye(4), (len(frames), 1, 1, 1)), np.array(frames))
 
 
 def _beams(found: Optimum) -> list[FloatArray]:
@@ -170,7 +170,9 @@ def _mirrored(problem: PackedProblem) -> PackedProblem:
 def _other_way(problem: PackedProblem) -> PackedProblem:
     """The same data with the sign of every sweep reversed."""
     looks = problem.looks
-    return replace(problem, looks=replace(looks, centre_rad=-looks.centre_rad, edge_gain=-looks.edge_gain))
+    return replace(
+        problem, looks=replace(looks, sweep=-looks.sweep, centre_rad=-looks.centre_rad, edge_gain=-looks.edge_gain)
+    )
 
 
 def _starts(problem: PackedProblem, frames: Sequence[FloatArray], model: SessionModel) -> SharedState:
@@ -182,9 +184,9 @@ def _starts(problem: PackedProblem, frames: Sequence[FloatArray], model: Session
         origin = (beams.rotation @ frame[:3, 3] + beams.translation_mm)[problem.look_beam]
         direction = (beams.rotation @ frame[:3, 2])[problem.look_beam]
         starts = registration_starts(origin, direction, arcs)
-        states.append(make_state(starts[:, None], frame, model.probe.radius_mm))
+        states.append(make_state(starts[:, None], frame))
     if model.initial_trus_T_camera is not None:
-        states.append(make_state(model.initial_trus_T_camera[None, None], frames[0], model.probe.radius_mm))
+        states.append(make_state(model.initial_trus_T_camera[None, None], frames[0]))
     return stack_states(states)
 
 
@@ -219,7 +221,7 @@ def search_epoch(
     if len({pair.pm for pair in pairs}) < 3:
         return EpochSearch((), None)
     subset = replace(measurements, pairs=_search_subset(pairs), epochs=measurements.epochs[:1])
-    problem = pack(subset, model)
+    problem = pack(subset, model, sigmas=search_sigmas(model))
     found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
     minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
     if len(problem.pms) > MIN_INLIER_PMS and not _is_clean(problem, found):
@@ -285,7 +287,7 @@ def _search_with_outliers(
         kept = np.ones(len(problem.pms), dtype=bool)
     names = {pm for pm, keep in zip(problem.pms, kept, strict=True) if keep}
     fitting = replace(measurements, pairs=tuple(pair for pair in measurements.pairs if pair.pm in names))
-    reduced = pack(fitting, model)
+    reduced = pack(fitting, model, sigmas=search_sigmas(model))
     states = [robust.state, *plain, _starts(reduced, frames, model)]
     found = optimize(reduced, stack_states(states), keep_within=keep_within)
     all_minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)
@@ -296,7 +298,7 @@ def _search_with_outliers(
         if both < RIVAL_OVERLAP * either:
             all_minima += (Minimum(level + float(robust.cost[index]) - base, robust.state.take([index])),)
     # The pairs without the aims show a marker that was swapped or moved between calibration and registration.
-    alone = pack(replace(measurements, aims=()), model)
+    alone = pack(replace(measurements, aims=()), model, sigmas=search_sigmas(model))
     free = graduated(alone, robust.state, keep_within=keep_within, wanted=base - aims_cost + OTHERS_WITHIN)
     return EpochSearch(
         tuple(sorted(all_minima, key=lambda minimum: minimum.cost)),
@@ -321,10 +323,10 @@ def _robust_starts(
     for frame in frames:
         starts = consensus_starts(problem, frame, SPOT_DISTANCE_MM)
         if len(starts):
-            states.append(make_state(starts[:, None], frame, model.probe.radius_mm))
+            states.append(make_state(starts[:, None], frame))
     if model.initial_trus_T_camera is not None or not states:
         guess = np.eye(4) if model.initial_trus_T_camera is None else model.initial_trus_T_camera
-        states.append(make_state(guess[None, None], frames[0], model.probe.radius_mm))
+        states.append(make_state(guess[None, None], frames[0]))
     return stack_states(states)
 
 

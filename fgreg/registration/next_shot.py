@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.errors import EstimationError
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import expected_tre_mm, target_jacobians
 from fgreg.geometry.transforms import (
     BoolArray,
@@ -30,7 +31,7 @@ from fgreg.geometry.transforms import (
     rotation_to_direction,
     transform_points,
 )
-from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.packing import PackedProblem, pack, pack_more
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate, pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
@@ -148,7 +149,7 @@ def advise(registration: Registration, *, epoch: int | None = None, count: int =
     state = registration.optimum.state
     transform = state.trus_T_camera(place)[0]
     block = slice(6 * place, 6 * place + 6)
-    problem = pack(Measurements((), found.pairs, registration.measurements.epochs), model)
+    problem = pack_more(found.pairs, model, registration.problem.columns)
     added = _contributions(problem, state, found.trus_p_mm)[2]
     after = np.linalg.inv(registration.optimum.evaluation.hessian[0] + added)[:, block, block]
     expected = expected_tre_mm(after, transform, model.targets_mm).mean(axis=-1)
@@ -245,7 +246,8 @@ def propose(registration: Registration, place: int) -> Candidates:
     )
     lambda_mm = float(np.median(at.lambda_mm[0, beams]))
     on_beam = state.beam_origin()[0] + lambda_mm * state.beam_direction()[0]
-    camera_T_marker = make_transform(turned, camera_p - turned @ on_beam + state.bias_mm[0])
+    bias = state.constants[0, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
+    camera_T_marker = make_transform(turned, camera_p - turned @ on_beam + bias)
     sweep = _sweep_side(registration, place)
     scan = np.array([_first_detection(p, sweep, model) for p in trus_p_spot])
     low, high = sorted(model.stage.scan_from_device(limit) for limit in model.stage.limits_device_rad)
@@ -270,6 +272,7 @@ def propose(registration: Registration, place: int) -> Candidates:
                 id=number,
             ),
             look=_exact_look(trus_p_spot[i], float(scan[i]), sweep, scan_sigma, look_covariance, model),
+            beam_offset_mm=model.noise_per_pm.beam_offset_mm,
         )
         for number, i in enumerate(index)
     )
@@ -365,6 +368,7 @@ def _exact_look(
         range_mm=math.hypot(float(dy), float(dz)),
         covariance=as_float_array(covariance, 2, 2),
         sweep=sweep,
+        window_sigma_rad=model.noise_per_pm.window_rad,
     )
 
 

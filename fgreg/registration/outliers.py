@@ -111,7 +111,7 @@ def log_outlier(problem: PackedProblem, pm_inlier: BoolArray) -> FloatArray:
 
 def free_variables(problem: PackedProblem) -> int:
     """Number of the shared variables, less the number of equations that are their priors."""
-    known = int(np.sum(problem.prior_information > 0)) + 6 * len(problem.links)
+    known = len(problem.columns.constants) + 6 * len(problem.links)
     if problem.anchor is not None:
         hessian = problem.anchor.hessian
         scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))

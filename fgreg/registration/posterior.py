@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem, only_aims, without_aims
@@ -183,37 +184,84 @@ def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
     return replace(private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
 
 
+def _split(columns: Columns) -> tuple[IntArray, IntArray]:
+    """Columns that are sampled, and those of the constants that enter (nearly) linearly, all but the window's edge."""
+    linear = [columns.at(Constant(c)) for c in columns.constants if c != Constant.WINDOW_EDGE]
+    rest = np.setdiff1d(np.arange(columns.size), np.array(linear, dtype=np.int64))
+    return rest, np.array(linear, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Conditional:
+    """Gaussian of the linear constants (C,) given the sampled variables (X,), about a mode: ``origin + gain x``."""
+
+    origin: FloatArray
+    gain: FloatArray
+    root: FloatArray
+
+    @classmethod
+    def of(cls, centre: FloatArray, covariance: FloatArray, sampled: IntArray, linear: IntArray) -> _Conditional:
+        """From a mode's tangent (D,) and its covariance (D, D)."""
+        cross = covariance[np.ix_(linear, sampled)]
+        gain = np.asarray(np.linalg.solve(covariance[np.ix_(sampled, sampled)], cross.T).T, dtype=np.float64)
+        left = covariance[np.ix_(linear, linear)] - gain @ cross.T
+        return cls(centre[linear] - gain @ centre[sampled], gain, _root(0.5 * (left + left.T)))
+
+    def log(self, x: FloatArray, c: FloatArray) -> FloatArray:
+        """(S,) log density of constants (S, C) at (S, X), up to a constant common to all modes."""
+        off = np.linalg.solve(self.root, (c - self.origin - x @ self.gain.T).T)
+        return np.asarray(-0.5 * np.sum(off**2, axis=0) - np.log(np.diag(self.root)).sum())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Students:
-    """Mixture of K multivariate Student densities, grouped by shape.
+    """Mixture of K multivariate Student densities of the sampled variables, grouped by shape.
+
+    The linear constants are drawn given these. Conditional on a sample their density is nearly Gaussian, so that they
+    cost no effective samples, however many they are.
 
     Attributes:
-        centre: (K, D). group: (K,) number of each one's root. scale: (K,) factor on it. share: (K,).
-        root: (G, D, D) lower triangular Cholesky factors of the shapes.
+        sampled (X,), linear (C,): columns.
+        centre: (K, X). group: (K,) number of each one's root. scale: (K,) factor on it. share: (K,).
+        root: (G, X, X) lower triangular Cholesky factors of the shapes.
+        mode: (K,) whose conditional holds for each one. conditional: one for each mode.
     """
 
+    sampled: IntArray
+    linear: IntArray
     centre: FloatArray
     group: IntArray
     scale: FloatArray
     share: FloatArray
     root: FloatArray
+    mode: IntArray
+    conditional: tuple[_Conditional, ...]
 
     def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """(count, D) samples of all variables."""
         which = rng.choice(len(self.share), count, p=self.share)
         normal = rng.standard_normal((count, self.centre.shape[1]))
         stretch = self.scale[which] * np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
-        out = self.centre[which]
+        x = self.centre[which]
         for group, root in enumerate(self.root):
             mine = self.group[which] == group
-            out[mine] += (normal[mine] * stretch[mine, None]) @ root.T
+            x[mine] += (normal[mine] * stretch[mine, None]) @ root.T
+        out = np.empty((count, len(self.sampled) + len(self.linear)))
+        out[:, self.sampled] = x
+        noise = rng.standard_normal((count, len(self.linear)))
+        for mode, given in enumerate(self.conditional):
+            rows = np.flatnonzero(self.mode[which] == mode)
+            out[np.ix_(rows, self.linear)] = given.origin + x[rows] @ given.gain.T + noise[rows] @ given.root.T
         return out
 
-    def log(self, x: FloatArray) -> FloatArray:
-        """(S,) log density up to a constant common to all mixtures."""
+    def log(self, samples: FloatArray) -> FloatArray:
+        """(S,) log density of all variables (S, D), up to a constant common to all mixtures."""
+        x, c = samples[:, self.sampled], samples[:, self.linear]
         size = x.shape[1]
-        out = np.empty((len(self.root), len(x)))
-        for group, root in enumerate(self.root):
-            mine = np.flatnonzero(self.group == group)
+        out = []
+        for mode, group in sorted({*zip(self.mode.tolist(), self.group.tolist(), strict=True)}):
+            root = self.root[group]
+            mine = np.flatnonzero((self.group == group) & (self.mode == mode))
             # Distances from the group's first centre keep the squares small, which is more accurate.
             origin = self.centre[mine[0]]
             at = np.linalg.solve(root, (x - origin).T)
@@ -221,8 +269,9 @@ class _Students:
             square = np.sum(centre**2, axis=0)[:, None] - 2.0 * centre.T @ at + np.sum(at**2, axis=0)
             square = np.maximum(square, 0.0) / (DEGREES_OF_FREEDOM * self.scale[mine, None] ** 2)
             kernel = np.exp(-0.5 * (DEGREES_OF_FREEDOM + size) * np.log(1.0 + square))
-            out[group] = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
-        return logsumexp(out, axis=0)
+            log = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
+            out.append(log + self.conditional[mode].log(x, c))
+        return logsumexp(np.array(out), axis=0)
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -241,25 +290,37 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
     return np.asarray(np.exp(power * log_weight - logsumexp(power * log_weight)))
 
 
-def _refitted(x: FloatArray, log_weight: FloatArray, fallback: FloatArray, rng: np.random.Generator) -> _Students:
-    """The next round's proposal: Students about the samples' mean and about some of the samples."""
+def _refitted(
+    first: _Students, x: FloatArray, log_weight: FloatArray, nearest: IntArray, rng: np.random.Generator
+) -> _Students:
+    """The next round's proposal: Students about the samples' mean and about some of the samples.
+
+    Args:
+        first: the first round's proposal; the shape of its first component is used as far as samples are few.
+        x: (S, D) samples. log_weight: (S,). nearest: (S,) mode of each.
+        rng: random numbers.
+    """
+    x = x[:, first.sampled]
     size = x.shape[1]
     weight = _tempered(log_weight, 3.0 * size)
     effective = 1.0 / float(np.sum(weight**2))
     centre = weight @ x
     spread = x - centre
     trust = effective / (effective + size)
+    fallback = first.root[0] @ first.root[0].T
     moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * fallback
-    root = _root(moment)
     # Kernel width of a density estimate from this many samples (Silverman).
     width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
-    at = x[rng.choice(len(x), KERNELS, p=weight)]
-    return _Students(
-        centre=np.concatenate([centre[None], centre[None], at]),
+    chosen = rng.choice(len(x), KERNELS, p=weight)
+    main = int(np.argmax(np.bincount(nearest, weight)))
+    return replace(
+        first,
+        centre=np.concatenate([centre[None], centre[None], x[chosen]]),
         group=np.zeros(2 + KERNELS, dtype=np.int64),
         scale=np.concatenate([[1.0, WIDE], np.full(KERNELS, width)]),
         share=np.concatenate([SHARES[:2], np.full(KERNELS, SHARES[2] / KERNELS)]),
-        root=root[None],
+        root=_root(moment)[None],
+        mode=np.concatenate([[main, main], nearest[chosen]]),
     )
 
 
@@ -310,19 +371,27 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
     rng = np.random.default_rng(seed)
     modes = tuple(light(mode) for mode in modes)
     columns, target = modes[0].problem.columns, _Target(modes)
-    fallback = modes[0].covariance
     starts = [np.zeros((1, columns.size))]
     starts += [
         tangent_of_step(step_between(modes[0].optimum.state, mode.optimum.state, columns), columns)
         for mode in modes[1:]
     ]
+    sampled, linear = _split(columns)
+    at = np.concatenate(starts)
     proposals = [
         _Students(
-            centre=np.concatenate(starts),
+            sampled=sampled,
+            linear=linear,
+            centre=at[:, sampled],
             group=np.arange(len(modes)),
             scale=np.ones(len(modes)),
             share=np.full(len(modes), 1.0 / len(modes)),
-            root=np.stack([_root(mode.covariance) for mode in modes]),
+            root=np.stack([_root(mode.covariance[np.ix_(sampled, sampled)]) for mode in modes]),
+            mode=np.arange(len(modes)),
+            conditional=tuple(
+                _Conditional.of(centre, mode.covariance, sampled, linear)
+                for centre, mode in zip(at, modes, strict=True)
+            ),
         )
     ]
     x, log_target, nearest = np.zeros((0, columns.size)), np.zeros(0), np.zeros(0, dtype=np.int64)
@@ -349,7 +418,7 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
             goal = TAILS * goal  # far from Gaussian: tails not drawn yet do not lower the effective number
         if _effective(log_weight) >= goal or len(x) >= most:
             break
-        proposals.append(_refitted(x, log_weight, fallback, rng))
+        proposals.append(_refitted(proposals[0], x, log_weight, nearest, rng))
         draws = min(max(300, len(x) // 2), max(most - len(x), 100))
     effective = _effective(log_weight) if np.isfinite(log_weight).any() else 0.0
     if effective < LEAST_SAMPLES:
@@ -425,12 +494,16 @@ def target_errors(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> F
     return np.asarray(np.sqrt(np.einsum("sin,sin->sn", moved, moved)))
 
 
-def predicted_tre(posterior: Posterior, epoch: int, targets_mm: FloatArray) -> PredictedTre:
-    """Predicted target registration error of one epoch (definitions: :class:`fgreg.model.estimate.PredictedTre`)."""
+def predicted_tre(
+    posterior: Posterior, epoch: int, targets_mm: FloatArray
+) -> tuple[PredictedTre, FloatArray, FloatArray]:
+    """Predicted target registration error of one epoch (definitions: :class:`fgreg.model.estimate.PredictedTre`).
+
+    Returns:
+        the figures; per target (n,), the root of the expected square and the 95 % quantile, mm.
+    """
     error = target_errors(posterior, epoch, targets_mm)
     quantiles = weighted_quantile(error, posterior.weight, QUANTILE)
-    return PredictedTre(
-        mean_mm=float(np.sqrt(posterior.weight @ error**2).mean()),
-        p95_mm=float(quantiles.mean()),
-        worst_mm=float(quantiles.max()),
-    )
+    root = np.sqrt(posterior.weight @ error**2)
+    figures = PredictedTre(float(root.mean()), float(quantiles.mean()), float(quantiles.max()))
+    return figures, root, quantiles

@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.expectation_propagation import inverse_hessian, propagate
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
-from fgreg.graph.shared_state import SharedState, make_state
+from fgreg.graph.shared_state import SharedState, in_columns, make_state
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.multistart import targets_moved
 from fgreg.registration.outliers import log_outlier
@@ -107,6 +108,7 @@ def _with_outlier_mixture(shots: Shots, mode: Mode) -> Mode:
         aims=problem.aims,
         aim_spot_mm=problem.aim_spot_mm,
         aim_spot_covariance=problem.aim_spot_covariance,
+        aim_spot_by_constants=problem.aim_spot_by_constants,
     )
     whole = replace(whole, log_outlier=log_outlier(whole, shots.pm_inlier))
     at = evaluate(whole, state, _settled(whole, state))
@@ -126,30 +128,31 @@ def sound_speed_from_residuals(registration: Registration) -> Estimated:
 
     For a registration in which it is not a variable: one Gauss-Newton step from its optimum with the ratio added.
     """
-    free = pack(registration.measurements, registration.model, sound_speed_sigma=FREE_SOUND_SPEED)
-    prior = registration.problem.anchor
-    if prior is not None:  # the ratio, which is the last variable, is not in it
-        gradient, hessian = np.pad(prior.gradient, (0, 1)), np.pad(prior.hessian, ((0, 1), (0, 1)))
-        free = replace(free, anchor=replace(prior, gradient=gradient, hessian=hessian))
-    optimum, column = registration.optimum, free.columns.sound_speed
+    sigmas = registration.model.constant_sigmas.copy()
+    sigmas[Constant.SOUND_SPEED] = FREE_SOUND_SPEED
+    free = pack(registration.measurements, registration.model, sigmas=sigmas)
+    if (prior := registration.problem.anchor) is not None:
+        free = replace(free, anchor=in_columns(prior, registration.problem.columns, free.columns))
+    optimum, column = registration.optimum, free.columns.at(Constant.SOUND_SPEED)
     at = evaluate(free, optimum.state, optimum.evaluation.private)
     inverse = inverse_hessian(at.hessian[0])
     if inverse is None or column is None:
         return Estimated(1.0, FREE_SOUND_SPEED)
-    return Estimated(1.0 - float(inverse[column] @ at.gradient[0]), float(np.sqrt(inverse[column, column])))
+    ratio = 1.0 + float(optimum.state.constant(Constant.SOUND_SPEED)[0])
+    return Estimated(ratio - float(inverse[column] @ at.gradient[0]), float(np.sqrt(inverse[column, column])))
 
 
 def estimated_sound_speed(found: Registration) -> Estimated | None:
     """The ratio of true to assumed sound speed where it is a variable."""
-    at = found.problem.columns.sound_speed
-    value = float(found.optimum.state.sound_speed_ratio[0])
+    at = found.problem.columns.at(Constant.SOUND_SPEED)
+    value = 1.0 + float(found.optimum.state.constant(Constant.SOUND_SPEED)[0])
     return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
 
 
 def estimated_radius(found: Registration) -> Estimated | None:
     """The probe's radius (mm) where it is a variable."""
-    at = found.problem.columns.radius
-    value = float(found.optimum.state.radius_mm[0])
+    at = found.problem.columns.at(Constant.RADIUS)
+    value = found.problem.radius_mm + float(found.optimum.state.constant(Constant.RADIUS)[0])
     return None if at is None else Estimated(value, float(np.sqrt(found.covariance[at, at])))
 
 
@@ -181,7 +184,8 @@ def _modes(registration: Registration) -> tuple[Mode, ...]:
                 continue
             transforms = np.stack([best.state.trus_T_camera(k) for k in range(problem.columns.epochs)], axis=1)
             transforms[0, place] = transform
-            start = make_state(transforms, best.state.marker_T_nominal[0], problem.radius_mm, best.state.beam)
+            start = make_state(transforms, best.state.marker_T_nominal[0], best.state.beam)
+            start = replace(start, constants=best.state.constants)
             found = optimize(problem, start)
             inverse = inverse_hessian(found.evaluation.hessian[0])
             cost = float(found.evaluation.cost[0])

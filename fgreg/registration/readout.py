@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import exp_so3, make_transform, rotation_to_direction
+from fgreg.graph.reduced_blocks import expected_rotation
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import AimEstimate, LaserEstimate, PairEstimate
 from fgreg.model.measurements import Measurements
-from fgreg.model.sensitivity import rotation_of_arc, wrap_angle
+from fgreg.model.sensitivity import wrap_angle
 from fgreg.model.session_model import SessionModel
 from fgreg.registration.register import Registration
 
@@ -84,7 +86,8 @@ def read_pairs(
     covariance = at.point_covariance[0] + gain @ registration.covariance @ np.swapaxes(gain, -1, -2)
     nis, kept = shots.innovations.pm, shots.pm_inlier
     looks = problem.looks
-    radius, ratio = float(state.radius_mm[0]), float(state.sound_speed_ratio[0])
+    radius = problem.radius_mm + float(state.constant(Constant.RADIUS)[0])
+    expected = expected_rotation(problem, state)[0]
     out: list[PairEstimate] = []
     look = 0
     for pair in measurements.pairs:
@@ -96,7 +99,7 @@ def read_pairs(
         dy = float(points[pm, 1]) - radius * np.sin(scan)
         dz = float(points[pm, 2]) - radius * np.cos(scan)
         delta = float(wrap_angle(np.arctan2(dy, dz) - scan))
-        rotation = float(rotation_of_arc(delta, ratio * float(looks.range_mm[look]), radius))
+        rotation = float(wrap_angle(at.look_residual[0, look, 2] + expected[look]))
         out.append(
             PairEstimate(
                 t=pair.t,

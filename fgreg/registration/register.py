@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.errors import EstimationError
+from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, inverse
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
@@ -122,9 +123,7 @@ def too_few_text(pms: int, config: SolveConfig) -> str:
     return f"{pms} pairs are too few for a registration: take at least {config.min_pairs}"
 
 
-def joint_start(
-    measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int], model: SessionModel
-) -> SharedState:
+def joint_start(measurements: Measurements, chosen: dict[int, Minimum], solvable: list[int]) -> SharedState:
     """One state with all solvable epochs: each from its own minimum, else from another one by the measured motions."""
     transforms = {k: minimum.state.trus_T_camera()[0] for k, minimum in chosen.items()}
     while len(transforms) < len(solvable):
@@ -143,8 +142,7 @@ def joint_start(
     # A chart about the beam found: its direction is the nominal z, far from the chart's edge.
     frame = nominal_frame(beam.beam_origin()[0], beam.beam_direction()[0])
     stacked = np.stack([transforms[k] for k in solvable])[None]
-    start = make_state(stacked, frame, model.probe.radius_mm)
-    return replace(start, edge_rad=beam.edge_rad, bias_mm=beam.bias_mm)
+    return replace(make_state(stacked, frame), constants=beam.constants)
 
 
 def _points_backwards(optimum: Optimum) -> bool:
@@ -153,18 +151,17 @@ def _points_backwards(optimum: Optimum) -> bool:
     return bool(np.median(np.concatenate([at.lambda_mm[0], at.aim_lambda_mm[0]])) < 0)
 
 
-def _turned(state: SharedState, model: SessionModel) -> SharedState:
+def _turned(state: SharedState) -> SharedState:
     """The same hypothesis with the beam's chart pointing the other way."""
     frame = nominal_frame(state.beam_origin()[0], -state.beam_direction()[0])
     count = state.rotation.shape[1]
-    return make_state(np.stack([state.trus_T_camera(k) for k in range(count)], axis=1), frame, model.probe.radius_mm)
+    return make_state(np.stack([state.trus_T_camera(k) for k in range(count)], axis=1), frame)
 
 
 def _best_start(
     measurements: Measurements,
     chosen: dict[int, Minimum],
     solvable: list[int],
-    model: SessionModel,
     packed: Pack,
     finished: FinishedEpochs | None,
     *,
@@ -178,7 +175,7 @@ def _best_start(
     if finished is not None:
         starts = _starts_of_prior(finished.prior, next(iter(chosen.values()), None))
     else:
-        starts = [joint_start(measurements, chosen, solvable, model)]
+        starts = [joint_start(measurements, chosen, solvable)]
         count = {k: sum(pair.epoch == k for pair in measurements.pairs) for k in chosen}
         leaders: dict[int, Minimum] = {}
         for chain in epoch_chains(measurements, solvable):
@@ -186,7 +183,7 @@ def _best_start(
             best = max(among, key=lambda k: count[k])
             leaders[best] = chosen[best]
         if len(leaders) < len(chosen):
-            starts.append(joint_start(measurements, leaders, solvable, model))
+            starts.append(joint_start(measurements, leaders, solvable))
     if len(starts) == 1:
         return starts[0]
     if not clean:
@@ -250,17 +247,30 @@ def _open_minima(
     return start, left
 
 
+def constants_of(
+    model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """(COUNT,) prior standard deviations and means of the rig's constants: the session's, less certain where the
+    configuration asks for an estimate."""
+    sigmas, mean = model.constant_sigmas.copy(), np.zeros(COUNT)
+    if config.estimate_sound_speed:
+        prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+        sigmas[Constant.SOUND_SPEED], mean[Constant.SOUND_SPEED] = prior.sigma, prior.mean - 1.0
+    if config.estimate_radius:
+        sigmas[Constant.RADIUS] = max(sigmas[Constant.RADIUS], config.radius_sigma_mm)
+    return sigmas, mean
+
+
 def pack_session(
     measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
 ) -> PackedProblem:
     """The measurements as arrays, with the variables and shapes that the configuration asks for."""
-    prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
+    sigmas, mean = constants_of(model, config, sound_speed)
     return pack(
         measurements,
         model,
-        sound_speed_sigma=prior.sigma if config.estimate_sound_speed else None,
-        sound_speed_mean=prior.mean if config.estimate_sound_speed else 1.0,
-        radius_sigma_mm=config.radius_sigma_mm if config.estimate_radius else None,
+        sigmas=sigmas,
+        mean=mean,
         shapes=config.window_shape,
         amplitude_sigma=config.amplitude_sigma,
     )
@@ -442,7 +452,7 @@ def register(
         return problem if finished is None else replace(problem, anchor=finished.prior)
 
     epochs = restrict_epochs(measurements, solvable)
-    start = _best_start(measurements, chosen, solvable, model, packed, finished, clean=clean)
+    start = _best_start(measurements, chosen, solvable, packed, finished, clean=clean)
     is_open = {k for k, (_, undecided) in choices.items() if undecided}
     start, is_open = _open_minima(fitting, searches, is_open, solvable, start, model, config, packed, finished)
     # A motion leads from each minimum of an ambiguous epoch to one of the epoch after it.
@@ -452,7 +462,7 @@ def register(
     kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
     if finished is None and _points_backwards(optimum):
         # The given nominal beam points backwards and no aim shows it: +z points towards the spots.
-        start = _turned(optimum.state, model)
+        start = _turned(optimum.state)
         kept, problem, optimum, shots = _solve_jointly(epochs, packed, start, beam.aim_inlier, clean=clean)
     return _registration(model, tuple(solvable), searches, tuple(sorted(is_open)), (kept, problem, optimum, shots))
 

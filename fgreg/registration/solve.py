@@ -10,7 +10,7 @@ import numpy as np
 
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.gtsam_graph import GraphOptions, build_graph
+from fgreg.graph.gtsam_graph import GraphOptions, Rig, build_graph
 from fgreg.graph.gtsam_values import PrivateValues, SharedValues, newton_step, values_at
 from fgreg.graph.reduced_blocks import moved_markers
 from fgreg.graph.shared_state import SharedState
@@ -21,6 +21,7 @@ from fgreg.model.estimate import (
     LaserEstimate,
     PairEstimate,
     SessionEstimate,
+    SystematicEstimate,
     TrackEstimate,
     Verdict,
 )
@@ -30,9 +31,11 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
 from fgreg.registration.camera_conditions import camera_conditions
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
+from fgreg.registration.error_budget import Budget, error_budget, largest_causes, random_errors_only
+from fgreg.registration.group_tests import group_conditions
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.outliers import free_variables
-from fgreg.registration.posterior import Posterior, predicted_tre
+from fgreg.registration.posterior import Posterior
 from fgreg.registration.posterior_mean import (
     estimated_radius,
     estimated_sound_speed,
@@ -96,6 +99,7 @@ class Solution:
     pairs: tuple[PairEstimate, ...]
     tracks: tuple[TrackEstimate, ...]
     aims: tuple[AimEstimate, ...]
+    systematic: tuple[SystematicEstimate, ...] = ()
     registration: Registration | None = None
     posterior: Posterior | None = None
     snapshot: Snapshot | None = None
@@ -104,7 +108,15 @@ class Solution:
     def as_session(self, name: str) -> SessionEstimate:
         """The estimate as files and reports have it."""
         return SessionEstimate(
-            name, self.verdict, self.reasons, self.laser, self.epochs, self.pairs, self.tracks, self.aims
+            name,
+            self.verdict,
+            self.reasons,
+            self.laser,
+            self.epochs,
+            self.pairs,
+            self.tracks,
+            self.aims,
+            self.systematic,
         )
 
 
@@ -145,17 +157,20 @@ def solve(
     readout = read_laser(centred, model)
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
     aims = read_aims(measurements, centred, readout.origin_shift_mm)
+    budget = error_budget(registration, posterior, config, sound_speed_prior)
     common = [
         *conditions,
         *camera_conditions(
             measurements, model, config, [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
         ),
-        *_common_conditions(registration, pairs, aims),
+        *random_errors_only(model),
+        *_common_conditions(registration, pairs, aims, config),
         *sampling(posterior.effective),
         *_variable_conditions(centred, sound_speed_prior, config),
+        *budget.conditions,
     ]
-    steady = {k: _move_odds(registration, place) for place, k in enumerate(registration.epochs)}
-    reports = _epoch_verdicts(measurements, centred, posterior, pairs, model, config, common, steady, before)
+    steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
+    reports = _epoch_verdicts(measurements, centred, posterior, budget, pairs, model, config, common, steady, before)
     epochs, several = tuple(report.estimate for report in reports), len(reports) > 1
     found = [f"epoch {k}: {c.text}" if several else c.text for k, of in enumerate(reports) for c in of.conditions]
     reports = (*reports[:-1], replace(reports[-1], conditions=(*common, *reports[-1].conditions)))
@@ -173,6 +188,7 @@ def solve(
         pairs=pairs,
         tracks=tuple(track(query, snapshot) for query in tracks),
         aims=aims,
+        systematic=budget.constants,
         registration=registration,
         posterior=posterior,
         snapshot=snapshot,
@@ -199,7 +215,7 @@ def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions
 
 
 def _common_conditions(
-    registration: Registration, pairs: Sequence[PairEstimate], aims: Sequence[AimEstimate]
+    registration: Registration, pairs: Sequence[PairEstimate], aims: Sequence[AimEstimate], config: SolveConfig
 ) -> list[Condition]:
     """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
@@ -223,13 +239,12 @@ def _common_conditions(
         )
     deviant = np.concatenate([shots.pm_beyond_limit, shots.aim_beyond_limit])
     found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
-    if problem.columns.sound_speed is None:
+    if not config.estimate_sound_speed:
         asked = sound_speed_from_residuals(registration)
         found.extend(sound_speed_condition(asked.value, asked.sigma))
     if found and verdict_of(found) is Verdict.REFUSED:
         return found  # inconsistent data cannot test whether the two forms of the graph agree
-    # The explicit graph has no radius variable, and no prior of finished epochs.
-    if len(pairs) <= GRAPH_PAIRS and problem.columns.radius is None and problem.anchor is None:
+    if len(pairs) <= GRAPH_PAIRS and problem.anchor is None:  # the explicit graph has no prior of finished epochs
         found.extend(_agreement(registration))
     return found
 
@@ -237,11 +252,10 @@ def _common_conditions(
 def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, config: SolveConfig) -> list[Condition]:
     """Estimated sound speed and radius, where they are variables."""
     found = []
-    speed, radius = estimated_sound_speed(centred), estimated_radius(centred)
-    if speed is not None:
+    if config.estimate_sound_speed and (speed := estimated_sound_speed(centred)) is not None:
         given = prior or SoundSpeedPrior(1.0, config.sound_speed_sigma)
         found.append(estimated("sound speed ratio", speed.value, speed.sigma, given.mean, given.sigma, ""))
-    if radius is not None:
+    if config.estimate_radius and (radius := estimated_radius(centred)) is not None:
         given_mm = centred.model.probe.radius_mm
         found.append(estimated("radius", radius.value, radius.sigma, given_mm, config.radius_sigma_mm, " mm"))
     return found
@@ -264,26 +278,22 @@ def distance_to_explicit(registration: Registration) -> float:
     """
     state, problem, at = registration.optimum.state, registration.problem, registration.optimum.evaluation
     epochs = problem.columns.epochs
-    speed = problem.columns.sound_speed
     options = GraphOptions(
         marker_T_nominal=state.marker_T_nominal[0],
         unknown_motion_sigma=None,
-        sound_speed_sigma=None if speed is None else float(problem.prior_information[speed] ** -0.5),
-        sound_speed_mean=problem.sound_speed_mean,
+        rig=Rig(problem.columns.constants, problem.prior),
     )
     explicit = build_graph(registration.measurements, registration.model, options)
     shared = SharedValues(
         trus_T_camera=tuple(state.trus_T_camera(k)[0] for k in range(epochs)),
         marker_laser=state.beam[0],
-        window_edge_rad=float(state.edge_rad[0]),
-        marker_bias_mm=state.bias_mm[0],
-        sound_speed_ratio=float(state.sound_speed_ratio[0]),
+        constants=state.constants[0],
     )
-    private, bias_mm = at.private, state.bias_mm[0]
+    private = at.private
     there = PrivateValues(
-        aim_camera_T_marker=moved_markers(problem.aims, private.aim_error[0], bias_mm),
+        aim_camera_T_marker=moved_markers(problem.aims, private.aim_error[0], state.constants[0]),
         camera_p_spot_mm=problem.aim_spot_mm + private.aim_shift[0],
-        camera_T_marker=moved_markers(problem.beams, private.beam_error[0], bias_mm),
+        camera_T_marker=moved_markers(problem.beams, private.beam_error[0], state.constants[0]),
         trus_p_pm_mm=private.trus_p_pm[0],
     )
     step = newton_step(explicit, values_at(explicit, shared, there))
@@ -299,6 +309,7 @@ def _epoch_verdicts(
     measurements: Measurements,
     registration: Registration,
     posterior: Posterior,
+    budget: Budget,
     pairs: Sequence[PairEstimate],
     model: SessionModel,
     config: SolveConfig,
@@ -322,8 +333,9 @@ def _epoch_verdicts(
         else:
             place = registration.epochs.index(k)
             found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
-            tre = predicted_tre(posterior, place, model.targets_mm)
-            found.extend(accuracy(tre, config, causes_of_error(registration, place, model.targets_mm)))
+            tre = budget.predicted[place]
+            causes = causes_of_error(registration, place, model.targets_mm)
+            found.extend(accuracy(tre, config, causes, largest_causes(budget.constants)))
             block = slice(6 * place, 6 * place + 6)
             estimate = EpochEstimate(
                 index=k,
@@ -367,6 +379,12 @@ def _epoch_conditions(
             found.extend(spread(directions, points, config))
         found.extend(sweeps(mine, config))
     return found
+
+
+def _steadiness(registration: Registration, place: int) -> list[Condition]:
+    """Whether all PMs of an epoch have one registration: over all split points in time, and by groups."""
+    groups = group_conditions(registration.problem, registration.optimum, registration.covariance, place)
+    return [*_move_odds(registration, place), *groups]
 
 
 def _move_odds(registration: Registration, place: int) -> list[Condition]:

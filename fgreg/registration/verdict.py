@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import bdtrc, chdtrc, chdtri
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.graph.split_points import ALARM
 from fgreg.model.estimate import PredictedTre, Verdict, worst_verdict
@@ -340,13 +341,20 @@ class Causes:
     edge: float
 
 
-def accuracy(tre: PredictedTre, config: SolveConfig, causes: Causes | None = None) -> list[Condition]:
-    """Predicted error at the worst target against the limit, with the advice that would lower it most."""
+def accuracy(
+    tre: PredictedTre, config: SolveConfig, causes: Causes | None = None, largest: str = ""
+) -> list[Condition]:
+    """Predicted error at the worst target against the limit, with the advice that would lower it most.
+
+    ``largest``: the systematic causes with the largest part in it, as text.
+    """
     if tre.worst_mm <= config.limit_mm:
         return []
     far = tre.worst_mm > 2.0 * config.limit_mm
     advice = "take more pairs, spread over the field and with sweeps from both sides"
-    if causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
+    if largest and tre.systematic is not None and tre.systematic.worst_mm > math.sqrt(DOMINANT) * tre.worst_mm:
+        advice = f"most of it is systematic ({largest}): measure these, and take looks from both sides at each PM"
+    elif causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
         advice = (
             f"{causes.beam:.0%} of its variance is the beam's: take more aims, at short and long distances, and roll "
             "the fibre about its beam during calibration"
@@ -372,7 +380,9 @@ def causes_of_error(registration: Registration, place: int, targets_mm: FloatArr
     total = np.einsum("nij,jk,nik->n", move, covariance[pose, pose], move)
     worst = int(np.argmax(total))
     shares = []
-    for known in (slice(columns.beam, columns.beam + 4), slice(columns.edge, columns.edge + 1)):
+    edge = columns.at(Constant.WINDOW_EDGE)
+    assert edge is not None
+    for known in (slice(columns.beam, columns.beam + 4), slice(edge, edge + 1)):
         cross, own = covariance[pose, known], covariance[known, known]
         explained = cross @ np.linalg.solve(own, cross.T)
         shares.append(float(np.trace(move[worst] @ explained @ move[worst].T) / total[worst]))

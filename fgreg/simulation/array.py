@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.model.session_model import ProbeModel
-from fgreg.model.systematic import Constant
 
 
 @dataclass(frozen=True, slots=True, eq=False)

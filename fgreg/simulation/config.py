@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.session_model import (
     BoardModel,
@@ -24,7 +25,7 @@ from fgreg.model.session_model import (
     StereoRig,
     TagModel,
 )
-from fgreg.model.systematic import Constant, Systematic
+from fgreg.model.systematic import Systematic
 from fgreg.simulation.acoustics import Elevation, Pulse
 from fgreg.simulation.array import TrueArray
 from fgreg.simulation.disturbances import Disturbances

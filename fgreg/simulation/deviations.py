@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.systematic import TEXTS, Constant
+from fgreg.model.systematic import TEXTS
 from fgreg.simulation.config import SimulationConfig
 
 NAMES: dict[str, Constant] = {text.name: constant for constant, text in zip(Constant, TEXTS, strict=True)}

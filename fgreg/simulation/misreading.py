@@ -12,9 +12,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, as_float_array, exp_so3, make_transform, transform_points
 from fgreg.model.session_model import BoardModel, CameraModel, MarkerModel, StereoRig
-from fgreg.model.systematic import CAMERA, Constant
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.lens import project_points
 

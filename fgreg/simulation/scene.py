@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import (
     BoolArray,
     FloatArray,
@@ -18,7 +19,6 @@ from fgreg.geometry.transforms import (
     transform_points,
 )
 from fgreg.model.session_model import CameraModel, StereoRig, TagModel
-from fgreg.model.systematic import Constant
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.lens import project_points
 

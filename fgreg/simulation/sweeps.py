@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.session_model import SensitivityModel, StageModel
-from fgreg.model.systematic import Constant
 from fgreg.simulation.config import SimulationConfig, Sweep
 
 

@@ -22,28 +22,32 @@ from scipy.linalg.lapack import dgeqrf, dtrtrs
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import point_on_line_factor
+from fgreg.factors.rig import RigKey
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.columns import Columns
 from fgreg.graph.gtsam_graph import Variable, make_ordering
-from fgreg.graph.gtsam_values import beam_of_chart
+from fgreg.graph.gtsam_values import beam_of_chart, bearing_from_array
+from fgreg.graph.packing import line_sigma_mm, marker_gain
 from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
 from fgreg.model.sensitivity import arc_of_rotation, sensitivity_priors
 from fgreg.model.session_model import SessionModel
+from fgreg.model.systematic import TEXTS
 from fgreg.smoother.shared_variables import Layout, finite, marginal_prior_factor, number_at
 
 THRESHOLDS: dict[Variable, tuple[float, ...]] = {
     Variable.trus_T_camera: (6e-4, 6e-4, 6e-4, 0.06, 0.06, 0.06),
     Variable.marker_laser: (0.03, 0.03, 6e-4, 6e-4),
-    Variable.window_edge: (3e-4,),
-    Variable.marker_bias: (0.03, 0.03, 0.03),
-    Variable.sound_speed_ratio: (6e-4,),
     Variable.camera_T_marker: (1e-3, 1e-3, 1e-3, 0.03, 0.03, 0.03),
     Variable.trus_p_pm: (0.1, 0.1, 0.1),
     Variable.lam: (0.15,),
     Variable.theta: (1.5e-3,),
 }
 """Steps (rad, mm) beyond which a variable is linearised again."""
+RIG_STEPS = {"": 6e-4, "mm": 0.03, "deg": 3e-4, "px": 0.3}
+"""The same of the rig's constants, by their unit (in rad for degrees)."""
 PRIVATE_STEPS = 10
 SETTLED_MM = 0.5
 """The private variables of a new pair have converged after a step that moves the PM by less: the rest is of second
@@ -172,8 +176,7 @@ def factors_of(
     """The looks at one PM as factors (arguments as of :func:`prepare`; ``windows`` as of :func:`windows_of`)."""
     markers, lambdas, point, thetas = private_keys(pairs, first)
     shared, columns = layout.keys(epoch), layout.columns
-    bias = Variable.marker_bias.key() if columns.bias is not None else None
-    ratio = Variable.sound_speed_ratio.key() if columns.sound_speed is not None else None
+    rig = RigKey(shared[2], columns.constants)
     radius_mm = model.probe.radius_mm
     centres, gains, sigmas = windows
     graph = gtsam.NonlinearFactorGraph()
@@ -183,18 +186,30 @@ def factors_of(
         if marker.id not in shot_of:
             shot = shot_of[marker.id] = len(shot_of)
             covariance = usable_covariance(marker.covariance, POSE_FLOOR)
-            graph.add(marker_pose_factor(markers[shot], marker.camera_T_marker, covariance, bias))
+            graph.add(marker_pose_factor(markers[shot], marker.camera_T_marker, covariance, marker_gain(marker), rig))
+            sigma_mm = line_sigma_mm(pair.beam_offset_mm)
             graph.add(
-                point_on_line_factor(shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal)
+                point_on_line_factor(
+                    shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal, sigma_mm
+                )
             )
         covariance = usable_covariance(look.covariance, (FLOOR_MM,) * 2)
         graph.add(
-            point_on_arc_factor(point, thetas[i], look.scan_rad, look.x_mm, look.range_mm, covariance, radius_mm, ratio)
+            point_on_arc_factor(
+                point,
+                thetas[i],
+                look.scan_rad,
+                look.x_mm,
+                look.range_mm,
+                covariance,
+                radius_mm,
+                rig,
+                look.sweep,
+            )
         )
-        edge = shared[2] if gains[i] else None
         graph.add(
             sensitivity_prior_factor(
-                thetas[i], look.scan_rad, look.range_mm, radius_mm, centres[i], gains[i], sigmas[i], edge, ratio
+                thetas[i], look.scan_rad, look.range_mm, radius_mm, centres[i], gains[i], sigmas[i], rig, look.sweep
             )
         )
     return graph
@@ -208,8 +223,9 @@ def _beginning(
     radius_mm = model.probe.radius_mm
     centres, gains, _ = windows
     look = pairs[0].look
-    reach = float(state.sound_speed_ratio[0]) * look.range_mm
-    expected = centres[0] + gains[0] * float(state.edge_rad[0])
+    constants = state.constants[0]
+    reach = (1.0 + float(constants[Constant.SOUND_SPEED])) * look.range_mm + float(constants[Constant.RANGE_OFFSET])
+    expected = centres[0] + gains[0] * float(constants[Constant.WINDOW_EDGE])
     theta = look.scan_rad + float(arc_of_rotation(expected, look.range_mm, radius_mm))
     trus_p = np.array(
         [
@@ -224,15 +240,13 @@ def _beginning(
     origin, direction = beam_of_chart(state.beam[0], layout.marker_T_nominal)
     shot_of: dict[int, int] = {}
     for i, pair in enumerate(pairs):
-        scan = pair.look.scan_rad
         if pair.marker.id not in shot_of:
             shot = shot_of[pair.marker.id] = len(shot_of)
-            pose = pair.marker.camera_T_marker.copy()
-            pose[:3, 3] -= state.bias_mm[0]
+            pose = pair.marker.camera_T_marker
             values.insert(markers[shot], gtsam.Pose3(pose))
             lam = float(direction @ (pose[:3, :3].T @ (camera_p - pose[:3, 3]) - origin))
             values.insert(number_at(lambdas[shot], lam))
-        own = math.atan2(float(trus_p[1]) - radius_mm * math.sin(scan), float(trus_p[2]) - radius_mm * math.cos(scan))
+        own = bearing_from_array(trus_p, pair.look, radius_mm, constants)
         values.insert(number_at(thetas[i], own))
     return values
 
@@ -307,7 +321,7 @@ class ActiveWindow:
     covariance: FloatArray
 
 
-def empty_isam() -> gtsam.ISAM2:
+def empty_isam(columns: Columns) -> gtsam.ISAM2:
     """iSAM2 that eliminates by QR (see fgreg.graph.gtsam_values.newton_step); re-linearises by the thresholds above."""
     parameters = gtsam.ISAM2Params()
     parameters.setFactorization("QR")
@@ -317,6 +331,8 @@ def empty_isam() -> gtsam.ISAM2:
     thresholds = gtsam.ISAM2ThresholdMap()
     for variable, steps in THRESHOLDS.items():
         thresholds.insert((variable.value, np.array(steps)))
+    rig_steps = [RIG_STEPS[TEXTS[constant].unit] for constant in columns.constants]
+    thresholds.insert((Variable.rig.value, np.array(rig_steps)))
     parameters.setRelinearizeThreshold(thresholds)
     return gtsam.ISAM2(parameters)
 
@@ -337,7 +353,7 @@ def open_active_window(groups: Sequence[Group], prior: Quadratic, layout: Layout
         ArithmeticError: an indeterminate system, or a result that is not finite.
         RuntimeError: another failure of GTSAM.
     """
-    isam = empty_isam()
+    isam = empty_isam(layout.columns)
     theta = isam.getLinearizationPoint()
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     layout.insert(values, prior.state, epoch)

@@ -16,6 +16,7 @@ from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import EpochStart
+from fgreg.model.systematic import TEXTS
 from fgreg.smoother.shared_variables import small_step
 
 PRIVATE_ROUNDS = 3
@@ -26,7 +27,7 @@ WEAK_RAD, WEAK_MM = 1.0, 100.0
 """Sigmas of a weak prior on each earlier registration, about its estimate: few pairs do not determine it."""
 DAMPING = 10.0
 """Factor on the weak prior's information after a step that does not lower the cost."""
-FAR_RAD, FAR_MM, FAR_EDGE_RAD, FAR_RATIO = 2e-3, 0.2, 1e-3, 1e-3
+FAR_RAD, FAR_MM, FAR_RATIO, FAR_PX = 2e-3, 0.2, 1e-3, 1.0
 """Steps of the estimate from the linearisation point beyond which a marginal prior is linearised again."""
 
 
@@ -122,9 +123,9 @@ def _limits(problem: PackedProblem) -> FloatArray:
     columns = problem.columns
     limits = np.full(columns.size, FAR_MM)
     limits[:3] = limits[columns.beam + 2 : columns.beam + 4] = FAR_RAD
-    limits[columns.edge] = FAR_EDGE_RAD
-    if columns.sound_speed is not None:
-        limits[columns.sound_speed] = FAR_RATIO
+    for place, constant in enumerate(columns.constants, columns.first_constant):
+        text = TEXTS[constant]
+        limits[place] = FAR_PX if text.unit == "px" else FAR_MM if text.unit == "mm" else FAR_RATIO
     return limits
 
 

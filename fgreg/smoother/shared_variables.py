@@ -1,7 +1,7 @@
 """The shared variables of one camera epoch: GTSAM's variables, the reduced problem's state, and quadratics on them.
 
 Their steps are those of :meth:`fgreg.graph.shared_state.SharedState.retract`: 6 of ``trus_T_camera``, 4 of the beam's
-chart, the window's edge, then the marker bias and the sound speed ratio where they are variables.
+chart, then the rig's constants that are variables.
 """
 
 from __future__ import annotations
@@ -37,11 +37,7 @@ def small_step(first: SharedState, second: SharedState, columns: Columns) -> Flo
     out[:3] *= 0.5
     out[3:6] = back @ (second.translation_mm[0, 0] - first.translation_mm[0, 0])
     out[6:10] = second.beam[0] - first.beam[0]
-    out[10] = second.edge_rad[0] - first.edge_rad[0]
-    if columns.bias is not None:
-        out[columns.bias : columns.bias + 3] = second.bias_mm[0] - first.bias_mm[0]
-    if columns.sound_speed is not None:
-        out[columns.sound_speed] = second.sound_speed_ratio[0] - first.sound_speed_ratio[0]
+    out[columns.rig] = (second.constants[0] - first.constants[0])[list(columns.constants)]
     return out
 
 
@@ -81,7 +77,7 @@ def number_at(key: int, value: float) -> gtsam.Values:
 class Layout:
     """Places of an epoch's shared variables: columns of the reduced problem (one epoch) and GTSAM's keys.
 
-    ``marker_T_nominal`` (4, 4): fixed frame of the beam's chart. ``sound_speed_mean``: prior mean of the ratio.
+    ``marker_T_nominal`` (4, 4): fixed frame of the beam's chart.
     """
 
     columns: Columns
@@ -89,22 +85,12 @@ class Layout:
 
     def keys(self, epoch: int) -> tuple[int, ...]:
         """GTSAM's keys in the order of the columns."""
-        keys = [Variable.trus_T_camera.key(epoch), Variable.marker_laser.key(), Variable.window_edge.key()]
-        if self.columns.bias is not None:
-            keys.append(Variable.marker_bias.key())
-        if self.columns.sound_speed is not None:
-            keys.append(Variable.sound_speed_ratio.key())
-        return tuple(keys)
+        return Variable.trus_T_camera.key(epoch), Variable.marker_laser.key(), Variable.rig.key()
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """Tangent dimensions of :meth:`keys`."""
-        sizes = [6, 4, 1]
-        if self.columns.bias is not None:
-            sizes.append(3)
-        if self.columns.sound_speed is not None:
-            sizes.append(1)
-        return tuple(sizes)
+        return 6, 4, len(self.columns.constants)
 
     def in_chart(self, state: SharedState) -> SharedState:
         """A state (one hypothesis) with its beam in this layout's chart."""
@@ -117,30 +103,22 @@ class Layout:
         keys = self.keys(epoch)
         values.insert(keys[0], gtsam.Pose3(state.trus_T_camera()[0]))
         values.insert(keys[1], state.beam[0])
-        values.insert(number_at(keys[2], float(state.edge_rad[0])))
-        if self.columns.bias is not None:
-            values.insert(Variable.marker_bias.key(), state.bias_mm[0])
-        if self.columns.sound_speed is not None:
-            values.insert(number_at(Variable.sound_speed_ratio.key(), float(state.sound_speed_ratio[0])))
+        values.insert(keys[2], state.constants[0, self.columns.constants])
 
     def read(self, isam: gtsam.ISAM2, epoch: int, like: SharedState) -> SharedState:
         """The estimate of the shared variables; quantities that are not variables are those of ``like``."""
         keys = self.keys(epoch)
         pose = isam.calculateEstimatePose3(keys[0]).matrix()
         # Copies in row-major order: the last digits of sums depend on the memory layout.
-        state = replace(
+        constants = like.constants.copy()
+        constants[0, self.columns.constants] = isam.calculateEstimateVector(keys[2])
+        return replace(
             like,
             rotation=pose[None, None, :3, :3].copy(),
             translation_mm=pose[None, None, :3, 3].copy(),
             beam=isam.calculateEstimateVector(keys[1])[None],
-            edge_rad=np.array([isam.calculateEstimateDouble(keys[2])]),
+            constants=constants,
         )
-        if self.columns.bias is not None:
-            state = replace(state, bias_mm=isam.calculateEstimateVector(Variable.marker_bias.key())[None])
-        if self.columns.sound_speed is not None:
-            ratio = isam.calculateEstimateDouble(Variable.sound_speed_ratio.key())
-            state = replace(state, sound_speed_ratio=np.array([ratio]))
-        return state
 
 
 def finite(state: SharedState) -> bool:
@@ -159,14 +137,7 @@ def marginal_prior_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> g
     starts = np.cumsum((0, *sizes)).tolist()
     state = quadratic.state
     old_R_trus, old_t = state.rotation[0, 0].T.copy(), state.translation_mm[0, 0].copy()
-    at = [state.beam[0].copy(), float(state.edge_rad[0])]
-    readers = ["vector", "double"]
-    if layout.columns.bias is not None:
-        at.append(state.bias_mm[0].copy())
-        readers.append("vector")
-    if layout.columns.sound_speed is not None:
-        at.append(float(state.sound_speed_ratio[0]))
-        readers.append("double")
+    beam, constants = state.beam[0].copy(), state.constants[0, layout.columns.constants]
 
     def evaluate(values: gtsam.Values, want_jacobians: bool) -> Residual:
         pose = values.atPose3(keys[0]).matrix()
@@ -174,9 +145,8 @@ def marginal_prior_factor(quadratic: Quadratic, layout: Layout, epoch: int) -> g
         step = np.empty(starts[-1])
         step[:3] = log_so3(turn)
         step[3:6] = old_R_trus @ (pose[:3, 3] - old_t)
-        for i, (kind, origin) in enumerate(zip(readers, at, strict=True), start=1):
-            value = values.atVector(keys[i]) if kind == "vector" else values.atDouble(keys[i])
-            step[starts[i] : starts[i + 1]] = value - origin
+        step[starts[1] : starts[2]] = values.atVector(keys[1]) - beam
+        step[starts[2] :] = values.atVector(keys[2]) - constants
         error = (residual + rows @ step).tolist()
         if not want_jacobians:
             return error, ()

@@ -12,7 +12,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
-from fgreg.graph.packing import PackedProblem
+from fgreg.graph.packing import ConstantsPrior, PackedProblem, camera_evidence, observed_dependences
 from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
@@ -203,7 +203,7 @@ def own_prior(state: State, labels: frozenset[int], at: SharedState, setting: Se
         return None
     shots = [shot for shot in state.current if shot.label in labels]
     problem = setting.pack(Measurements((), pairs_of_epoch(shots), (EpochStart(0.0),)))
-    problem = replace(problem, prior_information=np.zeros_like(problem.prior_information))
+    problem = replace(problem, prior=ConstantsPrior.none(problem.columns))
     return marginal_prior(problem, at)[0]
 
 
@@ -230,8 +230,10 @@ def finished_prior(state: State, at: SharedState, setting: Setting) -> State:
     shots = [shot for shot in state.shots[: state.now.first] if shot.inlier and shot.pair.epoch in known]
     numbers = {key: number for number, key in enumerate(looks_by_pm(shots))}
     starts = tuple(epoch.start for epoch in state.epochs)
-    problem = setting.pack(restrict_epochs(Measurements((), numbered(shots, numbers), starts), [*known, now]))
-    problem = replace(problem, prior_information=np.zeros_like(problem.prior_information))
+    finished = restrict_epochs(Measurements((), numbered(shots, numbers), starts), [*known, now])
+    problem = setting.pack(finished)
+    # The configuration's priors are those of the solve that uses this one.
+    problem = replace(problem, prior=camera_evidence(observed_dependences(finished), problem.columns))
     each = [found for k in known if (found := state.epochs[k].state) is not None]
     prior, settled = marginal_prior(problem, with_registrations(at, [*each, at]))
     epochs = list(state.epochs)
@@ -259,4 +261,20 @@ def total_prior(state: State, at: SharedState, setting: Setting) -> Quadratic:
     if state.carried is None:
         raise ValueError("there is no registration")
     prior = state.carried.at(at, setting.columns)
+    seen = _seen_in_pictures(state, at, setting.columns)
+    if seen is not None:
+        prior = prior.plus(seen)
     return prior if state.older is None else prior.plus(state.older.at(at, setting.columns))
+
+
+def _seen_in_pictures(state: State, at: SharedState, columns: Columns) -> Quadratic | None:
+    """What the pictures of the current epoch's pairs say about the camera's constants; None without pictures."""
+    shots = Measurements((), tuple(shot.pair for shot in state.current), (EpochStart(0.0),))
+    evidence = camera_evidence(observed_dependences(shots), columns)
+    if not evidence.information.any():
+        return None
+    step = at.constants[0, columns.constants] - evidence.mean
+    pull = evidence.information @ step
+    gradient, hessian = np.zeros(columns.size), np.zeros((columns.size, columns.size))
+    gradient[columns.rig], hessian[columns.rig, columns.rig] = pull, evidence.information
+    return Quadratic(at, float(step @ pull), gradient, hessian)

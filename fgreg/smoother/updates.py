@@ -73,6 +73,9 @@ def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setti
     state = replace(state, shots=tuple(shots))
     change = Change((Group(label, tuple(places), pairs, prepared),), () if same is None else (label,))
     state, change = _marginalised(state, active, change, setting)
+    dependence = state.shots[-1].pair.marker.dependence
+    if change.prior is None and dependence is not None and dependence.information.any():
+        change = replace(change, prior=total_prior(state, active.state, setting))
     return settled(state, active, layout, change, setting)
 
 

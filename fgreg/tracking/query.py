@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, parent_from_right_covariance
 from fgreg.graph.expectation_propagation import inverse_hessian, settle
 from fgreg.graph.packing import PackedProblem, pack_pairs
@@ -144,7 +145,8 @@ def _from_surface(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Pl
 def _beam(marker: MarkerObservation, state: SharedState, error: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points at lambda = 0 (S, 3) and directions (S, 3) in TRUS, for marker errors (S, 6) along the camera's axes."""
     rotation = exp_so3(error[:, :3]) @ marker.camera_T_marker[:3, :3]
-    camera_p = times(rotation, state.beam_origin()) + marker.camera_T_marker[:3, 3] + error[:, 3:] - state.bias_mm
+    camera_p = times(rotation, state.beam_origin()) + marker.camera_T_marker[:3, 3] + error[:, 3:]
+    camera_p = camera_p - state.constants[:, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
     trus_R_camera = state.rotation[:, 0]
     start = times(trus_R_camera, camera_p) + state.translation_mm[:, 0]
     return start, times(trus_R_camera @ rotation, state.beam_direction())

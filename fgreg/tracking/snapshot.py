@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fgreg.geometry.rig import COUNT
 from fgreg.geometry.transforms import FloatArray, IntArray
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import SharedState
@@ -19,9 +20,8 @@ from fgreg.model.session_model import SensitivityModel, SessionModel, StageModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 
-EDGE, BIAS, SPEED, RADIUS, SHARED = 10, 11, 14, 15, 16
-"""Places of window edge (rad), marker bias (3, mm), sound speed ratio and probe radius (mm) in the covariance of one
-epoch, and its size; the order is that of fgreg.graph.columns, with a place for each optional variable."""
+SHARED = 10 + COUNT
+"""Size of an epoch's covariance: registration 6, beam 4, and a place for each of the rig's constants."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ class Snapshot:
         t: session time of the last event taken in. pairs: number of pairs. causal: whether no later events are used.
         epochs: those with a registration, and those refused.
         marker_T_nominal: (4, 4) of the beam chart. beam: (4,). origin_shift_mm: lambda of the laser frame's origin.
-        edge_rad, bias_mm (3,), sound_speed_ratio, radius_mm: as in :class:`fgreg.graph.shared_state.SharedState`.
+        constants: (COUNT,) as in :class:`fgreg.graph.shared_state.SharedState`. radius_mm: the declared one.
         sensitivity, stage: of the session. amplitude_sigma, window_shape: of its configuration.
         surface: where the PMs trace one.
         oldest: lowest number of the epochs that it may have.
@@ -60,9 +60,7 @@ class Snapshot:
     marker_T_nominal: FloatArray
     beam: FloatArray
     origin_shift_mm: float
-    edge_rad: float
-    bias_mm: FloatArray
-    sound_speed_ratio: float
+    constants: FloatArray
     radius_mm: float
     sensitivity: SensitivityModel
     stage: StageModel
@@ -81,18 +79,13 @@ class Snapshot:
     def shared(self, epoch: EpochSnapshot) -> tuple[SharedState, Columns, FloatArray]:
         """An epoch's shared variables: values (one hypothesis), columns and covariance (D, D) of those estimated."""
         estimated = np.diag(epoch.covariance) > 0.0
-        columns = make_columns(
-            1, bias=bool(estimated[BIAS]), sound_speed=bool(estimated[SPEED]), radius=bool(estimated[RADIUS])
-        )
+        columns = make_columns(1, np.diag(epoch.covariance)[10:])
         state = SharedState(
             rotation=epoch.rotation[None, None],
             translation_mm=epoch.translation_mm[None, None],
             marker_T_nominal=self.marker_T_nominal[None],
             beam=self.beam[None],
-            edge_rad=np.array([self.edge_rad]),
-            bias_mm=self.bias_mm[None],
-            sound_speed_ratio=np.array([self.sound_speed_ratio]),
-            radius_mm=np.array([self.radius_mm]),
+            constants=self.constants[None],
         )
         return state, columns, epoch.covariance[np.ix_(estimated, estimated)]
 
@@ -107,9 +100,7 @@ class Snapshot:
             marker_T_nominal=np.eye(4),
             beam=np.zeros(4),
             origin_shift_mm=0.0,
-            edge_rad=0.0,
-            bias_mm=np.zeros(3),
-            sound_speed_ratio=1.0,
+            constants=np.zeros(COUNT),
             radius_mm=model.probe.radius_mm,
             sensitivity=model.probe.sensitivity,
             stage=model.stage,
@@ -126,12 +117,8 @@ def _refused_epoch(number: int, reason: str) -> EpochSnapshot:
 
 def _epoch_columns(columns: Columns, place: int) -> tuple[IntArray, IntArray]:
     """Columns of the whole covariance that concern an epoch, and their places among the ``SHARED``."""
-    whole = [*range(6 * place, 6 * place + 6), *range(columns.beam, columns.beam + 4), columns.edge]
-    mine = [*range(EDGE + 1)]
-    for at, to, size in ((columns.bias, BIAS, 3), (columns.sound_speed, SPEED, 1), (columns.radius, RADIUS, 1)):
-        if at is not None:
-            whole += range(at, at + size)
-            mine += range(to, to + size)
+    whole = [*range(6 * place, 6 * place + 6), *range(columns.beam, columns.size)]
+    mine = [*range(10), *(10 + constant for constant in columns.constants)]
     return np.array(whole), np.array(mine)
 
 
@@ -178,10 +165,8 @@ def make_snapshot(
         marker_T_nominal=state.marker_T_nominal[0].copy(),
         beam=state.beam[0].copy(),
         origin_shift_mm=origin_shift_mm,
-        edge_rad=float(state.edge_rad[0]),
-        bias_mm=state.bias_mm[0].copy(),
-        sound_speed_ratio=float(state.sound_speed_ratio[0]),
-        radius_mm=float(state.radius_mm[0]),
+        constants=state.constants[0].copy(),
+        radius_mm=model.probe.radius_mm,
         sensitivity=model.probe.sensitivity,
         stage=model.stage,
         amplitude_sigma=config.amplitude_sigma,

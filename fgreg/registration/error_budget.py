@@ -1,0 +1,239 @@
+"""What part of the predicted error is systematic, which of the rig's constants cause it, and what the data say of them.
+
+All by the Gaussian at the optimum of the graph (Hessian H of the shared variables, covariance H^-1), in which the
+constants c are variables: exact for what enters linearly, as the constants do, and free of the sampling noise of the
+posterior. With the covariance split into registration p and constants c:
+
+    random part        S_pp - S_pc S_cc^-1 S_cp, the error if all constants were known
+    systematic part    S_pc S_cc^-1 S_cp, what is left of them
+    one constant k     S_pk S_kk^-1 S_kp, what would go if this one were known
+
+A constant that the data bear out has ``value / sqrt(prior variance - variance)`` standard normal before the data are
+seen: this is the score test of its prior mean (Rao, 1948), and its square what the chi square would fall by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.geometry.rig import Constant
+from fgreg.geometry.target_error import target_jacobians
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.columns import Columns
+from fgreg.graph.packing import pack_more
+from fgreg.graph.reduced_blocks import inner, look_rows
+from fgreg.graph.shared_state import SharedState
+from fgreg.model.estimate import PredictedPart, PredictedTre, SystematicEstimate, Verdict
+from fgreg.model.measurements import Look, MarkerObservation, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.model.systematic import TEXTS
+from fgreg.registration.posterior import QUANTILE, Posterior, predicted_tre
+from fgreg.registration.register import Registration, SoundSpeedPrior, constants_of
+from fgreg.registration.verdict import Condition
+
+DRAWS = 2000
+"""Of a Gaussian in three dimensions, for the quantile of its length."""
+CONFLICT_Z = 3.5
+"""Score of a constant from which it is named: one session in 2,000 has it by chance, for each constant that its data
+determine."""
+ALIKE = 0.9
+"""Constants whose score is at least this share of the largest one cannot be told apart from it."""
+UNOBSERVED = 1e-3
+"""Share of a constant's prior variance that the data have to remove before a score means anything."""
+CAUSES = 3
+"""Number of causes that are named."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Budget:
+    """The systematic part of a solve.
+
+    Attributes:
+        constants: one for each of the rig's constants that is a variable.
+        predicted: the predicted error of each solved epoch with its parts, in the order of ``registration.epochs``.
+        conditions: of constants that the data contradict.
+    """
+
+    constants: tuple[SystematicEstimate, ...]
+    predicted: tuple[PredictedTre, ...]
+    conditions: tuple[Condition, ...]
+
+
+def error_budget(
+    registration: Registration, posterior: Posterior, config: SolveConfig, sound_speed: SoundSpeedPrior | None
+) -> Budget:
+    """The budget of a registration at the optimum of the graph (before it is centred on the posterior's mean)."""
+    model, columns = registration.model, registration.problem.columns
+    sigmas, _ = constants_of(model, config, sound_speed)
+    predicted = tuple(
+        _predicted(registration, posterior, place, model.targets_mm) for place in range(len(registration.epochs))
+    )
+    last = len(registration.epochs) - 1
+    causes = _causes_mm(registration, last)
+    covariance, value = registration.covariance, registration.optimum.state.constants[0]
+    constants = []
+    for place, constant in enumerate(columns.constants):
+        at = columns.first_constant + place
+        prior, sigma = float(sigmas[constant]), float(np.sqrt(covariance[at, at]))
+        text = TEXTS[constant]
+        if prior <= 0.0:
+            continue
+        observed = min(max(1.0 - (sigma / prior) ** 2, 0.0), 1.0)
+        score = float(value[constant]) / (prior * np.sqrt(observed)) if observed > UNOBSERVED else 0.0
+        constants.append(
+            SystematicEstimate(
+                name=text.name,
+                prior_sigma=prior * text.per_unit,
+                value=float(value[constant]) * text.per_unit,
+                sigma=sigma * text.per_unit,
+                observed=observed,
+                score=float(score),
+                worst_target_mm=float(causes[place]),
+            )
+        )
+    return Budget(tuple(constants), predicted, tuple(conflicts(constants)))
+
+
+def random_errors_only(model: SessionModel) -> list[Condition]:
+    """A session that declares no systematic errors knows its random errors only."""
+    if model.systematic.declared:
+        return []
+    text = (
+        "systematic: none in session.yaml, so the predicted error is that of random errors only: state how well probe, "
+        "stage, camera and prints are known"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
+def largest_causes(constants: Sequence[SystematicEstimate], count: int = CAUSES) -> str:
+    """The constants that cause most of the error at the worst target, as text; empty where none does."""
+    texts = {text.name: text for text in TEXTS}
+    order = sorted(constants, key=lambda constant: -constant.worst_target_mm)[:count]
+    parts = [f"{texts[c.name].what} {c.worst_target_mm:.2f} mm" for c in order if c.worst_target_mm >= 0.005]
+    return ", ".join(parts)
+
+
+def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
+    """Constants that the data contradict: the one with the largest score, and those that cannot be told apart."""
+    beyond = sorted((c for c in constants if abs(c.score) >= CONFLICT_Z), key=lambda c: -abs(c.score))
+    if not beyond:
+        return []
+    first = beyond[0]
+    texts = {text.name: text for text in TEXTS}
+    text = texts[first.name]
+    alike = [texts[c.name].what for c in constants if c is not first and abs(c.score) >= ALIKE * abs(first.score)]
+    or_else = f" (or the {' or the '.join(alike)})" if alike else ""
+    return [
+        Condition(
+            Verdict.WARNING,
+            f"the shots contradict the {text.what}{or_else}: {_amount(first)} where it is declared to "
+            f"{_sigma(first)} (score {abs(first.score):.1f}): {text.remedy}",
+        )
+    ]
+
+
+def _amount(constant: SystematicEstimate) -> str:
+    """By how much a constant differs from the declared one."""
+    value = constant.value / max(constant.observed, 1e-6)  # without the pull of its prior
+    unit = {text.name: text for text in TEXTS}[constant.name].unit
+    if not unit:
+        return f"{100.0 * abs(value):.1f} % {'larger' if value > 0 else 'smaller'} than declared fits best"
+    return f"{value:+.2g} {unit} fits best"
+
+
+def _sigma(constant: SystematicEstimate) -> str:
+    unit = {text.name: text for text in TEXTS}[constant.name].unit
+    return f"{constant.prior_sigma:.2g} {unit}" if unit else f"{100.0 * constant.prior_sigma:.2g} %"
+
+
+def _parts(registration: Registration, place: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Covariance blocks of an epoch's registration and the constants: (6, 6), (6, K), (K, K)."""
+    pose, rig, covariance = slice(6 * place, 6 * place + 6), registration.problem.columns.rig, registration.covariance
+    return covariance[pose, pose], covariance[pose, rig], covariance[rig, rig]
+
+
+def _traces(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(n,) expected squared error at the targets."""
+    return np.asarray(np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian))
+
+
+def _predicted(registration: Registration, posterior: Posterior, place: int, targets_mm: FloatArray) -> PredictedTre:
+    """Predicted error of one epoch, its random and systematic part, and that of targets which the scanner shows.
+
+    Total figures are those of the posterior's samples; the parts have the shares of the Gaussian at the optimum.
+    """
+    total, root, quantiles = predicted_tre(posterior, place, targets_mm)
+    transform = registration.optimum.state.trus_T_camera(place)[0]
+    jacobian = target_jacobians(transform, targets_mm)
+    pose, cross, own = _parts(registration, place)
+    explained = cross @ np.linalg.solve(own, cross.T)
+    share = np.clip(_traces(jacobian, explained) / np.maximum(_traces(jacobian, pose), 1e-30), 0.0, 1.0)
+
+    def part(factor: FloatArray) -> PredictedPart:
+        return PredictedPart(
+            float((root * factor).mean()), float((quantiles * factor).mean()), float((quantiles * factor).max())
+        )
+
+    return replace(
+        total,
+        random=part(np.sqrt(1.0 - share)),
+        systematic=part(np.sqrt(share)),
+        seen=_seen(registration, place, jacobian, targets_mm),
+    )
+
+
+def _causes_mm(registration: Registration, place: int) -> FloatArray:
+    """(K,) RMS error at the epoch's worst target that would go if one constant were known."""
+    transform = registration.optimum.state.trus_T_camera(place)[0]
+    jacobian = target_jacobians(transform, registration.model.targets_mm)
+    pose, cross, own = _parts(registration, place)
+    worst = jacobian[int(np.argmax(_traces(jacobian, pose)))]
+    moved = worst @ cross / np.sqrt(np.diag(own))
+    return np.asarray(np.linalg.norm(moved, axis=0))
+
+
+def scanner_displacement(model: SessionModel, state: SharedState, columns: Columns, points: FloatArray) -> FloatArray:
+    """(n, 3, K) by how much points (n, 3) that the scanner shows in its plane truly lie elsewhere, per constant.
+
+    TRUS axes. The plane is turned to each point; ``x``, range and rotation are held while the constants change.
+    """
+    nowhere = MarkerObservation(np.eye(4), np.eye(6), 0)
+    pairs = []
+    for number, (x, y, z) in enumerate(points.tolist()):
+        scan = float(np.arctan2(y, z))
+        look = Look(scan, 1e-3, x, float(np.hypot(y, z)) - model.probe.radius_mm, np.eye(2))
+        pairs.append(Pair(0.0, number, 0, nowhere, look))
+    problem = pack_more(pairs, model, columns)
+    declared = SharedState(
+        state.rotation[:, :1], state.translation_mm[:, :1], state.marker_T_nominal, state.beam, 0.0 * state.constants
+    )
+    wanted = columns.of_looks
+    rows = look_rows(problem, declared, inner(points[None]), wanted)[..., 0]
+    out = np.zeros((len(points), 3, len(columns.constants)))
+    out[:, :, : len(wanted)] = -np.linalg.solve(rows[:, :, 1:4], rows[:, :, 4:])
+    edge = columns.constants.index(Constant.WINDOW_EDGE)
+    out[:, :, edge] = 0.0
+    return out
+
+
+def _seen(registration: Registration, place: int, jacobian: FloatArray, targets_mm: FloatArray) -> PredictedPart:
+    """Predicted distance between where the registration puts targets and where the scanner shows them."""
+    state, columns = registration.optimum.state, registration.problem.columns
+    transform = state.trus_T_camera(place)[0]
+    shown = scanner_displacement(registration.model, state, columns, targets_mm)
+    shown = np.einsum("ji,njk->nik", transform[:3, :3], shown)  # to the camera's axes
+    gain = np.concatenate([jacobian, -shown], axis=2)
+    pose, cross, own = _parts(registration, place)
+    covariance = np.block([[pose, cross], [cross.T, own]])
+    mean = -shown @ state.constants[0, columns.constants]
+    spread = np.einsum("nij,jk,nlk->nil", gain, covariance, gain)
+    root = np.linalg.cholesky(spread + 1e-12 * np.eye(3))
+    draws = np.random.default_rng(0).standard_normal((DRAWS, 3))
+    length = np.linalg.norm(np.einsum("nij,sj->sni", root, draws) + mean, axis=-1)
+    quantiles = np.quantile(length, QUANTILE, axis=0)
+    square = np.trace(spread, axis1=1, axis2=2) + np.sum(mean**2, axis=1)
+    return PredictedPart(float(np.sqrt(square).mean()), float(quantiles.mean()), float(quantiles.max()))
