@@ -8,10 +8,10 @@ Content of each kind, and how it is converted (``right_T_left`` maps left coordi
   are ``right_T_left`` itself, in the units of the board; read as millimetres.
 - Kalibr: ``cam0`` is left, ``cam1`` right, ``T_cn_cnm1`` of cam1 is ``right_T_left``, metres.
 
-A session's camera has five distortion parameters (plumb_bob, radtan). Files of other models are refused unless their
-further parameters are zero. ``rectified`` reads the model of images that were rectified already: the matrix from ``P``,
-no distortion, cameras parallel. The ``camera`` frame is then the *rectified* left camera, rotated by ``R_left`` against
-the real one, and the registration refers to it.
+Lens models are those of OpenCV: plumb_bob or radtan, the rational and the thin prism one, and fisheye (equidistant, of
+Kannala and Brandt). Files of other models are refused by name. ``rectified`` reads the model of images that were
+rectified already: the matrix from ``P``, no distortion, cameras parallel. The ``camera`` frame is then the *rectified*
+left camera, rotated by ``R_left`` against the real one, and the registration refers to it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from fgreg.session.yaml_loader import load_yaml, read_bounded
 MM_PER = {"m": 1000.0, "mm": 1.0}
 """Units that a calibration's lengths can have."""
 
-PLUMB_BOB = ("plumb_bob", "radtan", "none", "")
+POLYNOMIAL = ("plumb_bob", "radtan", "rational_polynomial", "pinhole", "none", "")
+FISHEYE = ("fisheye", "equidistant")
 _BASELINE_MM = (0.5, 500.0)
 _MAX_BYTES = 4_000_000
 _ROTATION_TOLERANCE = 1e-3
@@ -146,32 +147,39 @@ def _info_model(info: CameraInfo, rectified: bool) -> CameraModel:
         raise InputError(f"{info.where}: R", "a matrix that is no rotation", "a rotation")
     if rectified:
         return _camera(info.image_size, info.projection[:, :3], np.zeros(5), f"{info.where}: P")
-    distortion = five_parameters(info.distortion, info.distortion_model, f"{info.where}: D")
-    return _camera(info.image_size, info.matrix, distortion, f"{info.where}: K")
+    distortion, fisheye = lens(info.distortion, info.distortion_model, f"{info.where}: D")
+    return _camera(info.image_size, info.matrix, distortion, f"{info.where}: K", fisheye)
 
 
-def five_parameters(values: FloatArray, model: str, where: str) -> FloatArray:
-    """OpenCV's (k1, k2, p1, p2, k3) of a file's distortion parameters.
+def lens(values: FloatArray, model: str, where: str) -> tuple[FloatArray, bool]:
+    """A file's distortion parameters in OpenCV's order, at least 5 or 4 of a fisheye lens, and whether it is one.
 
     Raises:
-        InputError: a model or parameters that these five cannot express.
+        InputError: another model, or a number of parameters that it does not have.
     """
     values = np.asarray(values, dtype=np.float64).ravel()
-    expected = "plumb_bob or radtan with up to 5 parameters k1, k2, p1, p2, k3; calibrate with these"
-    if model not in PLUMB_BOB and not (model == "rational_polynomial" and not values[5:].any()):
+    if model in FISHEYE:
+        if values.size != 4:
+            raise InputError(where, f"{values.size} parameters", "4, of a fisheye lens")
+        return values, True
+    if model not in POLYNOMIAL:
+        expected = "plumb_bob, radtan, rational_polynomial, or equidistant (fisheye); calibrate with one of these"
         raise InputError(where, f"the distortion model {shown(model)}", expected)
     if values.size not in (0, 4, 5, 8, 12, 14):
-        raise InputError(where, f"{values.size} parameters", expected)
-    if values[5:].any():
-        raise InputError(where, f"{values.size} parameters, not all beyond the fifth zero", expected)
-    out = np.zeros(5)
-    out[: min(5, values.size)] = values[:5]
-    return out
+        raise InputError(where, f"{values.size} parameters", "4, 5, 8 or 12, in OpenCV's order")
+    if values[12:].any():
+        raise InputError(where, f"{values.size} parameters, with a tilted sensor", "4, 5, 8 or 12, in OpenCV's order")
+    needed = next(size for size in (5, 8, 12) if not values[size:].any())
+    out = np.zeros(needed)
+    out[: values.size] = values[:needed]
+    return out, False
 
 
-def _camera(size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, where: str) -> CameraModel:
+def _camera(
+    size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, where: str, fisheye: bool = False
+) -> CameraModel:
     try:
-        matrix, distortion = as_float_array(matrix, 3, 3), as_float_array(distortion, 5)
+        matrix, distortion = as_float_array(matrix, 3, 3), as_float_array(distortion)
     except ValueError as error:
         raise InputError(where, str(error), "a camera matrix of 3 x 3 numbers") from None
     off = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1.0)
@@ -179,7 +187,7 @@ def _camera(size: tuple[int, int], matrix: FloatArray, distortion: FloatArray, w
         raise InputError(where, "another matrix", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0")
     if not all(1 <= n <= 32768 for n in size):
         raise InputError(where, f"an image of {size[0]} x {size[1]} px", "width and height of the images")
-    return CameraModel(size, matrix, distortion)
+    return CameraModel(size, matrix, distortion, fisheye)
 
 
 def _checked(rig: StereoRig, name: str, unit: str) -> Calibration:
@@ -304,7 +312,16 @@ def _storage_camera(
     values = _array(content, matrix, name, 9).reshape(3, 3)
     found = next((key for key in distortion if key in content), None)
     parameters = np.zeros(5) if found is None else _array(content, (found,), name, None)
-    return _camera(size, values, five_parameters(parameters, "", f"{name}: {found}"), f"{name}: {matrix[0]}")
+    coefficients, fisheye = lens(parameters, _storage_model(content), f"{name}: {found}")
+    return _camera(size, values, coefficients, f"{name}: {matrix[0]}", fisheye)
+
+
+def _storage_model(content: Mapping[str, object]) -> str:
+    """The lens model that an OpenCV file names; nothing where it names none. Four parameters alone do not tell."""
+    if any(content.get(key) not in (None, 0.0) for key in ("fisheye_model", "fisheye")):
+        return "fisheye"
+    named = next((content[key] for key in ("distortion_model", "camera_model", "model") if key in content), "")
+    return named.lower() if isinstance(named, str) else ""
 
 
 def _array(content: Mapping[str, object], names: Sequence[str], file: str, count: int | None) -> FloatArray:
@@ -367,8 +384,8 @@ def _kalibr_camera(file: _Values, key: str) -> CameraModel:
     distortion = file.read(_PARAMETERS, key, "distortion_coeffs", default=np.zeros(0))
     matrix = np.array([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
     size = _whole(float(width), float(height), f"{file.name}: {key}.resolution")
-    parameters = five_parameters(distortion, distortion_model, f"{file.name}: {key}.distortion_coeffs")
-    return _camera(size, matrix, parameters, f"{file.name}: {key}.intrinsics")
+    parameters, fisheye = lens(distortion, distortion_model, f"{file.name}: {key}.distortion_coeffs")
+    return _camera(size, matrix, parameters, f"{file.name}: {key}.intrinsics", fisheye)
 
 
 # Values of other programs' YAML files; unknown keys are ignored.

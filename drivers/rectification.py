@@ -89,7 +89,8 @@ def _common_matrix(cameras: tuple[tuple[CameraModel, FloatArray], ...]) -> Float
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
     middles = []
     for camera, turn in cameras:
-        normal = cv2.undistortPoints(corners[:, None, :], camera.matrix, camera.distortion, R=turn)
+        undistort = cv2.fisheye.undistortPoints if camera.fisheye else cv2.undistortPoints
+        normal = undistort(corners[:, None, :], camera.matrix, camera.distortion, R=turn)
         middles.append(np.asarray(normal).reshape(-1, 2).mean(axis=0))
     middle = np.mean(middles, axis=0)
     cx, cy = (width - 1) / 2.0 - fx * middle[0], (height - 1) / 2.0 - fy * middle[1]
@@ -97,7 +98,8 @@ def _common_matrix(cameras: tuple[tuple[CameraModel, FloatArray], ...]) -> Float
 
 
 def _maps(camera: CameraModel, turn: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    x, y = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, matrix, camera.image_size, cv2.CV_32FC1)
+    make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
+    x, y = make(camera.matrix, camera.distortion, turn, matrix, camera.image_size, cv2.CV_32FC1)
     return np.asarray(x), np.asarray(y)
 
 

@@ -181,7 +181,7 @@ def test_kalibr_camchain_in_metres(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"camera_model": "omni"}, "camera_model.*found 'omni', expected pinhole"),
-        ({"distortion_model": "equidistant"}, "distortion model 'equidistant', expected plumb_bob or radtan"),
+        ({"distortion_model": "fov"}, "distortion model 'fov', expected plumb_bob, radtan"),
         ({"intrinsics": [1.0, 2.0]}, "cam1.intrinsics.*expected a list of 4 numbers"),
         ({"T_cn_cnm1": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "cam1.T_cn_cnm1.*not rigid"),
         ({"resolution": [640, 480]}, "resolution.*two cameras of one size"),
@@ -218,16 +218,49 @@ def test_monocular_info_as_the_right_camera_has_no_baseline(tmp_path: Path) -> N
         read_calibration([info(tmp_path, "left"), info(tmp_path, "right")])
 
 
-def test_models_beyond_five_parameters_are_refused_unless_they_say_nothing_more(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"left\.yaml: D: found the distortion model 'equidistant'"):
-        read_calibration([info(tmp_path, "left", model="equidistant")])
+def test_lens_models_are_opencvs_and_others_are_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"left\.yaml: D: found the distortion model 'fov'"):
+        read_calibration([info(tmp_path, "left", model="fov")])
     eight = np.array([[-0.3, 0.1, 0.0, 0.0, 0.05, 0.0, 0.0, 0.0]])
     path = storage(tmp_path / "c.yml", camera_matrix=M1, distortion_coefficients=eight, image_size=(640, 240))
     np.testing.assert_allclose(read_calibration([path]).rig.left.distortion, [-0.3, 0.1, 0, 0, 0.05])
     eight[0, 5] = 0.01
     storage(path, camera_matrix=M1, distortion_coefficients=eight, image_size=(640, 240))
-    with pytest.raises(InputError, match="8 parameters, not all beyond the fifth zero"):
+    np.testing.assert_allclose(read_calibration([path]).rig.left.distortion, eight[0])
+    tilted = np.array([[-0.3, 0.1, 0.0, 0.0, 0.05, 0, 0, 0, 0, 0, 0, 0, 0.01, 0.0]])
+    storage(path, camera_matrix=M1, distortion_coefficients=tilted, image_size=(640, 240))
+    with pytest.raises(InputError, match="14 parameters, with a tilted sensor"):
         read_calibration([path])
+
+
+def test_four_parameters_of_an_opencv_file_are_fisheye_only_where_it_says_so(tmp_path: Path) -> None:
+    four = np.array([[0.1, 0.05, 0.01, 0.02]])
+    path = storage(tmp_path / "f.yml", K1=M1, D1=four, K2=M2, D2=four, R=R, T=T, image_size=(640, 240))
+    rig = read_calibration([path]).rig
+    assert not rig.left.fisheye
+    np.testing.assert_allclose(rig.left.distortion, [0.1, 0.05, 0.01, 0.02, 0.0])
+    path.write_text(path.read_text() + "fisheye_model: 1\n")
+    rig = read_calibration([path]).rig
+    assert rig.right is not None
+    assert rig.left.fisheye
+    assert rig.right.fisheye
+    np.testing.assert_allclose(rig.left.distortion, four[0])
+    five = np.array([[0.1, 0.05, 0.01, 0.02, 0.0]])
+    storage(path, K1=M1, D1=five, K2=M2, D2=five, R=R, T=T, image_size=(640, 240))
+    path.write_text(path.read_text() + "fisheye_model: 1\n")
+    with pytest.raises(InputError, match=r"D1: found 5 parameters, expected 4, of a fisheye lens"):
+        read_calibration([path])
+
+
+def test_kalibrs_equidistant_model_is_fisheye(tmp_path: Path) -> None:
+    chain = kalibr()
+    chain["cam1"] |= {"distortion_model": "equidistant", "distortion_coeffs": [0.1, 0.05, 0.01, 0.02]}
+    path = tmp_path / "camchain.yaml"
+    path.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    rig = read_calibration([path]).rig
+    assert rig.right is not None
+    assert rig.right.fisheye
+    assert not rig.left.fisheye
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,13 @@ from fgreg.detection.camera import (
     pixels_from_ideal,
     project,
 )
+from fgreg.detection.marker import detect_marker
+from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import CameraModel
-from tests.marker_scene import LEFT
+from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.simulation.lens import project_points
+from fgreg.simulation.render import Optics, render_frame
+from tests.marker_scene import LEFT, ONE_TAG, facing_pose, rotation_error_deg, surfaces_of
 
 
 def test_projection_is_opencvs() -> None:
@@ -25,6 +29,48 @@ def test_projection_is_opencvs() -> None:
     points = np.column_stack([rng.uniform(-60, 60, (50, 2)), rng.uniform(80, 200, 50)])
     expected, _ = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), LEFT.matrix, LEFT.distortion)
     assert np.abs(project(LEFT, points) - expected.reshape(-1, 2)).max() < 1e-9
+
+
+LENSES = [
+    ([-0.1, 0.06, 0.001, -0.002], False),
+    ([-0.1, 0.06, 0.001, -0.002, 0.01, 0.02, 0.03, 0.001], False),
+    ([-0.1, 0.06, 0.001, -0.002, 0.01, 0.02, 0.03, 0.001, 0.002, 0.001, -0.001, 0.002], False),
+    ([0.1, -0.05, 0.01, 0.002], True),
+]
+WIDE = as_float_array([[600.0, 0.0, 640.0], [0.0, 605.0, 360.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(("distortion", "fisheye"), LENSES, ids=["four", "rational", "prism", "fisheye"])
+def test_all_lens_models_are_opencvs_with_inverse_and_jacobian(distortion: list[float], fisheye: bool) -> None:
+    camera = CameraModel((1280, 720), WIDE, as_float_array(distortion), fisheye)
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-90, 90, (100, 2)), rng.uniform(90, 200, 100)])
+    see = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    expected, _ = see(points[:, None], np.zeros(3), np.zeros(3), WIDE, np.array(distortion))
+    pixels = project(camera, points)
+    assert np.abs(pixels - expected.reshape(-1, 2)).max() < 1e-9
+    assert np.abs(project_points(camera, points) - expected.reshape(-1, 2)).max() < 1e-9  # the simulator's own
+    normalized = points[:, :2] / points[:, 2:]
+    assert np.abs(normalized_from_pixels(camera, pixels) - normalized).max() < 1e-8
+    for k in range(2):
+        d = np.eye(2)[k] * 1e-6
+        numeric = (distort(camera, normalized + d) - distort(camera, normalized - d)) / 2e-6
+        assert np.abs(numeric - distort_jacobian(camera, normalized)[..., k]).max() < 1e-7
+    assert np.abs(distort_jacobian(camera, np.zeros((1, 2))) - np.eye(2)).max() < 1e-9
+
+
+def test_marker_is_found_through_a_fisheye_lens() -> None:
+    camera = CameraModel((1280, 720), WIDE, as_float_array([0.1, -0.05, 0.01, 0.002]), fisheye=True)
+    true = facing_pose((45.0, -20.0, 70.0), 20.0)
+    rng = np.random.default_rng(0)
+    image = render_frame(camera, surfaces_of(ONE_TAG, true), rng, Optics(blur_px=0.8))
+    fit = detect_marker(image, None, StereoRig(camera), ONE_TAG)
+    assert isinstance(fit, MarkerFit)
+    assert rotation_error_deg(true, fit.camera_T_marker) < 0.1
+    assert np.linalg.norm(fit.camera_T_marker[:3, 3] - true[:3, 3]) < 0.05
+    plain = CameraModel((1280, 720), WIDE, camera.distortion)  # taken for k1, k2, p1, p2
+    wrong = detect_marker(image, None, StereoRig(plain), ONE_TAG)
+    assert isinstance(wrong, NotFound) or np.linalg.norm(wrong.camera_T_marker[:3, 3] - true[:3, 3]) > 1.0
 
 
 def test_hand_computed_point() -> None:

@@ -12,6 +12,7 @@ import yaml
 from numpy.testing import assert_allclose
 
 from fgreg.errors import InputError
+from fgreg.geometry.transforms import as_float_array
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
@@ -22,7 +23,7 @@ from fgreg.model.events import (
     StageEvent,
     TrackEvent,
 )
-from fgreg.model.session_model import NoiseModel, default_targets_mm
+from fgreg.model.session_model import STEREO_RIG, CameraModel, NoiseModel, StereoRig, default_targets_mm
 from fgreg.session.session_reader import read_ground_truth, read_session
 from tests import session_files
 
@@ -318,3 +319,17 @@ def test_bad_ground_truth(tmp_path: Path, text: str, words: str) -> None:
     with pytest.raises(InputError) as caught:
         read_ground_truth(tmp_path)
     assert str(caught.value).startswith("ground_truth.yaml: " + words)
+
+
+def test_a_fisheye_lens_is_written_and_read() -> None:
+    matrix = as_float_array([[600.0, 0.0, 640.0], [0.0, 605.0, 360.0], [0.0, 0.0, 1.0]])
+    left = CameraModel((1280, 720), matrix, as_float_array([0.1, -0.05, 0.01, 0.002]), fisheye=True)
+    right = CameraModel((1280, 720), matrix, as_float_array([-0.1, 0.06, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0]))
+    shift = as_float_array([[1.0, 0.0, 0.0, -5.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    written = STEREO_RIG.write(StereoRig(left, right, shift))
+    assert written["left"]["model"] == "fisheye"
+    assert "model" not in written["right"]
+    rig = STEREO_RIG.read(written)
+    assert rig.left.fisheye
+    assert not rig.right.fisheye
+    assert np.array_equal(rig.right.distortion, right.distortion)

@@ -8,6 +8,7 @@ that names the key.
 import math
 import re
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -25,11 +26,13 @@ from fgreg.schema.kinds import (
     Converted,
     Integer,
     IntegerPair,
+    JsonSchema,
     Number,
     Numbers,
     NumberTuple,
     Text,
     in_radians,
+    list_schema,
     points,
 )
 from fgreg.schema.matrices import Matrix, Transform
@@ -40,6 +43,8 @@ SESSION_FORMAT = "fgreg-session/1"
 
 _MICROSECONDS = Number(-1e6, 1e6, unit="us")
 _PIXELS = 1e5
+DISTORTION_SIZES = (4, 5, 8, 12)
+"""Numbers of coefficients of OpenCV's lens models."""
 
 DICTIONARY_SIZES = {
     **{f"DICT_{n}X{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
@@ -227,11 +232,38 @@ class StageModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel:
-    """Pinhole camera with OpenCV's five-parameter distortion: matrix (3, 3) px, distortion (5,), size (w, h) px."""
+    """A camera with one of OpenCV's lens models.
+
+    Attributes:
+        image_size: (w, h) px.
+        matrix: (3, 3) px.
+        distortion: (4,), (5,), (8,) or (12,): k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4; for a fisheye lens (4,).
+        fisheye: the model of Kannala and Brandt, for wide angles: the angle from the axis is distorted.
+    """
 
     image_size: tuple[int, int]
     matrix: FloatArray
     distortion: FloatArray
+    fisheye: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Distortion(Numbers):
+    """The coefficients of a lens, of one of the numbers that OpenCV knows."""
+
+    def read(self, value: object, _folder: Path | None = None, /) -> FloatArray:
+        if not isinstance(value, list) or len(value) not in DISTORTION_SIZES:
+            raise FieldError.of(shown(value), self.expected)
+        out: FloatArray = Numbers.read(self, value)
+        return out
+
+    @property
+    def expected(self) -> str:
+        return f"a list of 4, 5, 8 or 12 numbers, each {self.each.expected}"
+
+    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
+        each = self.each.json_schema(definitions)
+        return {"anyOf": [list_schema(each, size, size) for size in DISTORTION_SIZES]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,9 +271,16 @@ class _LensSection:
     """One camera of ``session.yaml``; its image size is that of both."""
 
     matrix: Annotated[FloatArray, Key("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px", Matrix(3))]
-    distortion: Annotated[FloatArray, Key("[k1, k2, p1, p2, k3], OpenCV's", Numbers(5, Number(-1e4, 1e4)))]
+    distortion: Annotated[
+        FloatArray, Key("[k1, k2, p1, p2, k3, ...], OpenCV's: 4, 5, 8 or 12", _Distortion(None, Number(-1e4, 1e4)))
+    ]
+    model: Annotated[str | None, Key("Kannala-Brandt, with 4 coefficients", Text(allowed=("fisheye",)))] = None
+
+    JSON_RULES: ClassVar = ({"if": {"required": ["model"]}, "then": {"properties": {"distortion": {"maxItems": 4}}}},)
 
     def __post_init__(self) -> None:
+        if self.model is not None and len(self.distortion) != 4:
+            raise FieldError.of(f"{len(self.distortion)} numbers", "4 numbers, for model: fisheye", "distortion")
         matrix = self.matrix
         zeros = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1.0)
         positive = matrix[0, 0] > 0 and matrix[1, 1] > 0
@@ -289,16 +328,19 @@ class _CameraSection:
         """The rig that the section describes."""
 
         def camera(lens: _LensSection) -> CameraModel:
-            return CameraModel(self.image_size, lens.matrix, lens.distortion)
+            return CameraModel(self.image_size, lens.matrix, lens.distortion, lens.model is not None)
 
         return StereoRig(camera(self.left), None if self.right is None else camera(self.right), self.right_T_left)
 
     @classmethod
     def of(cls, rig: StereoRig) -> Self:
         """The section that describes a rig."""
-        left, right = rig.left, rig.right
-        lens = None if right is None else _LensSection(right.matrix, right.distortion)
-        return cls(left.image_size, _LensSection(left.matrix, left.distortion), lens, rig.right_T_left)
+
+        def lens(camera: CameraModel) -> _LensSection:
+            return _LensSection(camera.matrix, camera.distortion, "fisheye" if camera.fisheye else None)
+
+        right = None if rig.right is None else lens(rig.right)
+        return cls(rig.left.image_size, lens(rig.left), right, rig.right_T_left)
 
 
 STEREO_RIG = Converted(record(_CameraSection), _CameraSection.rig, _CameraSection.of)

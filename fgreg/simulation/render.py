@@ -82,7 +82,7 @@ def render_frame(
         spoilt: what spoils this picture.
     """
     optics = optics or Optics()
-    rays = _rays(camera.image_size, camera.matrix.tobytes(), camera.distortion.tobytes())
+    rays = _rays(camera.image_size, camera.matrix.tobytes(), camera.distortion.tobytes(), camera.fisheye)
     width, height = camera.image_size
     image = np.zeros((height, width), dtype=np.float32)
     if background is not None:
@@ -105,8 +105,8 @@ def render_frame(
 
 
 @lru_cache(maxsize=8)
-def _rays(image_size: tuple[int, int], matrix: bytes, distortion: bytes) -> _Rays:
-    camera = CameraModel(image_size, np.frombuffer(matrix).reshape(3, 3), np.frombuffer(distortion))
+def _rays(image_size: tuple[int, int], matrix: bytes, distortion: bytes, fisheye: bool) -> _Rays:
+    camera = CameraModel(image_size, np.frombuffer(matrix).reshape(3, 3), np.frombuffer(distortion), fisheye)
     width, height = image_size
     columns, rows = np.meshgrid(np.arange(width + 1) - 0.5, np.arange(height + 1) - 0.5)
     x, y = undistorted_rays(camera, columns, rows)
