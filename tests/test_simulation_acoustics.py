@@ -12,8 +12,11 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import (
     Elevation,
+    FaceSound,
     Hearing,
+    PickUp,
     Pulse,
+    Reflection,
     element_positions,
     noise_channels,
     quantised,
@@ -94,6 +97,44 @@ def test_signal_to_noise_ratio_is_of_the_loudest_element() -> None:
     assert (quiet[:, :600]).std() == pytest.approx(1.0, abs=0.02)
     # Elements hear less to the side.
     assert envelope[0] < 0.75 * envelope[33]
+
+
+def test_a_reflection_is_a_later_copy_from_the_mirror_image() -> None:
+    # 6 mm behind the source and 1.6 mm (4 elements) aside, half as loud; hypot(36, 3.2 or 4.8) from two elements.
+    a = math.radians(20.0)
+    source = np.array([0.0, 40.0 * math.sin(a), 40.0 * math.cos(a)])
+    copy = Reflection(6.0, 1.6, -6.02)
+    direct = simulate_channels(probe(), source, a, rng(), snr_db=60.0, hearing=IN_PLANE)
+    both = simulate_channels(probe(), source, a, rng(), snr_db=60.0, hearing=IN_PLANE, artefacts=(copy,))
+    alone = both - direct
+    for i in (28, 36, 48):
+        assert arrival_us(alone[i]) == pytest.approx(math.hypot(36.0, (i - 36) * 0.4) / 1.5, abs=0.003)
+    envelope = np.abs(hilbert(alone, axis=1)).max()
+    assert envelope == pytest.approx(0.5 * np.abs(hilbert(direct, axis=1)).max(), rel=0.01)
+
+
+def test_pick_up_reaches_a_part_of_the_channels_at_one_time() -> None:
+    source = np.array([0.0, 0.0, 40.0])
+    direct = simulate_channels(probe(), source, 0.0, rng(), snr_db=10.0, hearing=IN_PLANE)
+    signal = PickUp(7.3, 40.0, 0.0, (0.25, 0.5))
+    both = simulate_channels(probe(t0_us=2.0), source, 0.0, rng(), snr_db=10.0, hearing=IN_PLANE, artefacts=(signal,))
+    assert arrival_us(both[20]) == pytest.approx(5.3, abs=0.01)
+    direct = simulate_channels(probe(t0_us=2.0), source, 0.0, rng(), snr_db=10.0, hearing=IN_PLANE)
+    reached = np.flatnonzero(np.abs(both - direct).max(axis=1) > 0.0)
+    assert reached.tolist() == list(range(16, 32))
+    assert np.abs(hilbert(both[20])).max() == pytest.approx(math.sqrt(2.0) * 100.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("width_mm", "aside"), [(20.0, 0.0), (0.0, 1.0)])
+def test_sound_of_the_face_is_flat_where_light_is_wide_and_runs_along_where_it_is_a_spot(
+    width_mm: float, aside: float
+) -> None:
+    source = np.array([0.0, 0.0, 40.0])
+    sound = FaceSound(70.0, 1.5, 0.8, width_mm)
+    both = simulate_channels(probe(), source, 0.0, rng(), snr_db=0.0, hearing=IN_PLANE, artefacts=(sound,))
+    for i in (32, 34, 37):
+        distance = math.hypot(1.5, aside * ((i - 32) * 0.4 - 0.8))
+        assert arrival_us(both[i]) == pytest.approx(distance / 1.5, abs=0.01)
 
 
 def test_source_off_the_plane_is_softer_down_to_the_threshold() -> None:

@@ -3,7 +3,8 @@
 Frames are simulated (fgreg.simulation.acoustics) with sources at x -20 to 20 mm and range 15 to 60 mm, pulses of 3 to
 7 MHz with 50 to 80 % bandwidth, 128 elements of 0.43 mm, 800 samples at 40 MHz that begin shortly before the wave does.
 The signal-to-noise ratio is the peak amplitude / sqrt(2) over the noise's standard deviation, per sample, on the
-element with the largest amplitude.
+element with the largest amplitude. Frames of the section "artefacts" hold a reflection of the source behind it, or
+pick-up of the trigger or sound of the probe's face before it.
 
 Exit status is 1 if a target is missed.
 """
@@ -30,7 +31,17 @@ from fgreg.detection.results import NoSignal, PaFind, pool_sound_speed_ratio
 from fgreg.detection.wavefront_fit import fit_wavefront
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
-from fgreg.simulation.acoustics import Hearing, Pulse, noise_channels, simulate_channels, simulate_envelope_image
+from fgreg.simulation.acoustics import (
+    Artefact,
+    FaceSound,
+    Hearing,
+    PickUp,
+    Pulse,
+    Reflection,
+    noise_channels,
+    simulate_channels,
+    simulate_envelope_image,
+)
 
 ASSUMED_M_S = 1540.0
 SAMPLES = 800
@@ -109,6 +120,157 @@ def channel_frames(
         tally.add(locate(frame, probe), x, r * ASSUMED_M_S / speed_m_s)
         progress(number + 1, frames)
     return tally
+
+
+REFLECTION_DB = (0.0, 3.0, 6.0)
+BEHIND_MM = (3.0, 5.0, 8.0, 11.0, 15.0)
+OTHER_WITHIN_MM = 0.3
+
+
+@dataclass
+class FirstWave:
+    """How often the direct wave is found among others, and how often the other one is reported."""
+
+    frames: int = 0
+    found: int = 0
+    wrong: int = 0
+    others: int = 0
+    seconds: float = 0.0
+
+    def __add__(self, more: FirstWave) -> FirstWave:
+        return FirstWave(*(getattr(self, name) + getattr(more, name) for name in self.__dataclass_fields__))
+
+    def locate(self, frame: npt.NDArray[Any], probe: ProbeModel, at_mm: FloatArray, other_mm: FloatArray) -> None:
+        """Take in one frame with its source, and its reflection, at (x, range)."""
+
+        def near(x_mm: float, range_mm: float, there: FloatArray) -> bool:
+            return bool(np.abs(np.array([x_mm, range_mm]) - there).max() < OTHER_WITHIN_MM)
+
+        start = time.process_time()
+        find = locate_in_channels(frame, probe)
+        self.seconds += time.process_time() - start
+        self.frames += 1
+        if isinstance(find, NoSignal):
+            return
+        if not near(find.x_mm, find.range_mm, at_mm):
+            self.wrong += 1
+            return
+        self.found += 1
+        self.others += any(near(other.x_mm, other.range_mm, other_mm) for other in find.others)
+
+    def figures(self) -> dict[str, float]:
+        share = self.found / self.frames
+        return {
+            "frames": self.frames,
+            "found": round(share, 4),
+            "standard_error": round(math.sqrt(share * (1.0 - share) / self.frames), 4),
+            "wrong": round(self.wrong / self.frames, 4),
+            "other_reported": round(self.others / self.frames, 4),
+            "ms": round(1e3 * self.seconds / self.frames, 1),
+        }
+
+
+def reflected(frames: int, seed: int, snr_db: float, gain_db: float, behind_mm: float) -> FirstWave:
+    """Sources with a reflection: ``channel_frames`` with a louder copy behind, up to 2 mm aside, of any phase."""
+    tally = FirstWave()
+    for number in range(frames):
+        rng = np.random.default_rng([seed, number])
+        x, r = rng.uniform(-20.0, 20.0), rng.uniform(*RANGES_MM)
+        pulse = Pulse(rng.uniform(3.0, 7.0), rng.uniform(0.5, 0.8), 0.0, rng.uniform(0.0, 2.0 * math.pi))
+        probe = probe_for(max(0.0, 5.0 * math.floor((r / (ASSUMED_M_S * 1e-3) - 1.5) / 5.0)))
+        aside = rng.uniform(-2.0, 2.0)
+        copy = Reflection(behind_mm, aside, gain_db, rng.uniform(0.0, 2.0 * math.pi))
+        source, hearing = np.array([x, 0.0, probe.radius_mm + r]), Hearing(elevation=None)
+        frame = simulate_channels(probe, source, 0.0, rng, pulse, snr_db, SAMPLES, None, hearing, artefacts=(copy,))
+        tally.locate(frame, probe, np.array([x, r]), np.array([x + aside, r + behind_mm]))
+        progress(number + 1, frames)
+    return tally
+
+
+def pick_up(rng: np.random.Generator, snr_db: float, range_mm: float) -> tuple[Artefact, ...]:
+    """Of the trigger, at any time before the direct wave, in all channels or in 15 to 40 % of them."""
+    share = 1.0 if rng.random() < 0.5 else rng.uniform(0.15, 0.4)
+    first = rng.uniform(0.0, 1.0 - share)
+    pulse = Pulse(rng.uniform(1.0, 8.0), rng.uniform(0.3, 0.8))
+    at_us = rng.uniform(0.5, range_mm / (ASSUMED_M_S * 1e-3) - 2.0)
+    return (PickUp(at_us, snr_db, 0.3, (first, first + share), pulse),)
+
+
+def face_area(rng: np.random.Generator, snr_db: float, _: float) -> tuple[Artefact, ...]:
+    """Light on the face, 5 to 30 mm (standard deviation) wide."""
+    return (FaceSound(snr_db, rng.uniform(0.2, 2.0), rng.uniform(-25.0, 25.0), rng.uniform(5.0, 30.0)),)
+
+
+def face_spot(rng: np.random.Generator, snr_db: float, _: float) -> tuple[Artefact, ...]:
+    """A spot of light on the face."""
+    return (FaceSound(snr_db, rng.uniform(0.2, 2.0), rng.uniform(-25.0, 25.0)),)
+
+
+def all_three(rng: np.random.Generator, snr_db: float, range_mm: float) -> tuple[Artefact, ...]:
+    """Pick-up, a spot of light on the face, and a reflection."""
+    copy = Reflection(rng.uniform(3.0, 15.0), rng.uniform(-2.0, 2.0), rng.uniform(0.0, 6.0), rng.uniform(0.0, 6.28))
+    return (*pick_up(rng, snr_db, range_mm), *face_spot(rng, snr_db, range_mm), copy)
+
+
+EARLY = {"pick-up": pick_up, "face, area": face_area, "face, spot": face_spot, "all and reflection": all_three}
+
+
+def early(frames: int, seed: int, snr_db: float, louder_db: float, kind: str, *, silent: bool = False) -> FirstWave:
+    """Whole records with a signal before the direct wave, this much louder; ``silent``: without a source."""
+    tally, probe = FirstWave(), probe_for(0.0)
+    for number in range(frames):
+        rng = np.random.default_rng([seed, number])
+        x, r = rng.uniform(-20.0, 20.0), rng.uniform(*RANGES_MM)
+        pulse = Pulse(rng.uniform(3.0, 7.0), rng.uniform(0.5, 0.8), 0.0, rng.uniform(0.0, 2.0 * math.pi))
+        artefacts = EARLY[kind](rng, snr_db + louder_db, r)
+        if silent:
+            artefacts = tuple(artefact for artefact in artefacts if not isinstance(artefact, Reflection))
+        source, samples = np.array([x, 0.0, probe.radius_mm + r]), 200 * math.ceil((r / 1.54 + 18.0) / 5.0)
+        frame = simulate_channels(
+            probe,
+            source,
+            0.0,
+            rng,
+            pulse,
+            -300.0 if silent else snr_db,
+            samples,
+            None,
+            Hearing(elevation=None),
+            artefacts=artefacts,
+        )
+        tally.locate(frame, probe, np.array([x, r]), np.array([np.inf, np.inf]))
+        progress(number + 1, frames)
+    return tally
+
+
+def artefacts(study: Study, options: argparse.Namespace) -> None:
+    """The first wave, not the strongest; nothing that comes before it."""
+
+    def text(figures: dict[str, float]) -> str:
+        return (
+            f"found {figures['found']:.3f} +- {figures['standard_error']:.3f}, wrong {figures['wrong']:.3f}, "
+            f"other reported {figures['other_reported']:.3f}, {figures['ms']:.0f} ms"
+        )
+
+    limits = {10.0: 0.99, 0.0: 0.97}
+    for snr_db, limit in limits.items():
+        for gain_db in REFLECTION_DB:
+            whole = FirstWave()
+            for behind_mm in BEHIND_MM:
+                tally = reflected(options.frames, options.seed + 7, snr_db, gain_db, behind_mm)
+                name = f"reflection {gain_db:+.0f} dB, {behind_mm:.0f} mm, {snr_db:g} dB"
+                study.note(name, tally.figures(), text(tally.figures()))
+                whole += tally
+            name = f"reflection {gain_db:+.0f} dB, {snr_db:g} dB"
+            study.note(name, whole.figures(), study.target(name, whole.found / whole.frames, 1.0, limit))
+        for kind in EARLY:
+            for louder_db in (0.0, 20.0):
+                tally = early(options.frames, options.seed + 8, snr_db, louder_db, kind)
+                name = f"{kind} {louder_db:+.0f} dB, {snr_db:g} dB"
+                study.note(name, tally.figures(), text(tally.figures()))
+                print("    found", study.target(name, tally.found / tally.frames, 1.0, limit), end="; ")
+                none = early(options.frames, options.seed + 9, snr_db, louder_db, kind, silent=True)
+                study.note(name + ", no source", none.figures(), f"{none.wrong + none.found} finds in {none.frames}")
 
 
 def with_ratio_fixed(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSignal:
@@ -323,6 +485,7 @@ SECTIONS = {
     "curve": curve,
     "false-finds": false_finds,
     "sound-speed": sound_speed,
+    "artefacts": artefacts,
     "images": images,
     "image-false-finds": image_false_finds,
     "timing": timing,

@@ -1,4 +1,4 @@
-"""Preprocessing of channel data: live channels, removal of the common flash, complex baseband in a frequency band.
+"""Preprocessing of channel data: live channels, removal of flat waves, muting, complex baseband in a frequency band.
 
 Arrays are (elements, samples); times in us after the laser pulse, frequencies in MHz.
 """
@@ -6,7 +6,7 @@ Arrays are (elements, samples); times in us after the laser pulse, frequencies i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import fft as scipy_fft
 
 from fgreg.errors import EstimationError
-from fgreg.geometry.transforms import BoolArray
+from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.session_model import ChannelModel
 
 Complex64Array = npt.NDArray[np.complex64]
@@ -26,11 +26,6 @@ MIN_RATE_MHZ = 30.0
 """Least sampling rate of the baseband: linear interpolation of an envelope has no relevant error at it."""
 LOUD = 2.0
 """A channel this many times noisier than the median channel is scaled down to it."""
-FLASH_SIGMA = 0.6
-"""Level of the channels' median, in noise sigmas, above which a common flash is suspected. The median of 128
-noise channels stays below 0.5. A source reaches few channels at any one time and moves it by 0.1."""
-FLASH_PARTICIPATION = 0.5
-FLASH_GUARD_US = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +48,7 @@ class Channels:
         start_us: arrival time, less the pulse delay, of a wave whose maximum is at sample 0.
         noise: standard deviation of a sample, robust over the live channels, frame's units.
         peak: largest sample, frame's units.
+        kept: share of the live channels' samples that are not muted.
     """
 
     spectrum: Complex64Array
@@ -63,6 +59,7 @@ class Channels:
     start_us: float
     noise: float
     peak: float
+    kept: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +82,7 @@ class Baseband:
 
 
 def prepare_channels(frame: npt.NDArray[Any], sampling: ChannelModel) -> Channels:
-    """Subtract offsets, find dead channels, remove a flash common to all channels.
+    """Subtract offsets, find dead channels, scale noisy ones down.
 
     Args:
         frame: (elements, samples) real numbers, finite.
@@ -108,7 +105,6 @@ def prepare_channels(frame: npt.NDArray[Any], sampling: ChannelModel) -> Channel
     loud = live & (noise_each > max(LOUD * noise, 1e-3 * peak))
     if loud.any() and noise > 0.0:
         data[loud] *= (noise / noise_each[loud])[:, None].astype(np.float32)
-    remove_flash(data, live, noise, sampling.sampling_mhz)
     samples = data.shape[1]
     padded = int(scipy_fft.next_fast_len(samples + math.ceil(PAD_US * sampling.sampling_mhz), real=True))
     return Channels(
@@ -123,27 +119,38 @@ def prepare_channels(frame: npt.NDArray[Any], sampling: ChannelModel) -> Channel
     )
 
 
-def remove_flash(data: Float32Array, live: BoolArray, noise: float, sampling_mhz: float) -> None:
-    """Remove, in place, the signal that reaches all channels at the same time (the laser's light, interference).
+def without_flat_wave(channels: Channels, span_us: tuple[float, float], elements: slice) -> Channels:
+    """The channels without what these elements receive at the same time, each channel by its own gain.
 
-    A source's wavefront is curved: at any one time it is in few channels, so the channels' median does not see it.
-    Where the median rises, each channel's gain is fitted and its share subtracted, if most channels take part.
+    Args:
+        span_us: first and last time of the flat wave, as arrival times.
+        elements: the elements that give its shape; it is removed from all.
     """
-    level = FLASH_SIGMA * noise * math.sqrt(max(1.0, 100.0 / int(live.sum())))
-    # Early exit: a common signal is in the mean too, which is cheaper than the median.
-    if float(np.abs(data[live].mean(axis=0)).max()) < 0.7 * level:
-        return
-    common = np.median(data[live], axis=0)
-    hit = np.abs(common) > max(level, 1e-6 * float(np.abs(data).max()))
-    if not hit.any():
-        return
-    guard = max(1, round(FLASH_GUARD_US * sampling_mhz))
-    window = np.convolve(hit, np.ones(2 * guard + 1), mode="same") > 0.5
-    pattern = common[window]
-    gain = data[:, window] @ pattern / float(pattern @ pattern)
-    share = float(gain[live].sum() ** 2 / (live.sum() * (gain[live] ** 2).sum()))
-    if share > FLASH_PARTICIPATION:
-        data[:, window] -= np.outer(gain, pattern).astype(np.float32)
+    data = _samples(channels)
+    first, last = (round((time - channels.start_us) * channels.sampling_mhz) for time in span_us)
+    window = slice(max(0, first), max(0, last) + 1)
+    pattern = data[elements][channels.live[elements], window].mean(axis=0)
+    power = float(pattern @ pattern)
+    if power > 0.0:
+        data[:, window] -= np.outer(data[:, window] @ pattern / power, pattern)
+    return replace(channels, spectrum=np.asarray(scipy_fft.rfft(data, channels.padded, axis=1)))
+
+
+def muted(channels: Channels, from_us: FloatArray, until_us: FloatArray) -> Channels:
+    """The channels with zeros between two times (elements,) each, as arrival times."""
+    data = _samples(channels)
+    time_us = channels.start_us + np.arange(channels.samples) / channels.sampling_mhz
+    quiet = (time_us >= from_us[:, None]) & (time_us <= until_us[:, None])
+    data[quiet] = 0.0
+    return replace(
+        channels,
+        spectrum=np.asarray(scipy_fft.rfft(data, channels.padded, axis=1)),
+        kept=channels.kept * (1.0 - float(quiet[channels.live].mean())),
+    )
+
+
+def _samples(channels: Channels) -> Float32Array:
+    return np.asarray(scipy_fft.irfft(channels.spectrum, channels.padded, axis=1)[:, : channels.samples])
 
 
 def baseband(channels: Channels, band: Band) -> Baseband:
@@ -168,9 +175,10 @@ def baseband(channels: Channels, band: Band) -> Baseband:
     kept = min(length, math.ceil(channels.samples * rate / channels.sampling_mhz))
     data = np.zeros((kept + 1, channels.live.size), dtype=np.complex64)
     data[:kept] = np.asarray(scipy_fft.ifft(shifted, axis=1, overwrite_x=True))[:, :kept].T
-    # |complex Gaussian|^2 is exponential: its median is log 2 times its mean. A source fills few of the samples.
+    # |complex Gaussian|^2 is exponential: its median is log 2 times its mean. A source fills few of the samples; of
+    # muted samples, which are zero, the quantile is reckoned without.
     power = np.abs(data[:kept:4, channels.live]) ** 2
-    variance = float(np.median(power)) / math.log(2.0)
+    variance = float(np.median(power)) / math.log(2.0 * max(channels.kept, 0.6))
     return Baseband(data, rate, carrier * step, channels.start_us, max(variance, 1e-14 * float(power.max())))
 
 

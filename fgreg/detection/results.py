@@ -117,6 +117,16 @@ def board_corner_dependence(fit: BoardFit, column: int, row: int) -> CameraDepen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class OtherWave:
+    """A later wave in the frame of a find: x and range, covariance (2, 2) mm^2 and statistic as of :class:`PaFind`."""
+
+    x_mm: float
+    range_mm: float
+    covariance: FloatArray
+    statistic: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PaFind:
     """One photoacoustic source found in one frame.
 
@@ -134,6 +144,8 @@ class PaFind:
         sound_speed_ratio_sigma: its standard deviation.
         elements_used: number of elements that received the source and entered the fit; None for images.
         statistic, threshold: the detection statistic (log likelihood ratio) and its threshold.
+        others: later waves in the same frame, the strongest first: reflections, or the source after all where the
+            first wave has another cause.
     """
 
     x_mm: float
@@ -146,6 +158,7 @@ class PaFind:
     elements_used: int | None
     statistic: float
     threshold: float
+    others: tuple[OtherWave, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,13 +2,15 @@
 
 Everything starts from positions in space: element i at stage angle t is at (x_i, R sin t, R cos t), the wave takes
 |source - element| / c to arrive, one way. An element hears less off its axis, farther away, and when the source is off
-the image plane.
+the image plane. Options add what else a record holds: reflections, pick-up of the trigger, sound made at the probe's
+face.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -103,6 +105,63 @@ class Hearing:
     elevation: Elevation | None = field(default_factory=Elevation)
 
 
+@dataclass(frozen=True, slots=True)
+class Reflection:
+    """A later copy of the source's wave, as from the source's mirror image in an interface.
+
+    Attributes:
+        behind_mm: distance of the mirror image behind the source, along the range.
+        aside_mm: its distance from the source along x.
+        gain_db: its level over the direct wave's, each at the element that receives it loudest.
+        turn_rad: change of the carrier's phase.
+    """
+
+    behind_mm: float
+    aside_mm: float = 0.0
+    gain_db: float = 0.0
+    turn_rad: float = math.pi
+
+
+@dataclass(frozen=True, slots=True)
+class PickUp:
+    """A signal that reaches the channels at the same time: the laser's trigger or light.
+
+    Attributes:
+        time_us: of its maximum, after the pulse.
+        snr_db: as of a source, at a channel of gain 1.
+        unequal: standard deviation of the channels' gains about 1.
+        elements: first and last (exclusive) element that it reaches, as shares of the array.
+        pulse: its waveform.
+    """
+
+    time_us: float
+    snr_db: float = 20.0
+    unequal: float = 0.3
+    elements: tuple[float, float] = (0.0, 1.0)
+    pulse: Pulse = field(default_factory=Pulse)
+
+
+@dataclass(frozen=True, slots=True)
+class FaceSound:
+    """Sound that light makes at the probe's face: over an area, or in a spot.
+
+    Attributes:
+        snr_db: as of a source, at the element that receives it loudest.
+        range_mm: from the elements to the face, mm.
+        x_mm: middle of the light on the face.
+        width_mm: standard deviation of the light across the face; every element receives the part before it. 0: a
+            spot, whose sound runs along the array.
+    """
+
+    snr_db: float = 20.0
+    range_mm: float = 1.0
+    x_mm: float = 0.0
+    width_mm: float = 0.0
+
+
+Artefact = Reflection | PickUp | FaceSound
+
+
 def element_positions(probe: ProbeModel, scan_rad: float, array: TrueArray | None = None) -> FloatArray:
     """TRUS positions (elements, 3), mm, in the order of the data's rows, at stage angle ``scan_rad``.
 
@@ -140,6 +199,7 @@ def simulate_channels(
     hearing: Hearing | None = None,
     half_width_rad: float | None = None,
     array: TrueArray | None = None,
+    artefacts: Sequence[Artefact] = (),
 ) -> ChannelArray:
     """Channel data of one laser pulse, in units of the noise's standard deviation.
 
@@ -156,6 +216,7 @@ def simulate_channels(
         half_width_rad: of the window at this depth; the probe's table where absent.
         array: where it is mounted, its pitch and the delay of its trigger (not the sound speed); as declared where
             absent.
+        artefacts: what the record holds besides.
 
     Returns:
         (elements, samples) float32.
@@ -171,23 +232,61 @@ def simulate_channels(
     out = rng.standard_normal((probe.elements, samples), dtype=np.float32)
     array = array or TrueArray.of(probe, {})
     elements = element_positions(probe, scan_rad, array)
-    amplitude = _element_amplitudes(probe, source, elements, pulse, hearing, speed_mm_us)
-    loudest = math.sqrt(2.0) * 10.0 ** (snr_db / 20.0)
-    amplitude *= loudest / amplitude.max()
+    in_plane = 1.0
     if hearing.elevation is not None:
         offset = float(rotation_offset_rad(source, scan_rad, array))
         if half_width_rad is None:
             depth = float(array.distance_mm(source, np.asarray(scan_rad)))
             half_width_rad = float(np.interp(depth, probe.sensitivity.depth_mm, probe.sensitivity.half_width_rad))
-        amplitude *= float(hearing.elevation.amplitude(offset, half_width_rad))
-    distance_mm = np.linalg.norm(source - elements, axis=1) - array.range_offset_mm
-    centre = (distance_mm / speed_mm_us + channels.pulse_delay_us - channels.t0_us) * channels.sampling_mhz
+        in_plane = float(hearing.elevation.amplitude(offset, half_width_rad))
+
+    def arrive(distance_mm: FloatArray, amplitude: FloatArray, waveform: Pulse) -> None:
+        _add_wave(out, (distance_mm - array.range_offset_mm) / speed_mm_us, amplitude, waveform, channels)
+
+    def arrive_from(trus_p_mm: FloatArray, peak: float, waveform: Pulse, share: float = 1.0) -> None:
+        amplitude = _element_amplitudes(probe, trus_p_mm, elements, waveform, hearing, speed_mm_us)
+        amplitude *= peak / amplitude.max()
+        arrive(np.linalg.norm(trus_p_mm - elements, axis=1), amplitude * share, waveform)
+
+    arrive_from(source, _peak_of(snr_db), pulse, in_plane)
+    along, outwards = array.along(np.asarray(scan_rad)), source - elements.mean(axis=0)
+    outwards -= (outwards @ along) * along
+    outwards /= np.linalg.norm(outwards)
+    for artefact in artefacts:
+        if isinstance(artefact, Reflection):
+            mirrored = source + artefact.behind_mm * outwards + artefact.aside_mm * along
+            turned = replace(pulse, phase_rad=pulse.phase_rad + artefact.turn_rad)
+            arrive_from(mirrored, _peak_of(snr_db + artefact.gain_db), turned, in_plane)
+        elif isinstance(artefact, FaceSound) and artefact.width_mm == 0.0:
+            spot = elements.mean(axis=0) + artefact.range_mm * outwards + artefact.x_mm * along
+            arrive_from(spot, _peak_of(artefact.snr_db), pulse)
+        elif isinstance(artefact, FaceSound):
+            light = np.exp(-0.5 * ((probe.element_x_mm - artefact.x_mm) / artefact.width_mm) ** 2)
+            arrive(np.full(probe.elements, artefact.range_mm), _peak_of(artefact.snr_db) * light, pulse)
+        else:
+            share = (np.arange(probe.elements) + 0.5) / probe.elements
+            reached = (share >= artefact.elements[0]) & (share < artefact.elements[1])
+            gain = reached * (1.0 + artefact.unequal * rng.standard_normal(probe.elements))
+            time_us = np.full(probe.elements, artefact.time_us)
+            _add_wave(out, time_us, _peak_of(artefact.snr_db) * gain, artefact.pulse, channels)
+    return out
+
+
+def _peak_of(snr_db: float) -> float:
+    """Peak amplitude of a wave, in standard deviations of the noise."""
+    return float(math.sqrt(2.0) * 10.0 ** (snr_db / 20.0))
+
+
+def _add_wave(
+    out: ChannelArray, arrival_us: FloatArray, amplitude: FloatArray, pulse: Pulse, channels: ChannelModel
+) -> None:
+    """Add a pulse that reaches each element (elements,) at its time after the laser pulse, in place."""
+    centre = (arrival_us + channels.pulse_delay_us - channels.t0_us) * channels.sampling_mhz
     reach = math.ceil(pulse.support_us * channels.sampling_mhz) + 1
     index = np.rint(centre).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
     signal = amplitude[:, None] * pulse.waveform((index - centre[:, None]) / channels.sampling_mhz)
-    row, column = np.nonzero((index >= 0) & (index < samples))
+    row, column = np.nonzero((index >= 0) & (index < out.shape[1]))
     out[row, index[row, column]] += signal[row, column].astype(np.float32)
-    return out
 
 
 def noise_channels(probe: ProbeModel, rng: np.random.Generator, samples: int = 1600) -> ChannelArray:

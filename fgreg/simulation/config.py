@@ -26,7 +26,7 @@ from fgreg.model.session_model import (
     TagModel,
 )
 from fgreg.model.systematic import Systematic
-from fgreg.simulation.acoustics import Elevation, Pulse
+from fgreg.simulation.acoustics import Artefact, Elevation, Pulse
 from fgreg.simulation.array import TrueArray
 from fgreg.simulation.disturbances import Disturbances
 from fgreg.simulation.render import Optics
@@ -113,6 +113,7 @@ class SimulationConfig:
         stage_slip_rad, stage_slip_at: the plane stays behind the reading by this angle, for good, after this share of
             the PMs.
         camera_move_mm: the camera moves by this in a random direction, without a turn; else turns and shifts are drawn.
+        artefacts: what every record of the probe holds besides the source.
         declared_noise: the session's ``noise`` block; the true one (``noise``) where None.
         declared_camera: the session's camera; the true one (``camera``, but for ``deviations``) where None.
         declared: values that the session has instead of the true ones, by key: ``{"probe.radius_mm": 0.01}``.
@@ -201,6 +202,7 @@ class SimulationConfig:
     elevation: Elevation = field(default_factory=Elevation)
     snr_db: float = 15.0
     samples: int = 1200
+    artefacts: tuple[Artefact, ...] = ()
     targets_mm: FloatArray | None = None
 
     def __post_init__(self) -> None:

@@ -157,5 +157,6 @@ class LookPicture:
             hearing=Hearing(elevation=config.elevation),
             half_width_rad=self.half_width_rad,
             array=config.array,
+            artefacts=config.artefacts,
         )
         return quantised(channels[::-1] if config.reversed_elements else channels)
