@@ -432,6 +432,8 @@ def missed(cell: Cell, all_of: dict[str, Figure], quarters: list[dict[str, Figur
     elif cell.kind in ROWS:
         row = ROWS[cell.kind]
         most = 25.0 if cell.kind.endswith("checks") and cell.noise == "published" else row.most
+        if row.camera and row.far and cell.noise != RAW:
+            most = 100.0  # only frames show it: poses of a tag and a board that are as wrong fit each other
         name = "ok_far" if row.far else "ok_beyond"
         out += [] if 100.0 * value[name] <= most else [f"{name} at most {most:g} %"]
         out += [] if value["unseen"] == 0.0 else ["unseen moves"]
