@@ -13,10 +13,10 @@ from functools import cache
 from itertools import combinations
 
 import numpy as np
-import poselib
 
 from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, hat, inverse, make_transform, transform_points
 from fgreg.model.measurements import Aim
+from fgreg.registration.minimal_solver import poses_of_three
 
 SEED = 20260
 TRIPLES = 24
@@ -160,6 +160,6 @@ def _minimal_rotations(origin: FloatArray, direction: FloatArray, points: FloatA
     found: list[FloatArray] = []
     for triple in triples:
         rows = list(triple)
-        solutions = poselib.gp3p(origin[rows], direction[rows], points[rows])
+        solutions = poses_of_three(origin[rows], direction[rows], points[rows])
         found.extend(solution.R for solution in solutions if np.isfinite(solution.R).all())
     return np.array(found, dtype=np.float64).reshape(-1, 3, 3)

@@ -9,13 +9,13 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-import poselib
 
 from fgreg.geometry.transforms import FloatArray, inverse, make_transform, transform_points
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import arc_points, perpendicular_basis
 from fgreg.model.measurements import Aim
 from fgreg.registration.initialization import distinct_rotations
+from fgreg.registration.minimal_solver import poses_of_three
 
 TRIPLES = 160
 """Random triples of the consensus: with 60 % outliers ten of them still have inliers only."""
@@ -85,7 +85,7 @@ def _minimal_poses(origin: FloatArray, direction: FloatArray, points: FloatArray
         triples = np.argsort(np.random.default_rng(SEED).random((TRIPLES, count)), axis=1)[:, :3]
     rotations, translations = [], []
     for rows in triples:
-        for pose in poselib.gp3p(origin[rows], direction[rows], points[rows]):
+        for pose in poses_of_three(origin[rows], direction[rows], points[rows]):
             rotations.append(pose.R)
             translations.append(pose.t)
     if not rotations:
