@@ -9,11 +9,12 @@ chi square r' S^-1 r splits into two independent parts:
 - the rest, which no camera move explains.
 
 Either alarms with half of the false alarms, and the first with all of them where there is no rest (up to three PMs of
-one look each). The Bayes factor of a camera that is elsewhere, where using the registration would do harm, against
-outliers and noise (fgreg.camera_moves.bayes_filter, loop_closure) tells a move from a wrong detection.
+one look each). The Bayes factor of a camera move against outliers and noise (fgreg.camera_moves.bayes_filter) then
+tells a move from a wrong detection.
 
-Without an alarm the registration is valid only where that factor is small, and where the shots determine all six
-parameters. A single shot is two equations, and never shows every turn.
+Without an alarm the registration is valid only where the Bayes factor of a camera elsewhere, far enough for the
+registration to do harm (fgreg.camera_moves.loop_closure), is small, and where the shots determine all six parameters. A
+single shot is two equations, and never shows every turn.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class Verification:
 
     Attributes:
         validity, reason: the verdict, and a sentence with its figures and what to do.
-        log_odds: log Bayes factor of a camera that is elsewhere, against the registration's place.
+        log_odds: log Bayes factor of a camera move against none; without an alarm of a move far enough to do harm.
         p: tail probability of the shots' chi square, had nothing changed.
         shots: each PM; an outlier among agreeing ones is not used.
         shift_mm, turn_rad: smallest shift in every direction, and smallest turn about the middle of the targets about
@@ -136,7 +137,7 @@ def verify(
     problem = packed(used, shapes=True)
     before = Gaussian(np.zeros(len(covariance)), covariance)
     first = np.zeros(1, dtype=np.int64)
-    terms, settings = linearise(problem, state), MoveSettings(elsewhere_scales())
+    terms, settings = linearise(problem, state), MoveSettings() if fit.alarm else MoveSettings(elsewhere_scales())
     evidence = move_evidence(before, terms, first, settings, relinearisation(problem, state))
     log_odds = float(evidence.log_bayes[0])
     shots = tuple(
