@@ -156,6 +156,7 @@ class CommandKind(StrEnum):
     SEARCH = "search"
     FOLLOW = "follow"
     MOVED = "moved"
+    CHECK = "check"
     STOP = "stop"
     RESET = "reset"
 
@@ -166,12 +167,14 @@ class OperatorCommand:
 
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
     ``search``, ``follow``: the stage may turn to search for PMs, or to follow the beam; ``next``: leave this spot;
-    ``moved``: the camera has moved; ``stop`` the stage at once; ``reset``: the latched stage has been inspected, and
-    motions may be requested again.
+    ``moved``: the camera has moved; ``check``: a point that both devices show now, at ``point`` (u, v in the left frame
+    and u, v in the right one, px; x and range in the image plane, mm); ``stop`` the stage at once; ``reset``: the
+    latched stage has been inspected, and motions may be requested again.
     """
 
     kind: CommandKind
     corner: tuple[int, int] | None = None
+    point: tuple[float, float, float, float, float, float] | None = None
 
 
 class Operator(Device, Protocol):

@@ -15,6 +15,7 @@ LETTERS = {
     "f": CommandKind.FOLLOW,
     "n": CommandKind.NEXT,
     "m": CommandKind.MOVED,
+    "c": CommandKind.CHECK,
     "x": CommandKind.STOP,
 }
 """One-letter commands. ``s`` is search; an empty line and ``x`` stop. ``reset`` has no letter: a typing error must not
@@ -22,13 +23,14 @@ release a stage that has latched."""
 
 EXPECTED = (
     "home (h), aim COLUMN ROW (a), register (r), search (s), follow (f), next (n), moved (m), "
-    "stop (x, or an empty line), reset"
+    "check U V U V X RANGE (c), stop (x, or an empty line), reset"
 )
 LARGEST_CORNER = 199
 """Largest corner index of a board in session.yaml."""
 
 _WORDS: dict[str, CommandKind] = {**{said.value: said for said in CommandKind}, **LETTERS}
 _NUMBER = re.compile(r"[0-9]{1,3}")
+_DECIMAL = re.compile(r"-?[0-9]{1,4}(\.[0-9]{1,6})?")
 _STOP = re.compile(r"\bstop\b")
 
 
@@ -49,6 +51,8 @@ def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCom
         return f"{one_line(repr(line.strip()), 40)} is not understood; say {EXPECTED}"
     if said is CommandKind.AIM:
         return _aim(words[1:], corners)
+    if said is CommandKind.CHECK:
+        return _check(words[1:])
     if len(words) > 1:
         return f"{one_line(repr(line.strip()), 40)} is not understood; {said} takes nothing after it"
     return OperatorCommand(said)
@@ -63,6 +67,16 @@ def _aim(words: list[str], corners: tuple[int, int] | None) -> OperatorCommand |
     if not (column < columns and row < rows):
         return f"there is no corner {column} {row}: expected columns 0 to {columns - 1}, rows 0 to {rows - 1}"
     return OperatorCommand(CommandKind.AIM, (column, row))
+
+
+def _check(words: list[str]) -> OperatorCommand | str:
+    if len(words) != 6 or not all(_DECIMAL.fullmatch(word) for word in words):
+        return (
+            "a check is said as check U V U V X RANGE: a point's pixel in the left and in the right frame, and its x "
+            "and range (mm) in the image plane, turned to where it is brightest"
+        )
+    u, v, right_u, right_v, x_mm, range_mm = (float(word) for word in words)
+    return OperatorCommand(CommandKind.CHECK, point=(u, v, right_u, right_v, x_mm, range_mm))
 
 
 def asked(text: str, wants: CommandKind | None) -> str:

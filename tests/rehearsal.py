@@ -23,6 +23,7 @@ from fgreg.live.actions import (
     StageView,
     Sweep,
     TakeAim,
+    TakeCheck,
     TakeMove,
     TakePairs,
     Tell,
@@ -163,7 +164,7 @@ class Rehearsal:
                 self.latched = ""
             case TakeAim():
                 self._aim()
-            case TakeMove():
+            case TakeMove() | TakeCheck():
                 raise AssertionError("no one reported a move")
             case TakePairs(pm, looks):
                 spot = one_spot(looks)

@@ -24,8 +24,10 @@ from fgreg.drivers.tcp_link import Endpoint
 from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
 
+OTHERWISE = (CommandKind.AIM, CommandKind.CHECK, CommandKind.RESET)
 
-@pytest.mark.parametrize("said", [said for said in CommandKind if said not in (CommandKind.AIM, CommandKind.RESET)])
+
+@pytest.mark.parametrize("said", [said for said in CommandKind if said not in OTHERWISE])
 def test_each_word_and_its_letter_are_understood_in_any_case(said: CommandKind) -> None:
     letter = next(letter for letter, meant in LETTERS.items() if meant is said)
     for line in (said.value, said.value.upper(), letter, f"  {letter} \r"):
@@ -46,6 +48,12 @@ def test_an_aim_names_its_corner(line: str) -> None:
     assert understand(line, (9, 6)) == OperatorCommand(CommandKind.AIM, (3, 2))
 
 
+@pytest.mark.parametrize("line", ["check 640 350.5 600 351 -3.25 31", "c 640, 350.5, 600, 351, -3.25, 31"])
+def test_a_check_names_its_pixels_and_its_place_in_the_plane(line: str) -> None:
+    point = (640.0, 350.5, 600.0, 351.0, -3.25, 31.0)
+    assert understand(line) == OperatorCommand(CommandKind.CHECK, point=point)
+
+
 @pytest.mark.parametrize(
     ("line", "told"),
     [
@@ -56,6 +64,8 @@ def test_an_aim_names_its_corner(line: str) -> None:
         ("aim 3.0 2", "aim COLUMN ROW"),
         ("aim 9 2", "columns 0 to 8, rows 0 to 5"),
         ("aim 3 6", "columns 0 to 8, rows 0 to 5"),
+        ("check 1 2 3 4 5", "check U V U V X RANGE"),
+        ("c 1 2 3 4 5 x", "check U V U V X RANGE"),
         ("serch", EXPECTED),
         ("search the left side", "search takes nothing after it"),
         ("\x1b[A", "'\\x1b[a]'"[:6]),

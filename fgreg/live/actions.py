@@ -145,6 +145,14 @@ class TakeAim:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TakeCheck:
+    """Record a check: a point's pixels in both frames, its x and range, and the angle of the plane that it is in."""
+
+    point: tuple[float, float, float, float, float, float]
+    scan_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TakePairs:
     """Record these pulses as looks at one PM."""
 
@@ -172,4 +180,4 @@ class Tell:
     wants: CommandKind | None = None
 
 
-Action = Ask | Sweep | Follow | Halt | Release | TakeAim | TakePairs | TakeMove | Tell
+Action = Ask | Sweep | Follow | Halt | Release | TakeAim | TakeCheck | TakePairs | TakeMove | Tell

@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from fgreg.detection.board import detect_board
+from fgreg.detection.check_points import check_measurement
 from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner
 from fgreg.drivers.base import BmodeFrame, DeviceLost, OperatorCommand, Registration, StereoFrame, host_now
@@ -28,6 +29,7 @@ from fgreg.live.actions import (
     Release,
     Sweep,
     TakeAim,
+    TakeCheck,
     TakeMove,
     TakePairs,
     Tell,
@@ -42,7 +44,16 @@ from fgreg.live.stage_commands import Steering
 from fgreg.live.status import Devices, Figures, Status
 from fgreg.live.workflow import Workflow
 from fgreg.model.estimate import TrackEstimate, Verdict
-from fgreg.model.events import AimEvent, CameraMovedEvent, MarkerRecord, NoteEvent, PairEvent, TrusRecord
+from fgreg.model.events import (
+    AimEvent,
+    CameraMovedEvent,
+    CheckEvent,
+    MarkerRecord,
+    NoteEvent,
+    PairEvent,
+    PlaneRecord,
+    TrusRecord,
+)
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Latencies, TimedPose
@@ -299,6 +310,8 @@ class LiveLoop:
                 self.figures.orders += self._steering.order(action)
             case TakeAim(corner):
                 self._aim(corner)
+            case TakeCheck(point, scan_rad):
+                self._check_point(point, scan_rad)
             case TakePairs(pm, looks):
                 spot = one_spot(looks)
                 for look in spot.looks:
@@ -358,6 +371,22 @@ class LiveLoop:
         marker = MarkerRecord(pose.parent_T_child, pose.covariance)
         self._recorder.hand_over(AimEvent(self._t(pose.t_s), 0, marker, spot, covariance))
         self._tell(Tell(f"aim at corner {corner[0]}, {corner[1]} taken", done=True))
+
+    def _check_point(self, point: tuple[float, ...], scan_rad: float) -> None:
+        """Record a check."""
+        rig = self._model.camera
+        if rig is None or rig.right is None:
+            self._tell(Tell("no check: session.yaml has no stereo camera"))
+            return
+        device = math.degrees(self._model.stage.device_from_scan(scan_rad))
+        plane = PlaneRecord(device, point[4], point[5])
+        event = CheckEvent(self._t(host_now()), 0, left=np.array(point[:2]), right=np.array(point[2:4]), trus=plane)
+        why = check_measurement(event, 0, self._model)
+        if isinstance(why, str):
+            self._tell(Tell(f"no check: {why}"))
+            return
+        self._recorder.hand_over(event)
+        self._tell(Tell("check taken", done=True))
 
     def _pair(self, pm: int, pose: TimedPose, look: LocatedPulse) -> None:
         if look.scan_rad is None:

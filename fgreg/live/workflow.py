@@ -22,6 +22,7 @@ from fgreg.live.actions import (
     StageView,
     Sweep,
     TakeAim,
+    TakeCheck,
     TakeMove,
     TakePairs,
     Tell,
@@ -214,6 +215,11 @@ class Workflow:
             case CommandKind.MOVED:
                 self._search = None
                 return [TakeMove()]
+            case CommandKind.CHECK if command.point is not None:
+                if inputs.stage is None or inputs.stage.moving:
+                    why = "not there" if inputs.stage is None else "turning"
+                    return [Tell(f"no check: the stage is {why}")]
+                return [TakeCheck(command.point, inputs.stage.scan_rad)]
             case CommandKind.STOP:
                 self._search = None
                 return [Halt("the operator has stopped the stage")]
