@@ -24,6 +24,7 @@ from fgreg.model.events import (
     Event,
     MarkerRecord,
     NoteEvent,
+    OtherRecord,
     PairEvent,
     RefusedEvent,
     StageEvent,
@@ -59,6 +60,7 @@ def pair(rng: np.random.Generator, t: float, pm: int = 0) -> PairEvent:
         covariance=np.diag(rng.random(2) + 0.01),
         amplitude=0.7,
         sweep=-1,
+        others=(OtherRecord(1 / 3, 40.1, np.diag(rng.random(2) + 0.01)), OtherRecord(-2.0, 1 / 7)),
     )
     return PairEvent(t, 0, pm, pose(rng), look)
 

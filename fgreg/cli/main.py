@@ -181,7 +181,7 @@ def _summary_extras(report: "SolveReport") -> Any:
     from fgreg.model.events import PairEvent
 
     extracted, errors = report.extracted, report.errors
-    looks = dict(zip(extracted.pair_events, (pair.look for pair in extracted.measurements.pairs), strict=True))
+    looks = dict(zip(extracted.pair_events, report.looks, strict=True))
     pair_events = [index for index, event in enumerate(report.session.events) if isinstance(event, PairEvent)]
     detections = None
     if extracted.markers or extracted.finds:

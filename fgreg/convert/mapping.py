@@ -33,7 +33,7 @@ from fgreg.session.yaml_loader import load_yaml
 
 MAPPING_FORMAT = "fgreg-mapping/1"
 
-LOOK = tuple(key for key in record(TrusRecord).fields if not isinstance(key.kind, Covariance))
+LOOK = tuple(key for key in record(TrusRecord).fields if not isinstance(key.kind, Covariance | ListOf))
 """Keys of a look in a table."""
 
 COLUMNS = (

@@ -50,6 +50,7 @@ from fgreg.model.measurements import (
     Look,
     MarkerObservation,
     Measurements,
+    OtherPosition,
     Pair,
     Track,
     default_marker_covariance,
@@ -294,6 +295,11 @@ class _Builder:
         noise, stage = self.model.noise, self.model.stage
         covariance = record.covariance
         x_mm, range_mm, amplitude = record.x_mm, record.range_mm, record.amplitude
+        usual = np.diag([noise.lateral_mm**2, noise.range_mm**2])
+        others = tuple(
+            OtherPosition(other.x_mm, other.range_mm, usual if other.covariance is None else other.covariance)
+            for other in record.others
+        )
         if x_mm is None or range_mm is None:
             find = self.found.finds[index, number]
             if isinstance(find, NoSignal):
@@ -301,17 +307,17 @@ class _Builder:
             x_mm, range_mm = find.x_mm, find.range_mm
             covariance = find.covariance if covariance is None else covariance
             amplitude = find.amplitude if amplitude is None else amplitude
-        if covariance is None:
-            covariance = np.diag([noise.lateral_mm**2, noise.range_mm**2])
+            others = tuple(OtherPosition(other.x_mm, other.range_mm, other.covariance) for other in find.others)
         return Look(
             scan_rad=stage.scan_from_device(math.radians(record.scan_deg)),
             scan_sigma_rad=noise.scan_rad,
             x_mm=x_mm,
             range_mm=range_mm,
-            covariance=as_float_array(covariance, 2, 2),
+            covariance=as_float_array(usual if covariance is None else covariance, 2, 2),
             sweep=stage.direction * record.sweep,
             amplitude=amplitude,
             window_sigma_rad=self.model.noise_per_pm.window_rad,
+            others=others,
         )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.measurements import OtherPosition
 from fgreg.model.time_sync import PoseHistory, TimedPose
 from fgreg.stage.limits import MotionKind
 
@@ -20,6 +21,7 @@ class LocatedPulse:
         scan_rad: angle of the image plane; None if the plane was turning or its angle is unknown.
         marker: ``camera_T_marker`` at the pulse; None if it is unknown, and then ``unpaired`` gives the reason.
         x_mm, range_mm, covariance, amplitude: of the located source; None if no source was located.
+        others: other positions at which it may be.
     """
 
     pulse_s: float
@@ -30,6 +32,7 @@ class LocatedPulse:
     range_mm: float | None = None
     covariance: FloatArray | None = None
     amplitude: float | None = None
+    others: tuple[OtherPosition, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

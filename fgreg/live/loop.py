@@ -50,6 +50,7 @@ from fgreg.model.events import (
     CheckEvent,
     MarkerRecord,
     NoteEvent,
+    OtherRecord,
     PairEvent,
     PlaneRecord,
     TrusRecord,
@@ -392,7 +393,14 @@ class LiveLoop:
         if look.scan_rad is None:
             raise AssertionError("a look without a plane angle")
         device = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
-        trus = TrusRecord(device, look.x_mm, look.range_mm, covariance=look.covariance, amplitude=look.amplitude)
+        trus = TrusRecord(
+            device,
+            look.x_mm,
+            look.range_mm,
+            covariance=look.covariance,
+            amplitude=look.amplitude,
+            others=tuple(OtherRecord(other.x_mm, other.range_mm, other.covariance) for other in look.others),
+        )
         marker = MarkerRecord(pose.parent_T_child, pose.covariance)
         self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))
 

@@ -60,4 +60,6 @@ def one_spot(looks: Sequence[LocatedPulse]) -> Spot:
 def _wider(look: LocatedPulse, variance: float) -> LocatedPulse:
     if look.covariance is None:
         return look
-    return replace(look, covariance=look.covariance + variance * np.eye(2))
+    more = variance * np.eye(2)
+    others = tuple(replace(other, covariance=other.covariance + more) for other in look.others)
+    return replace(look, covariance=look.covariance + more, others=others)

@@ -20,6 +20,7 @@ from fgreg.detection.results import NoSignal, PaFind
 from fgreg.drivers.base import PaFrame, host_now
 from fgreg.live.actions import LocatedPulse
 from fgreg.live.pa_worker import Locator
+from fgreg.model.measurements import OtherPosition
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import DeviceClock, PairRefused, PoseHistory
 
@@ -147,7 +148,12 @@ class PulseLocator:
         if isinstance(found, NoSignal):
             return complete
         return replace(
-            complete, x_mm=found.x_mm, range_mm=found.range_mm, covariance=found.covariance, amplitude=found.amplitude
+            complete,
+            x_mm=found.x_mm,
+            range_mm=found.range_mm,
+            covariance=found.covariance,
+            amplitude=found.amplitude,
+            others=tuple(OtherPosition(wave.x_mm, wave.range_mm, wave.covariance) for wave in found.others),
         )
 
     def _stood(self, t_s: float) -> float | None:

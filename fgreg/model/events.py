@@ -57,6 +57,15 @@ class MarkerRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class OtherRecord:
+    """Another position in the plane at which the PM may be."""
+
+    x_mm: Annotated[float, Key("as of the look", LATERAL_MM)]
+    range_mm: Annotated[float, Key("as of the look", RANGE_MM)]
+    covariance: Annotated[FloatArray | None, Key("over (x_mm, range_mm)", Covariance(2))] = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TrusRecord:
     """A look as recorded: x and range, or the frame to get them from."""
 
@@ -82,6 +91,10 @@ class TrusRecord:
             brief=True,
         ),
     ] = 0
+    others: Annotated[
+        tuple[OtherRecord, ...],
+        Key("where the PM may be instead: later waves in the frame, the strongest first", requires="x_mm", brief=True),
+    ] = ()
 
     def __post_init__(self) -> None:
         if self.frame is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -58,6 +58,20 @@ class MarkerObservation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class OtherPosition:
+    """Another position in the image plane that a look may have detected the PM at.
+
+    Attributes:
+        x_mm, range_mm, covariance, amplitude: as of :class:`Look`.
+    """
+
+    x_mm: float
+    range_mm: float
+    covariance: FloatArray
+    amplitude: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Look:
     """One detection of a PM in the TRUS image plane.
 
@@ -70,6 +84,8 @@ class Look:
             hit, else 0.
         amplitude: comparable within one PM only.
         window_sigma_rad: standard deviation of the window's half width, from PM to PM.
+        others: other positions at which the PM may be instead, the likeliest first: later waves of the same frame.
+            Where this position is an outlier, one of them that fits is taken.
     """
 
     scan_rad: float
@@ -80,6 +96,22 @@ class Look:
     sweep: int = 0
     amplitude: float | None = None
     window_sigma_rad: float = 0.0
+    others: tuple[OtherPosition, ...] = ()
+
+    def elsewhere(self) -> tuple[Look, ...]:
+        """The look at each of its other positions; this position is then one of the others."""
+        here = OtherPosition(self.x_mm, self.range_mm, self.covariance, self.amplitude)
+        return tuple(
+            replace(
+                self,
+                x_mm=other.x_mm,
+                range_mm=other.range_mm,
+                covariance=other.covariance,
+                amplitude=other.amplitude,
+                others=(here, *self.others[:number], *self.others[number + 1 :]),
+            )
+            for number, other in enumerate(self.others)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

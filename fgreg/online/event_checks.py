@@ -45,6 +45,11 @@ def check(event: OnlineEvent, after: float) -> None:
         if look.sweep not in (-1, 0, 1):
             raise EventRefused(f"sweep is {look.sweep}, expected -1, 0 or 1")
         _covariance("covariance of the look", look.covariance, 2)
+        for other in look.others:
+            if not (math.isfinite(other.x_mm) and math.isfinite(other.range_mm) and other.range_mm > 0.0):
+                where = f"[{other.x_mm}, {other.range_mm}]"
+                raise EventRefused(f"another position of the look is {where}, expected x and a range > 0")
+            _covariance("covariance of another position of the look", other.covariance, 2)
         for name, number in (("pm", event.pm), ("marker id", event.marker.id)):
             if not -INT64 <= number < INT64:
                 raise EventRefused(f"{name} is {number}, expected a number of 64 bits")

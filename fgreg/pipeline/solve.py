@@ -29,7 +29,7 @@ from fgreg.model.estimate import (
     Verdict,
 )
 from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, TrackEvent, looks_of
-from fgreg.model.measurements import Check
+from fgreg.model.measurements import Check, Look
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
@@ -114,6 +114,14 @@ class SolveReport:
     result_path: Path
     rrd_path: Path | None
     elapsed_s: float
+
+    @property
+    def looks(self) -> tuple[Look, ...]:
+        """The look of each measured pair, in the position that was taken."""
+        registration, measurements = self.solution.registration, self.extracted.measurements
+        if registration is None:
+            return tuple(pair.look for pair in measurements.pairs)
+        return registration.looks_of(measurements)
 
 
 def solve_session(

@@ -21,7 +21,7 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import Quadratic, SharedState, make_state, nominal_frame, stack_states
-from fgreg.model.measurements import Measurements
+from fgreg.model.measurements import Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import (
@@ -73,6 +73,7 @@ class Shots:
 
     Attributes:
         problem: all shots, packed; the registration's own problem where all are inliers.
+        looks: of each of its pairs, in order; some in another of their positions than measured first.
         evaluation: at the registration's optimum (one hypothesis).
         pm_inlier (J,), aim_inlier (A,): which of ``problem``'s PMs and aims are inliers.
         innovations: of each PM and aim.
@@ -81,6 +82,7 @@ class Shots:
     """
 
     problem: PackedProblem
+    looks: tuple[Look, ...]
     evaluation: Evaluation
     pm_inlier: BoolArray
     aim_inlier: BoolArray
@@ -114,6 +116,14 @@ class Registration:
     covariance: FloatArray
     shots: Shots
 
+    def looks_of(self, measurements: Measurements) -> tuple[Look, ...]:
+        """The look of each of the session's pairs, in the position that was taken."""
+        taken = iter(self.shots.looks)
+        return tuple(next(taken) if pair.epoch in self.epochs else pair.look for pair in measurements.pairs)
+
+
+READINGS = 3
+"""Outlier PMs are read in another way at most this many times: with each PM that fits, the next are told better."""
 
 Pack = Callable[[Measurements], PackedProblem]
 
@@ -301,19 +311,21 @@ def _enough(problem: PackedProblem, pm_inlier: BoolArray, aim_inlier: BoolArray)
     return pm_inlier, aim_inlier
 
 
-def _split_looks(
+def _other_readings(
     measurements: Measurements,
     whole: PackedProblem,
     kept: tuple[BoolArray, BoolArray],
     selection: InlierSelection,
     packed: Pack,
 ) -> tuple[Measurements, BoolArray] | None:
-    """Split an outlier look off its PM, so that the PM's other looks are inliers.
+    """Read outlier PMs in another way that fits the inliers; None where there is none.
 
-    This is done only where exactly one look can be left out so that the rest of its PM fits. None without such a PM.
+    A look is taken at another of its positions. Or, where no such fits and exactly one look can be left out so that
+    the rest of its PM fits, that look is split off.
 
     Returns:
-        the measurements with each outlier look under a PM number of its own, and which of their PMs are inliers.
+        the measurements with the changed looks, those split off under a PM number of their own; which of their PMs are
+        inliers.
     """
     pm_inlier, _ = kept
     out = {pm for pm, keep in zip(whole.pms, pm_inlier, strict=True) if not keep}
@@ -321,32 +333,42 @@ def _split_looks(
     for index, pair in enumerate(measurements.pairs):
         if pair.pm in out:
             looks.setdefault(pair.pm, []).append(index)
-    trials = [(pm, left) for pm, indices in looks.items() if len(indices) > 1 for left in indices]
+    trials: list[tuple[int, Look | None]] = []  # a pair, and its look in another position, or None: left out
+    for indices in looks.values():
+        trials += [(index, look) for index in indices for look in measurements.pairs[index].look.elsewhere()]
+        trials += [(index, None) for index in indices if len(indices) > 1]
     if not trials:
         return None
     # Each trial is packed as a PM of its own.
-    variants = [
-        replace(measurements.pairs[index], pm=number)
-        for number, (pm, left) in enumerate(trials)
-        for index in looks[pm]
-        if index != left
-    ]
+    variants = []
+    for number, (changed, look) in enumerate(trials):
+        for index in looks[measurements.pairs[changed].pm]:
+            pair = replace(measurements.pairs[index], pm=number)
+            if index != changed:
+                variants.append(pair)
+            elif look is not None:
+                variants.append(replace(pair, look=look))
     fits = predicted_pms(packed(replace(measurements, pairs=tuple(variants))), whole, selection)
-    single: dict[int, list[int]] = {}
-    for (pm, left), good in zip(trials, fits, strict=True):
-        if good:
-            single.setdefault(pm, []).append(left)
-    outliers = {lefts[0] for lefts in single.values() if len(lefts) == 1}
-    if not outliers:
+    good: dict[int, list[tuple[int, Look | None]]] = {}
+    for trial, fit in zip(trials, fits, strict=True):
+        if fit:
+            good.setdefault(measurements.pairs[trial[0]].pm, []).append(trial)
+    pairs, rescued, spare = list(measurements.pairs), set(), min(whole.pms) - 1
+    for pm, fitting in good.items():
+        index, look = fitting[0]
+        if look is not None:
+            pairs[index] = replace(pairs[index], look=look)
+        elif len(fitting) == 1:
+            pairs[index] = replace(pairs[index], pm=spare - index)
+        else:
+            continue
+        rescued.add(pm)
+    if not rescued:
         return None
-    spare = min(whole.pms) - 1
-    pairs = tuple(
-        replace(pair, pm=spare - index) if index in outliers else pair for index, pair in enumerate(measurements.pairs)
-    )
-    rescued = {measurements.pairs[index].pm for index in outliers}
     names = dict.fromkeys(pair.pm for pair in pairs)
     before = dict(zip(whole.pms, pm_inlier, strict=True))
-    return replace(measurements, pairs=pairs), np.array([name in rescued or before.get(name, False) for name in names])
+    inlier = np.array([name in rescued or before.get(name, False) for name in names])
+    return replace(measurements, pairs=tuple(pairs)), inlier
 
 
 def _solve_jointly(
@@ -372,7 +394,8 @@ def _solve_jointly(
         beyond = beyond_limit(whole, found, everyone[0])
         plausible = optimum.evaluation.cost[0] <= plausible_cost(whole)
         if plausible and not (beyond.pm.any() or beyond.aim.any()):
-            shots = Shots(whole, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
+            looks = tuple(pair.look for pair in measurements.pairs)
+            shots = Shots(whole, looks, optimum.evaluation, *everyone, found, beyond.pm, beyond.aim)
             return measurements, whole, optimum, shots
         start = optimum.state
         clean = bool(plausible and beyond.pm.mean() <= FEW and beyond.aim.sum() <= 1)
@@ -384,9 +407,11 @@ def _solve_jointly(
         first = _enough(whole, robust.pm_inlier[0], robust.aim_inlier[0])
     selection = select_inliers(whole, start, *first)
     kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
-    apart = _split_looks(measurements, whole, kept, selection, packed)
-    if apart is not None:
-        measurements, pm_inlier = apart
+    for _ in range(READINGS):
+        other = _other_readings(measurements, whole, kept, selection, packed)
+        if other is None:
+            break
+        measurements, pm_inlier = other
         whole = packed(measurements)
         selection = select_inliers(whole, selection.state, pm_inlier, kept[1])
         kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
@@ -399,7 +424,8 @@ def _solve_jointly(
     for _ in range(4):
         _, private = refine(whole, optimum.state, private)
     at = evaluate(whole, optimum.state, private)
-    return chosen, problem, optimum, Shots(whole, at, *kept, found, deviants.pm, deviants.aim)
+    looks = tuple(pair.look for pair in measurements.pairs)
+    return chosen, problem, optimum, Shots(whole, looks, at, *kept, found, deviants.pm, deviants.aim)
 
 
 def register(

@@ -8,7 +8,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.shared_state import Quadratic, SharedState
-from fgreg.model.measurements import Measurements
+from fgreg.model.measurements import Look, Measurements
 from fgreg.registration.register import Registration
 from fgreg.smoother.innovation import sigma_distance
 from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare
@@ -29,7 +29,8 @@ class Initial:
         epochs: numbers of the solved ones.
         state: their registrations with the common variables (one hypothesis); covariance: (D, D).
         first: place of the first pair in the session's order; not 0 where earlier epochs were a prior, and stay.
-        labels, inlier: of the pairs from there on, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
+        looks: of the pairs from there on, in the position that was taken.
+        labels, inlier: of the same pairs, as of :class:`fgreg.smoother.state.Shot`. aim_inlier: of all aims.
         ambiguous: epochs that are: two minima fit equally well.
         fits: whether every PM is an inlier within its limit.
     """
@@ -38,6 +39,7 @@ class Initial:
     state: SharedState
     covariance: FloatArray
     first: int
+    looks: tuple[Look, ...]
     labels: tuple[int, ...]
     inlier: tuple[bool, ...]
     aim_inlier: tuple[bool, ...]
@@ -62,6 +64,7 @@ def initial_of(found: Registration, measurements: Measurements, first: int = 0) 
         found.optimum.state,
         found.covariance,
         first,
+        found.looks_of(measurements),
         tuple(labels),
         tuple(inlier),
         tuple(bool(kept) for kept in shots.aim_inlier),
@@ -85,7 +88,7 @@ def initialised(state: State, found: Initial, setting: Setting) -> State:
     for aim in later_aims:
         state = with_aim(state, aim, setting)
     for shot in later:
-        state = with_pair(state, shot.pair, setting)
+        state = with_pair(state, shot.as_measured, setting)
     used = bool(state.shots) and state.shots[-1].inlier and nis is not None
     return replace(state, nis=nis, used=used)
 
@@ -94,12 +97,17 @@ def _is_same(state: State, found: Initial, setting: Setting) -> bool:
     active, layout = state.active_window, state.layout
     if active is None or layout is None or state.epoch not in found.epochs:
         return False
-    mine = tuple((shot.label, shot.inlier) for shot in state.shots[found.first :])
-    if mine != tuple(zip(found.labels, found.inlier, strict=True)) or state.aim_inlier != found.aim_inlier:
+    mine = tuple((shot.label, shot.inlier, _place(shot.pair.look)) for shot in state.shots[found.first :])
+    places = map(_place, found.looks)
+    if mine != tuple(zip(found.labels, found.inlier, places, strict=True)) or state.aim_inlier != found.aim_inlier:
         return False
     there = _here(found, state)
     there = layout.in_chart(there)
     return sigma_distance(there, active.state, active.covariance, setting.columns) < SAME_SIGMA
+
+
+def _place(look: Look) -> tuple[float, float]:
+    return look.x_mm, look.range_mm
 
 
 def _is_open(k: int, epoch: Epoch, found: Initial) -> bool:
@@ -116,8 +124,10 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
     """The state at a registration of exactly its measurements."""
     layout = Layout(setting.columns, found.state.marker_T_nominal[0].copy())
     solved = tuple(
-        Shot(shot.pair, label, inlier)
-        for shot, label, inlier in zip(state.shots[found.first :], found.labels, found.inlier, strict=True)
+        Shot(replace(shot.pair, look=look), shot.measured, label, inlier)
+        for shot, look, label, inlier in zip(
+            state.shots[found.first :], found.looks, found.labels, found.inlier, strict=True
+        )
     )
     epochs = list(state.epochs)
     common = slice(6 * len(found.epochs), None)

@@ -14,7 +14,7 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import ConstantsPrior, PackedProblem, camera_evidence, observed_dependences
 from fgreg.graph.shared_state import Quadratic, SharedState
-from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
+from fgreg.model.measurements import Aim, EpochStart, Look, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import restrict_epochs
@@ -64,14 +64,21 @@ class Shot:
     """A pair with its label, inlier or outlier.
 
     Attributes:
-        pair: with the number of its camera epoch.
+        pair: with the number of its camera epoch, and its look in the position that was taken.
+        measured: its look as it was measured.
         label: number of its PM in the estimate: ``pair.pm``, or one of its own where it was split off as an outlier.
         inlier: whether it is an inlier.
     """
 
     pair: Pair
+    measured: Look
     label: int
     inlier: bool
+
+    @property
+    def as_measured(self) -> Pair:
+        """The pair as it was measured."""
+        return replace(self.pair, look=self.measured)
 
     @property
     def key(self) -> tuple[int, int]:
@@ -163,7 +170,7 @@ class State:
 
     def measurements(self) -> Measurements:
         """All measurements, as the batch solve takes them."""
-        pairs = tuple(shot.pair for shot in self.shots)
+        pairs = tuple(shot.as_measured for shot in self.shots)
         return Measurements(self.aims, pairs, tuple(epoch.start for epoch in self.epochs))
 
     def counts(self) -> tuple[int, int]:

@@ -24,6 +24,8 @@ SETTLED_SIGMA = 0.05
 def with_pair(state: State, pair: Pair, setting: Setting) -> State:
     """The state with one more pair, which is an inlier where its innovation is within the limit.
 
+    Where it is not, and its look has other positions, the first of them that is within the limit is taken.
+
     Where there is no registration yet the pair is only added. Where it contradicts the others so much that no
     registration is left, the epoch has none until it is registered again.
 
@@ -31,12 +33,20 @@ def with_pair(state: State, pair: Pair, setting: Setting) -> State:
         ArithmeticError: a result that is not finite, or a system that is undetermined, though there are many pairs.
         RuntimeError: another failure of GTSAM.
     """
-    shot = Shot(replace(pair, epoch=state.epoch), pair.pm, inlier=False)
+    shot = Shot(replace(pair, epoch=state.epoch), pair.look, pair.pm, inlier=False)
     joined = replace(state, shots=(*state.shots, shot), nis=None, used=False)
     if state.active_window is None or state.layout is None:
         return joined
     try:
-        return _one_more(joined, state.active_window, state.layout, setting)
+        first = _one_more(joined, state.active_window, state.layout, setting)
+        if first.used:
+            return first
+        for look in pair.look.elsewhere():
+            moved = replace(shot, pair=replace(shot.pair, look=look))
+            other = _one_more(replace(joined, shots=(*state.shots, moved)), state.active_window, state.layout, setting)
+            if other.used:
+                return other
+        return first
     except ArithmeticError as error:  # full steps may diverge among few pairs that contradict each other
         if sum(other.inlier for other in state.current) > FIRST_PAIRS:
             raise
@@ -164,8 +174,8 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
     ended = state.now if state.active_window is not None else replace(state.now, state=None, covariance=None)
     shots = list(state.shots)
     for place in range(first, len(shots)):
-        pair = replace(shots[place].pair, epoch=state.epoch + 1)
-        shots[place] = Shot(pair, pair.pm, inlier=False)
+        pair = replace(shots[place].as_measured, epoch=state.epoch + 1)
+        shots[place] = Shot(pair, pair.look, pair.pm, inlier=False)
     moved = replace(
         state,
         epochs=(*state.epochs[:-1], ended, Epoch(start, first)),

@@ -12,13 +12,14 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, parent_from_right_covariance
 from fgreg.graph.expectation_propagation import inverse_hessian, settle
 from fgreg.graph.packing import PackedProblem, pack_pairs
 from fgreg.graph.reduced_blocks import initial_private, times
-from fgreg.graph.reduced_graph import evaluate, refine
+from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.shared_state import SharedState, gaussian_prior
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import POSE_FLOOR, MarkerObservation, Pair, Track, usable_covariance
@@ -42,9 +43,14 @@ def _standard(size: int) -> FloatArray:
 
 
 STANDARD = _standard(SHARED + 6 + 1)
+OUTLIER_P = 1e-3
+"""Beam and looks do not agree where they would deviate as much with at most this probability."""
 SETTLED = 0.005
 """The windows' sites have converged when the PM's rotation changes by at most this share of its standard deviation.
 The sites of one PM's looks converge without damping."""
+
+
+_Settled = tuple[PackedProblem, SharedState, Evaluation]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +92,16 @@ def _refused(query: Track, snapshot: Snapshot, reason: str) -> TrackEstimate:
 
 
 def _from_looks(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Placed | str:
-    """The PM that the query's looks heard, or why its place cannot be computed."""
-    problem, state = _one_pm(query, snapshot, epoch)
-    _, private = refine(problem, state, initial_private(problem, state))
-    start = evaluate(problem, state, private)
-    settled = settle(problem, state, start, settled=SETTLED, damping=1.0)
-    if settled is None and problem.shapes is not None:  # the windows as Gaussians
-        settled = settle(replace(problem, shapes=None), state, start, settled=SETTLED)
+    """The PM that the query's looks detected, or why its place cannot be computed."""
+    settled = _settled(query, snapshot, epoch)
+    if any(look.others for look in query.looks) and not _fits(settled):
+        others = [
+            replace(query, looks=(*query.looks[:number], other, *query.looks[number + 1 :]))
+            for number, look in enumerate(query.looks)
+            for other in look.elsewhere()
+        ]
+        tried = (_settled(other, snapshot, epoch) for other in others)
+        settled = next((found for found in tried if _fits(found)), settled)
     shared = None if settled is None else inverse_hessian(settled[2].hessian[0])
     if settled is None or shared is None:
         return "beam and looks do not converge to one place of the PM"
@@ -102,6 +111,26 @@ def _from_looks(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Plac
     _, y, z = at.private.trus_p_pm[0, 0].tolist()
     by_point = np.array([0.0, z, -y]) / (y * y + z * z)
     return _Placed(math.atan2(y, z), math.sqrt(float(by_point @ covariance @ by_point)), float(at.lambda_mm[0, 0]))
+
+
+def _settled(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> _Settled | None:
+    """The posterior of the query's PM given its looks; None where it does not converge."""
+    problem, state = _one_pm(query, snapshot, epoch)
+    _, private = refine(problem, state, initial_private(problem, state))
+    start = evaluate(problem, state, private)
+    settled = settle(problem, state, start, settled=SETTLED, damping=1.0)
+    if settled is None and problem.shapes is not None:  # the windows as Gaussians
+        settled = settle(replace(problem, shapes=None), state, start, settled=SETTLED)
+    return settled
+
+
+def _fits(settled: _Settled | None) -> bool:
+    """Whether beam and looks agree."""
+    if settled is None:
+        return False
+    problem = settled[0]
+    degrees_of_freedom = 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3
+    return bool(settled[2].cost[0] <= chdtri(degrees_of_freedom, OUTLIER_P))
 
 
 def _one_pm(query: Track, snapshot: Snapshot, epoch: EpochSnapshot) -> tuple[PackedProblem, SharedState]:
