@@ -17,12 +17,14 @@ from fgreg.detection.edges import MIN_CONTRAST, Image
 from fgreg.detection.tags import FoundTag, dictionary_named, halved
 from fgreg.geometry.transforms import BoolArray, FloatArray
 
-MAX_SEGMENTS = 100
+MAX_SEGMENTS = 80
 """The longest ones are used."""
 MIN_SEGMENT_PX = 5.0
 MIN_SIDE_PX = 16.0
 MIN_TURN_RAD, MAX_TURN_RAD = 0.4, 2.75
 """Angle between neighbouring sides."""
+MAX_GAP = 2.5
+"""How far beyond its segments a corner may be, as a share of the longer one."""
 SLACK = 0.1
 """A segment may reach beyond its side's ends by this share of the side."""
 LEAST_SEEN = 0.3
@@ -91,26 +93,20 @@ def _outlines(segments: FloatArray) -> FloatArray:
     safe = np.where(np.abs(cross) < 1e-6, 1.0, cross)
     s = (between[..., 0] * along[None, :, 1] - between[..., 1] * along[None, :, 0]) / safe
     t = (between[..., 0] * along[:, None, 1] - between[..., 1] * along[:, None, 0]) / safe
+    longer = np.maximum(length[:, None], length[None])
     follows = (turn > MIN_TURN_RAD) & (turn < MAX_TURN_RAD)
     follows &= (s > 0.5 * length[:, None]) & (t < 0.5 * length[None])
-    # i, j, k, l with i first: paths i-j-k and k-l-i.
+    follows &= (s < length[:, None] + MAX_GAP * longer) & (t > -MAX_GAP * longer)
+    # Four sides i, j, k, l in turn, i the first in the list.
     i, j, k = np.nonzero(follows[:, :, None] & follows[None])
-    paths: dict[tuple[int, int], list[int]] = {}
-    for a, b, c in zip(i.tolist(), j.tolist(), k.tolist(), strict=True):
-        paths.setdefault((a, c), []).append(b)
-    cycles = [
-        (a, b, c, d)
-        for (a, c), middles in paths.items()
-        if a < c and (c, a) in paths
-        for b in middles
-        for d in paths[c, a]
-    ]
-    if not cycles:
+    first = (j > i) & (k > i)
+    i, j, k = i[first], j[first], k[first]
+    path, last = np.nonzero(follows[k] & follows[:, i].T & (np.arange(len(segments)) > i[:, None]))
+    side = np.stack([i[path], j[path], k[path], last], axis=1)
+    if not len(side):
         return np.empty((0, 4, 2))
-    side = np.array(cycles)
-    nxt, last = np.roll(side, -1, axis=1), np.roll(side, 1, axis=1)
-    ends = s[side, nxt]  # along each side, where the next one meets it
-    begins = t[last, side]
+    ends = s[side, np.roll(side, -1, axis=1)]  # along each side, where the next one meets it
+    begins = t[np.roll(side, 1, axis=1), side]
     size = ends - begins
     slack = SLACK * size
     ok = (size > MIN_SIDE_PX) & (begins < slack) & (length[side] < ends + slack)
@@ -135,28 +131,42 @@ def _read(image: Image, outlines: FloatArray, dictionary: str) -> list[tuple[int
     """Id, share of matching cells and corners (4, 2) as printed of each outline (n, 4, 2) that holds a tag."""
     codes = _codes(dictionary)
     cells = codes.shape[-1]
-    at = (np.arange(cells * SAMPLES) + 0.5) / SAMPLES / cells
-    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=np.float32)
-    grid = np.stack([*np.meshgrid(at, at), np.ones((len(at), len(at)))], axis=-1)
-    px = np.empty((len(outlines), len(at), len(at), 2))
-    for k, corners in enumerate(outlines):
-        mapped = grid @ cv2.getPerspectiveTransform(unit, corners.astype(np.float32)).T
-        px[k] = mapped[..., :2] / mapped[..., 2:]
-    level = _level(image, px).reshape(-1, cells, SAMPLES, cells, SAMPLES)
-    level = np.median(level.transpose(0, 1, 3, 2, 4).reshape(-1, cells, cells, SAMPLES * SAMPLES), axis=-1)
     border = np.ones((cells, cells), dtype=bool)
     border[1:-1, 1:-1] = False
-    dark = np.median(level[:, border], axis=1)
-    light = np.quantile(level[:, ~border], 0.9, axis=1)
-    white = level > (0.5 * (dark + light))[:, None, None]
+    # One pixel of each cell tells the most of them apart.
+    white, contrast = _white(_cell_levels(image, outlines, cells, 1), border)
+    likely = (contrast > MIN_CONTRAST) & (white[:, border].mean(axis=1) <= MAX_WRONG_BORDER + 0.1)
+    outlines = outlines[likely]
+    white, contrast = _white(_cell_levels(image, outlines, cells, SAMPLES), border)
     wrong_border = white[:, border].mean(axis=1)
     flat = codes[..., ~border].reshape(-1, int((~border).sum()))
     out = []
-    for k in np.flatnonzero((light - dark > MIN_CONTRAST) & (wrong_border <= MAX_WRONG_BORDER)).tolist():
+    for k in np.flatnonzero((contrast > MIN_CONTRAST) & (wrong_border <= MAX_WRONG_BORDER)).tolist():
         wrong = (flat != white[k][~border]).mean(axis=1)
         best = int(np.argmin(wrong))
         if wrong[best] <= MAX_WRONG_BITS and (wrong <= wrong[best]).sum() == 1:
-            turn = best % 4
-            match = 2.0 - wrong[best] - float(wrong_border[k])
-            out.append((best // 4, match, np.roll(outlines[k], -turn, axis=0)))
+            match = 2.0 - float(wrong[best]) - float(wrong_border[k])
+            out.append((best // 4, match, np.roll(outlines[k], -(best % 4), axis=0)))
     return out
+
+
+def _cell_levels(image: Image, outlines: FloatArray, cells: int, samples: int) -> FloatArray:
+    """Median level (n, cells, cells) of ``samples`` x ``samples`` pixels of each cell inside outlines (n, 4, 2)."""
+    at = (np.arange(cells * samples) + 0.5) / samples / cells
+    u, v = np.meshgrid(at, at)
+    # The homography of the unit square (Heckbert, Fundamentals of Texture Mapping, 1989).
+    p0, p1, p2, p3 = (outlines[:, i, :, None, None] for i in range(4))
+    d1, d2, sums = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+    det = d1[:, 0] * d2[:, 1] - d2[:, 0] * d1[:, 1]
+    g = ((sums[:, 0] * d2[:, 1] - d2[:, 0] * sums[:, 1]) / det)[:, None]
+    h = ((d1[:, 0] * sums[:, 1] - sums[:, 0] * d1[:, 1]) / det)[:, None]
+    px = ((p1 - p0 + g * p1) * u + (p3 - p0 + h * p3) * v + p0) / (g * u + h * v + 1.0)
+    level = _level(image, np.moveaxis(px, 1, -1)).reshape(-1, cells, samples, cells, samples)
+    return np.asarray(np.median(level, axis=(2, 4)))
+
+
+def _white(level: FloatArray, border: BoolArray) -> tuple[BoolArray, FloatArray]:
+    """Which cells (n, cells, cells) are white, and the contrast (n,), of cells whose border is mostly dark."""
+    dark = np.median(level[:, border], axis=1)
+    light = np.quantile(level[:, ~border], 0.9, axis=1)
+    return level > (0.5 * (dark + light))[:, None, None], light - dark
