@@ -23,7 +23,7 @@ from fgreg.model.camera_dependence import (
     plausible_share,
 )
 from fgreg.model.session_model import BoardModel, CameraModel, SessionModel, StereoRig
-from fgreg.model.systematic import Systematic
+from fgreg.model.systematic import CAREFUL_LAB, Systematic
 from tests.forward import make_session
 from tests.marker_scene import LEFT, ONE_TAG, RIG, RIGHT, RIGHT_T_LEFT, facing_pose
 
@@ -170,7 +170,7 @@ def test_a_spot_moves_with_its_board() -> None:
 
 def session(*, camera: bool = True, marker: bool = True, board: bool = True) -> SessionModel:
     return replace(
-        make_session(),
+        make_session(systematic=CAREFUL_LAB),
         camera=RIG if camera else None,
         marker=ONE_TAG if marker else None,
         board=BoardModel(9, 6, 9.0) if board else None,
