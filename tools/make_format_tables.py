@@ -14,6 +14,7 @@ from pathlib import Path
 
 from fgreg.convert.mapping import MAPPING
 from fgreg.drivers.registry import ENTRIES
+from fgreg.model.commissioned_rig import RIG
 from fgreg.model.estimate import RESULT
 from fgreg.model.events import EVENTS, MarkerRecord, PlaneRecord, TrusRecord
 from fgreg.model.session_model import SESSION
@@ -47,6 +48,7 @@ def _table(name: str) -> str:
         **{name: record(cls) for cls, name in _PARTS.items()},
         "truth": GROUND_TRUTH,
         "result": RESULT,
+        "rig": RIG,
         "mapping": MAPPING,
     }
     lines = [f"| {line}" for line in _rows(records[name])]

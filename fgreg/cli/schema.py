@@ -16,6 +16,7 @@ class Document(StrEnum):
     SESSION = "session"
     EVENTS = "events"
     RESULT = "result"
+    RIG = "rig"
     LIVE = "live"
 
 
@@ -23,6 +24,7 @@ DESCRIPTIONS = {
     Document.SESSION: ("fgreg.model.session_model:SESSION", "session.yaml: how a session was set up"),
     Document.EVENTS: ("fgreg.model.events:EVENTS", "a line of events.jsonl: what happened in a session"),
     Document.RESULT: ("fgreg.model.estimate:RESULT", "result.yaml: the result of a session"),
+    Document.RIG: ("fgreg.model.commissioned_rig:RIG", "rig.yaml: the constants of a commissioned rig"),
     Document.LIVE: ("fgreg.live.config_keys:LIVE", "CONFIG.yaml: devices of a live session"),
 }
 """Module and name of each description, and its title."""
@@ -33,7 +35,7 @@ def add_schema(app: typer.Typer) -> None:
 
     @app.command()
     def schema(
-        document: Annotated[Document, typer.Argument(metavar="DOCUMENT", help="session, events, result or live.")],
+        document: Annotated[Document, typer.Argument(metavar="DOCUMENT", help="session, events, result, rig or live.")],
     ) -> None:
         """Print the JSON Schema (draft 2020-12) of a document: for editors, and for programs that write sessions.
 

@@ -14,6 +14,7 @@ from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.event_reader import frames_of, read_line
 from fgreg.session.event_writer import event_line
 from fgreg.session.frame_files import FrameUse, check_frames
+from fgreg.session.rig_file import copy_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, check_session
 from fgreg.session.setup_reader import Setup, read_setup
 from fgreg.session.yaml_loader import load_yaml, read_bounded
@@ -56,7 +57,9 @@ def write_session(
         text = text.rstrip("\n") + "\n" + camera_yaml(rig)
     with whole_folder(out, overwrite=overwrite) as folder:
         (folder / SETUP_FILE).write_text(text, encoding="utf-8")
-        read = _read_setup(folder / SETUP_FILE, str(file), out.resolve().name)
+        read = _read_setup(folder / SETUP_FILE, str(file), out.resolve().name, file.parent.resolve())
+        if read.model is not None and read.model.rig_file is not None:
+            copy_rig(read.model.rig_file, folder / read.model.rig_file.relative_to(file.parent.resolve()))
         imported.write_frames(folder)
         lines, frames = _lines(imported.drafts, folder, read)
         note = {"type": "note", "t": imported.drafts[0].t, "text": _summary(imported)}
@@ -79,9 +82,10 @@ def _summary(imported: Imported) -> str:
     return f"converted from {one_line(imported.source, 300)}" + (f"; {missing}{tail}" if missing else "")
 
 
-def _read_setup(path: Path, name: str, session: str) -> Setup:
+def _read_setup(path: Path, name: str, session: str, source: Path) -> Setup:
+    """The set-up at ``path``, copied from the folder ``source``, in which its rig is."""
     problems: list[InputError] = []
-    found = read_setup(load_yaml(path, name), name, session or "session", problems)
+    found = read_setup(load_yaml(path, name), name, session or "session", problems, source)
     if problems:
         raise problems[0]
     return found

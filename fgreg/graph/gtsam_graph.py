@@ -300,7 +300,8 @@ def build_graph(
 def _rig_of(measurements: Measurements, session: SessionModel) -> Rig:
     sigmas = least_sigmas(session.constant_sigmas)
     columns = make_columns(len(measurements.epochs), sigmas)
-    return Rig(columns.constants, constants_prior(measurements, columns, sigmas, np.zeros(COUNT)))
+    prior = constants_prior(measurements, columns, sigmas, session.constant_means, session.constant_correlation)
+    return Rig(columns.constants, prior)
 
 
 def _add_epoch_changes(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.geometry.rig import CAMERA, COUNT, Constant
-from fgreg.geometry.transforms import FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import Quadratic
 from fgreg.model.measurements import (
@@ -186,9 +186,13 @@ def _beam_arrays(markers: Sequence[MarkerObservation], offset_mm: FloatArray) ->
 
 
 def constants_prior(
-    measurements: Measurements, columns: Columns, sigmas: FloatArray, mean: FloatArray
+    measurements: Measurements,
+    columns: Columns,
+    sigmas: FloatArray,
+    mean: FloatArray,
+    correlation: FloatArray | None = None,
 ) -> ConstantsPrior:
-    """Prior of the constants that are variables, from their standard deviations and from the cameras' pictures.
+    """Prior of the constants that are variables, from what is known of them and from the cameras' pictures.
 
     What the corners of tags and boards say about the camera's constants is the same in every shot of an observation,
     and enters here, not shot by shot.
@@ -196,12 +200,16 @@ def constants_prior(
     Args:
         measurements: with the pictures' dependence, where there are pictures.
         columns: which constants are variables.
-        sigmas, mean: (COUNT,) of all constants.
+        sigmas, mean: (COUNT,) of all constants; an infinite sigma: nothing is known.
+        correlation: (COUNT, COUNT); none where None.
     """
     chosen = np.array(columns.constants, dtype=np.int64)
     seen = camera_evidence(observed_dependences(measurements), columns)
-    information = np.diag(sigmas[chosen] ** -2.0) + seen.information
-    pull = mean[chosen] * sigmas[chosen] ** -2.0 + seen.information @ seen.mean
+    known = np.diag(sigmas[chosen] ** -2.0)
+    if correlation is not None:
+        known = np.linalg.inv(correlation[np.ix_(chosen, chosen)]) / np.outer(sigmas[chosen], sigmas[chosen])
+    information = known + seen.information
+    pull = known @ mean[chosen] + seen.information @ seen.mean
     return ConstantsPrior(_mean(information, pull), information)
 
 
@@ -275,13 +283,18 @@ def pack(
     Args:
         measurements: aims, pairs and epochs.
         model: the session's set-up.
-        sigmas: (COUNT,) prior standard deviations of the rig's constants; 0: no variable. None: the session's.
-        mean: (COUNT,) prior means; None: zero.
+        sigmas: (COUNT,) prior standard deviations of the rig's constants; 0: no variable. None: the session's. Those
+            that are not the session's are of constants that are independent of all others.
+        mean: (COUNT,) prior means; None: the session's.
         shapes: keep the windows' own shapes, and the amplitudes, for the posterior, in addition to the Gaussian priors.
         amplitude_sigma: relative noise of amplitudes.
     """
     probe = model.probe
+    correlation = model.constant_correlation
+    if sigmas is not None and correlation is not None:
+        correlation = _independent(correlation, sigmas != model.constant_sigmas)
     sigmas = least_sigmas(model.constant_sigmas if sigmas is None else sigmas)
+    mean = model.constant_means if mean is None else mean
     columns = make_columns(len(measurements.epochs), sigmas)
     aims = measurements.aims
     alone = pack_pairs(
@@ -306,8 +319,14 @@ def pack(
         ),
         aim_spot_by_constants=by_constants,
         links=_links(measurements.epochs),
-        prior=constants_prior(measurements, columns, sigmas, np.zeros(COUNT) if mean is None else mean),
+        prior=constants_prior(measurements, columns, sigmas, mean, correlation),
     )
+
+
+def _independent(correlation: FloatArray, alone: BoolArray) -> FloatArray:
+    """The correlation (n, n) where some quantities (n,) depend on no other one."""
+    joint = np.outer(~alone, ~alone) | np.eye(len(alone), dtype=bool)
+    return np.where(joint, correlation, 0.0)
 
 
 def pack_more(pairs: Sequence[Pair], model: SessionModel, columns: Columns) -> PackedProblem:

@@ -82,15 +82,23 @@ def nominal_frame(origin_mm: FloatArray, direction: FloatArray) -> FloatArray:
     return make_transform(rotation_to_direction(direction), origin_mm)
 
 
-def make_state(trus_T_camera: FloatArray, marker_T_nominal: FloatArray, beam: FloatArray | None = None) -> SharedState:
-    """Hypotheses from registrations (S, E, 4, 4) and beams (S, 4, 4); the constants as declared."""
+def make_state(
+    trus_T_camera: FloatArray,
+    marker_T_nominal: FloatArray,
+    beam: FloatArray | None = None,
+    constants: FloatArray | None = None,
+) -> SharedState:
+    """Hypotheses from registrations (S, E, 4, 4) and beams (S, 4, 4).
+
+    ``constants``: (COUNT,), as declared where None.
+    """
     count = len(trus_T_camera)
     return SharedState(
         rotation=np.array(trus_T_camera[..., :3, :3], dtype=np.float64),
         translation_mm=np.array(trus_T_camera[..., :3, 3], dtype=np.float64),
         marker_T_nominal=np.array(np.broadcast_to(marker_T_nominal, (count, 4, 4)), dtype=np.float64),
         beam=np.zeros((count, 4)) if beam is None else np.array(beam, dtype=np.float64),
-        constants=np.zeros((count, COUNT)),
+        constants=np.array(np.broadcast_to(0.0 if constants is None else constants, (count, COUNT)), dtype=np.float64),
     )
 
 

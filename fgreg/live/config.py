@@ -123,6 +123,7 @@ class LiveConfig:
             self.holder,
             self.latencies,
             None if context.room is None else room_truth(context.room),
+            self.model.rig_file,
         )
 
     def stage_setup(self, context: DriverContext) -> StageSetup | None:
@@ -180,7 +181,7 @@ class _Reader:
         if settings is None:
             raise FieldError.of("nothing", record(LiveSettings).expected, "settings")
         setup, label, rectified = self._session(document, devices, room, settings.workflow.aims)
-        model = self._model(setup, label)
+        model = self._model(setup, label, document)
         _check_model(model, devices, settings.workflow.aims)
         limits = (document.stage[1].limits if document.stage else None) or {}
         if document.stage:
@@ -243,9 +244,11 @@ class _Reader:
             )
         return document.room or RoomOptions()
 
-    def _model(self, setup: str, label: str) -> SessionModel:
+    def _model(self, setup: str, label: str, document: LiveDocument) -> SessionModel:
         problems: list[InputError] = []
-        found = read_setup(parse_yaml(setup, label), label, "session", problems)
+        path = document.session
+        folder = None if path is None else (path if path.is_dir() else path.parent).resolve()
+        found = read_setup(parse_yaml(setup, label), label, "session", problems, folder)
         self.warnings += found.warnings
         if found.model is None:
             raise problems[0]

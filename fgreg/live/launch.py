@@ -25,7 +25,9 @@ from fgreg.online.engine_process import EngineProcess
 from fgreg.online.live_session import Engine, LiveSession
 from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
 from fgreg.registration.register import SoundSpeedPrior
+from fgreg.session.rig_file import copy_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE
+from fgreg.session.yaml_loader import parse_yaml
 from fgreg.stage.client import StageLink, StageRecord
 from fgreg.stage.limits import MotionLimits
 from fgreg.stage.reconnect import ReconnectingStage
@@ -65,6 +67,7 @@ class LiveSetup:
         holder: accuracy of the endoscope's holder, if there is one.
         latencies: of the devices.
         write_truth: called after the last event is recorded, if the ground truth is known.
+        rig_file: the commissioned rig that ``setup`` names.
     """
 
     setup: str
@@ -74,6 +77,7 @@ class LiveSetup:
     holder: HolderSettings = field(default_factory=HolderSettings)
     latencies: Latencies = field(default_factory=Latencies)
     write_truth: WriteTruth | None = None
+    rig_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,8 +133,10 @@ class NewestSnapshots:
         return received if alive else replace(received, closed=True)
 
 
-def make_folder(folder: Path, setup: str) -> None:
+def make_folder(folder: Path, setup: str, rig_file: Path | None = None) -> None:
     """Make a new session's folder with its ``session.yaml``; an existing session is resumed if its file is the same.
+
+    ``rig_file``: the commissioned rig that the file names, which is copied.
 
     Raises:
         InputError: the folder holds something else, or cannot be made.
@@ -145,6 +151,8 @@ def make_folder(folder: Path, setup: str) -> None:
             found = "a folder that is not empty" if folder.is_dir() else "a file"
             raise InputError(str(folder), found, "a new or empty folder, or a session")
         folder.mkdir(parents=True, exist_ok=True)
+        if rig_file is not None:
+            copy_rig(rig_file, folder / str(parse_yaml(setup, SETUP_FILE)["rig"]))
         path.write_text(setup, encoding="utf-8")
     except OSError as error:
         raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from None
@@ -176,7 +184,7 @@ def running(
         InputError: bad input.
         FgregError: a part did not start.
     """
-    make_folder(folder, live.setup)
+    make_folder(folder, live.setup, live.rig_file)
     with ExitStack() as stack:
         say("starting the registration")
         make_engine = EngineProcesses()

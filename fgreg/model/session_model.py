@@ -14,8 +14,11 @@ from typing import Annotated, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.geometry.rig import COUNT
 from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.commissioned_rig import CommissionedRig
 from fgreg.model.systematic import CAREFUL_LAB, SYSTEMATIC, Systematic
+from fgreg.schema.files import FileName
 from fgreg.schema.kinds import (
     COORDINATE_MM,
     NOISE_MM,
@@ -37,7 +40,7 @@ from fgreg.schema.kinds import (
 )
 from fgreg.schema.matrices import Matrix, Transform
 from fgreg.schema.problems import FieldError, shown
-from fgreg.schema.record import Key, record
+from fgreg.schema.record import Key, NotStored, record
 
 SESSION_FORMAT = "fgreg-session/1"
 
@@ -528,6 +531,12 @@ class SessionModel:
         ),
     ] = CAREFUL_LAB
 
+    rig_file: Annotated[
+        Path | None,
+        Key("rig.yaml of a commissioning, in the session's folder: replaces the above", FileName(), name="rig"),
+    ] = None
+    rig: Annotated[CommissionedRig | None, NotStored(None)] = None
+
     def __post_init__(self) -> None:
         if not len(self.targets_mm):
             object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
@@ -540,7 +549,27 @@ class SessionModel:
     @property
     def constant_sigmas(self) -> FloatArray:
         """(COUNT,) standard deviations of the rig's constants, in the order of :class:`Constant`."""
-        return self.systematic.sigmas(self.probe.sensitivity.edge_sigma_rad, self.noise.marker_bias_mm)
+        declared = self.systematic.sigmas(self.probe.sensitivity.edge_sigma_rad, self.noise.marker_bias_mm)
+        if self.rig is not None:
+            declared[list(self.rig.constants)] = self.rig.sigma
+        return declared
+
+    @property
+    def constant_means(self) -> FloatArray:
+        """(COUNT,) what the constants are expected to be: zero, as declared, without a commissioned rig."""
+        means = np.zeros(COUNT)
+        if self.rig is not None:
+            means[list(self.rig.constants)] = self.rig.value
+        return means
+
+    @property
+    def constant_correlation(self) -> FloatArray | None:
+        """(COUNT, COUNT) correlation of the constants; None, without a commissioned rig: they are independent."""
+        if self.rig is None:
+            return None
+        correlation = np.eye(COUNT)
+        correlation[np.ix_(self.rig.constants, self.rig.constants)] = self.rig.correlation
+        return correlation
 
 
 SESSION = record(SessionModel, ("format", SESSION_FORMAT))

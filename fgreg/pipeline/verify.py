@@ -20,12 +20,13 @@ from fgreg.geometry.target_error import tre_mm
 from fgreg.model.estimate import EpochEstimate, Verdict
 from fgreg.model.events import CameraMovedEvent, Event, PairEvent, refused_lines
 from fgreg.model.measurements import Pair
-from fgreg.model.session_model import SESSION, SessionModel
+from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.pipeline.solve import RESULT_FILE, Progress, detection_conditions, sound_speed_prior, with_moves
 from fgreg.registration.register import SoundSpeedPrior
 from fgreg.registration.solve import solve
 from fgreg.session.result_file import read_result
+from fgreg.session.rig_file import sections
 from fgreg.session.session_reader import Session, read_more_events, read_session
 from fgreg.tracking.snapshot import Snapshot
 
@@ -105,7 +106,7 @@ def _new_events(new: Path, session: Session) -> tuple[tuple[Event, ...], Session
     model = session.model
     if new.is_dir():
         other = read_session(new)
-        ours, theirs = SESSION.write(model), SESSION.write(other.model)
+        ours, theirs = sections(model), sections(other.model)
         for section in SAME_RIG:
             if ours.get(section) != theirs.get(section):
                 where = f"{new / 'session.yaml'}: {section}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -136,6 +136,8 @@ def camera_conditions(
     corners = corner_information(measurements)
     if corners is None:
         return found
+    # From here on the constants count from what a commissioned rig expects.
+    corners = replace(corners, pull=corners.pull - corners.information @ model.constant_means[CAMERA])
     camera_p = [transform_points(inverse(transform), model.targets_mm) for transform in trus_T_camera]
     sigmas = model.constant_sigmas[CAMERA]
     prints = _print_condition(corners, sigmas, camera_p, config)

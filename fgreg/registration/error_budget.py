@@ -68,7 +68,7 @@ def error_budget(
 ) -> Budget:
     """The budget of a registration at the optimum of the graph (before it is centred on the posterior's mean)."""
     model, columns = registration.model, registration.problem.columns
-    sigmas, _ = constants_of(model, config, sound_speed)
+    sigmas, mean = constants_of(model, config, sound_speed)
     predicted = tuple(
         _predicted(registration, posterior, place, model.targets_mm) for place in range(len(registration.epochs))
     )
@@ -83,7 +83,7 @@ def error_budget(
         if prior <= 0.0:
             continue
         observed = min(max(1.0 - (sigma / prior) ** 2, 0.0), 1.0)
-        score = float(value[constant]) / (prior * np.sqrt(observed)) if observed > UNOBSERVED else 0.0
+        score = float(value[constant] - mean[constant]) / (prior * np.sqrt(observed)) if observed > UNOBSERVED else 0.0
         constants.append(
             SystematicEstimate(
                 name=text.name,
@@ -138,7 +138,8 @@ def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
 
 def _amount(constant: SystematicEstimate) -> str:
     """By how much a constant differs from the declared one."""
-    value = constant.value / max(constant.observed, 1e-6)  # without the pull of its prior
+    pulled = constant.score * constant.prior_sigma * np.sqrt(constant.observed)  # from what was expected
+    value = constant.value + pulled * (1.0 / max(constant.observed, 1e-6) - 1.0)  # without the pull of its prior
     unit = {text.name: text for text in TEXTS}[constant.name].unit
     if not unit:
         return f"{100.0 * abs(value):.1f} % {'larger' if value > 0 else 'smaller'} than declared fits best"

@@ -106,22 +106,22 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
     if not aims:
         return Calibration(tuple(candidates), everything)
     alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model, sigmas=search_sigmas(model))
-    found = optimize(alone, _beam_states(candidates))
+    found = optimize(alone, _beam_states(candidates, model))
     if len(aims) > MIN_INLIER_AIMS and not _is_clean(alone, found):
         candidates += [nominal_frame(origin, direction) for origin, direction in consensus_beams(aims)]
-        robust = graduated(alone, _beam_states(candidates), robust_aims=True)
+        robust = graduated(alone, _beam_states(candidates, model), robust_aims=True)
         none = np.zeros(0, dtype=bool)
         kept = select_inliers(alone, robust.state.take([0]), none, robust.aim_inlier[0]).aim_inlier
         if MIN_INLIER_AIMS <= kept.sum() < len(aims):
             fitting = tuple(aim for aim, keep in zip(aims, kept, strict=True) if keep)
             alone = pack(Measurements(fitting, (), measurements.epochs[:1]), model, sigmas=search_sigmas(model))
-            found = optimize(alone, _beam_states(candidates))
+            found = optimize(alone, _beam_states(candidates, model))
             return Calibration(tuple(_beams(found)), kept)
     return Calibration(tuple(_beams(found)), everything)
 
 
-def _beam_states(frames: list[FloatArray]) -> SharedState:
-    return make_state(np.tile(np.eye(4), (len(frames), 1, 1, 1)), np.array(frames))
+def _beam_states(frames: list[FloatArray], model: SessionModel) -> SharedState:
+    return make_state(np.tile(np.eye(4), (len(frames), 1, 1, 1)), np.array(frames), constants=model.constant_means)
 
 
 def _beams(found: Optimum) -> list[FloatArray]:
@@ -184,9 +184,9 @@ def _starts(problem: PackedProblem, frames: Sequence[FloatArray], model: Session
         origin = (beams.rotation @ frame[:3, 3] + beams.translation_mm)[problem.look_beam]
         direction = (beams.rotation @ frame[:3, 2])[problem.look_beam]
         starts = registration_starts(origin, direction, arcs)
-        states.append(make_state(starts[:, None], frame))
+        states.append(make_state(starts[:, None], frame, constants=model.constant_means))
     if model.initial_trus_T_camera is not None:
-        states.append(make_state(model.initial_trus_T_camera[None, None], frames[0]))
+        states.append(make_state(model.initial_trus_T_camera[None, None], frames[0], constants=model.constant_means))
     return stack_states(states)
 
 
@@ -323,10 +323,10 @@ def _robust_starts(
     for frame in frames:
         starts = consensus_starts(problem, frame, SPOT_DISTANCE_MM)
         if len(starts):
-            states.append(make_state(starts[:, None], frame))
+            states.append(make_state(starts[:, None], frame, constants=model.constant_means))
     if model.initial_trus_T_camera is not None or not states:
         guess = np.eye(4) if model.initial_trus_T_camera is None else model.initial_trus_T_camera
-        states.append(make_state(guess[None, None], frames[0]))
+        states.append(make_state(guess[None, None], frames[0], constants=model.constant_means))
     return stack_states(states)
 
 

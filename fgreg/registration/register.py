@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.errors import EstimationError
-from fgreg.geometry.rig import COUNT, Constant
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, inverse
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_blocks import initial_private
@@ -165,7 +165,8 @@ def _turned(state: SharedState) -> SharedState:
     """The same hypothesis with the beam's chart pointing the other way."""
     frame = nominal_frame(state.beam_origin()[0], -state.beam_direction()[0])
     count = state.rotation.shape[1]
-    return make_state(np.stack([state.trus_T_camera(k) for k in range(count)], axis=1), frame)
+    transforms = np.stack([state.trus_T_camera(k) for k in range(count)], axis=1)
+    return replace(make_state(transforms, frame), constants=state.constants)
 
 
 def _best_start(
@@ -262,7 +263,7 @@ def constants_of(
 ) -> tuple[FloatArray, FloatArray]:
     """(COUNT,) prior standard deviations and means of the rig's constants: the session's, less certain where the
     configuration asks for an estimate."""
-    sigmas, mean = model.constant_sigmas.copy(), np.zeros(COUNT)
+    sigmas, mean = model.constant_sigmas, model.constant_means
     if config.estimate_sound_speed:
         prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
         sigmas[Constant.SOUND_SPEED], mean[Constant.SOUND_SPEED] = prior.sigma, prior.mean - 1.0

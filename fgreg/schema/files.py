@@ -11,7 +11,7 @@ from fgreg.schema.kinds import JsonSchema, Kind
 from fgreg.schema.problems import FieldError, shown
 
 _MAX_NAME = 1024
-_FRAME_NAME = "a relative name of a file inside the session's folder"
+_FILE_NAME = "a relative name of a file inside the session's folder"
 
 
 class FrameKind(Enum):
@@ -22,14 +22,12 @@ class FrameKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class FrameName(Kind):
-    """The name of a raw frame, relative to the session's folder; read as its resolved path.
+class FileName(Kind):
+    """The name of a file in the session's folder, relative to it; read as its resolved path.
 
     The file need not exist, but must be inside the folder: names that are absolute, have ``..`` or control characters,
     or leave it by a symbolic link are refused. The folder passed must be resolved.
     """
-
-    use: FrameKind
 
     def read(self, value: object, folder: Path | None = None, /) -> Path:
         if not isinstance(value, str) or not value:
@@ -37,16 +35,16 @@ class FrameName(Kind):
         windows = PureWindowsPath(value)
         outside = PurePosixPath(value).is_absolute() or windows.drive or windows.root or ".." in windows.parts
         if outside or not value.isprintable() or len(value) > _MAX_NAME:
-            raise FieldError.of(shown(value), _FRAME_NAME)
+            raise FieldError.of(shown(value), _FILE_NAME)
         if folder is None:
-            raise AssertionError("frames are relative to a folder")
+            raise AssertionError("names are relative to a folder")
         try:
             path = (folder / value).resolve()
             inside = path.is_relative_to(folder) and path != folder
         except (OSError, RuntimeError, ValueError):  # loops of links, names the file system cannot have
             inside = False
         if not inside:
-            raise FieldError.of(f"{shown(value)}, which leads out of the folder", _FRAME_NAME)
+            raise FieldError.of(f"{shown(value)}, which leads out of the folder", _FILE_NAME)
         return path
 
     def write(self, value: Path, folder: Path | None = None, /) -> str:
@@ -58,10 +56,21 @@ class FrameName(Kind):
 
     @property
     def expected(self) -> str:
-        return "the name of a frame"
+        return "the name of a file"
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
         return {"type": "string", "minLength": 1, "maxLength": _MAX_NAME}
+
+
+@dataclass(frozen=True, slots=True)
+class FrameName(FileName):
+    """The name of a raw frame."""
+
+    use: FrameKind
+
+    @property
+    def expected(self) -> str:
+        return "the name of a frame"
 
 
 @dataclass(frozen=True, slots=True)

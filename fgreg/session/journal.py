@@ -163,7 +163,8 @@ def _resolved(folder: Path) -> Path:
 def _setup(folder: Path) -> Setup:
     """The session's set-up, read before any file is created in its folder."""
     problems: list[InputError] = []
-    setup = read_setup(load_yaml(folder / SETUP_FILE, SETUP_FILE), SETUP_FILE, folder.name or "session", problems)
+    data = load_yaml(folder / SETUP_FILE, SETUP_FILE)
+    setup = read_setup(data, SETUP_FILE, folder.name or "session", problems, folder)
     if problems:
         raise problems[0]
     return setup

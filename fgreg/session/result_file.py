@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import secrets
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from fgreg.model.estimate import RESULT, SessionEstimate
 from fgreg.model.session_model import SessionModel
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.schema.yaml_writer import yaml_text
+from fgreg.session.atomic_file import why_refused, write_atomically
 from fgreg.session.yaml_loader import load_yaml
 
 RESULT_FILE = "result.yaml"
@@ -44,7 +43,9 @@ def remove_result(path: Path) -> None:
             raise InputError(str(path), "a file that is not a result", "a new name, or that of an older result")
         path.unlink(missing_ok=True)
     except (OSError, ValueError) as error:
-        raise InputError(str(path), f"a file that cannot be removed ({_reason(error)})", "an older result") from None
+        raise InputError(
+            str(path), f"a file that cannot be removed ({why_refused(error)})", "an older result"
+        ) from None
 
 
 def _is_result(path: Path) -> bool:
@@ -73,35 +74,7 @@ def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, ver
     document = RESULT.write(replace(estimate, session=model.name, version=version))
     # The format line comes first and unquoted: _is_result recognises an older result by it.
     text = f"format: {document.pop('format')}\n" + yaml_text(document, _ONE_LINE)
-    temporary = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
-    try:
-        try:
-            with temporary.open("x", encoding="utf-8", newline="\n") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            raise
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise InputError(str(path), f"a file that cannot be written ({_reason(error)})", "a writable place") from None
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush a rename to disk; file systems that do not support it are ignored."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-def _reason(error: OSError | ValueError) -> str:
-    return getattr(error, "strerror", None) or str(error)
+    write_atomically(path, text)
 
 
 def read_result(path: Path) -> SessionEstimate:

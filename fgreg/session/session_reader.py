@@ -126,7 +126,7 @@ def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, Event
     setup: Setup | None = None
     try:
         data = load_yaml(folder / SETUP_FILE, SETUP_FILE)
-        setup = read_setup(data, SETUP_FILE, resolved.name or "session", problems)
+        setup = read_setup(data, SETUP_FILE, resolved.name or "session", problems, resolved)
     except InputError as error:
         problems.append(error)
     return setup, read_events(folder / EVENTS_FILE, EVENTS_FILE, resolved, setup, problems)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 from fgreg.errors import InputError
 from fgreg.model.plausible import implausible, implausible_setup
 from fgreg.model.session_model import NAME, SESSION, BoardModel, MarkerModel, ProbeModel, SessionModel, StereoRig
 from fgreg.schema.problems import FieldError, Problem, input_error
+from fgreg.session.rig_file import read_rig, same_rig
 
 Part = TypeVar("Part")
 
@@ -30,21 +32,31 @@ class Setup:
     warnings: tuple[str, ...]
 
 
-def read_setup(data: Mapping[str, object], file: str, default_name: str, problems: list[InputError]) -> Setup:
+def read_setup(
+    data: Mapping[str, object], file: str, default_name: str, problems: list[InputError], folder: Path | None = None
+) -> Setup:
     """Check a ``session.yaml``; appends all problems to ``problems``.
 
     Args:
         data: its content.
         file: how messages name the file.
         default_name: the session's name where the file has none.
+        folder: the session's, resolved, in which the commissioned rig is; None: the rig is not read.
     """
     model, found, parts = None, list[Problem](), dict[str, object]()
     try:
         given = {} if "name" in data else {"name": NAME.read(default_name)}
-        model = SESSION.read(data, **given)
+        model = SESSION.read(data, folder or Path.cwd(), **given)
     except FieldError as error:
         found, parts = list(error.problems), error.values
     problems += [input_error(problem, file, data) for problem in found]
+    if model is not None and model.rig_file is not None and folder is not None:
+        try:
+            rig = read_rig(model.rig_file, model.rig_file.relative_to(folder).as_posix())
+            same_rig(model, rig.sessions, file)
+            model = replace(model, rig=rig)
+        except InputError as error:
+            problems.append(error)
 
     def part(name: str, cls: type[Part]) -> Part | None:
         value = parts.get(name) if model is None else getattr(model, name)

@@ -1,0 +1,98 @@
+"""``rig.yaml``: reading, writing, and whether a session has the rig that it describes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.model.commissioned_rig import RIG, SHARED_SECTIONS, CommissionedRig
+from fgreg.model.session_model import SESSION, SessionModel
+from fgreg.schema.problems import FieldError, input_error
+from fgreg.schema.yaml_writer import yaml_text
+from fgreg.session.atomic_file import why_refused, write_atomically
+from fgreg.session.yaml_loader import load_yaml
+
+_ABSENT = ""
+
+
+def read_rig(path: Path, label: str | None = None) -> CommissionedRig:
+    """Read a rig; ``label``: how messages name the file.
+
+    Raises:
+        InputError: the first problem of the file.
+    """
+    label = label or str(path)
+    data = load_yaml(path, label)
+    try:
+        rig: CommissionedRig = RIG.read(data)
+    except FieldError as error:
+        raise input_error(error.problems[0], label, data) from None
+    return rig
+
+
+def write_rig(rig: CommissionedRig, path: Path) -> None:
+    """Write a rig, replacing an older one when it is complete.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    document = RIG.write(rig)
+    write_atomically(path, f"format: {document.pop('format')}\n" + yaml_text(document, {"sessions"}))
+
+
+def copy_rig(rig_file: Path, target: Path) -> None:
+    """Copy a session's rig into another session's folder.
+
+    Raises:
+        InputError: it cannot be copied.
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(rig_file, target)
+    except OSError as error:
+        raise InputError(str(rig_file), f"a file that cannot be copied ({why_refused(error)})", "a rig") from None
+
+
+def sections(model: SessionModel) -> dict[str, object]:
+    """The sections of a session's file as plain data, without the rig that it takes up."""
+    return SESSION.write(replace(model, rig_file=None))
+
+
+def section_hashes(model: SessionModel) -> dict[str, str]:
+    """SHA-256 of the sections that a rig's values are deviations from; a session may lack some."""
+    document = sections(model)
+    return {
+        name: hashlib.sha256(json.dumps(document[name], sort_keys=True).encode()).hexdigest()
+        for name in SHARED_SECTIONS
+        if name in document
+    }
+
+
+def same_rig(model: SessionModel, others: Iterable[Mapping[str, str]], label: str) -> None:
+    """Whether a session has the same probe, cameras and prints as the sessions of a rig.
+
+    A board may be absent: only aims need it. Files' hashes alone, without those of sections, are not compared.
+
+    Args:
+        model: of the session.
+        others: hashes of sections, as :func:`section_hashes` has them.
+        label: how messages name the session's file.
+
+    Raises:
+        InputError: a section differs.
+    """
+    mine = section_hashes(model)
+    for other in others:
+        if "probe" not in other:
+            continue
+        for name in SHARED_SECTIONS:
+            here, there = mine.get(name, _ABSENT), other.get(name, _ABSENT)
+            if here != there and not (name == "board" and _ABSENT in (here, there)):
+                found = "nothing" if here == _ABSENT else "another one"
+                expected = "none" if there == _ABSENT else "the same as in the sessions that the rig is of"
+                raise InputError(f"{label}: {name}", found, expected)
