@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from fgreg.cli.commission import add_commission
 from fgreg.cli.convert import add_convert
 from fgreg.cli.devices import add_devices
 from fgreg.cli.evaluate import add_commands
@@ -331,6 +332,7 @@ def simulate(
 
 
 add_commands(app, _progress)
+add_commission(app, _progress)
 add_live(app, _summary_extras)
 add_replay(app, _summary_extras)
 add_verify(app, _progress)

@@ -194,6 +194,26 @@ def nominal_spot_gain(model: SessionModel, camera_p_mm: FloatArray) -> FloatArra
     return gain[:, 3:].reshape(plain.shape)
 
 
+def nominal_point_gain(model: SessionModel, camera_p_mm: FloatArray) -> FloatArray:
+    """(n, 3, 19) gain of points (n, 3) that both cameras see, each alone.
+
+    Without two cameras: distances scale with CAMERA_SCALE, depths with both focal lengths' mean.
+    """
+    rig = model.camera
+    if rig is None or rig.right is None or rig.right_T_left is None:
+        return _plain_gain(camera_p_mm)
+    camera_T_point = np.tile(np.eye(4), (len(camera_p_mm), 1, 1))
+    camera_T_point[:, :3, 3] = camera_p_mm
+    view_T_camera = np.stack([np.eye(4), rig.right_T_left])
+    focal_px = np.stack([np.diag(camera.matrix)[:2] for camera in (rig.left, rig.right)])
+    J, C = corner_derivatives(
+        camera_T_point, np.zeros((2, 3)), np.arange(2), focal_px, view_T_camera, Constant.TAG_SIZE
+    )
+    J, C = J[..., 3:].reshape(-1, 4, 3), C.reshape(-1, 4, CONSTANTS)
+    turned = np.swapaxes(J, -1, -2)
+    return -np.asarray(np.linalg.solve(turned @ J, turned @ C))
+
+
 def nominal_pose_dependence(model: SessionModel, camera_T_marker: FloatArray) -> CameraDependence:
     """Dependence of a marker pose (4, 4) that came without frames: nothing tells about the constants."""
     return _untold(nominal_pose_gain(model, camera_T_marker))

@@ -1,0 +1,366 @@
+"""The rig's constants from several sessions, as one graph: the constants common, all else of each session its own.
+
+With every session's own variables eliminated (Schur complement of its reduced graph) a session is a quadratic of the
+common constants c, its *evidence*; the sum of all evidence and one prior gives c. Own and common variables step
+together, by Gauss-Newton on the one graph, until they settle: its optimum.
+
+    minimise  (c - m)' P (c - m) + sum over sessions of F_i(x_i, c)
+
+The marker's bias stays each session's own: it comes from light, focus and window of the day. All other constants belong
+to probe, stage, cameras and prints.
+
+A new session is compared with a rig as on a control chart: its evidence alone, against the rig's mean m and covariance
+C. With information S and score u = S (c - m) of the session (its estimate c need not be determined), and the matrix
+M = S - S (S + C^-1)^-1 S, which is (S^-1 + C)^-1:
+
+    whether it is the same rig        chi square of u' S^-1 M S^-1 u in the directions that the session sees
+    whether constant k alone changed  z = v_k / sqrt(M_kk), v = M (c - m), by v_k / M_kk
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from scipy.special import chdtrc, ndtri
+
+from fgreg.errors import EstimationError
+from fgreg.geometry.rig import Constant
+from fgreg.geometry.transforms import BoolArray, FloatArray, hat
+from fgreg.graph.columns import Columns
+from fgreg.graph.packing import PackedProblem, constants_prior, least_sigmas
+from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.shared_state import SharedState
+from fgreg.model.camera_dependence import nominal_point_gain
+from fgreg.model.measurements import Check
+from fgreg.model.session_model import SessionModel
+from fgreg.registration.error_budget import scanner_displacement
+from fgreg.registration.register import Registration
+
+OWN = (Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
+"""Constants that each session has for itself."""
+SETTLED = 1e-6
+"""Newton decrement (chi square) of the whole graph below which it is at its optimum."""
+ROUNDS, HALVINGS = 50, 12
+OBSERVED = 0.5
+"""Share of a constant's prior variance that is gone where the sessions alone know it as well as its prior does."""
+NOTE_P, ALARM_P = 0.02, 0.002
+"""False alarms of a control chart: of a session of the same rig, all tests together."""
+SEEN = 0.1
+"""A direction counts in the chi square where the session's information is at least this share of the prior's."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What one session alone says about the common constants c: chi square ``c' information c - 2 pull' c``.
+
+    ``information`` (K, K), which may be singular; ``pull`` (K,).
+    """
+
+    information: FloatArray
+    pull: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Commissioned:
+    """The common constants.
+
+    Attributes:
+        constants: those that are common and variables, K of them, in ascending order.
+        value: (K,) true less declared. covariance: (K, K).
+        prior_sigma: (K,).
+        evidence: of each session at the optimum.
+        rounds: Gauss-Newton steps.
+    """
+
+    constants: tuple[Constant, ...]
+    value: FloatArray
+    covariance: FloatArray
+    prior_sigma: FloatArray
+    evidence: tuple[Evidence, ...]
+    rounds: int
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(K,)"""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def observed(self) -> FloatArray:
+        """(K,) share of the prior variance that is gone."""
+        return np.asarray(np.clip(1.0 - (self.sigma / self.prior_sigma) ** 2, 0.0, 1.0))
+
+    @property
+    def score(self) -> FloatArray:
+        """(K,) by how many standard deviations the sessions contradict each prior."""
+        known = np.maximum(self.prior_sigma**2 * self.observed, 1e-6 * self.prior_sigma**2)
+        return np.asarray(self.value / np.sqrt(known))
+
+    def without(self, place: int) -> tuple[FloatArray, FloatArray]:
+        """Mean (K,) and covariance (K, K) without one of the sessions."""
+        rest = np.linalg.inv(self.covariance) - self.evidence[place].information
+        covariance = _inverse(rest)
+        pull = np.sum([found.pull for found in self.evidence], axis=0) - self.evidence[place].pull
+        return covariance @ pull, covariance
+
+
+@dataclass(slots=True, eq=False)
+class _Session:
+    """One session's graph at its current variables: no prior on the common constants."""
+
+    problem: PackedProblem
+    common: BoolArray
+    checks: _Checks | None
+    state: SharedState
+    at: Evaluation
+
+    def moved(self, step: FloatArray) -> _Session:
+        """After a step (D,) of all its variables."""
+        points = self.at.private.trus_p_pm + (self.at.point_gain @ step[:, None])[..., 0]
+        state = self.state.retract(step[None], self.problem.columns)
+        _, private = refine(self.problem, state, replace(self.at.private, trus_p_pm=points))
+        return replace(self, state=state, at=_evaluated(self.problem, state, private, self.checks))
+
+    @property
+    def value(self) -> FloatArray:
+        """(K,) the common constants."""
+        return np.asarray(self.state.constants[0, list(self.problem.columns.constants)])[
+            self.common[self.problem.columns.rig]
+        ]
+
+    @property
+    def evidence(self) -> Evidence:
+        """Its own variables eliminated."""
+        hessian, gradient = self.at.hessian[0], self.at.gradient[0]
+        own, common = ~self.common, self.common
+        cross = hessian[np.ix_(own, common)]
+        back = _solved(hessian[np.ix_(own, own)], np.column_stack([cross, gradient[own]]))
+        information = hessian[np.ix_(common, common)] - cross.T @ back[:, :-1]
+        information = 0.5 * (information + information.T)
+        return Evidence(information, information @ self.value - (gradient[common] - cross.T @ back[:, -1]))
+
+    def step_to(self, value: FloatArray) -> FloatArray:
+        """(D,) to common constants (K,), with all others at their optimum given these."""
+        hessian, gradient = self.at.hessian[0], self.at.gradient[0]
+        own, common = ~self.common, self.common
+        step = np.zeros(len(gradient))
+        step[common] = value - self.value
+        pull = gradient[own] + hessian[np.ix_(own, common)] @ step[common]
+        step[own] = -_solved(hessian[np.ix_(own, own)], pull[:, None])[:, 0]
+        return step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Checks:
+    """Check points of one session as measurements: where the camera has them less where the scanner shows them.
+
+    Attributes:
+        checks: with the place of their epoch among the columns.
+        shown: (n, 3, K) by how much they lie elsewhere than the scanner shows them, per constant; TRUS axes.
+        seen: (n, 3, C) the same of the camera's, per constant of the camera; camera axes.
+        columns: of the problem.
+    """
+
+    checks: tuple[tuple[Check, int], ...]
+    shown: FloatArray
+    seen: FloatArray
+    columns: Columns
+
+    @classmethod
+    def of(cls, checks: Sequence[Check], registration: Registration) -> _Checks | None:
+        """Those of solved epochs; None without any."""
+        mine = tuple((c, registration.epochs.index(c.epoch)) for c in checks if c.epoch in registration.epochs)
+        if not mine:
+            return None
+        model, columns = registration.model, registration.problem.columns
+        points = np.stack([check.trus_p_mm for check, _ in mine])
+        shown = scanner_displacement(model, registration.optimum.state, columns, points)
+        seen = nominal_point_gain(model, np.stack([check.camera_p_mm for check, _ in mine]))
+        return cls(mine, shown, seen, columns)
+
+    def add_to(self, at: Evaluation, state: SharedState) -> Evaluation:
+        """The evaluation with the checks' terms."""
+        cost, gradient, hessian = at.cost.copy(), at.gradient.copy(), at.hessian.copy()
+        columns = self.columns
+        camera = [constant - Constant.MARKER_BIAS_X for constant in columns.of_camera]
+        c = state.constants[0, list(columns.constants)]
+        for (check, place), shown, seen in zip(self.checks, self.shown, self.seen, strict=True):
+            rotation = state.rotation[0, place]
+            of_camera = np.zeros((3, len(c)))
+            of_camera[:, len(c) - len(camera) :] = seen[:, camera]
+            camera_p = check.camera_p_mm + of_camera @ c
+            error = rotation @ camera_p + state.translation_mm[0, place] - check.trus_p_mm - shown @ c
+            jacobian = np.zeros((3, columns.size))
+            jacobian[:, 6 * place : 6 * place + 6] = np.concatenate([-rotation @ hat(camera_p), rotation], axis=1)
+            jacobian[:, columns.rig] = rotation @ of_camera - shown
+            spread = rotation @ check.covariance @ rotation.T + check.trus_covariance
+            weighted = np.linalg.solve(spread, np.column_stack([jacobian, error]))
+            hessian[0] += jacobian.T @ weighted[:, :-1]
+            gradient[0] += jacobian.T @ weighted[:, -1]
+            cost[0] += error @ weighted[:, -1]
+        return replace(at, cost=cost, gradient=gradient, hessian=hessian)
+
+
+def _evaluated(problem: PackedProblem, state: SharedState, private: object, checks: _Checks | None) -> Evaluation:
+    at = evaluate(problem, state, private)  # type: ignore[arg-type]
+    return at if checks is None else checks.add_to(at, state)
+
+
+def _session(registration: Registration, constants: Sequence[Constant], checks: Sequence[Check]) -> _Session:
+    """A session's graph at its own optimum, without the prior on the common constants."""
+    problem, model = registration.problem, registration.model
+    columns = problem.columns
+    sigmas = least_sigmas(model.constant_sigmas)
+    sigmas[list(constants)] = np.inf
+    prior = constants_prior(registration.measurements, columns, sigmas, model.constant_means)
+    problem = replace(problem, prior=prior, shapes=None)
+    common = np.zeros(columns.size, dtype=bool)
+    common[columns.rig] = np.isin(columns.constants, constants)
+    points, state = _Checks.of(checks, registration), registration.optimum.state
+    at = _evaluated(problem, state, registration.optimum.evaluation.private, points)
+    return _Session(problem, common, points, state, at)
+
+
+def session_evidence(
+    registration: Registration, constants: Sequence[Constant], checks: Sequence[Check] = ()
+) -> Evidence:
+    """What one session says about some of the constants, at its own optimum.
+
+    Args:
+        registration: in which the constants are variables, with independent priors.
+        constants: in ascending order.
+        checks: points known to both devices, as data.
+    """
+    return _session(registration, constants, checks).evidence
+
+
+def common_constants(model: SessionModel) -> tuple[Constant, ...]:
+    """The constants that a session takes as uncertain and that are common to the sessions of a rig."""
+    return tuple(c for c, sigma in zip(Constant, model.constant_sigmas, strict=True) if sigma > 0.0 and c not in OWN)
+
+
+def commission(registrations: Sequence[Registration], checks: Sequence[Sequence[Check]] = ()) -> Commissioned:
+    """The constants of the rig that sessions have in common.
+
+    Args:
+        registrations: at least one, each at its optimum; all with the same priors of the constants, and without a rig.
+        checks: of each session, as data; none where absent.
+
+    Raises:
+        EstimationError: the graph does not settle.
+    """
+    given = [*checks] or [()] * len(registrations)
+    constants = common_constants(registrations[0].model)
+    sessions = [_session(found, constants, points) for found, points in zip(registrations, given, strict=True)]
+    prior_sigma = registrations[0].model.constant_sigmas[list(constants)]
+    prior = np.diag(prior_sigma**-2.0)
+
+    def cost(of: Sequence[_Session], value: FloatArray) -> float:
+        return float(value @ prior @ value + sum(one.at.cost[0] for one in of))
+
+    value = None
+    for rounds in range(1, ROUNDS + 1):
+        evidence = [one.evidence for one in sessions]
+        total = prior + np.sum([found.information for found in evidence], axis=0)
+        wanted = _solved(total, np.sum([found.pull for found in evidence], axis=0)[:, None])[:, 0]
+        steps = [one.step_to(wanted) for one in sessions]
+        if value is None:  # each is at its own optimum, with constants of its own
+            sessions = [one.moved(step) for one, step in zip(sessions, steps, strict=True)]
+            value = wanted
+            continue
+        decrement = -sum(float(step @ one.at.gradient[0]) for one, step in zip(sessions, steps, strict=True))
+        decrement -= float((wanted - value) @ prior @ value)
+        if decrement < SETTLED:
+            return Commissioned(constants, value, _inverse(total), prior_sigma, tuple(evidence), rounds)
+        before = cost(sessions, value)
+        for halving in range(HALVINGS):
+            share = 0.5**halving
+            trial = [one.moved(share * step) for one, step in zip(sessions, steps, strict=True)]
+            there = value + share * (wanted - value)
+            if cost(trial, there) <= before + SETTLED:
+                sessions, value = trial, there
+                break
+        else:
+            break
+    raise EstimationError("the sessions' common constants do not settle: commission fewer of them, to find which")
+
+
+class ChartVerdict(StrEnum):
+    """Of a session against a rig."""
+
+    PASS = "pass"
+    NOTE = "note"
+    ALARM = "alarm"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chart:
+    """A session compared with a rig.
+
+    Attributes:
+        verdict: pass, or what the tests together have by chance at most in ``NOTE_P`` or ``ALARM_P`` of sessions.
+        chi_square, degrees_of_freedom: of the session's evidence in the directions that it sees.
+        z: (K,) whether each constant alone has changed.
+        change: (K,) by how much, the rig's value left behind. change_sigma: (K,); infinite where nothing tells.
+    """
+
+    verdict: ChartVerdict
+    chi_square: float
+    degrees_of_freedom: int
+    z: FloatArray
+    change: FloatArray
+    change_sigma: FloatArray
+
+
+def control_chart(evidence: Evidence, mean: FloatArray, covariance: FloatArray, scale: FloatArray) -> Chart:
+    """Compare a session's evidence with a rig.
+
+    Args:
+        evidence: of the session alone, over the same constants.
+        mean: (K,) of the rig. covariance: (K, K).
+        scale: (K,) size of a change that matters: the constants' prior standard deviations.
+    """
+    outer = np.outer(scale, scale)
+    information, spread = outer * evidence.information, covariance / outer
+    score = scale * (evidence.pull - evidence.information @ mean)
+    gain = _solved(information + _inverse(spread), np.column_stack([information, score]))
+    whole = information - information @ gain[:, :-1]
+    tested = score - information @ gain[:, -1]
+    values, vectors = np.linalg.eigh(information)
+    seen = values >= SEEN
+    chi_square, count = 0.0, int(seen.sum())
+    if count:
+        basis = vectors[:, seen]
+        estimate = (basis.T @ score) / values[seen]
+        off = np.diag(1.0 / values[seen]) + basis.T @ spread @ basis
+        chi_square = float(estimate @ np.linalg.solve(off, estimate))
+    told = np.diag(whole) > SEEN**2
+    root = np.sqrt(np.where(told, np.diag(whole), 1.0))
+    z = np.where(told, tested / root, 0.0)
+    chance = float(chdtrc(count, max(chi_square, 0.0))) if count else 1.0
+    beyond = float(np.abs(z).max(initial=0.0))
+    verdict = ChartVerdict.PASS
+    for limit, name in ((NOTE_P, ChartVerdict.NOTE), (ALARM_P, ChartVerdict.ALARM)):
+        if chance < 0.5 * limit or beyond > z_limit(limit, int(told.sum())):
+            verdict = name
+    change_sigma = np.where(told, scale / root, np.inf)
+    return Chart(verdict, chi_square, count, z, np.where(told, scale * tested / root**2, 0.0), change_sigma)
+
+
+def z_limit(chance: float, count: int) -> float:
+    """Of the z of one of ``count`` constants: half of the false alarms are the chi square's."""
+    return float(-ndtri(0.25 * chance / max(count, 1)))
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution (n, m) of a positive definite system whose rows have different units."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+    return np.asarray(scale[:, None] * np.linalg.solve(matrix * np.outer(scale, scale), scale[:, None] * right))
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of a positive definite matrix whose rows have different units."""
+    inverse = _solved(matrix, np.eye(len(matrix)))
+    return np.asarray(0.5 * (inverse + inverse.T))
