@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -119,3 +120,14 @@ def test_nothing_is_found_where_there_is_no_tag() -> None:
     other = MarkerModel("DICT_5X5_100", (TagModel(3, 30.0),))
     left, _ = frames_of(surfaces_of(other, facing_pose((5.0, 3.0, 120.0), 20.0)))
     assert find_spoilt_tags(left, "DICT_4X4_50", frozenset(range(50))) == []
+
+
+def test_clutter_of_rectangles_is_not_taken_for_a_tag() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        image = np.full((720, 1280), 90, dtype=np.uint8)
+        for _ in range(60):
+            centre, size = rng.uniform(0.0, 1.0, 2) * (1280, 720), rng.uniform(10.0, 150.0, 2)
+            outline = cv2.boxPoints((tuple(centre), tuple(size), float(rng.uniform(0.0, 180.0))))
+            cv2.fillPoly(image, [np.rint(outline).astype(np.int32)], int(rng.integers(0, 255)))
+        assert find_spoilt_tags(image, "DICT_4X4_50", frozenset([0])) == []

@@ -137,6 +137,8 @@ def _read(image: Image, outlines: FloatArray, dictionary: str) -> list[tuple[int
     white, contrast = _white(_cell_levels(image, outlines, cells, 1), border)
     likely = (contrast > MIN_CONTRAST) & (white[:, border].mean(axis=1) <= MAX_WRONG_BORDER + 0.1)
     outlines = outlines[likely]
+    if not len(outlines):
+        return []
     white, contrast = _white(_cell_levels(image, outlines, cells, SAMPLES), border)
     wrong_border = white[:, border].mean(axis=1)
     flat = codes[..., ~border].reshape(-1, int((~border).sum()))
