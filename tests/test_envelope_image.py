@@ -145,3 +145,28 @@ def test_a_frame_with_other_rows_than_elements_is_an_image() -> None:
     assert isinstance(find, PaFind)
     assert find.sound_speed_ratio is None
     assert find.x_mm == pytest.approx(6.0, abs=0.05)
+
+
+@pytest.mark.parametrize("gain_db", [0.0, 6.0])
+@pytest.mark.parametrize("behind_mm", [3.0, 9.0])
+def test_a_brighter_copy_behind_is_another_wave(gain_db: float, behind_mm: float) -> None:
+    for seed in range(3):
+        both = np.maximum(image_of(6.0, 20.0, 20.0, seed), image_of(7.0, 20.0 + behind_mm, 20.0 + gain_db, seed + 50))
+        find = found(both, probe_with())
+        assert find.x_mm == pytest.approx(6.0, abs=0.2)
+        assert find.range_mm == pytest.approx(20.0, abs=0.2)
+        if gain_db:
+            assert find.others[0].x_mm == pytest.approx(7.0, abs=0.5)
+            assert find.others[0].range_mm == pytest.approx(20.0 + behind_mm, abs=0.4)
+
+
+def test_a_bright_line_before_the_source_is_not_taken_for_it() -> None:
+    image = image_of(6.0, 25.0, 20.0, 1).astype(np.float64)
+    image[60:64] += 20.0
+    find = found(image, probe_with())
+    assert find.x_mm == pytest.approx(6.0, abs=0.2)
+    assert find.range_mm == pytest.approx(25.0, abs=0.2)
+    # In a part of the columns it hides the source, but is none.
+    image = image_of(6.0, 25.0, 20.0, 1).astype(np.float64)
+    image[60:64, 60:160] += 20.0
+    assert isinstance(locate_in_image(image, probe_with()), NoSignal)

@@ -3,13 +3,14 @@
 Power (envelope squared) is divided by the background at the same depth and smoothed at a few scales. Its maximum is
 tested against the tail of the image's own distribution: an exponential fitted between two high quantiles and
 extrapolated to the false-alarm rate, further where few independent speckle grains determine the tail. That needs no
-model of speckle. A bell is then fitted to the power near the peak.
+model of speckle. Before the strongest peak an earlier one is looked for, since the direct wave is the first one. A bell
+is then fitted to the power near the peak.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ import numpy.typing as npt
 from scipy import ndimage, optimize
 
 from fgreg.detection.channels import check_frame
-from fgreg.detection.results import NoSignal, PaFind
+from fgreg.detection.photoacoustic import LEAST_RANGE_MM
+from fgreg.detection.results import NoSignal, OtherWave, PaFind
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import ImageModel, ProbeModel
 
@@ -32,6 +34,12 @@ ROWS, ROWS_SHARE = 15, 8
 FIT_LEVEL = 0.25
 """Pixels above this share of the peak's power enter the fit (half the envelope)."""
 FLOOR_PIXELS = 0.01
+EARLIER_SHARE = 0.1
+"""Least power of an earlier source as a share of a later one's: softer ones are sidelobes of the beamformer."""
+FLAT_MM = 8.0
+"""What is wider along x than this is a flat wave."""
+OTHER_SIGMA_MM = (0.2, 0.15)
+"""Standard deviations (x, range) of a peak that is not fitted."""
 TYPICAL_MM, SIZE_SIGMA = (0.14, 0.2), 0.8
 """Prior of the widths (range, x) of a source's envelope, and the sigma of their logarithms."""
 SKEW_SIGMA, TILT_SIGMA = 0.2, 0.5
@@ -86,6 +94,12 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     threshold = head + peak.clusters * math.expm1(min(excess / max(peak.clusters, 1), 50.0))
     if peak.statistic < threshold:
         return NoSignal(f"no signal: statistic {peak.statistic:.1f}, threshold {threshold:.1f}")
+    others: list[_Peak] = []
+    while (
+        earlier := _find_earlier(relative, np.asarray(range_mm[first:], dtype=np.float64), peak, threshold, probe.image)
+    ) is not None:
+        others.append(peak)
+        peak = earlier
     fit = _fit_bell(power, level, relative, peak, probe.image)
     if fit is None:
         return NoSignal(
@@ -109,6 +123,15 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
         elements_used=None,
         statistic=peak.statistic,
         threshold=threshold,
+        others=tuple(
+            OtherWave(
+                probe.image.origin_mm[1] + other.column * probe.image.pixel_mm[1],
+                float(range_mm[first + other.row]),
+                np.diag(np.square(OTHER_SIGMA_MM)),
+                other.statistic,
+            )
+            for other in others
+        ),
     )
 
 
@@ -121,6 +144,23 @@ def background(power: FloatArray) -> FloatArray:
     smooth = ndimage.median_filter(each, size=min(max(ROWS, each.size // ROWS_SHARE), each.size), mode="nearest")
     level = np.maximum(smooth, 0.7 * each)
     return np.maximum(level, 1e-12 * float(power.max()))
+
+
+def _find_earlier(
+    relative: FloatArray, range_mm: FloatArray, peak: _Peak, threshold: float, image: ImageModel
+) -> _Peak | None:
+    """The strongest peak before another one; None where it is too soft, wide as a flat wave, or at the probe's face."""
+    rows = np.flatnonzero((range_mm > LEAST_RANGE_MM) & (range_mm < range_mm[peak.row] - AWAY_MM[0]))
+    if rows.size < 8:
+        return None
+    part = relative[rows[0] : rows[-1] + 1]
+    found = _find_peak(part, image)
+    if found.statistic < max(threshold, EARLIER_SHARE * peak.statistic):
+        return None
+    labels, _ = ndimage.label(part[found.row] > FIT_LEVEL * part[found.row, found.column])
+    if float(np.sum(labels == labels[found.column])) * image.pixel_mm[1] > FLAT_MM:
+        return None
+    return replace(found, row=found.row + int(rows[0]))
 
 
 def _find_peak(relative: FloatArray, image: ImageModel) -> _Peak:
