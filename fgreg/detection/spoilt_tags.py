@@ -32,8 +32,8 @@ LEAST_SEEN = 0.3
 MAX_OUTLINES = 400
 SAMPLES = 3
 """A cell's level is the median of SAMPLES x SAMPLES pixels."""
-MAX_WRONG_BORDER, MAX_WRONG_BITS = 0.3, 0.2
-"""Share of the border's cells, and of the code's, that may be spoilt."""
+MAX_WRONG_FRAME, MAX_WRONG_BITS = 0.3, 0.13
+"""Share of the cells of border and quiet zone, and of the code's, that may be spoilt."""
 
 
 def find_spoilt_tags(image: Image, dictionary: str, ids: frozenset[int]) -> list[FoundTag]:
@@ -131,30 +131,43 @@ def _read(image: Image, outlines: FloatArray, dictionary: str) -> list[tuple[int
     """Id, share of matching cells and corners (4, 2) as printed of each outline (n, 4, 2) that holds a tag."""
     codes = _codes(dictionary)
     cells = codes.shape[-1]
-    border = np.ones((cells, cells), dtype=bool)
-    border[1:-1, 1:-1] = False
     # One pixel of each cell tells the most of them apart.
-    white, contrast = _white(_cell_levels(image, outlines, cells, 1), border)
-    likely = (contrast > MIN_CONTRAST) & (white[:, border].mean(axis=1) <= MAX_WRONG_BORDER + 0.1)
-    outlines = outlines[likely]
+    white, contrast = _white_cells(image, outlines, cells, 1)
+    outlines = outlines[(contrast > MIN_CONTRAST) & _framed(white, MAX_WRONG_FRAME + 0.1)]
     if not len(outlines):
         return []
-    white, contrast = _white(_cell_levels(image, outlines, cells, SAMPLES), border)
-    wrong_border = white[:, border].mean(axis=1)
-    flat = codes[..., ~border].reshape(-1, int((~border).sum()))
+    white, contrast = _white_cells(image, outlines, cells, SAMPLES)
+    flat = codes[..., 1:-1, 1:-1].reshape(-1, (cells - 2) ** 2)
     out = []
-    for k in np.flatnonzero((contrast > MIN_CONTRAST) & (wrong_border <= MAX_WRONG_BORDER)).tolist():
-        wrong = (flat != white[k][~border]).mean(axis=1)
+    for k in np.flatnonzero((contrast > MIN_CONTRAST) & _framed(white, MAX_WRONG_FRAME)).tolist():
+        wrong = (flat != white[k, 2:-2, 2:-2].ravel()).mean(axis=1)
         best = int(np.argmin(wrong))
         if wrong[best] <= MAX_WRONG_BITS and (wrong <= wrong[best]).sum() == 1:
-            match = 2.0 - float(wrong[best]) - float(wrong_border[k])
+            inner, outer = _wrong_frame(white[k : k + 1])
+            match = 3.0 - float(wrong[best]) - float(inner[0]) - float(outer[0])
             out.append((best // 4, match, np.roll(outlines[k], -(best % 4), axis=0)))
     return out
 
 
-def _cell_levels(image: Image, outlines: FloatArray, cells: int, samples: int) -> FloatArray:
-    """Median level (n, cells, cells) of ``samples`` x ``samples`` pixels of each cell inside outlines (n, 4, 2)."""
-    at = (np.arange(cells * samples) + 0.5) / samples / cells
+def _wrong_frame(white: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Shares (n,) of the border that are white, and of the quiet zone that are not."""
+    n = white.shape[-1]
+    depth = np.minimum(*np.meshgrid(*[np.minimum(np.arange(n), np.arange(n)[::-1])] * 2))
+    return white[:, depth == 1].mean(axis=1), 1.0 - white[:, depth == 0].mean(axis=1)
+
+
+def _framed(white: BoolArray, most: float) -> BoolArray:
+    inner, outer = _wrong_frame(white)
+    return (inner <= most) & (outer <= most)
+
+
+def _white_cells(image: Image, outlines: FloatArray, cells: int, samples: int) -> tuple[BoolArray, FloatArray]:
+    """Which cells (n, cells + 2, cells + 2) are white, and the contrast (n,); ``samples`` x ``samples`` pixels each.
+
+    The outermost are the quiet zone about the outlines (n, 4, 2), close to them.
+    """
+    centre = np.concatenate([[-0.4], np.arange(cells) + 0.5, [cells + 0.4]])
+    at = (centre[:, None] + (np.arange(samples) + 0.5) / samples - 0.5).ravel() / cells
     u, v = np.meshgrid(at, at)
     # The homography of the unit square (Heckbert, Fundamentals of Texture Mapping, 1989).
     p0, p1, p2, p3 = (outlines[:, i, :, None, None] for i in range(4))
@@ -162,13 +175,11 @@ def _cell_levels(image: Image, outlines: FloatArray, cells: int, samples: int) -
     det = d1[:, 0] * d2[:, 1] - d2[:, 0] * d1[:, 1]
     g = ((sums[:, 0] * d2[:, 1] - d2[:, 0] * sums[:, 1]) / det)[:, None]
     h = ((d1[:, 0] * sums[:, 1] - sums[:, 0] * d1[:, 1]) / det)[:, None]
-    px = ((p1 - p0 + g * p1) * u + (p3 - p0 + h * p3) * v + p0) / (g * u + h * v + 1.0)
-    level = _level(image, np.moveaxis(px, 1, -1)).reshape(-1, cells, samples, cells, samples)
-    return np.asarray(np.median(level, axis=(2, 4)))
-
-
-def _white(level: FloatArray, border: BoolArray) -> tuple[BoolArray, FloatArray]:
-    """Which cells (n, cells, cells) are white, and the contrast (n,), of cells whose border is mostly dark."""
-    dark = np.median(level[:, border], axis=1)
-    light = np.quantile(level[:, ~border], 0.9, axis=1)
+    px = ((p1 - p0 + g * p1) * u + (p3 - p0 + h * p3) * v + p0) / np.maximum(g * u + h * v + 1.0, 1e-3)
+    level = _level(image, np.moveaxis(px, 1, -1)).reshape(-1, cells + 2, samples, cells + 2, samples)
+    level = np.median(level, axis=(2, 4))
+    inside = level[:, 1:-1, 1:-1]
+    border = np.ones((cells, cells), dtype=bool)
+    border[1:-1, 1:-1] = False
+    dark, light = np.median(inside[:, border], axis=1), np.quantile(inside[:, ~border], 0.9, axis=1)
     return level > (0.5 * (dark + light))[:, None, None], light - dark
