@@ -18,13 +18,14 @@ from fgreg.detection.results import RigidFit
 from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, rotation_to_direction
 from fgreg.model.camera_dependence import CONSTANTS, column, corner_dependence
+from fgreg.model.corner_information import corner_information, observed_dependences
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import EXACT, NONE
 from fgreg.pipeline.solve import SolveRequest, solve_session
-from fgreg.registration.camera_conditions import PrintSize, camera_conditions, corner_information, print_sizes
+from fgreg.registration.camera_conditions import PrintSize, camera_conditions, print_sizes
 from fgreg.registration.verdict import Condition, verdict_of
 from fgreg.session.session_reader import read_ground_truth, read_session
 from tests.marker_scene import ONE_TAG, RIG, facing_pose
@@ -72,7 +73,7 @@ def measured(c: FloatArray, seed: int, glint: int | None = None) -> Measurements
 
 
 def sizes(measurements: Measurements, model: SessionModel | None = None) -> tuple[PrintSize, ...]:
-    corners = corner_information(measurements)
+    corners = corner_information([*observed_dependences(measurements)])
     assert corners is not None
     return print_sizes(corners, (model or session()).constant_sigmas[CAMERA])
 
@@ -169,14 +170,18 @@ def test_without_frames_nothing_is_measured() -> None:
         ),
         pairs=tuple(replace(pair, marker=replace(pair.marker, dependence=None)) for pair in measurements.pairs),
     )
-    assert corner_information(poses) is None
+    assert corner_information([*observed_dependences(poses)]) is None
     assert conditions(poses) == []
 
 
 def test_one_marker_under_several_looks_is_counted_once() -> None:
     measurements = measured(np.zeros(CONSTANTS), 8)
     twice = replace(measurements, pairs=measurements.pairs * 2)
-    once, again = corner_information(measurements), corner_information(twice)
+    once = corner_information([*observed_dependences(measurements)])
+    again = corner_information([*observed_dependences(twice)])
+        corner_information([*observed_dependences(measurements)]),
+        corner_information([*observed_dependences(twice)]),
+    )
     assert once is not None
     assert again is not None
     np.testing.assert_array_equal(once.information, again.information)

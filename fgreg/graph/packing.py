@@ -8,7 +8,7 @@ problem perturbs the pose by a twist (w, n): the right tangent of GTSAM's Pose3,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from fgreg.geometry.rig import CAMERA, COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import Quadratic
+from fgreg.model.corner_information import corner_information, observed_dependences
 from fgreg.model.measurements import (
     FLOOR_MM,
     POSE_FLOOR,
@@ -219,9 +220,10 @@ def camera_evidence(dependences: Iterable[CameraDependence], columns: Columns) -
     of_camera = np.flatnonzero(chosen >= CAMERA.start)
     at = chosen[of_camera] - CAMERA.start
     information, pull = np.zeros((len(chosen), len(chosen))), np.zeros(len(chosen))
-    for found in dependences:
-        information[np.ix_(of_camera, of_camera)] += found.information[np.ix_(at, at)]
-        pull[of_camera] += found.pull[at]
+    found = corner_information([*dependences])
+    if found is not None:
+        information[np.ix_(of_camera, of_camera)] = found.information[np.ix_(at, at)]
+        pull[of_camera] = found.pull[at]
     return ConstantsPrior(_mean(information, pull), information)
 
 
@@ -232,17 +234,6 @@ def _mean(information: FloatArray, pull: FloatArray) -> FloatArray:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-30))
     inverse = np.linalg.pinv(information * np.outer(scale, scale), rcond=1e-10, hermitian=True)
     return np.asarray(scale * (inverse @ (scale * pull)))
-
-
-def observed_dependences(measurements: Measurements) -> Iterator[CameraDependence]:
-    """What each picture of a tag or board says about the constants, once for each."""
-    once: dict[int, CameraDependence] = {}
-    markers = [aim.marker for aim in measurements.aims] + [pair.marker for pair in measurements.pairs]
-    for marker in markers:
-        if marker.dependence is not None:
-            once[marker.id] = marker.dependence
-    yield from once.values()
-    yield from (aim.dependence for aim in measurements.aims if aim.dependence is not None)
 
 
 def _links(epochs: Sequence[EpochStart]) -> tuple[EpochLink, ...]:

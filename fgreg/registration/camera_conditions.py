@@ -16,13 +16,20 @@ from scipy.special import chdtrc
 
 from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, inverse, transform_points
-from fgreg.model.camera_dependence import CONSTANTS, MODEL_PX, column, plausible_share
+from fgreg.model.camera_dependence import CONSTANTS, MODEL_PX, column
+from fgreg.model.corner_information import (
+    DEFAULT_SIGMAS,
+    CornerInformation,
+    corner_information,
+    observed_dependences,
+    posterior_of,
+)
 from fgreg.model.estimate import Verdict
-from fgreg.model.measurements import Aim, CameraDependence, Measurements, Pair
+from fgreg.model.measurements import Measurements
 from fgreg.model.plausible import implausible_measurements, implausible_setup
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.model.systematic import TEXTS, Systematic
+from fgreg.model.systematic import TEXTS
 from fgreg.registration.verdict import Condition
 
 ALARM_P = 4.65e-4
@@ -34,9 +41,6 @@ MISFIT_DETECTIONS = 4
 """Share of detections whose corners miss the body, and their number, from which the lens is suspicious."""
 _FLAT = 1e3
 """Factor on a constant's default sigma that makes its prior flat."""
-_WIDE = 10.0
-"""The same for deciding which detections fit: constants far beyond their priors are still constants."""
-_ROUNDS = 10
 _GROUPS = (
     (Constant.FOCAL_LEFT, Constant.FOCAL_RIGHT),
     (Constant.CENTRE_LEFT_X, Constant.CENTRE_LEFT_Y, Constant.CENTRE_RIGHT_X, Constant.CENTRE_RIGHT_Y),
@@ -60,50 +64,6 @@ class PrintSize:
     ratio: float
     sigma: float
     declared_sigma: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CornerInformation:
-    """What all detections of a session say about the constants of ``CAMERA`` (n = 19).
-
-    Attributes:
-        information: (n, n). pull: (n,).
-        weight: of each detection; below 1 where no constants make its corners fit.
-        misfit: of each detection, chi square over degrees of freedom that no constants explain.
-    """
-
-    information: FloatArray
-    pull: FloatArray
-    weight: FloatArray
-    misfit: FloatArray
-
-
-def corner_information(measurements: Measurements) -> CornerInformation | None:
-    """Sum over the detections, each once; None where nothing was detected in frames.
-
-    A detection speaks with full weight where some constants, the same for all, make its corners fit: a wrong print
-    spoils every detection alike, a glint only one.
-    """
-    shots: tuple[Aim | Pair, ...] = (*measurements.aims, *measurements.pairs)
-    markers = {shot.marker.id: shot.marker.dependence for shot in shots}
-    found = [d for d in (*markers.values(), *(aim.dependence for aim in measurements.aims)) if _tells(d)]
-    told = [d for d in found if d is not None]
-    if not told:
-        return None
-    chi_square = np.array([d.chi_square for d in told])
-    degrees = np.array([d.degrees_of_freedom for d in told])
-    share = np.array([plausible_share(c, n) for c, n in zip(chi_square, degrees, strict=True)])
-    information = np.stack([d.information for d in told]) / share[:, None, None]
-    pull = np.stack([d.pull for d in told]) / share[:, None]
-    wide = _WIDE * _default_sigmas()
-    weight, left = share, chi_square
-    for _ in range(_ROUNDS):
-        c, _ = _posterior(np.tensordot(weight, information, 1), weight @ pull, wide)
-        left = np.maximum(chi_square + c @ information @ c - 2.0 * pull @ c, 0.0)
-        previous, weight = weight, np.array([plausible_share(r, n) for r, n in zip(left, degrees, strict=True)])
-        if np.abs(weight - previous).max() < 1e-3:
-            break
-    return CornerInformation(np.tensordot(weight, information, 1), weight @ pull, weight, left / degrees)
 
 
 def print_sizes(corners: CornerInformation, sigmas: FloatArray) -> tuple[PrintSize, ...]:
@@ -133,7 +93,7 @@ def camera_conditions(
     """
     found = [Condition(Verdict.WARNING, text) for text in implausible_setup(model)]
     found += [Condition(Verdict.WARNING, text) for text in implausible_measurements(measurements)]
-    corners = corner_information(measurements)
+    corners = corner_information([*observed_dependences(measurements)])
     if corners is None:
         return found
     # From here on the constants count from what a commissioned rig expects.
@@ -246,31 +206,15 @@ def _severity(error_mm: float, config: SolveConfig) -> Verdict:
     return Verdict.REFUSED if error_mm > 2.0 * config.limit_mm else Verdict.WARNING
 
 
-def _tells(dependence: CameraDependence | None) -> bool:
-    return dependence is not None and dependence.degrees_of_freedom > 0
-
-
 def _columns(constants: Sequence[Constant]) -> IntArray:
     return np.array([column(constant) for constant in constants], dtype=np.int64)
-
-
-def _default_sigmas() -> FloatArray:
-    return Systematic().sigmas(0.0, 0.0)[CAMERA]
-
-
-def _posterior(information: FloatArray, pull: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(mean (n,), covariance (n, n)) of constants with independent priors of these standard deviations (n,) or 0."""
-    root = np.outer(sigmas, sigmas)
-    inner = np.linalg.inv(np.eye(len(sigmas)) + root * information)
-    covariance = root * (0.5 * (inner + inner.T))
-    return covariance @ pull, covariance
 
 
 def _measured(corners: CornerInformation, columns: IntArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(estimate (m,), covariance (m, m)) of constants with a flat prior on them and the declared ones on the others."""
     prior = sigmas.copy()
-    prior[columns] = _FLAT * _default_sigmas()[columns]
-    mean, covariance = _posterior(corners.information, corners.pull, prior)
+    prior[columns] = _FLAT * DEFAULT_SIGMAS[columns]
+    mean, covariance = posterior_of(corners.information, corners.pull, prior)
     return mean[columns], covariance[np.ix_(columns, columns)]
 
 

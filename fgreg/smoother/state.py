@@ -12,8 +12,9 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
-from fgreg.graph.packing import ConstantsPrior, PackedProblem, camera_evidence, observed_dependences
+from fgreg.graph.packing import ConstantsPrior, PackedProblem, camera_evidence
 from fgreg.graph.shared_state import Quadratic, SharedState
+from fgreg.model.corner_information import observed_dependences
 from fgreg.model.measurements import Aim, EpochStart, Look, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
