@@ -179,9 +179,6 @@ def test_one_marker_under_several_looks_is_counted_once() -> None:
     twice = replace(measurements, pairs=measurements.pairs * 2)
     once = corner_information([*observed_dependences(measurements)])
     again = corner_information([*observed_dependences(twice)])
-        corner_information([*observed_dependences(measurements)]),
-        corner_information([*observed_dependences(twice)]),
-    )
     assert once is not None
     assert again is not None
     np.testing.assert_array_equal(once.information, again.information)
