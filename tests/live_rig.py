@@ -39,13 +39,13 @@ class Listening:
 
     def __init__(self, operator: Any) -> None:
         self._operator = operator
-        self.told: list[tuple[float, str]] = []
+        self.messages: list[tuple[float, str]] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._operator, name)
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
-        self.told.append((time.monotonic(), text))
+        self.messages.append((time.monotonic(), text))
         self._operator.tell(text, done=done, wants=wants)
 
 
@@ -70,7 +70,7 @@ class Rig:
 
     def told_after(self, since_s: float, text: str) -> float | None:
         """Seconds from a time until a message with this beginning."""
-        times = (at_s - since_s for at_s, said in self.operator.told if at_s >= since_s and said.startswith(text))
+        times = (at_s - since_s for at_s, said in self.operator.messages if at_s >= since_s and said.startswith(text))
         return next(times, None)
 
     def counts(self) -> FloatArray:
@@ -101,7 +101,7 @@ def rig(folder: Path) -> Iterator[Rig]:
         assert isinstance(operator, Listening)
         ready = Rig(room, session, operator, found[0])
         if not ready.run(PATIENCE_S, lambda: session.loop.figures.orders > 3):
-            raise AssertionError(f"the session did not begin: {operator.told[-3:]}")
+            raise AssertionError(f"the session did not begin: {operator.messages[-3:]}")
         yield ready
 
 
@@ -185,7 +185,7 @@ STUDIED = {
 class Trial:
     """One fault: seconds until the loss is reported, until the return is, until the next order; counts per second."""
 
-    told_s: float = math.nan
+    reported_s: float = math.nan
     back_s: float = math.nan
     order_s: float = math.nan
     rates: Sequence[float] = (math.nan,) * 3
@@ -199,7 +199,7 @@ def trial(case: Rig, fault: Fault, lasts_s: float, *, orders: bool = True, rest_
     mend = fault.begin(case, fault.what)
     lost, back = f"{fault.role} lost", f"{fault.role} is back"
     if case.run(PATIENCE_S, lambda: case.told_after(began, lost) is not None):
-        found.told_s = case.told_after(began, lost) or 0.0
+        found.reported_s = case.told_after(began, lost) or 0.0
     case.run(max(0.0, began + lasts_s - time.monotonic()))
     found.rates = ((case.counts() - before) / (time.monotonic() - began)).tolist()
     mended = time.monotonic()

@@ -52,9 +52,9 @@ class Rehearsal:
     Attributes:
         obliging: whether the operator gives the commands that are asked for.
         frame_s: interval of the pictures.
-        deaf_from_s: from this time the probe detects nothing. blind_from_s: from this time the camera sees no marker.
+        no_source_from_s: from this time the probe detects nothing. no_marker_from_s: the camera sees no marker.
         latched: why the stage may not move, as from the safety gate; a release clears it.
-        told: all messages to the operator, with their times. asked: all other actions.
+        messages: all messages to the operator, with their times. actions: all other actions.
         begun_mm: error of the registration and its prediction when the stage began to follow; set by the test.
         errors_deg: error of the plane's angle at the end of each hold while the stage follows.
     """
@@ -63,12 +63,12 @@ class Rehearsal:
     threshold: float = 0.45
     obliging: bool = True
     frame_s: float = 1.0 / 30.0
-    deaf_from_s: float = math.inf
-    blind_from_s: float = math.inf
+    no_source_from_s: float = math.inf
+    no_marker_from_s: float = math.inf
     latched: str = ""
     now_s: float = 0.0
-    told: list[tuple[float, Tell]] = field(default_factory=list)
-    asked: list[tuple[float, Action]] = field(default_factory=list)
+    messages: list[tuple[float, Tell]] = field(default_factory=list)
+    actions: list[tuple[float, Action]] = field(default_factory=list)
     errors_deg: list[float] = field(default_factory=list)
     begun_mm: tuple[float, float] = (math.inf, 0.0)
 
@@ -99,7 +99,7 @@ class Rehearsal:
         self.now_s += self.frame_s
         room, now = self.room, self.now_s
         room.pass_to(now)
-        if now < self.blind_from_s:
+        if now < self.no_marker_from_s:
             self.poses.add(self._observed(now))
         status = self.stage.status()
         heard = []
@@ -144,7 +144,7 @@ class Rehearsal:
 
     def _do(self, action: Action) -> None:
         if not isinstance(action, Tell):
-            self.asked.append((self.now_s, action))
+            self.actions.append((self.now_s, action))
         match action:
             case Ask(kind):
                 self.requested = kind
@@ -171,7 +171,7 @@ class Rehearsal:
                 for look in spot.looks:
                     self._pair(pm, spot.marker, look)
             case Tell():
-                self.told.append((self.now_s, action))
+                self.messages.append((self.now_s, action))
                 if action.wants is not None and self.obliging:
                     self._said.append(OperatorCommand(action.wants))
                 if action.done:
@@ -203,7 +203,7 @@ class Rehearsal:
         where = None if moving else scan + config.noise.scan_rad * rng.standard_normal()
         if not self.workflow.wants_pulses:  # then it is not processed (fgreg.live.pulse_locator)
             return LocatedPulse(t_s, None, marker, unpaired)
-        if amplitude < self.threshold or t_s >= self.deaf_from_s:
+        if amplitude < self.threshold or t_s >= self.no_source_from_s:
             return LocatedPulse(t_s, where, marker, unpaired)
         x = float(source[0]) + config.noise.lateral_mm * rng.standard_normal()
         covariance = np.diag([config.noise.lateral_mm**2, config.noise.range_mm**2])

@@ -74,10 +74,10 @@ def test_a_session_recorded_on_ros_topics_comes_back_and_is_solved_the_same(pose
         if "trus" in event:
             look = bags.point_stamped(t, (event["trus"]["x_mm"] / 1000.0, 0.0, event["trus"]["range_mm"] / 1000.0))
             messages.append(("/fgreg/look", t, look))
-        told: dict[str, Any] = {key: event[key] for key in ("type", "pm", "camera_p_spot_mm") if key in event}
+        mark: dict[str, Any] = {key: event[key] for key in ("type", "pm", "camera_p_spot_mm") if key in event}
         if sweep := event.get("trus", {}).get("sweep"):
-            told["sweep"] = sweep
-        messages.append(("/fgreg/mark", t, bags.text(json.dumps(told))))
+            mark["sweep"] = sweep
+        messages.append(("/fgreg/mark", t, bags.text(json.dumps(mark))))
     path = bags.write_bag(tmp_path / "bag", messages, mcap=True)
     done = convert(path, tmp_path / "out", "--setup", pose_session)
     assert done.exit_code == 0, done.output
@@ -164,8 +164,8 @@ def test_of_positions_and_frames_only_one_is_taken(tmp_path: Path) -> None:
     path, where = bags.write_bag(tmp_path / "bag", messages), setup(tmp_path)
     assert convert(path, tmp_path / "a", "--setup", where).exit_code == 0
     assert all("frame" in event["trus"] for event in events(tmp_path / "a")[1:])
-    told = mapping(tmp_path, topics={"look": "/fgreg/look"})
-    assert convert(path, tmp_path / "b", "--setup", where, "--map", told).exit_code == 0
+    looks_only = mapping(tmp_path, topics={"look": "/fgreg/look"})
+    assert convert(path, tmp_path / "b", "--setup", where, "--map", looks_only).exit_code == 0
     assert [event["trus"]["range_mm"] for event in events(tmp_path / "b")[1:]] == [30.0]
     both = mapping(tmp_path, topics={"look": "/fgreg/look", "frame": "/fgreg/frame"})
     assert "found look and frame, both" in refused(path, tmp_path / "c", "--setup", where, "--map", both)

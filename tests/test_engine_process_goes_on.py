@@ -240,7 +240,7 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
 ) -> None:
     monkeypatch.setattr(recorder_module, "AGAIN_S", 0.5)
     folder, events = session
-    told: list[Verdict] = []
+    verdicts: list[Verdict] = []
     with processes() as engines, LiveSession.open(folder, make_engine=engines, late=True) as live:
         snapshots = NewestSnapshots(live)
         recorder = Recorder(live)
@@ -257,7 +257,7 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
                     assert snapshots.read().snapshot.epochs
                 longest = max(longest, time.perf_counter() - start)
                 if ENGINE_ENDED in state.registration.reasons:
-                    told.append(state.registration.verdict)
+                    verdicts.append(state.registration.verdict)
                 taken_in = not state.waiting and state.aims + state.pairs >= done
                 if taken_in and not state.trouble and len(engines.made) >= made:
                     return
@@ -282,8 +282,8 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
         assert recorder.state.refused == 0
         taken = live.measurements()
     assert len(engines.made) == 3
-    assert told
-    assert all(verdict.severity >= Verdict.WARNING.severity for verdict in told)
+    assert verdicts
+    assert all(verdict.severity >= Verdict.WARNING.severity for verdict in verdicts)
     assert longest < 2.0
     fed = [event.t for event in shots if isinstance(event, PairEvent)]
     assert [pair.t for pair in taken.pairs] == fed

@@ -44,11 +44,11 @@ def test_the_checksum_is_the_c_librarys() -> None:
 def test_what_is_packed_reads_as_the_protocol_says(version: int) -> None:
     metadata = {"TransformStatus": "OK", "Reasons": "none"}
     packed = igtl.pack_transform("CameraToTrus", MATRIX, 1234.5, metadata, version)
-    told = read_message(packed)
-    assert (told.version, told.kind, told.device) == (version, "TRANSFORM", "CameraToTrus")
-    assert told.sent_s == pytest.approx(1234.5, abs=1e-8)
-    assert told.metadata == (metadata if version == 2 else {})
-    assert told.content == transform_body(MATRIX)
+    read = read_message(packed)
+    assert (read.version, read.kind, read.device) == (version, "TRANSFORM", "CameraToTrus")
+    assert read.sent_s == pytest.approx(1234.5, abs=1e-8)
+    assert read.metadata == (metadata if version == 2 else {})
+    assert read.content == transform_body(MATRIX)
     text = read_message(igtl.pack_text("Note", "angle 3°", 1.0, {}, version))
     assert text.content == struct.pack(">HH", 3, 11) + b"angle 3\\xb0"
     status = read_message(igtl.pack_status("S", igtl.Status(13, -2, "REFUSED", "why"), 1.0, {}, version))

@@ -172,15 +172,15 @@ def test_a_receiver_reads_the_registration_and_no_matrix_while_it_is_refused(pro
             sink.send(registration(verdict))
             time.sleep(0.1)
         wait_for(lambda: printed.read_text().count("STATUS ==") == 4)
-        told = printed.read_text()
-        states = re.findall(r"Code +: (\d+)\n.*\n Error Name: (\w+)\n Status +: (\w+)", told)
+        received = printed.read_text()
+        states = re.findall(r"Code +: (\d+)\n.*\n Error Name: (\w+)\n Status +: (\w+)", received)
         refused = ("13", "REFUSED", "because")
         assert states == [refused, refused, ("1", "OK", "because"), refused]
-        matrices = printed_matrices(told)
+        matrices = printed_matrices(received)
         assert len(matrices) == 2  # CameraToTrus and PlaneToTrus, once
         np.testing.assert_allclose(matrices[0], MATRIX, atol=1e-3)
         np.testing.assert_allclose(matrices[1][:3, 2], [0.0, np.sin(0.2), np.cos(0.2)], atol=1e-5)
-        assert told.count("Receiving STRING") == 4
+        assert received.count("Receiving STRING") == 4
     finally:
         sink.close()
 

@@ -245,10 +245,10 @@ def test_a_valid_registration_goes_out_with_its_covariance_and_angle(
     np.testing.assert_allclose(covariance, COVARIANCE, rtol=1e-8)
     assert before - 0.1 < transform.sent_s < time.time() + 0.1
     assert struct.unpack(">Hq20s", status.content[:30]) == (1, 0, b"OK".ljust(20, b"\0"))
-    told = json.loads(verdict.content[4:])
+    received = json.loads(verdict.content[4:])
     stage_deg = pytest.approx(math.degrees(0.09) - 12.4)
     angles = {"stage_deg": stage_deg, "plane_deg": pytest.approx(12.4), "sigma_deg": pytest.approx(0.5)}
-    assert told == {"verdict": "ok", **angles, "reasons": ["all good"]}
+    assert received == {"verdict": "ok", **angles, "reasons": ["all good"]}
     turned = read_matrix(plane.content) @ [0.0, 0.0, 1.0, 0.0]  # the image plane's z axis
     angle = math.radians(12.4)
     np.testing.assert_allclose(turned, [0.0, math.sin(angle), math.cos(angle), 0.0], atol=1e-6)
@@ -290,8 +290,8 @@ def test_a_refused_registration_is_never_a_transform(registration: Registration,
             assert (status.kind, verdict.kind) == ("STATUS", "STRING")
             code, _, error = struct.unpack(">Hq20s", status.content[:30])
             assert (code, error.rstrip(b"\0")) == (13, b"REFUSED")
-            told = json.loads(verdict.content[4:])
-            assert (told["verdict"], told["stage_deg"], told["sigma_deg"]) == ("refused", None, None)
+            received = json.loads(verdict.content[4:])
+            assert (received["verdict"], received["stage_deg"], received["sigma_deg"]) == ("refused", None, None)
             assert status.metadata.get("TransformStatus") == ("INVALID" if version == 2 else None)
     finally:
         sink.close()

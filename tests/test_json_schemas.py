@@ -43,8 +43,8 @@ def test_it_is_a_schema_with_words_for_each_key(document: Document) -> None:
     definitions: Any = SCHEMAS[document]["$defs"]
     for definition in definitions.values():
         for name, schema in definition["properties"].items():
-            told = "description" in schema or "const" in schema or "$ref" in schema
-            assert told or name in definition["required"] or "oneOf" in schema, name
+            described = "description" in schema or "const" in schema or "$ref" in schema
+            assert described or name in definition["required"] or "oneOf" in schema, name
 
 
 @pytest.mark.parametrize("name", ["phantom", "paper"])

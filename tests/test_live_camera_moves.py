@@ -47,7 +47,7 @@ class Device:
     def __init__(self, name: str) -> None:
         self.name, self.connected, self.dropped = name, True, 0
         self.waiting: list[Any] = []
-        self.told: list[str] = []
+        self.messages: list[str] = []
         self.sent: list[Registration] = []
 
     def poll(self) -> Sequence[Any]:
@@ -55,7 +55,7 @@ class Device:
         return found
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
-        self.told.append(f"{text} {done} {wants}")
+        self.messages.append(f"{text} {done} {wants}")
 
     def send(self, registration: Registration) -> None:
         self.sent.append(registration)
@@ -91,7 +91,7 @@ class Link:
         self.orders.append(scan_rad)
 
     def stop(self, _reason: str) -> None:
-        raise AssertionError("a move that is told needs no stop: the gate holds what follows")
+        raise AssertionError("a reported move needs no stop: the gate holds what follows")
 
 
 class Stand:
@@ -172,7 +172,7 @@ def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stan
     assert shown.verdict is Verdict.REFUSED
     assert "moving" in shown.reasons[0]
     assert "REFUSED" in status_line(shown).upper()
-    assert any("the camera moves" in told for told in stand.operator.told)
+    assert any("the camera moves" in text for text in stand.operator.messages)
     orders = len(stand.link.orders)
     stand.turn(0.25)
     assert len(stand.link.orders) == orders

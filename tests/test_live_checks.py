@@ -65,7 +65,7 @@ def test_a_check_that_the_operator_names_is_recorded_and_compared(stand: Stand) 
     assert check.error_mm is not None
     assert check.error_mm[0] == pytest.approx(0.3, abs=0.02)
     assert check.verdict is Verdict.OK
-    assert any("check taken" in told for told in stand.operator.told)
+    assert any("check taken" in told for told in stand.operator.messages)
 
 
 def test_a_check_that_is_off_costs_the_ok(stand: Stand) -> None:
@@ -79,6 +79,6 @@ def test_a_check_that_is_off_costs_the_ok(stand: Stand) -> None:
 def test_pixels_that_are_of_no_point_are_answered(stand: Stand) -> None:
     command = OperatorCommand(CommandKind.CHECK, point=(100.0, 100.0, 90.0, 180.0, 0.0, 30.0))
     stand.operator.waiting.append(command)
-    stand.turn(1.0, lambda: any("no check" in told for told in stand.operator.told))
-    assert any("px apart across the epipolar line" in told for told in stand.operator.told)
+    stand.turn(1.0, lambda: any("no check" in told for told in stand.operator.messages))
+    assert any("px apart across the epipolar line" in told for told in stand.operator.messages)
     assert checks_on_disk(stand) == []

@@ -112,8 +112,8 @@ def test_ctrl_c_in_any_phase_leaves_a_session_and_no_process(tmp_path: Path, pha
         assert "from frame to angle" in out
         orders = [json.loads(line) for line in (folder / "stage-orders.log").read_text().splitlines()]
         assert orders[-1]["command"] == "stop"
-        told = {event.command.split()[0] for event in session.events if isinstance(event, StageEvent)}
-        assert {"request", "home"} <= told <= {"request", "home", "search", "track", "stop", "emergency", "reset"}
+        commands = {event.command.split()[0] for event in session.events if isinstance(event, StageEvent)}
+        assert {"request", "home"} <= commands <= {"request", "home", "search", "track", "stop", "emergency", "reset"}
 
 
 def test_a_room_that_is_gone_is_said_and_the_session_survives(tmp_path: Path) -> None:

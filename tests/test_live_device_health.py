@@ -96,12 +96,12 @@ def test_a_repeated_picture_is_no_new_measurement_and_soon_reported(frozen: str)
     assert pictures.trouble(40 * FRAME_S) == ""
 
 
-@pytest.mark.parametrize(("level", "told"), [(2.0, "shows nothing"), (90.0, "shows nothing"), (255.0, "frozen")])
-def test_black_plain_and_white_pictures_are_reported(level: float, told: str) -> None:
+@pytest.mark.parametrize(("level", "trouble"), [(2.0, "shows nothing"), (90.0, "shows nothing"), (255.0, "frozen")])
+def test_black_plain_and_white_pictures_are_reported(level: float, trouble: str) -> None:
     rng, pictures = np.random.default_rng(3), Pictures()
     for i in range(30):
         pictures.is_new(frame(rng, level, 0.0, 0.4 * FLAT if level < 255.0 else 0.0), i * FRAME_S)
-    assert told in pictures.trouble(29 * FRAME_S)
+    assert trouble in pictures.trouble(29 * FRAME_S)
     assert pictures.is_new(frame(rng), 30 * FRAME_S)
     assert pictures.trouble(30 * FRAME_S) == ""
 

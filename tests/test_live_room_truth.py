@@ -84,12 +84,12 @@ def test_the_room_sends_it_over_its_socket_in_host_time(tmp_path: Path) -> None:
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
-        told = ask_truth(tmp_path / "socket", [began + 0.05, began + 9.0], [began + 9.0])
+        truth = ask_truth(tmp_path / "socket", [began + 0.05, began + 9.0], [began + 9.0])
     finally:
         server.stop()
         thread.join()
-    np.testing.assert_allclose(told["trus_T_camera"][1], room.trus_T_camera(9.0))
-    assert np.shape(told["spots_mm"]) == (1, 3)
-    assert abs(told["moved_s"][0] - (began + 0.1)) < 5.0
+    np.testing.assert_allclose(truth["trus_T_camera"][1], room.trus_T_camera(9.0))
+    assert np.shape(truth["spots_mm"]) == (1, 3)
+    assert abs(truth["moved_s"][0] - (began + 0.1)) < 5.0
     with pytest.raises(FgregError, match="does not send its ground truth"):
         ask_truth(tmp_path / "nowhere", [0.0], [])

@@ -247,9 +247,9 @@ def test_reported_and_detected_moves_of_the_camera_are_epochs_for_every_reader(t
     config = replace(PRESETS["camera-move"], aims=8, pairs=14)
     write_session(simulate(config, 3), tmp_path / "s")
     folder, events = empty_copy(tmp_path / "s")
-    told = next(i for i, event in enumerate(events) if isinstance(event, CameraMovedEvent))
+    reported = next(i for i, event in enumerate(events) if isinstance(event, CameraMovedEvent))
     silent = [event for event in events if not isinstance(event, CameraMovedEvent)]
-    after = [event for event in events[told:] if isinstance(event, PairEvent)]
+    after = [event for event in events[reported:] if isinstance(event, PairEvent)]
 
     def noticing(*arguments: object) -> BatchEngine:
         engine = BatchEngine(*arguments)  # type: ignore[arg-type]

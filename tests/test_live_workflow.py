@@ -50,27 +50,27 @@ def test_the_stage_follows_the_beam(whole: Rehearsal) -> None:
 
 def test_every_motion_comes_after_a_request_for_its_kind(whole: Rehearsal) -> None:
     requested: MotionKind | None = None
-    for _, action in whole.asked:
+    for _, action in whole.actions:
         if isinstance(action, Ask):
             requested = action.kind
         elif isinstance(action, Sweep):
             assert requested is MotionKind.SEARCH
         elif isinstance(action, Follow):
             assert requested is MotionKind.TRACK
-    kinds = [a.kind for _, a in whole.asked if isinstance(a, Ask)]
+    kinds = [a.kind for _, a in whole.actions if isinstance(a, Ask)]
     assert kinds[:3] == [MotionKind.HOME, MotionKind.SEARCH, MotionKind.TRACK]
     assert kinds.count(MotionKind.HOME) == 1
 
 
 def test_beams_that_miss_the_known_tissue_are_searched_and_then_followed(whole: Rehearsal) -> None:
-    wants = [tell for _, tell in whole.told if tell.wants is CommandKind.SEARCH]
+    wants = [tell for _, tell in whole.messages if tell.wants is CommandKind.SEARCH]
     assert any("hold it still and search here" in tell.text for tell in wants)
-    kinds = [a.kind for _, a in whole.asked if isinstance(a, Ask)]
+    kinds = [a.kind for _, a in whole.actions if isinstance(a, Ask)]
     assert kinds.count(MotionKind.TRACK) >= 2
 
 
 def test_looks_at_a_pm_are_within_its_window_and_paired_at_their_pulse(whole: Rehearsal) -> None:
-    taken = [(t, a) for t, a in whole.asked if isinstance(a, TakePairs)]
+    taken = [(t, a) for t, a in whole.actions if isinstance(a, TakePairs)]
     assert len({a.pm for _, a in taken}) == len(taken)
     for t, pairs in taken:
         for look in pairs.looks:
@@ -85,43 +85,43 @@ def test_looks_at_a_pm_are_within_its_window_and_paired_at_their_pulse(whole: Re
 def test_a_stage_that_was_not_asked_to_turn_does_not() -> None:
     session = rehearsal(aims=0, obliging=False)
     session.run(25.0)
-    assert session.asked == []
-    wants = [tell.wants for _, tell in session.told if tell.wants is not None]
+    assert session.actions == []
+    wants = [tell.wants for _, tell in session.messages if tell.wants is not None]
     assert 2 <= len(wants) <= 4  # asked again from time to time, not at every frame
 
 
 def test_a_fibre_that_moves_during_a_search_gives_no_pair() -> None:
     session = rehearsal(aims=0)
-    while not any(isinstance(a, Sweep) for _, a in session.asked):
+    while not any(isinstance(a, Sweep) for _, a in session.actions):
         session.run(0.1)
     session.run(0.3)
     session.room.proceed(session.now_s)
     session.run(0.6)
-    assert not any(isinstance(a, TakePairs) for _, a in session.asked)
-    assert any("the fibre has moved during the search" in tell.text for _, tell in session.told)
+    assert not any(isinstance(a, TakePairs) for _, a in session.actions)
+    assert any("the fibre has moved during the search" in tell.text for _, tell in session.messages)
 
 
 def test_the_search_for_a_pm_that_is_not_detected_ends_with_a_message() -> None:
-    session = rehearsal(aims=0, deaf_from_s=0.0)
+    session = rehearsal(aims=0, no_source_from_s=0.0)
     session.run(45.0)
-    assert not any(isinstance(a, TakePairs) for _, a in session.asked)
-    assert any("nothing detected between" in tell.text and tell.done for _, tell in session.told)
+    assert not any(isinstance(a, TakePairs) for _, a in session.actions)
+    assert any("nothing detected between" in tell.text and tell.done for _, tell in session.messages)
 
 
 def test_without_the_marker_nothing_is_searched() -> None:
-    session = rehearsal(aims=0, blind_from_s=0.0)
+    session = rehearsal(aims=0, no_marker_from_s=0.0)
     session.run(15.0)
-    assert not any(isinstance(a, Sweep) for _, a in session.asked)
+    assert not any(isinstance(a, Sweep) for _, a in session.actions)
 
 
 def test_a_marker_lost_during_a_search_ends_it() -> None:
     session = rehearsal(aims=0)
-    while not any(isinstance(a, Sweep) for _, a in session.asked):
+    while not any(isinstance(a, Sweep) for _, a in session.actions):
         session.run(0.1)
-    session.blind_from_s = session.now_s
+    session.no_marker_from_s = session.now_s
     session.run(3.0)
-    assert any("the marker is not seen" in tell.text for _, tell in session.told)
-    assert not any(isinstance(a, TakePairs) for _, a in session.asked)
+    assert any("the marker is not seen" in tell.text for _, tell in session.messages)
+    assert not any(isinstance(a, TakePairs) for _, a in session.actions)
 
 
 def test_after_a_reported_move_it_halts_and_searches_again(whole: Rehearsal) -> None:
@@ -131,9 +131,9 @@ def test_after_a_reported_move_it_halts_and_searches_again(whole: Rehearsal) -> 
     whole.room.bump(whole.now_s)
     whole.run(1.0)
     whole.engine.add(CameraMoved(whole.now_s))
-    before = len(whole.asked)
+    before = len(whole.actions)
     whole.run(30.0)
-    after = [a for _, a in whole.asked[before:]]
+    after = [a for _, a in whole.actions[before:]]
     assert isinstance(after[0], Halt)
     assert not any(isinstance(a, Follow) for a in after)
     assert any(isinstance(a, Ask) and a.kind is MotionKind.SEARCH for a in after)
@@ -146,19 +146,19 @@ def test_an_epoch_that_stays_refused_is_reported_with_what_helps() -> None:
     session.workflow = Workflow(
         session.model, WorkflowSettings(aims=0, pms=2, most_pms=2, hearing_threshold=session.threshold)
     )
-    while session.now_s < 200.0 and sum(isinstance(a, TakePairs) for _, a in session.asked) < 5:
+    while session.now_s < 200.0 and sum(isinstance(a, TakePairs) for _, a in session.actions) < 5:
         session.run(1.0)
-    told = [tell.text for _, tell in session.told if "say so (moved)" in tell.text]
-    assert [text.split()[0] for text in told] == ["2", "4"]
-    assert "2 pairs are too few for a registration: take at least 6" in told[0]
-    assert "the beam has no start" in told[1]
+    messages = [tell.text for _, tell in session.messages if "say so (moved)" in tell.text]
+    assert [text.split()[0] for text in messages] == ["2", "4"]
+    assert "2 pairs are too few for a registration: take at least 6" in messages[0]
+    assert "the beam has no start" in messages[1]
 
 
 def test_a_bump_after_few_pms_ends_in_following_all_the_same() -> None:
     session = rehearsal(4, frame_s=1.0 / 30.0)
     settings = WorkflowSettings(aims=8, pms=8, most_pms=9, hearing_threshold=session.threshold)
     session.workflow = Workflow(session.model, settings)
-    while sum(isinstance(a, TakePairs) for _, a in session.asked) < 2:
+    while sum(isinstance(a, TakePairs) for _, a in session.actions) < 2:
         session.run(0.5)
     bumped_s = session.now_s
     session.room.bump(bumped_s)

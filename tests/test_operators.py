@@ -55,7 +55,7 @@ def test_a_check_names_its_pixels_and_its_place_in_the_plane(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "expected"),
     [
         ("aim", "aim COLUMN ROW"),
         ("aim 3", "aim COLUMN ROW"),
@@ -71,10 +71,10 @@ def test_a_check_names_its_pixels_and_its_place_in_the_plane(line: str) -> None:
         ("\x1b[A", "'\\x1b[a]'"[:6]),
     ],
 )
-def test_what_is_not_understood_is_answered_with_what_is_expected(line: str, told: str) -> None:
+def test_what_is_not_understood_is_answered_with_what_is_expected(line: str, expected: str) -> None:
     answer = understand(line, (9, 6))
     assert isinstance(answer, str)
-    assert told.lower() in answer.lower()
+    assert expected.lower() in answer.lower()
     assert answer.isprintable()
 
 
@@ -94,9 +94,9 @@ class Typed:
     """A keyboard operator on a pipe or another input."""
 
     def __init__(self, corners: tuple[int, int] | None = None) -> None:
-        self.told: list[str] = []
+        self.messages: list[str] = []
         self.read_end, self.write_end = os.pipe()
-        self.operator = KeyboardOperator(self.told.append, self.read_end, corners)
+        self.operator = KeyboardOperator(self.messages.append, self.read_end, corners)
 
     def type(self, data: bytes) -> None:
         os.write(self.write_end, data)
@@ -132,15 +132,15 @@ def test_lines_come_as_commands_in_order_however_they_are_cut(typed: Typed) -> N
     ]
     assert collect(operator.poll, 5) == [*said, OperatorCommand(CommandKind.SEARCH)]
     assert operator.poll() == []
-    assert (operator.connected, operator.dropped, typed.told) == (True, 0, [])
+    assert (operator.connected, operator.dropped, typed.messages) == (True, 0, [])
 
 
 def test_unknown_words_are_answered_and_the_next_line_works(typed: Typed) -> None:
     typed.type(b"aim 9 9\ngo\n\xff\xfe\nnext\n")
     assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.NEXT)]
-    assert len(typed.told) == 3
-    assert "columns 0 to 8" in typed.told[0]
-    assert "'go' is not understood" in typed.told[1]
+    assert len(typed.messages) == 3
+    assert "columns 0 to 8" in typed.messages[0]
+    assert "'go' is not understood" in typed.messages[1]
 
 
 def test_the_end_of_the_input_is_no_loss_and_its_last_line_counts(typed: Typed) -> None:
@@ -149,7 +149,7 @@ def test_the_end_of_the_input_is_no_loss_and_its_last_line_counts(typed: Typed) 
     assert collect(typed.operator.poll, 2) == [OperatorCommand(CommandKind.MOVED), OperatorCommand(CommandKind.STOP)]
     wait_for(lambda: not typed.operator.connected)
     assert typed.operator.poll() == []  # an end is no empty line
-    assert typed.told == []
+    assert typed.messages == []
 
 
 def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -> None:
@@ -157,7 +157,7 @@ def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -
         typed.type(b"a" * MAX_LINE_BYTES)
     typed.type(b"\nfollow\n")
     assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.FOLLOW)]
-    assert typed.told == [f"a line of more than {MAX_LINE_BYTES} characters is not understood"]
+    assert typed.messages == [f"a line of more than {MAX_LINE_BYTES} characters is not understood"]
 
 
 def test_commands_not_fetched_are_dropped_oldest_first_but_never_a_stop(typed: Typed) -> None:
@@ -171,7 +171,7 @@ def test_commands_not_fetched_are_dropped_oldest_first_but_never_a_stop(typed: T
 def test_a_message_is_one_line_with_the_command_that_is_wanted(typed: Typed) -> None:
     typed.operator.tell("the stage has to find\nits zero", wants=CommandKind.HOME)
     typed.operator.tell("registered", done=True)
-    assert typed.told == ["the stage has to find\\nits zero: say home (h)", "registered"]
+    assert typed.messages == ["the stage has to find\\nits zero: say home (h)", "registered"]
 
 
 def test_closing_does_not_wait_for_a_line_and_may_be_done_twice(typed: Typed) -> None:
@@ -245,7 +245,7 @@ def words(text: str, device: str = "FootSwitch") -> bytes:
     return message("STRING", device, (3).to_bytes(2, "big") + len(data).to_bytes(2, "big") + data)
 
 
-def told(peer: socket.socket) -> str:
+def received(peer: socket.socket) -> str:
     data = b""
     while len(data) < 58 or len(data) < 58 + int.from_bytes(data[42:50], "big"):
         data += peer.recv(65536)
@@ -269,10 +269,10 @@ def test_a_peer_gets_messages_and_replies(switch: tuple[IgtlOperator, socket.soc
     operator, peer = switch
     wait_for(lambda: operator.connected)
     operator.tell("the stage is ready to follow the beam", wants=CommandKind.FOLLOW)
-    assert told(peer) == "the stage is ready to follow the beam: say follow (f)"
+    assert received(peer) == "the stage is ready to follow the beam: say follow (f)"
     peer.sendall(words("go"))
     wait_for(lambda: operator.poll() or operator.rejected)
-    assert "'go' is not understood" in told(peer)
+    assert "'go' is not understood" in received(peer)
     assert operator.rejected == 1
 
 
@@ -298,8 +298,8 @@ def test_several_operators_are_one_and_a_loss_delays_no_stop(
     peer.sendall(words("search"))
     assert {command.kind for command in collect(both.poll, 2)} == {CommandKind.HOME, CommandKind.SEARCH}
     both.tell("registered")
-    assert told(peer) == "registered"
-    assert typed.told == ["registered"]
+    assert received(peer) == "registered"
+    assert typed.messages == ["registered"]
     peer.close()
     wait_for(lambda: not foot.connected)
     typed.type(b"\n")

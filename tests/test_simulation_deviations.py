@@ -502,7 +502,7 @@ def test_checks_are_seen_by_both_devices() -> None:
         np.testing.assert_allclose(trus_T_camera @ [*check["camera_p_mm"], 1.0], [*true, 1.0], atol=1e-6)
         np.testing.assert_allclose(check["trus_p_mm"], true, atol=1e-6)
     assert not any(event["type"] == "check" for event in exact.events)
-    # The scanner's own map has them 1 mm nearer to the axis where the radius is 1 mm larger than it is told.
+    # The scanner's own map has them 1 mm nearer to the axis where the radius is 1 mm larger than set in it.
     wide = simulate(quiet({Constant.RADIUS: 1.0}, checks=5, check_sigma_mm=(0.0, 0.0)), 1)
     for check, true in zip(wide.checks, wide.check_points_mm, strict=True):
         reach = math.hypot(true[1], true[2])

@@ -111,7 +111,7 @@ class _Session:
             assert time.monotonic() < end, f"did not happen: {self.reports} {self.link.view}"
             self.run(0.05)
 
-    def told(self) -> list[str]:
+    def commands(self) -> list[str]:
         return [line["what"] for line in read_trace(self.folder / "trace") if line["what"] not in ("status", "close")]
 
     def trouble(self, text: str) -> None:
@@ -135,7 +135,7 @@ def test_orders_are_written_down_before_they_are_given_and_arrivals_come_back(se
         ("request search", "pedal"),
         ("search", "sweep, position 1"),
     ]
-    assert session.told() == ["stop", "move"]
+    assert session.commands() == ["stop", "move"]
     moved = next(line["t"] for line in read_trace(session.folder / "trace") if line["what"] == "move")
     assert session.log[1].host_s < moved
     written = json.loads((session.folder / "watchdog.log").read_text(encoding="utf-8").splitlines()[1])
@@ -158,11 +158,11 @@ def test_order_that_cannot_be_logged_is_not_given_but_a_stop_is(session: _Sessio
     with pytest.raises(OSError, match="disk full"):
         session.link.search_to(math.radians(3.0), "sweep")
     session.run(0.2)
-    assert session.told() == ["stop"]
+    assert session.commands() == ["stop"]
     with pytest.raises(OSError, match="disk full"):
         session.link.stop("enough")
     session.refuse_log = False
-    session.until(lambda: session.told() == ["stop", "stop"])
+    session.until(lambda: session.commands() == ["stop", "stop"])
     session.until(lambda: any(report.what == "stopped" for report in session.reports))
 
 
@@ -186,7 +186,7 @@ def test_unplugged_stage_is_reported_within_a_second_and_comes_back(session: _Se
     session.until(lambda: session.link.view is not None and not session.link.view.connected)
     session.trouble("")
     session.until(lambda: session.link.view is not None and session.link.view.connected)
-    assert session.told()[-1] == "stop"
+    assert session.commands()[-1] == "stop"
     session.link.request(MotionKind.SEARCH, "pedal")
     session.until(lambda: any("latched" in report.reason for report in session.reports))
     session.link.reset("nurse")
@@ -198,23 +198,23 @@ def test_unplugged_stage_is_reported_within_a_second_and_comes_back(session: _Se
 def test_stop_that_the_stage_does_not_take_is_tried_again(session: _Session) -> None:
     session.link.request(MotionKind.SEARCH, "pedal")
     session.link.search_to(math.radians(30.0), "far")
-    session.until(lambda: "move" in session.told())
+    session.until(lambda: "move" in session.commands())
     session.trouble("stop fails")
     session.link.stop("enough")
-    session.until(lambda: session.told().count("stop") >= 5)
+    session.until(lambda: session.commands().count("stop") >= 5)
     session.until(lambda: not read_trace(session.folder / "trace")[-1].get("moving", True))
-    assert session.told()[-1] == "stop"
+    assert session.commands()[-1] == "stop"
 
 
 def test_bug_in_the_driver_stops_the_stage_and_is_noticed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     session = _Session(tmp_path)
     session.link.request(MotionKind.SEARCH, "pedal")
     session.link.search_to(math.radians(30.0), "far")
-    session.until(lambda: "move" in session.told())
+    session.until(lambda: "move" in session.commands())
     session.trouble("broken driver")
     with pytest.raises(StageLost, match="watchdog"):
         session.run(10.0)
-    assert session.told()[-1] == "stop"
+    assert session.commands()[-1] == "stop"
     with pytest.raises(StageLost):
         session.link.search_to(0.0, "no")
     with pytest.raises(StageLost):
@@ -259,6 +259,6 @@ def test_leaving_by_an_exception_is_an_emergency_stop(tmp_path: Path) -> None:
 
     with pytest.raises(KeyError):
         work()
-    assert session.told()[:3] == ["stop", "move", "stop"]
+    assert session.commands()[:3] == ["stop", "move", "stop"]
     log = (tmp_path / "watchdog.log").read_text(encoding="utf-8").splitlines()
     assert json.loads(log[2])["reason"] in ("emergency stop", "the main program is gone")

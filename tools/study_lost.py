@@ -36,7 +36,7 @@ def show(name: str, trials: Sequence[Trial]) -> bool:
         known = [value for value in values if math.isfinite(value)]
         return f"{np.median(known):6.2f} {max(known):6.2f}" if known else "     -      -"
 
-    told = [one.told_s for one in trials]
+    told = [one.reported_s for one in trials]
     rates = np.mean([one.rates for one in trials], axis=0)
     print(
         f"{name:<16} {len(trials):>3}  {column(told)}   {column([one.back_s for one in trials])}   "
@@ -62,7 +62,7 @@ def main() -> int:
             case.session.recorder.close()
             notes = [e for e in read_session(Path(folder) / "session").events if isinstance(e, NoteEvent)]
             lost = sum(one.text.startswith(f"{fault.role} lost") for one in notes)
-            told = [said for _, said in case.operator.told if " lost: " in said]
+            told = [said for _, said in case.operator.messages if " lost: " in said]
             own = [said for said in told if said.startswith(f"{fault.role} lost")]
             for said in told:
                 if said not in own:
