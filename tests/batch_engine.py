@@ -13,7 +13,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
-from fgreg.registration.register import SoundSpeedPrior, register
+from fgreg.registration.register import register
 from fgreg.registration.solve import Solution, solve
 
 
@@ -23,8 +23,8 @@ class BatchEngine:
     the time of that move.
     """
 
-    def __init__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None = None) -> None:
-        self.model, self.config, self.prior = model, config, prior
+    def __init__(self, model: SessionModel, config: SolveConfig) -> None:
+        self.model, self.config = model, config
         self.all = Measurements((), (), (EpochStart(0.0),))
         self.estimate: OnlineEstimate | None = None
         self.refuse_t: set[float] = set()

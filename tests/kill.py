@@ -204,7 +204,7 @@ def difference_from_uninterrupted(folder: Path, source: Path) -> float:
     with LiveSession.open(folder) as live:
         reopened, model, config = live.estimate, live.journal.model, live.config
     feed, extractor = (
-        EpochFeed(online_engine(model, config, None), CheckPoints(config.limit_mm)),
+        EpochFeed(online_engine(model, config), CheckPoints(config.limit_mm)),
         MeasurementExtractor(model),
     )
     unbroken = None

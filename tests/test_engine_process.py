@@ -41,7 +41,7 @@ def case() -> Case:
 @pytest.fixture(scope="module")
 def started(case: Case) -> Iterator[EngineProcess]:
     """After all events of the case, and the full solve of them."""
-    with EngineProcess(case[0], SolveConfig(), None) as engine:
+    with EngineProcess(case[0], SolveConfig()) as engine:
         for event in events(case[1]):
             engine.add(event)
         end = time.monotonic() + PATIENCE_S
@@ -91,7 +91,7 @@ def test_a_refused_event_is_refused_here_and_later_ones_work(case: Case, started
 
 
 def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:
-    engine = EngineProcess(case[0], SolveConfig(), None)
+    engine = EngineProcess(case[0], SolveConfig())
     engine.add(case[1].aims[0])
     assert engine.pid is not None
     os.kill(engine.pid, signal.SIGKILL)
@@ -104,7 +104,7 @@ def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:
 
 
 def test_it_ends_when_it_is_closed_and_its_memory_with_it(case: Case) -> None:
-    engine = EngineProcess(case[0], SolveConfig(), None)
+    engine = EngineProcess(case[0], SolveConfig())
     reader = engine.reader()
     (process,) = [child for child in multiprocessing.active_children() if child.pid == engine.pid]
     engine.close()
@@ -118,7 +118,7 @@ def test_it_ends_when_it_is_closed_and_its_memory_with_it(case: Case) -> None:
 
 def test_one_that_hangs_is_killed(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine_process, "ANSWER_S", 1.0)
-    with EngineProcess(case[0], SolveConfig(), None) as engine:
+    with EngineProcess(case[0], SolveConfig()) as engine:
         assert engine.pid is not None
         os.kill(engine.pid, signal.SIGSTOP)
         with pytest.raises(EngineGone):
@@ -128,4 +128,4 @@ def test_one_that_hangs_is_killed(case: Case, monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_model_that_no_engine_takes_is_said() -> None:
     with pytest.raises(EngineGone, match="AttributeError"):
-        EngineProcess(None, SolveConfig(), None)  # type: ignore[arg-type]
+        EngineProcess(None, SolveConfig())  # type: ignore[arg-type]

@@ -26,7 +26,6 @@ from fgreg.online.engine_process import EngineGone, EngineProcess
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import OnlineEvent
 from fgreg.online.live_session import MOST_DEATHS, LiveSession
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
@@ -52,8 +51,8 @@ class Processes:
     def __init__(self) -> None:
         self.made: list[EngineProcess] = []
 
-    def __call__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
-        self.made.append(EngineProcess(model, config, prior))
+    def __call__(self, model: SessionModel, config: SolveConfig) -> EngineProcess:
+        self.made.append(EngineProcess(model, config))
         return self.made[-1]
 
     def kill(self) -> None:
@@ -204,8 +203,8 @@ def test_an_event_that_ends_the_registration_again_and_again_is_refused(session:
     folder, events = session
     made: list[Deadly] = []
 
-    def make(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> Deadly:
-        made.append(Deadly(model, config, prior))
+    def make(model: SessionModel, config: SolveConfig) -> Deadly:
+        made.append(Deadly(model, config))
         return made[-1]
 
     try:

@@ -10,19 +10,18 @@ from typer.testing import CliRunner
 
 from fgreg.cli.main import app
 from fgreg.errors import InputError
-from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel, SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.model.systematic import EXACT
 from fgreg.registration.posterior_mean import (
     estimated_radius,
     estimated_sound_speed,
     posterior_mean,
-    sound_speed_from_residuals,
 )
-from fgreg.registration.register import SoundSpeedPrior, register
-from fgreg.registration.solve import distance_to_explicit, solve
+from fgreg.registration.register import register
+from fgreg.registration.solve import solve
 from tests.forward import Truth, make_measurements, make_session
 
 QUIET = NoiseModel(
@@ -40,19 +39,15 @@ def _tre(trus_T_camera: FloatArray, truth: Truth, model: SessionModel) -> float:
 
 
 def test_a_wrong_sound_speed_is_found_where_the_noise_lets_it() -> None:
+    declared = make_session(noise_model=QUIET, systematic=replace(EXACT, sound_speed=0.01))
     model, measurements, _ = make_measurements(
-        np.random.default_rng(1), pairs=30, session=make_session(noise_model=QUIET), sound_speed_ratio=1.05
+        np.random.default_rng(1), pairs=30, session=declared, sound_speed_ratio=1.05
     )
-    config = SolveConfig()
-    asked = sound_speed_from_residuals(register(measurements, model, config))
-    assert asked.value == pytest.approx(1.05, abs=3.5 * asked.sigma)
-    assert asked.sigma < 0.012
-    solution = solve(measurements, [], model, config)
+    solution = solve(measurements, [], model, SolveConfig())
     assert solution.verdict is not Verdict.OK
-    assert any(
-        "pairs fit better with sound at 1.0" in reason and "--estimate sound_speed" in reason
-        for reason in solution.reasons
-    )
+    assert any("contradict the sound speed" in reason for reason in solution.reasons)
+    (speed,) = solution.systematic[1:]
+    assert abs(speed.value / speed.observed - 0.05) < 3.5 * speed.sigma / speed.observed
 
 
 def test_estimating_the_sound_speed_takes_its_error_out() -> None:
@@ -95,21 +90,12 @@ def test_the_radius_is_estimated_with_its_prior() -> None:
     assert any("estimated radius" in reason for reason in solution.reasons)
 
 
-def test_the_ratio_from_frames_is_the_prior() -> None:
-    model, measurements, _ = make_measurements(np.random.default_rng(3), pairs=8)
-    config = SolveConfig(estimate_sound_speed=True)
-    prior = SoundSpeedPrior(1.03, 0.0005)
-    registration = register(measurements, model, config, prior)
-    assert 1.0 + registration.optimum.state.constant(Constant.SOUND_SPEED)[0] == pytest.approx(1.03, abs=0.002)
-    # The explicit graph has the same prior, and so the same optimum.
-    assert distance_to_explicit(registration) < 0.01
-
-
 def test_with_default_noise_a_right_sound_speed_is_not_suspected() -> None:
     for seed in range(6):
-        model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=15)
-        asked = sound_speed_from_residuals(register(measurements, model, SolveConfig()))
-        assert abs(asked.value - 1.0) < 3.0 * asked.sigma
+        session = make_session(systematic=replace(EXACT, sound_speed=0.03))
+        model, measurements, _ = make_measurements(np.random.default_rng(seed), pairs=15, session=session)
+        solution = solve(measurements, [], model, SolveConfig())
+        assert not [reason for reason in solution.reasons if "sound speed" in reason]
 
 
 def test_the_command_refuses_names_it_does_not_know() -> None:

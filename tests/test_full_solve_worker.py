@@ -130,7 +130,7 @@ class Late(InProcessSolver):
 @pytest.fixture
 def late(case: tuple[SessionModel, Measurements]) -> tuple[OnlineRegistration, Late]:
     engine = OnlineRegistration(case[0], verdicts=False, find_moves=False)
-    solver = Late(case[0], SolveConfig(), None, verdicts=False)
+    solver = Late(case[0], SolveConfig(), verdicts=False)
     engine._solver = solver
     return restored(engine, first(case[1], PAIRS)), solver
 

@@ -30,7 +30,6 @@ from fgreg.model.time_sync import Stamp, TimedPose
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.live_session import LiveSession
 from fgreg.online.shared_snapshot import Received
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
@@ -141,8 +140,8 @@ def standing(folder: Path) -> Iterator[Stand]:
     (folder / "session.yaml").write_text(yaml.safe_dump(setup))
     engines: list[OnlineRegistration] = []
 
-    def make(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> OnlineRegistration:
-        engines.append(OnlineRegistration(model, config, sound_speed_prior=prior))
+    def make(model: SessionModel, config: SolveConfig) -> OnlineRegistration:
+        engines.append(OnlineRegistration(model, config))
         return engines[-1]
 
     with LiveSession.open(folder, make_engine=make, late=True) as session:

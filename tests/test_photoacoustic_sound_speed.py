@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgreg.detection.photoacoustic import locate_in_channels
-from fgreg.detection.results import PaFind, pool_sound_speed_ratio
+from fgreg.detection.results import PaFind
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.session_model import ChannelModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, simulate_channels
@@ -44,33 +44,17 @@ def test_two_percent_show_in_every_frame(ratio: float, snr_db: float) -> None:
 
 
 def test_the_right_speed_raises_no_alarm() -> None:
-    pooled = pool_sound_speed_ratio(find for find, _, _ in finds(1.0, 5.0, 10))
-    assert pooled is not None
-    ratio, sigma = pooled
-    assert abs(ratio - 1.0) < max(3.0 * sigma, 0.005)
-    assert sigma < 0.002
+    heard = [find.wavefront for find, _, _ in finds(1.0, 5.0, 10)]
+    ratios = np.array([wavefront.ratio for wavefront in heard if wavefront is not None])
+    assert len(ratios) == 10
+    assert abs(ratios.mean() - 1.0) < 0.002
+    assert max(wavefront.sigma for wavefront in heard if wavefront is not None) < 0.005
 
 
 def test_water_instead_of_tissue_is_found_all_the_same() -> None:
     for find, x_mm, range_mm in finds(1480.0 / 1540.0, 0.0, 5):
         assert find.x_mm == pytest.approx(x_mm, abs=0.1)
         assert find.range_mm == pytest.approx(range_mm * 1540.0 / 1480.0, abs=0.1)
-
-
-def test_pooling_weighs_by_variance() -> None:
-    def find(ratio: float | None, sigma: float | None) -> PaFind:
-        return PaFind(0.0, 20.0, np.eye(2), 1.0, 10.0, ratio, sigma, 100, 50.0, 20.0)
-
-    pooled = pool_sound_speed_ratio([find(1.0, 0.01), find(1.02, 0.02), find(None, None)])
-    assert pooled is not None
-    # Weights 4 to 1: 1.004; sigma 1 / sqrt(1 / 0.01^2 + 1 / 0.02^2); spread (0.02^2 / 0.0005 = 0.8) below expectation.
-    assert pooled[0] == pytest.approx(1.004)
-    assert pooled[1] == pytest.approx(0.01 * math.sqrt(0.8))
-    # Three finds that contradict each other: sigma grows with their spread.
-    spread = pool_sound_speed_ratio([find(0.9, 0.001), find(1.0, 0.001), find(1.1, 0.001)])
-    assert spread is not None
-    assert spread[1] == pytest.approx(0.1 / math.sqrt(3.0))
-    assert pool_sound_speed_ratio([find(None, None)]) is None
 
 
 def test_delays_in_the_tissue_widen_the_covariance() -> None:

@@ -21,7 +21,6 @@ from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, LoopClosed, OnlineEvent
 from fgreg.online.live_session import LiveSession
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.session_reader import check_session, read_session
 from tests.forward import make_measurements
 from tests.online_streams import events, first, restored, sigmas_between, unreported_move
@@ -161,8 +160,8 @@ def test_a_note_that_only_looks_like_a_loop_closure_changes_nothing() -> None:
 Shots = list[AimEvent | PairEvent | CameraMovedEvent]
 
 
-def _engine(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> OnlineRegistration:
-    return OnlineRegistration(model, config, verdicts=False, sound_speed_prior=prior)
+def _engine(model: SessionModel, config: SolveConfig) -> OnlineRegistration:
+    return OnlineRegistration(model, config, verdicts=False)
 
 
 def _emptied(session: Path) -> tuple[Path, Shots]:

@@ -140,8 +140,15 @@ def test_a_wrong_sound_speed_is_reported(raw_session: Path) -> None:
     assert wrong != text
     (raw_session / "session.yaml").write_text(wrong)
     report = solve_session(SolveRequest(raw_session))
-    assert report.estimate.verdict is not Verdict.OK
-    assert any("probe.sound_speed_m_s" in reason for reason in report.estimate.reasons)
+    estimate = report.estimate
+    assert any("the shots measure the sound speed" in reason for reason in estimate.reasons)
+    (speed,) = (constant for constant in estimate.systematic if constant.name == "sound_speed")
+    assert speed.value / speed.observed == pytest.approx(1540.0 / 1510.0 - 1.0, abs=0.006)
+    predicted, errors = estimate.epochs[0].predicted_tre, report.errors
+    assert predicted is not None
+    assert errors is not None
+    assert errors.tre_mm[0] is not None
+    assert errors.tre_mm[0].max() < predicted.worst_mm
 
 
 def test_a_recording_is_written_with_the_result(solved: Solved) -> None:

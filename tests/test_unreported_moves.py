@@ -22,7 +22,7 @@ from fgreg.online.events import DetectedMove
 from fgreg.online.live_session import LiveSession
 from fgreg.online.recorded_moves import find_moves, renumbered, split_epochs
 from fgreg.pipeline.replay import ReplayRequest, replay_session
-from fgreg.registration.register import SoundSpeedPrior, register
+from fgreg.registration.register import register
 from fgreg.session.result_file import read_result
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.presets import PRESETS
@@ -150,8 +150,8 @@ def test_a_session_recorded_while_the_engine_looks_for_moves_has_the_move_as_an_
     (folder / "session.yaml").write_text((recorded / "session.yaml").read_text())
     events = [e for e in read_session(recorded).events if isinstance(e, AimEvent | PairEvent)]
 
-    def engine(model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> OnlineRegistration:
-        return OnlineRegistration(model, config, verdicts=False, sound_speed_prior=prior)
+    def engine(model: SessionModel, config: SolveConfig) -> OnlineRegistration:
+        return OnlineRegistration(model, config, verdicts=False)
 
     with LiveSession.open(folder, CONFIG, engine) as live:
         for event in events:

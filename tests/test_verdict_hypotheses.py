@@ -10,18 +10,16 @@ import pytest
 from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
 from fgreg.model.estimate import PredictedTre, Verdict
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.posterior_mean import sound_speed_from_residuals
-from fgreg.registration.register import Registration, register
+from fgreg.model.systematic import EXACT
+from fgreg.registration.register import register
 from fgreg.registration.solve import solve
 from fgreg.registration.verdict import (
     Causes,
-    Condition,
     accuracy,
     causes_of_error,
-    sound_speed_condition,
     understated_noise,
 )
-from tests.forward import make_measurements
+from tests.forward import make_measurements, make_session
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -63,20 +61,16 @@ def test_noise_of_three_times_the_stated_one_is_reported() -> None:
         assert any("larger than the stated noise explains" in reason for reason in solution.reasons)
 
 
-def _sound_speed(registration: Registration) -> list[Condition]:
-    asked = sound_speed_from_residuals(registration)
-    return sound_speed_condition(asked.value, asked.sigma)
-
-
 def test_a_wrong_sound_speed_shows_where_pairs_are_many() -> None:
-    model, right, _ = make_measurements(np.random.default_rng(0), pairs=400)
-    assert _sound_speed(register(right, model, SolveConfig())) == []
-    model, wrong, _ = make_measurements(np.random.default_rng(0), pairs=400, sound_speed_ratio=1.02)
-    found = _sound_speed(register(wrong, model, SolveConfig()))
-    assert len(found) == 1
-    assert "probe.sound_speed_m_s" in found[0].text
-    ratio, sigma = (float(found[0].text.split("sound at ")[1].split()[i]) for i in (0, 2))
-    assert abs(ratio - 1.02) < 4 * sigma
+    declared = make_session(systematic=replace(EXACT, sound_speed=0.001))
+    model, right, _ = make_measurements(np.random.default_rng(0), pairs=400, session=declared)
+    assert not [reason for reason in solve(right, [], model, SolveConfig()).reasons if "sound speed" in reason]
+    model, wrong, _ = make_measurements(np.random.default_rng(0), pairs=400, session=declared, sound_speed_ratio=1.02)
+    found = solve(wrong, [], model, SolveConfig())
+    assert found.verdict is not Verdict.OK
+    assert any("contradict the sound speed" in reason and "larger than declared" in reason for reason in found.reasons)
+    (speed,) = (constant for constant in found.systematic if constant.name == "sound_speed")
+    assert speed.value / speed.observed == pytest.approx(0.02, abs=0.01)
 
 
 def test_the_beams_share_of_the_error_grows_as_aims_are_taken_away() -> None:

@@ -91,7 +91,7 @@ def row(name: str, times: list[Times], limits: dict[float, float]) -> bool:
 def bench(model: SessionModel, measurements: Measurements) -> bool:
     """One session; whether the limits are met."""
     engine = OnlineRegistration(model)
-    engine._solver = solver = TimedSolver(model, SolveConfig(), None, verdicts=True)
+    engine._solver = solver = TimedSolver(model, SolveConfig(), verdicts=True)
     alone: list[Times] = []
     whole: list[Times] = []
     tracks: list[Times] = []

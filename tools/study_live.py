@@ -197,8 +197,8 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
     engines: list[OnlineRegistration] = []
 
     def make_engine(*arguments: object) -> OnlineRegistration:
-        model, config, prior = arguments
-        engines.append(OnlineRegistration(model, config, sound_speed_prior=prior))  # type: ignore[arg-type]
+        model, config = arguments
+        engines.append(OnlineRegistration(model, config))  # type: ignore[arg-type]
         return engines[-1]
 
     request = ReplayRequest(folder, folder / "replay.yaml")

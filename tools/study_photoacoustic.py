@@ -27,7 +27,7 @@ import numpy.typing as npt
 from fgreg.detection.channels import prepare_channels
 from fgreg.detection.envelope import locate_in_image
 from fgreg.detection.photoacoustic import locate_in_channels
-from fgreg.detection.results import NoSignal, PaFind, pool_sound_speed_ratio
+from fgreg.detection.results import NoSignal, PaFind
 from fgreg.detection.wavefront_fit import fit_wavefront
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
@@ -438,9 +438,8 @@ def sound_speed(study: Study, options: argparse.Namespace) -> None:
             ratios = np.array([find.sound_speed_ratio for find in tally.finds], dtype=np.float64)
             sigmas = np.array([find.sound_speed_ratio_sigma for find in tally.finds], dtype=np.float64)
             shows = int(np.sum(np.abs(ratios - 1.0) > np.maximum(3.0 * sigmas, 0.005)))
-            pooled = pool_sound_speed_ratio(tally.finds)
-            if pooled is None:
-                raise SystemExit("no find has a ratio of sound speeds")
+            weight = sigmas**-2.0
+            pooled = float(weight @ ratios / weight.sum()), float(weight.sum() ** -0.5)
             summary = tally.summary()
             figures = {
                 **summary,

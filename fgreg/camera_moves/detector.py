@@ -40,7 +40,7 @@ from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.outliers import pm_limits
-from fgreg.registration.register import SoundSpeedPrior, pack_session
+from fgreg.registration.register import pack_session
 
 MIN_KNOWN = 6
 """PMs needed for a registration: with fewer on both sides of a split point a move cannot be tested there."""
@@ -111,7 +111,6 @@ def find_camera_move(
     case: MoveCase,
     model: SessionModel,
     config: SolveConfig,
-    sound_speed_prior: SoundSpeedPrior | None = None,
     settings: MoveSettings | None = None,
     closure: LoopClosureSettings | None = None,
 ) -> CameraMove | LoopClosure | None:
@@ -119,7 +118,7 @@ def find_camera_move(
 
     Args:
         case: the current epoch.
-        model, config, sound_speed_prior: of the session.
+        model, config: of the session.
         settings: priors and threshold of a move. closure: of a loop closure.
     """
     settings = settings or MoveSettings()
@@ -128,7 +127,7 @@ def find_camera_move(
     def packed(pms: Pms, *, shapes: bool) -> PackedProblem:
         pairs = tuple(replace(pair, pm=number, epoch=0) for number, looks in enumerate(pms) for pair in looks)
         alone = Measurements((), pairs, (EpochStart(0.0),))
-        return pack_session(alone, model, config if shapes else gaussian, sound_speed_prior)
+        return pack_session(alone, model, config if shapes else gaussian)
 
     move = _camera_move(case, packed, settings)
     return move or _loop_closure(case, packed, closure or LoopClosureSettings())

@@ -35,7 +35,7 @@ from fgreg.graph.packing import PackedProblem
 from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.register import SoundSpeedPrior, pack_session
+from fgreg.registration.register import pack_session
 from fgreg.tracking.snapshot import EpochSnapshot, Snapshot
 
 FALSE_ALARMS = 0.01
@@ -101,14 +101,13 @@ def verify(
     epoch: EpochSnapshot,
     model: SessionModel,
     config: SolveConfig,
-    sound_speed: SoundSpeedPrior | None = None,
 ) -> Verification:
     """Compare new pairs with a registration.
 
     Args:
         pairs: new ones; their epochs are ignored.
         snapshot, epoch: the registration.
-        model, config, sound_speed: as it was solved with.
+        model, config: as it was solved with.
     """
     if not pairs:
         return Verification(Validity.CANNOT_TELL, "there is no usable pair: take one", 0.0, 1.0, ())
@@ -123,7 +122,7 @@ def verify(
             if pair.pm == numbers[i]
         )
         settings = config if shapes else replace(config, window_shape=False)
-        return pack_session(Measurements((), mine, (EpochStart(0.0),)), model, settings, sound_speed)
+        return pack_session(Measurements((), mine, (EpochStart(0.0),)), model, settings)
 
     every = np.arange(len(numbers))
     terms = linearise(packed(every, shapes=False), state)

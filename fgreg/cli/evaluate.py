@@ -176,7 +176,6 @@ def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]
     """A session as a case, with detection in its frames done once, and the conditions from the detection."""
     from fgreg.detection.events_to_measurements import extract_measurements
     from fgreg.evaluation.case import Case, Truth
-    from fgreg.model.solve_config import SolveConfig
     from fgreg.pipeline.solve import detection_conditions
     from fgreg.session.session_reader import read_ground_truth, read_session
 
@@ -194,4 +193,4 @@ def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]
         answers = tuple(stage.get(round(track.t, 6)) for track in extracted.tracks)
         truth = Truth(known.trus_T_camera, known.marker_T_laser, answers)
     case = Case(session.model.name, session.model, extracted.measurements, extracted.tracks, truth)
-    return case, detection_conditions(extracted, SolveConfig())
+    return case, detection_conditions(extracted)

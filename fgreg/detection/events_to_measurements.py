@@ -300,6 +300,7 @@ class _Builder:
             OtherPosition(other.x_mm, other.range_mm, usual if other.covariance is None else other.covariance)
             for other in record.others
         )
+        wavefront = None
         if x_mm is None or range_mm is None:
             find = self.found.finds[index, number]
             if isinstance(find, NoSignal):
@@ -308,6 +309,7 @@ class _Builder:
             covariance = find.covariance if covariance is None else covariance
             amplitude = find.amplitude if amplitude is None else amplitude
             others = tuple(OtherPosition(other.x_mm, other.range_mm, other.covariance) for other in find.others)
+            wavefront = find.wavefront
         return Look(
             scan_rad=stage.scan_from_device(math.radians(record.scan_deg)),
             scan_sigma_rad=noise.scan_rad,
@@ -318,6 +320,7 @@ class _Builder:
             amplitude=amplitude,
             window_sigma_rad=self.model.noise_per_pm.window_rad,
             others=others,
+            wavefront=wavefront,
         )
 
 

@@ -5,8 +5,6 @@ Separate from the detectors, so that code that reads results does not load OpenC
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +12,7 @@ import numpy as np
 from fgreg.detection.corner_noise import CornerNoise, fit_covariance
 from fgreg.geometry.transforms import FloatArray, hat
 from fgreg.model.camera_dependence import corner_dependence
-from fgreg.model.measurements import CameraDependence
+from fgreg.model.measurements import CameraDependence, Wavefront
 from fgreg.model.session_model import BoardModel
 
 
@@ -160,37 +158,19 @@ class PaFind:
     threshold: float
     others: tuple[OtherWave, ...] = ()
 
+    @property
+    def wavefront(self) -> Wavefront | None:
+        """What the wavefront's curvature says about the sound speed; None for images."""
+        if self.sound_speed_ratio is None or self.sound_speed_ratio_sigma is None:
+            return None
+        return Wavefront(self.sound_speed_ratio, self.sound_speed_ratio_sigma)
+
 
 @dataclass(frozen=True, slots=True)
 class NoSignal:
     """No source in the frame; ``reason`` gives the statistic and the threshold."""
 
     reason: str
-
-
-def pool_sound_speed_ratio(finds: Iterable[PaFind]) -> tuple[float, float] | None:
-    """Ratio of true to assumed sound speed over many finds, weighted by their variances.
-
-    The sigma is enlarged where the spread of the finds exceeds their sigmas.
-
-    Args:
-        finds: finds in channel data; those without a ratio are ignored.
-
-    Returns:
-        (ratio, sigma), or None where no find has a ratio. Warn where ``abs(ratio - 1)`` exceeds both 3 sigma
-        and 0.005.
-    """
-    pairs = [
-        (find.sound_speed_ratio, find.sound_speed_ratio_sigma**-2)
-        for find in finds
-        if find.sound_speed_ratio is not None and find.sound_speed_ratio_sigma is not None
-    ]
-    if not pairs:
-        return None
-    weight = math.fsum(w for _, w in pairs)
-    ratio = math.fsum(w * value for value, w in pairs) / weight
-    spread = math.fsum(w * (value - ratio) ** 2 for value, w in pairs) / max(len(pairs) - 1, 1)
-    return ratio, math.sqrt(max(1.0, spread) / weight)
 
 
 @dataclass(slots=True, eq=False)

@@ -8,7 +8,7 @@ problem perturbs the pose by a twist (w, n): the right tangent of GTSAM's Pose3,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,6 @@ from fgreg.model.corner_information import corner_information, observed_dependen
 from fgreg.model.measurements import (
     FLOOR_MM,
     POSE_FLOOR,
-    CameraDependence,
     EpochStart,
     MarkerObservation,
     Measurements,
@@ -30,6 +29,7 @@ from fgreg.model.measurements import (
 )
 from fgreg.model.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
 from fgreg.model.session_model import SensitivityModel, SessionModel
+from fgreg.model.wavefront_evidence import wavefront_evidence
 
 LEAST_EDGE_SIGMA_RAD = 1e-9
 """The window's edge is always a variable."""
@@ -193,19 +193,16 @@ def constants_prior(
     mean: FloatArray,
     correlation: FloatArray | None = None,
 ) -> ConstantsPrior:
-    """Prior of the constants that are variables, from what is known of them and from the cameras' pictures.
-
-    What the corners of tags and boards say about the camera's constants is the same in every shot of an observation,
-    and enters here, not shot by shot.
+    """Prior of the constants that are variables, from what is known of them and what pictures and wavefronts say.
 
     Args:
-        measurements: with the pictures' dependence, where there are pictures.
+        measurements: with the pictures' dependence and the wavefronts, where there are frames.
         columns: which constants are variables.
         sigmas, mean: (COUNT,) of all constants; an infinite sigma: nothing is known.
         correlation: (COUNT, COUNT); none where None.
     """
     chosen = np.array(columns.constants, dtype=np.int64)
-    seen = camera_evidence(observed_dependences(measurements), columns)
+    seen = evidence(measurements, columns)
     known = np.diag(sigmas[chosen] ** -2.0)
     if correlation is not None:
         known = np.linalg.inv(correlation[np.ix_(chosen, chosen)]) / np.outer(sigmas[chosen], sigmas[chosen])
@@ -214,17 +211,25 @@ def constants_prior(
     return ConstantsPrior(_mean(information, pull), information)
 
 
-def camera_evidence(dependences: Iterable[CameraDependence], columns: Columns) -> ConstantsPrior:
-    """What pictures of tags and boards say about the constants, without what is known of these otherwise."""
-    chosen = np.array(columns.constants, dtype=np.int64)
-    of_camera = np.flatnonzero(chosen >= CAMERA.start)
-    at = chosen[of_camera] - CAMERA.start
-    information, pull = np.zeros((len(chosen), len(chosen))), np.zeros(len(chosen))
-    found = corner_information([*dependences])
+def evidence(measurements: Measurements, columns: Columns) -> ConstantsPrior:
+    """What pictures of tags and boards, and wavefronts, say about the constants by themselves.
+
+    It is the same in every shot, so it enters here, not shot by shot; without what is known of the constants otherwise.
+    """
+    information, pull = wavefront_evidence(pair.look for pair in measurements.pairs)
+    found = corner_information([*observed_dependences(measurements)])
     if found is not None:
-        information[np.ix_(of_camera, of_camera)] = found.information[np.ix_(at, at)]
-        pull[of_camera] = found.pull[at]
+        information[CAMERA, CAMERA] = found.information
+        pull[CAMERA] = found.pull
+    chosen = np.array(columns.constants, dtype=np.int64)
+    information, pull = information[np.ix_(chosen, chosen)], pull[chosen]
     return ConstantsPrior(_mean(information, pull), information)
+
+
+def tells_of_constants(pair: Pair) -> bool:
+    """Whether a pair's frames say something about the constants by themselves (:func:`evidence`)."""
+    seen = pair.marker.dependence
+    return pair.look.wavefront is not None or (seen is not None and bool(seen.information.any()))
 
 
 def _mean(information: FloatArray, pull: FloatArray) -> FloatArray:

@@ -24,7 +24,6 @@ from fgreg.model.time_sync import Latencies
 from fgreg.online.engine_process import EngineProcess
 from fgreg.online.live_session import Engine, LiveSession
 from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.rig_file import copy_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE
 from fgreg.session.yaml_loader import parse_yaml
@@ -97,9 +96,9 @@ class EngineProcesses:
     def __init__(self) -> None:
         self._engine: EngineProcess | None = None
 
-    def __call__(self, model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None) -> EngineProcess:
+    def __call__(self, model: SessionModel, config: SolveConfig) -> EngineProcess:
         self.close()
-        self._engine = EngineProcess(model, config, prior)
+        self._engine = EngineProcess(model, config)
         return self._engine
 
     def close(self) -> None:

@@ -57,6 +57,17 @@ class MarkerObservation:
     dependence: CameraDependence | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Wavefront:
+    """The sound speed that the curvature of a wavefront shows, given the measured range: true over assumed.
+
+    ``sigma``: its standard deviation by the frame's noise.
+    """
+
+    ratio: float
+    sigma: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherPosition:
     """Another position in the image plane that a look may have detected the PM at.
@@ -84,6 +95,7 @@ class Look:
             hit, else 0.
         amplitude: comparable within one PM only.
         window_sigma_rad: standard deviation of the window's half width, from PM to PM.
+        wavefront: where the PM was found in channel data.
         others: other positions at which the PM may be instead, the likeliest first: later waves of the same frame.
             Where this position is an outlier, one of them that fits is taken.
     """
@@ -96,6 +108,7 @@ class Look:
     sweep: int = 0
     amplitude: float | None = None
     window_sigma_rad: float = 0.0
+    wavefront: Wavefront | None = None
     others: tuple[OtherPosition, ...] = ()
 
     def elsewhere(self) -> tuple[Look, ...]:
@@ -108,6 +121,7 @@ class Look:
                 range_mm=other.range_mm,
                 covariance=other.covariance,
                 amplitude=other.amplitude,
+                wavefront=None,  # it was this position's
                 others=(here, *self.others[:number], *self.others[number + 1 :]),
             )
             for number, other in enumerate(self.others)

@@ -39,7 +39,6 @@ from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
 from fgreg.registration.multistart import EpochSearch, Minimum
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
@@ -78,7 +77,6 @@ class OnlineRegistration:
             results are taken over with the next event or by :meth:`refresh`.
         verdicts: False leaves posterior and verdict out of the full solve, which only registers.
         find_moves: whether unreported camera moves are looked for.
-        sound_speed_prior: prior of the sound speed ratio, where the configuration makes it a variable.
         start: of the first epoch.
 
     Raises:
@@ -93,11 +91,10 @@ class OnlineRegistration:
         full_solve: Where = "in_process",
         verdicts: bool = True,
         find_moves: bool = True,
-        sound_speed_prior: SoundSpeedPrior | None = None,
         start: EpochStart | None = None,
     ) -> None:
-        self._model, self._config, self._prior = model, config or SolveConfig(), sound_speed_prior
-        self._setting = make_setting(model, self._config, sound_speed_prior)
+        self._model, self._config = model, config or SolveConfig()
+        self._setting = make_setting(model, self._config)
         self._state = State((Epoch(start or EpochStart(0.0), 0),))
         self._t = -math.inf
         self._serial = 0  # changes with the measurements and their epochs
@@ -121,7 +118,7 @@ class OnlineRegistration:
         self._moves: list[DetectedMove] = []
         self._loop_closures: list[DetectedLoopClosure] = []
         self._noticed: dict[int, str] = {}
-        self._solver = make_solver(full_solve, model, self._config, sound_speed_prior, verdicts=verdicts)
+        self._solver = make_solver(full_solve, model, self._config, verdicts=verdicts)
         self._estimate = self._estimated(self._state, 0.0)
 
     def __enter__(self) -> OnlineRegistration:
@@ -467,7 +464,7 @@ class OnlineRegistration:
     def _solve_all(self) -> None:
         """Run the full solve of everything in this process."""
         case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements())
-        self._take_over(full_solve(case, self._model, self._config, self._prior, verdicts=self._verdicts))
+        self._take_over(full_solve(case, self._model, self._config, verdicts=self._verdicts))
 
     # --- estimate ---------------------------------------------------------------------------------------------------
 
@@ -522,7 +519,7 @@ class OnlineRegistration:
     def solution(self) -> Solution:
         """The full solve of everything, taken over as by :meth:`settle`."""
         measurements = self.measurements()
-        solution = solve(measurements, [], self._model, self._config, sound_speed_prior=self._prior)
+        solution = solve(measurements, [], self._model, self._config)
         case = FullSolveCase(self._serial, self._state.epoch, measurements)
         self._solver.failure = ""
         self._solve_wanted = False

@@ -25,7 +25,6 @@ from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import DetectedLoopClosure, DetectedMove, OnlineEvent
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import Layout
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.tracking.query import track
 from fgreg.workers.worker_process import Work, WorkerProcess
 
@@ -54,7 +53,7 @@ class EngineProcess:
         EngineGone: the process did not start.
     """
 
-    def __init__(self, model: SessionModel, config: SolveConfig, sound_speed_prior: SoundSpeedPrior | None) -> None:
+    def __init__(self, model: SessionModel, config: SolveConfig) -> None:
         self._turn = threading.Lock()
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
@@ -63,7 +62,6 @@ class EngineProcess:
             _registering,
             model,
             config,
-            sound_speed_prior,
             name="fgreg-engine",
             what="the registration's process",
             answer_s=ANSWER_S,
@@ -179,12 +177,10 @@ class EngineProcess:
 
 
 @contextmanager
-def _registering(
-    model: SessionModel, config: SolveConfig, prior: SoundSpeedPrior | None
-) -> Iterator[Work[Call, After]]:
+def _registering(model: SessionModel, config: SolveConfig) -> Iterator[Work[Call, After]]:
     """In the process."""
     with (
-        OnlineRegistration(model, config, full_solve="worker", sound_speed_prior=prior) as engine,
+        OnlineRegistration(model, config, full_solve="worker") as engine,
         SharedSnapshot(Layout.of(model)) as shared,
     ):
         yield _Registering(engine, shared)

@@ -24,7 +24,7 @@ from fgreg.model.tissue_surface import TissueSurface
 from fgreg.registration.epochs import FinishedEpochs
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.posterior import pose_tangent
-from fgreg.registration.register import Registration, SoundSpeedPrior, register
+from fgreg.registration.register import Registration, register
 from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import Initial, initial_of
 
@@ -118,7 +118,6 @@ def full_solve(
     case: FullSolveCase,
     model: SessionModel,
     config: SolveConfig,
-    sound_speed: SoundSpeedPrior | None,
     *,
     verdicts: bool = True,
 ) -> FullSolveResult:
@@ -130,20 +129,19 @@ def full_solve(
     if case.move is not None:
         failure = ""
         try:
-            move = find_camera_move(case.move, model, config, sound_speed)
+            move = find_camera_move(case.move, model, config)
         except Exception as error:  # the registration does not depend on it
             failure = f"{type(error).__name__}: {error}"
         else:
             if move is not None:
                 return FullSolveResult(case.serial, case.epoch, move, move_failure="")
-    return replace(_solved(case, model, config, sound_speed, verdicts=verdicts), move_failure=failure)
+    return replace(_solved(case, model, config, verdicts=verdicts), move_failure=failure)
 
 
 def _solved(
     case: FullSolveCase,
     model: SessionModel,
     config: SolveConfig,
-    sound_speed: SoundSpeedPrior | None,
     *,
     verdicts: bool,
 ) -> FullSolveResult:
@@ -151,7 +149,7 @@ def _solved(
         return FullSolveResult(case.serial, case.epoch)
     if not verdicts:
         try:
-            found = register(case.measurements, model, config, sound_speed, case.known, case.finished)
+            found = register(case.measurements, model, config, case.known, case.finished)
         except EstimationError as error:
             return FullSolveResult(case.serial, case.epoch, why_none=str(error))
         return _registered(case, case.measurements, found, None)
@@ -160,7 +158,6 @@ def _solved(
         [],
         model,
         config,
-        sound_speed_prior=sound_speed,
         known=case.known,
         finished=case.finished,
         before=case.before,

@@ -37,7 +37,6 @@ from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
 
@@ -69,7 +68,7 @@ class Engine(Protocol):
     def loop_closures(self) -> tuple[DetectedLoopClosure, ...]: ...
 
 
-MakeEngine = Callable[[SessionModel, SolveConfig, SoundSpeedPrior | None], Engine]
+MakeEngine = Callable[[SessionModel, SolveConfig], Engine]
 
 
 class EpochFeed:
@@ -143,7 +142,7 @@ class LiveSession:
         self._gone = False  # the engine's process has ended: no event goes into the estimate before a revival
         self._ended_at: Event | None = None  # the event that it ended at
         self._deaths: dict[int, int] = {}  # ends of the engine's process while it took an event in, by its line
-        self._begin_with(make_engine(journal.model, config, None))
+        self._begin_with(make_engine(journal.model, config))
 
     def _begin_with(self, engine: Engine) -> None:
         """Start with an engine that has taken in nothing yet."""
@@ -199,7 +198,7 @@ class LiveSession:
             if self._deaths[event.line] >= MOST_DEATHS:
                 self._refuse(event, event.line, f"the registration's process has ended {MOST_DEATHS} times at it")
         self._write_waiting(patient=False)
-        self._begin_with(self._make_engine(self.journal.model, self.config, None))
+        self._begin_with(self._make_engine(self.journal.model, self.config))
         self._take_up(self.journal.reread())
         self._untaken.clear()
         self._gone = False
@@ -445,9 +444,8 @@ class LiveSession:
 def online_engine(
     model: SessionModel,
     config: SolveConfig,
-    sound_speed_prior: SoundSpeedPrior | None,
     *,
     find_moves: bool = True,
 ) -> Engine:
     """The engine with its full solve in the same process: the same events always give the same estimates."""
-    return OnlineRegistration(model, config, find_moves=find_moves, sound_speed_prior=sound_speed_prior)
+    return OnlineRegistration(model, config, find_moves=find_moves)

@@ -12,7 +12,6 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
-from fgreg.registration.register import SoundSpeedPrior
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +36,6 @@ def find_epochs(
     measurements: Measurements,
     model: SessionModel,
     config: SolveConfig,
-    sound_speed_prior: SoundSpeedPrior | None = None,
 ) -> EpochsFound:
     """Unreported moves and loop closures in the order of time, as the online engine detects them in the same events.
 
@@ -45,9 +43,7 @@ def find_epochs(
     """
     if config.estimate_radius:
         config = replace(config, estimate_radius=False)
-    engine = OnlineRegistration(
-        model, config, verdicts=False, sound_speed_prior=sound_speed_prior, start=measurements.epochs[0]
-    )
+    engine = OnlineRegistration(model, config, verdicts=False, start=measurements.epochs[0])
     index_of: list[int] = []
     for index, event in events_in_order(measurements):
         try:

@@ -8,7 +8,6 @@ from typing import Literal, Protocol
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, full_solve
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 Where = Literal["in_process", "worker"]
@@ -40,10 +39,8 @@ class Solver(Protocol):
 class InProcessSolver:
     """Solves at once: the same events give the same results."""
 
-    def __init__(
-        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
-    ) -> None:
-        self._work = partial(full_solve, model=model, config=config, sound_speed=sound_speed, verdicts=verdicts)
+    def __init__(self, model: SessionModel, config: SolveConfig, *, verdicts: bool) -> None:
+        self._work = partial(full_solve, model=model, config=config, verdicts=verdicts)
         self._found: FullSolveResult | None = None
         self.failure = ""
         self.busy = self.lost = False
@@ -68,11 +65,9 @@ class InProcessSolver:
 class WorkerSolver:
     """Solves in a worker process."""
 
-    def __init__(
-        self, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
-    ) -> None:
+    def __init__(self, model: SessionModel, config: SolveConfig, *, verdicts: bool) -> None:
         self._worker: WorkerProcess[FullSolveCase, FullSolveResult] = WorkerProcess(
-            _work, model, config, sound_speed, verdicts, name="fgreg-solve", what="the full solve's process"
+            _work, model, config, verdicts, name="fgreg-solve", what="the full solve's process"
         )
 
     @property
@@ -113,22 +108,18 @@ class WorkerSolver:
         self._worker.close()
 
 
-def _work(
-    model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, verdicts: bool
-) -> Work[FullSolveCase, FullSolveResult]:
-    return partial(full_solve, model=model, config=config, sound_speed=sound_speed, verdicts=verdicts)
+def _work(model: SessionModel, config: SolveConfig, verdicts: bool) -> Work[FullSolveCase, FullSolveResult]:
+    return partial(full_solve, model=model, config=config, verdicts=verdicts)
 
 
-def make_solver(
-    where: Where, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None, *, verdicts: bool
-) -> Solver:
+def make_solver(where: Where, model: SessionModel, config: SolveConfig, *, verdicts: bool) -> Solver:
     """The solver for ``full_solve`` = ``where``.
 
     Raises:
         ValueError: there is no such kind.
     """
     if where == "in_process":
-        return InProcessSolver(model, config, sound_speed, verdicts=verdicts)
+        return InProcessSolver(model, config, verdicts=verdicts)
     if where == "worker":
-        return WorkerSolver(model, config, sound_speed, verdicts=verdicts)
+        return WorkerSolver(model, config, verdicts=verdicts)
     raise ValueError(f"full_solve is {where!r}, expected 'in_process' or 'worker'")

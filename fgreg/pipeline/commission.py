@@ -212,7 +212,7 @@ def _step(progress: Progress | None, place: int, total: int) -> Callable[[], Non
 def _solved(session: Session, model: SessionModel, use_checks: bool, done: Callable[[], None]) -> _Solved:
     extracted = extract_measurements(session.events, model)
     config = SolveConfig()
-    solution = solve(extracted.measurements, (), model, config, detection_conditions(extracted, config))
+    solution = solve(extracted.measurements, (), model, config, detection_conditions(extracted))
     done()
     checks = tuple(extracted.checks.values()) if use_checks else ()
     if solution.verdict is Verdict.REFUSED or solution.registration is None:

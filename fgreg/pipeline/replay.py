@@ -35,7 +35,6 @@ from fgreg.pipeline.solve import (
     remove_older_result,
     session_estimate,
     show_frames,
-    sound_speed_prior,
 )
 from fgreg.registration.checks import CHECKS_REFUSE
 from fgreg.registration.solve import solve
@@ -142,10 +141,9 @@ def replay_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        prior = sound_speed_prior(extracted, config)
         # Moves that were detected during recording are events: they are used as recorded, without a new search.
         recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
-        engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config, prior)
+        engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config)
         player = _Player(session, extracted, engine, viewer, request.speed, config)
         player.play(on_step)
         taken, found = player.taken(), player.found()
@@ -154,8 +152,7 @@ def replay_session(
             (),
             session.model,
             config,
-            [*move_conditions(found), *detection_conditions(extracted, config)],
-            prior,
+            [*move_conditions(found), *detection_conditions(extracted)],
         )
         settled = engine.settle() if player.estimate is not None else None
         estimate = session_estimate(session, replace(taken, track_events=()), solution, config)

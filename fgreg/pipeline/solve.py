@@ -16,7 +16,7 @@ import numpy as np
 
 from fgreg.detection.camera import project
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
-from fgreg.detection.results import MarkerFit, NoSignal, PaFind, pool_sound_speed_ratio
+from fgreg.detection.results import MarkerFit, NoSignal, PaFind
 from fgreg.errors import InputError
 from fgreg.geometry.target_error import beam_error, tre_mm
 from fgreg.geometry.transforms import FloatArray, transform_points
@@ -33,7 +33,6 @@ from fgreg.model.measurements import Check, Look
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
-from fgreg.registration.register import SoundSpeedPrior
 from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import Condition
 from fgreg.session.ground_truth import GroundTruth
@@ -49,8 +48,6 @@ if TYPE_CHECKING:
     from fgreg.viewer.scene import ShotKind
 
 RESULT_FILE = "result.yaml"
-SOUND_SPEED_TOLERANCE = 0.005
-"""Smaller deviations of the sound speed ratio give no warning: their error is below that of the noise."""
 TOO_FEW_AIMS = 0.5
 """Share of unusable aims from which there is a warning."""
 
@@ -147,13 +144,12 @@ def solve_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        prior = sound_speed_prior(extracted, config)
         moves: tuple[DetectedMove, ...] = ()
-        conditions = detection_conditions(extracted, config)
+        conditions = detection_conditions(extracted)
         if request.detect_moves:
             from fgreg.online.recorded_moves import find_epochs  # loads the online engine
 
-            found = find_epochs(extracted.measurements, session.model, config, prior)
+            found = find_epochs(extracted.measurements, session.model, config)
             extracted, moves = with_moves(extracted, found), found.moves
             conditions = [*move_conditions(found), *conditions]
         solution = solve(
@@ -162,7 +158,6 @@ def solve_session(
             session.model,
             config,
             conditions,
-            prior,
         )
         estimate = session_estimate(session, extracted, solution, config)
         errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
@@ -205,29 +200,9 @@ def move_conditions(found: EpochsFound) -> list[Condition]:
     return [Condition(Verdict.WARNING, text) for text in found.texts]
 
 
-def sound_speed_prior(extracted: ExtractedMeasurements, config: SolveConfig) -> SoundSpeedPrior | None:
-    """The sound speed from the wavefronts, combined with the configuration's prior; None without wavefronts."""
-    pooled = pool_sound_speed_ratio(find for find in extracted.finds.values() if isinstance(find, PaFind))
-    if pooled is None:
-        return None
-    ratio, sigma = pooled
-    by_frames, by_prior = sigma**-2, config.sound_speed_sigma**-2
-    mean = (ratio * by_frames + by_prior) / (by_frames + by_prior)
-    return SoundSpeedPrior(mean, (by_frames + by_prior) ** -0.5)
-
-
-def detection_conditions(extracted: ExtractedMeasurements, config: SolveConfig) -> list[Condition]:
-    """Conditions of the verdict from the frames: wrong sound speed (unless estimated), unusable calibration shots."""
+def detection_conditions(extracted: ExtractedMeasurements) -> list[Condition]:
+    """Conditions of the verdict from the frames: unusable calibration shots."""
     found = []
-    pooled = pool_sound_speed_ratio(find for find in extracted.finds.values() if isinstance(find, PaFind))
-    if pooled is not None and not config.estimate_sound_speed:
-        ratio, sigma = pooled
-        if abs(ratio - 1.0) > max(3.0 * sigma, SOUND_SPEED_TOLERANCE):
-            text = (
-                f"the wavefronts give a sound speed of {ratio:.4f} +- {sigma:.4f} times probe.sound_speed_m_s: "
-                "correct it in session.yaml (ranges given as numbers have to be computed again)"
-            )
-            found.append(Condition(Verdict.WARNING, text))
     lost_aims, used = extracted.unused_aims, len(extracted.measurements.aims)
     if lost_aims and len(lost_aims) >= TOO_FEW_AIMS * (used + len(lost_aims)):
         text = (

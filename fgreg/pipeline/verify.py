@@ -22,8 +22,7 @@ from fgreg.model.events import CameraMovedEvent, Event, PairEvent, refused_lines
 from fgreg.model.measurements import Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.pipeline.solve import RESULT_FILE, Progress, detection_conditions, sound_speed_prior, with_moves
-from fgreg.registration.register import SoundSpeedPrior
+from fgreg.pipeline.solve import RESULT_FILE, Progress, detection_conditions, with_moves
 from fgreg.registration.solve import solve
 from fgreg.session.result_file import read_result
 from fgreg.session.rig_file import sections
@@ -87,7 +86,7 @@ def verify_session(
     if result.verdict is Verdict.REFUSED or not result.epochs:
         raise InputError(str(result_path), "a refused registration", "one that may be used")
     events, model = _new_events(new, session)
-    snapshot, prior = _solved_again(session, result.epochs, config, progress)
+    snapshot = _solved_again(session, result.epochs, config, progress)
     epoch = snapshot.epoch(result.epochs[-1].index)
     if epoch is None:
         raise AssertionError("the registration of the last epoch was compared")
@@ -97,7 +96,7 @@ def verify_session(
         text = f"{new} reports a camera move at {moved.t:.1f} s: register again"
         found = Verification(Validity.MOVED, text, np.inf, 0.0, ())
     else:
-        found = verify(pairs, snapshot, epoch, session.model, config, prior)
+        found = verify(pairs, snapshot, epoch, session.model, config)
     return VerifyReport(session.model.name, new, found, unused, time.perf_counter() - start)
 
 
@@ -136,7 +135,7 @@ def _new_pairs(
 
 def _solved_again(
     session: Session, epochs: Sequence[EpochEstimate], config: SolveConfig, progress: Progress | None
-) -> tuple[Snapshot, SoundSpeedPrior | None]:
+) -> Snapshot:
     """The snapshot of the session solved again; its last registration is that of the result.
 
     Raises:
@@ -147,13 +146,12 @@ def _solved_again(
         session.model,
         progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
     )
-    prior = sound_speed_prior(extracted, config)
     if len(epochs) != len(extracted.measurements.epochs):
         from fgreg.online.recorded_moves import find_epochs  # loads the online engine
 
-        extracted = with_moves(extracted, find_epochs(extracted.measurements, session.model, config, prior))
-    conditions = detection_conditions(extracted, config)
-    solution = solve(extracted.measurements, (), session.model, config, conditions, prior)
+        extracted = with_moves(extracted, find_epochs(extracted.measurements, session.model, config))
+    conditions = detection_conditions(extracted)
+    solution = solve(extracted.measurements, (), session.model, config, conditions)
     wanted = "that of the session as it is now: solve it again (with the same options here and there)"
     there, now = epochs[-1].trus_T_camera, solution.epochs[-1].trus_T_camera
     if there is None or now is None or solution.snapshot is None or len(epochs) != len(solution.epochs):
@@ -161,4 +159,4 @@ def _solved_again(
     apart_mm = float(tre_mm(now, there, session.model.targets_mm).max())
     if apart_mm > SAME_MM:
         raise InputError(str(session.folder / RESULT_FILE), f"a registration {apart_mm:.2f} mm away", wanted)
-    return solution.snapshot, prior
+    return solution.snapshot

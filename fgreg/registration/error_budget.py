@@ -32,7 +32,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import TEXTS
 from fgreg.registration.posterior import QUANTILE, Posterior, predicted_tre
-from fgreg.registration.register import Registration, SoundSpeedPrior, constants_of
+from fgreg.registration.register import Registration, constants_of
 from fgreg.registration.verdict import Condition
 
 DRAWS = 2000
@@ -40,10 +40,15 @@ DRAWS = 2000
 CONFLICT_Z = 3.5
 """Score of a constant from which it is named: one session in 2,000 has it by chance, for each constant that its data
 determine."""
-ALIKE = 0.9
-"""Constants whose score is at least this share of the largest one cannot be told apart from it."""
+ALIKE_CHI2 = 9.0
+"""The squared score is what the chi square falls by: constants within this of the largest, three sigma, cannot be told
+apart from it."""
 UNOBSERVED = 1e-3
 """Share of a constant's prior variance that the data have to remove before a score means anything."""
+_MEASURED = (TEXTS[Constant.SOUND_SPEED].name, TEXTS[Constant.RANGE_OFFSET].name)
+NOTED_SIGMAS = 1.5
+CERTAIN_SIGMAS = 4.0
+"""A constant that the shots measure is noted where it is off by this many of its prior's sigmas, and of its own."""
 CAUSES = 3
 """Number of causes that are named."""
 
@@ -63,12 +68,10 @@ class Budget:
     conditions: tuple[Condition, ...]
 
 
-def error_budget(
-    registration: Registration, posterior: Posterior, config: SolveConfig, sound_speed: SoundSpeedPrior | None
-) -> Budget:
+def error_budget(registration: Registration, posterior: Posterior, config: SolveConfig) -> Budget:
     """The budget of a registration at the optimum of the graph (before it is centred on the posterior's mean)."""
     model, columns = registration.model, registration.problem.columns
-    sigmas, mean = constants_of(model, config, sound_speed)
+    sigmas, mean = constants_of(model, config)
     predicted = tuple(
         _predicted(registration, posterior, place, model.targets_mm) for place in range(len(registration.epochs))
     )
@@ -95,7 +98,7 @@ def error_budget(
                 worst_target_mm=float(causes[place]),
             )
         )
-    return Budget(tuple(constants), predicted, tuple(conflicts(constants)))
+    return Budget(tuple(constants), predicted, tuple(conflicts(constants) or measured(constants)))
 
 
 def random_errors_only(model: SessionModel) -> list[Condition]:
@@ -123,17 +126,37 @@ def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
     if not beyond:
         return []
     first = beyond[0]
+    alike = [c for c in constants if c is not first and c.score**2 > first.score**2 - ALIKE_CHI2]
+    named = [first, *sorted(alike, key=lambda c: -abs(c.score))]
     texts = {text.name: text for text in TEXTS}
-    text = texts[first.name]
-    alike = [texts[c.name].what for c in constants if c is not first and abs(c.score) >= ALIKE * abs(first.score)]
-    or_else = f" (or the {' or the '.join(alike)})" if alike else ""
-    return [
-        Condition(
-            Verdict.WARNING,
-            f"the shots contradict the {text.what}{or_else}: {_amount(first)} where it is declared to "
-            f"{_sigma(first)} (score {abs(first.score):.1f}): {text.remedy}",
-        )
-    ]
+    which = " or ".join(
+        f"the {texts[c.name].what} ({_amount(c)} where it is declared to {_sigma(c)}, score {abs(c.score):.1f})"
+        for c in named
+    )
+    remedies = "; ".join(dict.fromkeys(texts[c.name].remedy for c in named))
+    return [Condition(Verdict.WARNING, f"the shots contradict {which}: {remedies}")]
+
+
+def measured(constants: Sequence[SystematicEstimate]) -> list[Condition]:
+    """Notes on what wavefronts measure: a sound speed or an offset well off, though within what is declared.
+
+    Where a constant is contradicted, no other one is to be corrected before it.
+    """
+    found = []
+    for constant in constants:
+        root = float(np.sqrt(constant.observed))
+        pulled = abs(constant.score) * constant.prior_sigma * root  # from what was expected
+        off = pulled > NOTED_SIGMAS * constant.prior_sigma * constant.observed
+        if constant.name in _MEASURED and off and pulled > CERTAIN_SIGMAS * constant.sigma:
+            text = {text.name: text for text in TEXTS}[constant.name]
+            found.append(
+                Condition(
+                    Verdict.OK,
+                    f"the shots measure the {text.what}, and it is taken into account: {_amount(constant)} "
+                    f"(declared to {_sigma(constant)}); correct what is declared",
+                )
+            )
+    return found
 
 
 def _amount(constant: SystematicEstimate) -> str:

@@ -14,11 +14,11 @@ import numpy as np
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.expectation_propagation import inverse_hessian, propagate
-from fgreg.graph.packing import PackedProblem, pack
+from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
-from fgreg.graph.shared_state import SharedState, in_columns, make_state
+from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.multistart import targets_moved
 from fgreg.registration.outliers import log_outlier
@@ -38,8 +38,6 @@ RIVAL_CHI2 = 14.0
 """Minima whose chi square is larger by more than this have too small a share of the posterior to matter."""
 OPEN_PMS = 5
 """With fewer PMs the registration is undetermined, however many samples there are: a third of the draws is enough."""
-FREE_SOUND_SPEED = 0.1
-"""Prior sigma of the sound speed ratio where only the residuals should determine it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,25 +119,6 @@ class Estimated:
 
     value: float
     sigma: float
-
-
-def sound_speed_from_residuals(registration: Registration) -> Estimated:
-    """The ratio of true to assumed sound speed that fits the pairs best, with a very weak prior.
-
-    For a registration in which it is not a variable: one Gauss-Newton step from its optimum with the ratio added.
-    """
-    sigmas = registration.model.constant_sigmas.copy()
-    sigmas[Constant.SOUND_SPEED] = FREE_SOUND_SPEED
-    free = pack(registration.measurements, registration.model, sigmas=sigmas)
-    if (prior := registration.problem.anchor) is not None:
-        free = replace(free, anchor=in_columns(prior, registration.problem.columns, free.columns))
-    optimum, column = registration.optimum, free.columns.at(Constant.SOUND_SPEED)
-    at = evaluate(free, optimum.state, optimum.evaluation.private)
-    inverse = inverse_hessian(at.hessian[0])
-    if inverse is None or column is None:
-        return Estimated(1.0, FREE_SOUND_SPEED)
-    ratio = 1.0 + float(optimum.state.constant(Constant.SOUND_SPEED)[0])
-    return Estimated(ratio - float(inverse[column] @ at.gradient[0]), float(np.sqrt(inverse[column, column])))
 
 
 def estimated_sound_speed(found: Registration) -> Estimated | None:

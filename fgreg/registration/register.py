@@ -59,14 +59,6 @@ SAME_CHI2 = 1e-3
 """Chi squares that differ by less are the same: three PMs fit each of their minima exactly."""
 
 
-@dataclass(frozen=True, slots=True)
-class SoundSpeedPrior:
-    """Prior of the ratio of true to assumed sound speed."""
-
-    mean: float
-    sigma: float
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Shots:
     """All shots of the solved epochs, evaluated at the optimum of the inliers.
@@ -258,25 +250,20 @@ def _open_minima(
     return start, left
 
 
-def constants_of(
-    model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
-) -> tuple[FloatArray, FloatArray]:
+def constants_of(model: SessionModel, config: SolveConfig) -> tuple[FloatArray, FloatArray]:
     """(COUNT,) prior standard deviations and means of the rig's constants: the session's, less certain where the
     configuration asks for an estimate."""
     sigmas, mean = model.constant_sigmas, model.constant_means
     if config.estimate_sound_speed:
-        prior = sound_speed or SoundSpeedPrior(1.0, config.sound_speed_sigma)
-        sigmas[Constant.SOUND_SPEED], mean[Constant.SOUND_SPEED] = prior.sigma, prior.mean - 1.0
+        sigmas[Constant.SOUND_SPEED] = max(sigmas[Constant.SOUND_SPEED], config.sound_speed_sigma)
     if config.estimate_radius:
         sigmas[Constant.RADIUS] = max(sigmas[Constant.RADIUS], config.radius_sigma_mm)
     return sigmas, mean
 
 
-def pack_session(
-    measurements: Measurements, model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None = None
-) -> PackedProblem:
+def pack_session(measurements: Measurements, model: SessionModel, config: SolveConfig) -> PackedProblem:
     """The measurements as arrays, with the variables and shapes that the configuration asks for."""
-    sigmas, mean = constants_of(model, config, sound_speed)
+    sigmas, mean = constants_of(model, config)
     return pack(
         measurements,
         model,
@@ -433,7 +420,6 @@ def register(
     measurements: Measurements,
     model: SessionModel,
     config: SolveConfig,
-    sound_speed: SoundSpeedPrior | None = None,
     searched: Mapping[int, EpochSearch] | None = None,
     finished: FinishedEpochs | None = None,
 ) -> Registration:
@@ -442,7 +428,6 @@ def register(
     Args:
         measurements: aims, pairs, epochs.
         model, config: of the session.
-        sound_speed: prior of the ratio where it is estimated; the configuration's prior where None.
         searched: search results of epochs that are not searched again.
         finished: earlier epochs as a prior; only the last epoch is solved then.
 
@@ -475,7 +460,7 @@ def register(
     clean = all(search.clean for search in searches)
 
     def packed(of: Measurements) -> PackedProblem:
-        problem = pack_session(of, model, config, sound_speed)
+        problem = pack_session(of, model, config)
         return problem if finished is None else replace(problem, anchor=finished.prior)
 
     epochs = restrict_epochs(measurements, solvable)
@@ -500,7 +485,6 @@ def register_near(
     config: SolveConfig,
     start: SharedState,
     epochs: Sequence[int],
-    sound_speed: SoundSpeedPrior | None = None,
 ) -> Registration:
     """:func:`register` from a start near the optimum, without a search; inliers are selected again.
 
@@ -509,7 +493,7 @@ def register_near(
 
     Args:
         measurements: of the session.
-        model, config, sound_speed: as of :func:`register`.
+        model, config: as of :func:`register`.
         start: one hypothesis, with the registrations of ``epochs``.
         epochs: those to be solved.
 
@@ -518,7 +502,7 @@ def register_near(
     """
 
     def packed(of: Measurements) -> PackedProblem:
-        return pack_session(of, model, config, sound_speed)
+        return pack_session(of, model, config)
 
     mine = restrict_epochs(measurements, list(epochs))
     aims = np.ones(len(mine.aims), dtype=bool)

@@ -40,10 +40,9 @@ from fgreg.registration.posterior_mean import (
     estimated_radius,
     estimated_sound_speed,
     posterior_mean,
-    sound_speed_from_residuals,
 )
 from fgreg.registration.readout import read_aims, read_laser, read_pairs
-from fgreg.registration.register import Registration, SoundSpeedPrior, register, too_few_text
+from fgreg.registration.register import Registration, register, too_few_text
 from fgreg.registration.verdict import (
     SURE_OF_AIMS,
     SURE_OF_PAIRS,
@@ -59,7 +58,6 @@ from fgreg.registration.verdict import (
     possible_camera_move,
     repeated_markers,
     sampling,
-    sound_speed_condition,
     spread,
     sweeps,
     too_few_to_tell,
@@ -126,7 +124,6 @@ def solve(
     model: SessionModel,
     config: SolveConfig,
     conditions: Sequence[Condition] = (),
-    sound_speed_prior: SoundSpeedPrior | None = None,
     known: Mapping[int, EpochSearch] | None = None,
     finished: FinishedEpochs | None = None,
     before: Sequence[EpochReport] = (),
@@ -139,7 +136,6 @@ def solve(
         model: the session's set-up.
         config: limits of the verdict.
         conditions: of the detection, added to those found here.
-        sound_speed_prior: prior of the sound speed ratio, where the configuration makes it a variable.
         known: search results of epochs that are not searched again.
         finished: earlier epochs as a prior; only the last epoch is solved then, and only its pairs are in the solution.
         before: reports of the finished epochs.
@@ -147,7 +143,7 @@ def solve(
     if finished is not None:
         measurements = last_epoch(measurements)
     try:
-        registration = register(measurements, model, config, sound_speed_prior, known, finished)
+        registration = register(measurements, model, config, known, finished)
     except EstimationError as error:
         seen = camera_conditions(measurements, model, config)
         return _no_solution(measurements, tracks, [*conditions, *seen, Condition(Verdict.REFUSED, str(error))])
@@ -157,16 +153,16 @@ def solve(
     readout = read_laser(centred, model)
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
     aims = read_aims(measurements, centred, readout.origin_shift_mm)
-    budget = error_budget(registration, posterior, config, sound_speed_prior)
+    budget = error_budget(registration, posterior, config)
     common = [
         *conditions,
         *camera_conditions(
             measurements, model, config, [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
         ),
         *random_errors_only(model),
-        *_common_conditions(registration, pairs, aims, config),
+        *_common_conditions(registration, pairs, aims),
         *sampling(posterior.effective),
-        *_variable_conditions(centred, sound_speed_prior, config),
+        *_variable_conditions(centred, config),
         *budget.conditions,
     ]
     steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
@@ -215,7 +211,7 @@ def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions
 
 
 def _common_conditions(
-    registration: Registration, pairs: Sequence[PairEstimate], aims: Sequence[AimEstimate], config: SolveConfig
+    registration: Registration, pairs: Sequence[PairEstimate], aims: Sequence[AimEstimate]
 ) -> list[Condition]:
     """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
@@ -239,9 +235,6 @@ def _common_conditions(
         )
     deviant = np.concatenate([shots.pm_beyond_limit, shots.aim_beyond_limit])
     found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
-    if not config.estimate_sound_speed:
-        asked = sound_speed_from_residuals(registration)
-        found.extend(sound_speed_condition(asked.value, asked.sigma))
     if found and verdict_of(found) is Verdict.REFUSED:
         return found  # inconsistent data cannot test whether the two forms of the graph agree
     if len(pairs) <= GRAPH_PAIRS and problem.anchor is None:  # the explicit graph has no prior of finished epochs
@@ -249,12 +242,11 @@ def _common_conditions(
     return found
 
 
-def _variable_conditions(centred: Registration, prior: SoundSpeedPrior | None, config: SolveConfig) -> list[Condition]:
+def _variable_conditions(centred: Registration, config: SolveConfig) -> list[Condition]:
     """Estimated sound speed and radius, where they are variables."""
     found = []
     if config.estimate_sound_speed and (speed := estimated_sound_speed(centred)) is not None:
-        given = prior or SoundSpeedPrior(1.0, config.sound_speed_sigma)
-        found.append(estimated("sound speed ratio", speed.value, speed.sigma, given.mean, given.sigma, ""))
+        found.append(estimated("sound speed ratio", speed.value, speed.sigma, 1.0, config.sound_speed_sigma, ""))
     if config.estimate_radius and (radius := estimated_radius(centred)) is not None:
         given_mm = centred.model.probe.radius_mm
         found.append(estimated("radius", radius.value, radius.sigma, given_mm, config.radius_sigma_mm, " mm"))

@@ -37,8 +37,6 @@ MIRROR_CHANCE = 2.0
 MILD_NIS = 60.0
 MILD_OUTLIERS = 0.1
 """Most outliers have a larger innovation than the first; this share of them has not."""
-MOST_SOUND_SPEED = 0.1
-"""No medium's sound speed is farther off than this share: there is another cause."""
 TELLING_PMS = 6
 """Fewer PMs do not determine one registration, so they cannot show a second one."""
 FEW_PMS = 21
@@ -50,8 +48,6 @@ warning. One in twelve sessions of 10 to 20 PMs without a move reaches it, and s
 CLEARLY_MOVED = 2.0
 """The same Bayes factor from which the registration is refused. One in fifty registrations from 6 to 21 PMs without a
 move reaches it, mostly for one PM or two (first-hit pairs; none in 160 with windows only)."""
-SUSPICIOUS_Z = 4.0
-SOUND_SPEED_TOLERANCE = 0.005
 DOMINANT = 0.5
 """Share of the error's variance above which a cause is named."""
 LEAST_EFFECTIVE = 60.0
@@ -387,18 +383,6 @@ def causes_of_error(registration: Registration, place: int, targets_mm: FloatArr
         explained = cross @ np.linalg.solve(own, cross.T)
         shares.append(float(np.trace(move[worst] @ explained @ move[worst].T) / total[worst]))
     return Causes(beam=shares[0], edge=shares[1])
-
-
-def sound_speed_condition(ratio: float, sigma: float) -> list[Condition]:
-    """Whether the pairs fit better with another sound speed than the given one; ``ratio`` is the one they fit best."""
-    if not max(SUSPICIOUS_Z * sigma, SOUND_SPEED_TOLERANCE) < abs(ratio - 1.0) < MOST_SOUND_SPEED:
-        return []
-    text = (
-        f"the pairs fit better with sound at {ratio:.3f} +- {sigma:.3f} of probe.sound_speed_m_s: measure the medium's "
-        "temperature or sound speed and correct it in session.yaml (with ranges computed again), or solve with "
-        "--estimate sound_speed"
-    )
-    return [Condition(Verdict.WARNING, text)]
 
 
 def beam_sides(lambda_mm: FloatArray) -> list[Condition]:

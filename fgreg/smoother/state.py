@@ -12,14 +12,13 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
-from fgreg.graph.packing import ConstantsPrior, PackedProblem, camera_evidence
+from fgreg.graph.packing import ConstantsPrior, PackedProblem, evidence
 from fgreg.graph.shared_state import Quadratic, SharedState
-from fgreg.model.corner_information import observed_dependences
 from fgreg.model.measurements import Aim, EpochStart, Look, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import restrict_epochs
-from fgreg.registration.register import SoundSpeedPrior, pack_session
+from fgreg.registration.register import pack_session
 from fgreg.smoother.isam_window import ActiveWindow
 from fgreg.smoother.marginal_prior import has_moved, marginal_prior, one_epoch, with_registrations
 from fgreg.smoother.shared_variables import Layout
@@ -27,14 +26,13 @@ from fgreg.smoother.shared_variables import Layout
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """The constants: the session's set-up, the configuration, the prior of the sound speed.
+    """The constants: the session's set-up and the configuration.
 
     ``empty``: a problem without shots and with one epoch, for its columns.
     """
 
     model: SessionModel
     config: SolveConfig
-    sound_speed: SoundSpeedPrior | None
     empty: PackedProblem
 
     @property
@@ -44,10 +42,10 @@ class Setting:
 
     def pack(self, measurements: Measurements) -> PackedProblem:
         """Measurements as arrays, with Gaussian sensitivity windows."""
-        return pack_session(measurements, self.model, self.config, self.sound_speed)
+        return pack_session(measurements, self.model, self.config)
 
 
-def make_setting(model: SessionModel, config: SolveConfig, sound_speed: SoundSpeedPrior | None) -> Setting:
+def make_setting(model: SessionModel, config: SolveConfig) -> Setting:
     """The setting of a session.
 
     Raises:
@@ -56,8 +54,8 @@ def make_setting(model: SessionModel, config: SolveConfig, sound_speed: SoundSpe
     if config.estimate_radius:
         raise ValueError("estimate_radius is set; online registration holds the probe's radius as the session gives it")
     gaussian = replace(config, window_shape=False)
-    empty = pack_session(Measurements((), (), (EpochStart(0.0),)), model, gaussian, sound_speed)
-    return Setting(model, gaussian, sound_speed, empty)
+    empty = pack_session(Measurements((), (), (EpochStart(0.0),)), model, gaussian)
+    return Setting(model, gaussian, empty)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,7 +239,7 @@ def finished_prior(state: State, at: SharedState, setting: Setting) -> State:
     finished = restrict_epochs(Measurements((), numbered(shots, numbers), starts), [*known, now])
     problem = setting.pack(finished)
     # The configuration's priors are those of the solve that uses this one.
-    problem = replace(problem, prior=camera_evidence(observed_dependences(finished), problem.columns))
+    problem = replace(problem, prior=evidence(finished, problem.columns))
     each = [found for k in known if (found := state.epochs[k].state) is not None]
     prior, settled = marginal_prior(problem, with_registrations(at, [*each, at]))
     epochs = list(state.epochs)
@@ -269,20 +267,20 @@ def total_prior(state: State, at: SharedState, setting: Setting) -> Quadratic:
     if state.carried is None:
         raise ValueError("there is no registration")
     prior = state.carried.at(at, setting.columns)
-    seen = _seen_in_pictures(state, at, setting.columns)
+    seen = _seen_in_frames(state, at, setting.columns)
     if seen is not None:
         prior = prior.plus(seen)
     return prior if state.older is None else prior.plus(state.older.at(at, setting.columns))
 
 
-def _seen_in_pictures(state: State, at: SharedState, columns: Columns) -> Quadratic | None:
-    """What the pictures of the current epoch's pairs say about the camera's constants; None without pictures."""
+def _seen_in_frames(state: State, at: SharedState, columns: Columns) -> Quadratic | None:
+    """What the frames of the current epoch's pairs say about the rig's constants; None without frames."""
     shots = Measurements((), tuple(shot.pair for shot in state.current), (EpochStart(0.0),))
-    evidence = camera_evidence(observed_dependences(shots), columns)
-    if not evidence.information.any():
+    seen = evidence(shots, columns)
+    if not seen.information.any():
         return None
-    step = at.constants[0, columns.constants] - evidence.mean
-    pull = evidence.information @ step
+    step = at.constants[0, columns.constants] - seen.mean
+    pull = seen.information @ step
     gradient, hessian = np.zeros(columns.size), np.zeros((columns.size, columns.size))
-    gradient[columns.rig], hessian[columns.rig, columns.rig] = pull, evidence.information
+    gradient[columns.rig], hessian[columns.rig, columns.rig] = pull, seen.information
     return Quadratic(at, float(step @ pull), gradient, hessian)

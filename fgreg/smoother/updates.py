@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from fgreg.graph.packing import tells_of_constants
 from fgreg.graph.shared_state import Quadratic, SharedState
 from fgreg.model.measurements import Aim, EpochStart, Pair
 from fgreg.smoother.innovation import aim_fits, innovation, limit_of, sigma_distance
@@ -83,8 +84,7 @@ def _one_more(state: State, active: ActiveWindow, layout: Layout, setting: Setti
     state = replace(state, shots=tuple(shots))
     change = Change((Group(label, tuple(places), pairs, prepared),), () if same is None else (label,))
     state, change = _marginalised(state, active, change, setting)
-    dependence = state.shots[-1].pair.marker.dependence
-    if change.prior is None and dependence is not None and dependence.information.any():
+    if change.prior is None and tells_of_constants(state.shots[-1].pair):
         change = replace(change, prior=total_prior(state, active.state, setting))
     return settled(state, active, layout, change, setting)
 
