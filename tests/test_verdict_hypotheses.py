@@ -88,7 +88,10 @@ def test_a_beam_that_dominates_the_error_is_to_be_calibrated_with_roll() -> None
     assert "roll the fibre about its beam during calibration" in text
     assert "70%" in text
     assert "more pairs" in accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.1))[0].text
-    assert "the other way" in accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6))[0].text
+    assert "both sides at each PM" in accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6))[0].text
+    known = accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6), both_sides=True)[0].text
+    assert "both sides" not in known
+    assert "measure the window's half width" in known
 
 
 def test_one_shot_far_off_is_an_outlier_but_several_a_little_off_are_noise() -> None:

@@ -110,7 +110,7 @@ def test_collinear_spots_are_refused() -> None:
 def test_sweeps_from_one_side_are_at_most_a_warning() -> None:
     solution, _, _ = _solve(pairs=30, one_way=True)
     assert solution.verdict is Verdict.WARNING
-    assert any("take 3 pairs sweeping the other way" in reason for reason in solution.reasons)
+    assert any("look at the next PMs from both sides (at least 3)" in reason for reason in solution.reasons)
 
 
 @pytest.mark.parametrize("how", ["stage", "elements"])

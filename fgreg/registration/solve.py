@@ -61,6 +61,7 @@ from fgreg.registration.verdict import (
     spread,
     sweeps,
     too_few_to_tell,
+    two_sided,
     understated_noise,
     verdict_of,
 )
@@ -327,7 +328,8 @@ def _epoch_verdicts(
             found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
             tre = budget.predicted[place]
             causes = causes_of_error(registration, place, model.targets_mm)
-            found.extend(accuracy(tre, config, causes, largest_causes(budget.constants)))
+            both = two_sided(pair for pair in measurements.pairs if pair.epoch == k)
+            found.extend(accuracy(tre, config, causes, largest_causes(budget.constants), both_sides=both))
             block = slice(6 * place, 6 * place + 6)
             estimate = EpochEstimate(
                 index=k,

@@ -272,9 +272,17 @@ def sweeps(pairs: Iterable[Pair], config: SolveConfig) -> list[Condition]:
         Condition(
             Verdict.WARNING,
             f"{max(up, down)} of {up + down} sweeps went one way, where a wrong window edge or sweep sign does not "
-            f"show: take {missing} pairs sweeping the other way",
+            f"show: look at the next PMs from both sides (at least {missing})",
         )
     ]
+
+
+def two_sided(pairs: Iterable[Pair]) -> bool:
+    """Whether most PMs have looks from both sides."""
+    sides: dict[int, set[int]] = {}
+    for pair in pairs:
+        sides.setdefault(pair.pm, set()).add(pair.look.sweep)
+    return 2 * sum({1, -1} <= swept for swept in sides.values()) > len(sides)
 
 
 def repeated_markers(pairs: Iterable[Pair]) -> list[Condition]:
@@ -338,25 +346,33 @@ class Causes:
 
 
 def accuracy(
-    tre: PredictedTre, config: SolveConfig, causes: Causes | None = None, largest: str = ""
+    tre: PredictedTre,
+    config: SolveConfig,
+    causes: Causes | None = None,
+    largest: str = "",
+    *,
+    both_sides: bool = False,
 ) -> list[Condition]:
     """Predicted error at the worst target against the limit, with the advice that would lower it most.
 
-    ``largest``: the systematic causes with the largest part in it, as text.
+    ``largest``: the systematic causes with the largest part in it, as text. ``both_sides``: most PMs have looks from
+    both sides already.
     """
     if tre.worst_mm <= config.limit_mm:
         return []
     far = tre.worst_mm > 2.0 * config.limit_mm
-    advice = "take more pairs, spread over the field and with sweeps from both sides"
+    advice = "take more pairs, spread over the field, with looks from both sides at each PM"
     if largest and tre.systematic is not None and tre.systematic.worst_mm > math.sqrt(DOMINANT) * tre.worst_mm:
-        advice = f"most of it is systematic ({largest}): measure these, and take looks from both sides at each PM"
+        also = "" if both_sides else ", and take looks from both sides at each PM"
+        advice = f"most of it is systematic ({largest}): measure these{also}"
     elif causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
         advice = (
             f"{causes.beam:.0%} of its variance is the beam's: take more aims, at short and long distances, and roll "
             "the fibre about its beam during calibration"
         )
     elif causes is not None and causes.edge > DOMINANT:
-        advice = f"{causes.edge:.0%} of its variance is the window edge's: take as many pairs sweeping the other way"
+        what = "measure the window's half width" if both_sides else "take looks from both sides at each PM"
+        advice = f"{causes.edge:.0%} of its variance is the window edge's: {what}"
     return [
         Condition(
             Verdict.REFUSED if far else Verdict.WARNING,
