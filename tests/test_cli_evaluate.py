@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -128,11 +129,18 @@ def test_advice_as_table_and_json(
     text = capsys.readouterr().out
     assert "Where the next shot helps most: eight" in text
     assert "beam leans" in text
+    assert "two looks at each spot" in " ".join(text.split())
+    assert len(re.findall(r"\d\.\d up\b", text)) == len(re.findall(r"\d\.\d down\b", text)) == 3
     assert run(monkeypatch, "advise", str(session), "--json", "-n", "2") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["pairs"] == 8
     assert len(document["shots"]) == 2
     assert document["shots"][0]["expected_tre_mm"] < document["expected_tre_mm"]
+    assert [look["sweep"] for look in document["shots"][0]["looks"]] == [1, -1]
+    assert run(monkeypatch, "advise", str(session), "--json", "--one-look") == 0
+    single = json.loads(capsys.readouterr().out)["shots"]
+    assert all(len(shot["looks"]) == 1 for shot in single)
+    assert document["shots"][0]["expected_tre_mm"] < single[0]["expected_tre_mm"]
 
 
 def test_no_advice_without_a_registration(

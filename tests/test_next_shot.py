@@ -32,8 +32,10 @@ def test_predicted_error_is_that_of_the_session_with_the_shot_added() -> None:
     advice = advise(found)
     state = found.optimum.state
     for shot in advice.shots[:2]:
-        added = replace(advice.candidates.pairs[shot.candidate], pm=999)
-        longer = pack(replace(measurements, pairs=(*measurements.pairs, added)), model)
+        added = [replace(pair, pm=999) for pair in advice.candidates.shots[shot.candidate]]
+        assert len({pair.marker.id for pair in added}) == 1
+        added = [replace(pair, marker=replace(pair.marker, id=999)) for pair in added]
+        longer = pack(replace(measurements, pairs=(*measurements.pairs, *added)), model)
         # Everything linearised at the estimate, the virtual PM at its place.
         private = initial_private(longer, state)
         points = np.concatenate([found.optimum.evaluation.private.trus_p_pm, shot.trus_p_mm[None, None]], axis=1)
@@ -54,7 +56,7 @@ def test_shots_are_ranked_distinct_and_within_reach() -> None:
     assert expected == sorted(expected)
     low, high = model.stage.limits_device_rad
     for shot in advice.shots:
-        assert low <= shot.device_rad <= high
+        assert all(low <= look.device_rad <= high for look in shot.looks)
         assert math.hypot(shot.tilt_right_rad, shot.tilt_down_rad) < 1.2 * TILT_RAD
         assert np.linalg.norm(shot.camera_d) == pytest.approx(1.0)
     worst = advice.order[-1]
@@ -66,8 +68,8 @@ def test_virtual_pairs_lie_on_their_beam_and_are_detected_where_stated() -> None
     candidates = advise(found).candidates
     state = found.optimum.state
     transform = state.trus_T_camera()[0]
-    for i in (0, len(candidates.pairs) // 2, -1):
-        pair, trus_p = candidates.pairs[i], candidates.trus_p_mm[i]
+    for i in (0, len(candidates.shots) // 2, -1):
+        trus_p = candidates.trus_p_mm[i]
         spot = transform_points(inverse(transform), trus_p)
         np.testing.assert_allclose(candidates.camera_p_spot_mm[i], spot, atol=1e-9)
         marker = candidates.camera_T_marker[i]
@@ -75,22 +77,50 @@ def test_virtual_pairs_lie_on_their_beam_and_are_detected_where_stated() -> None
         direction = marker[:3, :3] @ state.beam_direction()[0]
         np.testing.assert_allclose(direction, candidates.camera_d[i], atol=1e-9)
         assert np.linalg.norm(np.cross(spot - origin, direction)) < 1e-9
-        distance, _, rotation = hear(trus_p, pair.look.scan_rad, model.probe.radius_mm)
-        assert pair.look.range_mm == pytest.approx(distance)
-        # In the middle of the step of its first detection: 6 deg less half of 2.
-        assert rotation * pair.look.sweep == pytest.approx(math.radians(5.0), abs=1e-4)
+        assert [pair.look.sweep for pair in candidates.shots[i]] == [1, -1]
+        for pair in candidates.shots[i]:
+            distance, _, rotation = hear(trus_p, pair.look.scan_rad, model.probe.radius_mm)
+            assert pair.look.range_mm == pytest.approx(distance)
+            # In the middle of the step of its first detection: 6 deg less half of 2.
+            assert rotation * pair.look.sweep == pytest.approx(math.radians(5.0), abs=1e-4)
 
 
-def test_the_sweep_comes_from_the_side_used_less() -> None:
+def test_both_looks_are_given_by_the_device_s_angles_and_directions() -> None:
+    _, _, found = _registered(3)
+    for direction in (1, -1):
+        model = replace(found.model, stage=replace(found.model.stage, direction=direction))
+        advice = advise(replace(found, model=model))
+        for shot in advice.shots:
+            up, down = shot.looks  # the lower angle is that of the sweep upwards
+            assert (up.sweep, down.sweep) == (1, -1)
+            assert down.device_rad - up.device_rad == pytest.approx(math.radians(10.0), abs=2e-4)
+            middle = model.stage.scan_from_device(0.5 * (up.device_rad + down.device_rad))
+            assert middle == pytest.approx(math.atan2(shot.trus_p_mm[1], shot.trus_p_mm[2]), abs=1e-4)
+        assert any("two looks at each spot" in note for note in advice.notes)
+
+
+def test_looks_from_both_sides_are_expected_to_help_more_than_one() -> None:
+    _, _, found = _registered(0, one_way=True)
+    both, one = advise(found), advise(found, both_sides=False)
+    assert both.expected_mm == one.expected_mm
+    assert both.shots[0].expected_mm < one.shots[0].expected_mm
+    _, _, alternating = _registered(1)
+    both, one = advise(alternating), advise(alternating, both_sides=False)
+    assert both.shots[0].expected_mm < 0.97 * one.shots[0].expected_mm
+
+
+def test_one_look_comes_from_the_side_used_less() -> None:
     _, measurements, found = _registered(3, one_way=True)
     assert all(pair.look.sweep == 1 for pair in measurements.pairs)
-    advice = advise(found)
-    assert advice.candidates.sweep == -1
+    advice = advise(found, both_sides=False)
+    assert advice.candidates.sweeps == (-1,)
+    assert [len(shot) for shot in advice.candidates.shots] == [1] * len(advice.candidates.shots)
     assert any("both sides" in note for note in advice.notes)
     device = replace(found.model, stage=replace(found.model.stage, direction=-1))
-    assert advise(replace(found, model=device)).shots[0].sweep == 1
+    assert advise(replace(found, model=device), both_sides=False).shots[0].looks[0].sweep == 1
     _, _, window = _registered(3, first_hit=False)
-    assert advise(window).candidates.sweep == 0
+    assert advise(window, both_sides=False).candidates.sweeps == (0,)
+    assert advise(window).candidates.sweeps == (1, -1)
 
 
 def test_few_pairs_are_reported_and_still_get_advice() -> None:
@@ -131,7 +161,7 @@ def test_nothing_outside_the_camera_s_view_is_advised() -> None:
     wide = CameraModel((640, 480), matrix, as_float_array(np.zeros(5)))
     seen = advise(replace(found, model=replace(model, camera=StereoRig(wide))))
     everything = advise(found)
-    assert 0 < len(seen.candidates.pairs) < len(everything.candidates.pairs)
+    assert 0 < len(seen.candidates.shots) < len(everything.candidates.shots)
     narrow = CameraModel((64, 48), as_float_array([[4e4, 0, 32], [0, 4e4, 24], [0, 0, 1]]), as_float_array(np.zeros(5)))
     with pytest.raises(EstimationError, match="no spot"):
         advise(replace(found, model=replace(model, camera=StereoRig(narrow))))

@@ -102,13 +102,17 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
     def advise(
         session: Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")],
         count: Annotated[int, typer.Option("--count", "-n", help="How many shots to list.")] = 5,
+        one_look: Annotated[
+            bool, typer.Option("--one-look", help="One look at each spot, from the side used less, instead of two.")
+        ] = False,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
     ) -> None:
         """Where the next shot helps most: spots and beam directions, ranked by the predicted TRE after them.
 
-        Uses all shots up to now; at least 4 pairs. The advice is for the last camera epoch. Exit status 1 where there
-        is no registration.
+        A shot is two looks at one spot (one pm): sweep up to the first detection, and down to the first one from the
+        other side. Uses all shots up to now; at least 4 pairs. The advice is for the last camera epoch. Exit status 1
+        where there is no registration.
         """
         from fgreg.errors import EstimationError
         from fgreg.evaluation.advised import advice_dict, print_advice
@@ -121,7 +125,9 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         with progress_bar(quiet or as_json) as progress:
             case, _ = read_case(session, progress)
             try:
-                advice = run(register(case.measurements, case.model, SolveConfig()), count=count)
+                advice = run(
+                    register(case.measurements, case.model, SolveConfig()), count=count, both_sides=not one_look
+                )
             except EstimationError as error:
                 if as_json:
                     typer.echo(json.dumps({"session": case.name, "shots": [], "notes": [str(error)]}, indent=2))

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from fgreg.evaluation.export import plain
 from fgreg.evaluation.tables import number
-from fgreg.registration.next_shot import Advice, AdvisedShot
+from fgreg.registration.next_shot import Advice, AdvisedLook, AdvisedShot
 
 UPRIGHT_DEG = 1.0
 """Smaller tilts are not shown."""
@@ -27,6 +27,11 @@ def lean_in_words(shot: AdvisedShot) -> str:
     if abs(down) >= UPRIGHT_DEG:
         words.append(f"{abs(down):.0f} {'down' if down > 0 else 'up'}")
     return ", ".join(words) or "as the mean"
+
+
+def look_in_words(look: AdvisedLook) -> str:
+    """Stage angle of the first detection and the sweep's direction, e.g. ``12.4 up`` (degrees)."""
+    return f"{math.degrees(look.device_rad):.1f}{ {1: ' up', -1: ' down', 0: ''}[look.sweep] }"
 
 
 def print_advice(name: str, advice: Advice, console: Console | None = None) -> None:
@@ -52,8 +57,7 @@ def _page(name: str, advice: Advice) -> list[RenderableType]:
         ("spot", "camera, mm"),
         ("beam leans", "in the image, deg"),
         ("direction", "camera"),
-        ("detected at", "deg"),
-        ("sweep", ""),
+        ("detected at", "stage, deg"),
         ("TRE then", "mm"),
         *([("tells apart", "chi square")] if rival else []),
     ]
@@ -65,8 +69,7 @@ def _page(name: str, advice: Advice) -> list[RenderableType]:
             " ".join(f"{v:.0f}" for v in shot.camera_p_spot_mm),
             lean_in_words(shot),
             " ".join(f"{v:.2f}" for v in shot.camera_d),
-            f"{math.degrees(shot.device_rad):.1f}",
-            {1: "up", -1: "down", 0: "-"}[shot.sweep],
+            "\n".join(look_in_words(look) for look in shot.looks),
             number(shot.expected_mm),
             *([number(shot.separation, 1)] if rival else []),
         )
@@ -83,7 +86,7 @@ def advice_dict(name: str, advice: Advice) -> dict[str, Any]:
             "pairs": advice.pairs,
             "expected_tre_mm": advice.expected_mm,
             "notes": list(advice.notes),
-            "candidates": len(advice.candidates.pairs),
+            "candidates": len(advice.candidates.shots),
             "shots": [
                 {
                     "camera_p_spot_mm": shot.camera_p_spot_mm,
@@ -91,8 +94,7 @@ def advice_dict(name: str, advice: Advice) -> dict[str, Any]:
                     "tilt_right_deg": math.degrees(shot.tilt_right_rad),
                     "tilt_down_deg": math.degrees(shot.tilt_down_rad),
                     "trus_p_mm": shot.trus_p_mm,
-                    "stage_deg": math.degrees(shot.device_rad),
-                    "sweep": shot.sweep,
+                    "looks": [{"stage_deg": math.degrees(look.device_rad), "sweep": look.sweep} for look in shot.looks],
                     "expected_tre_mm": shot.expected_mm,
                     "separation_chi2": shot.separation,
                 }

@@ -1,10 +1,11 @@
 """Where the next shot helps most: candidate beams and spots, ranked by the decrease of the predicted target error.
 
-Candidates are spots on the tissue surface that the measured PMs trace, each hit from directions about the mean beam.
-The information of a candidate is known before it is taken: a noise-free virtual pair at the estimate adds its Hessian A
-to the information H of the shared variables, so the covariance after it is (H + A)^-1.
+Candidates are spots on the tissue surface that the measured PMs trace, each hit from directions about the mean beam and
+detected by a sweep from either side: the middle of the two is free of the window's width and of the backlash. The
+information of a candidate is known before it is taken: noise-free virtual looks at the estimate add their Hessian A to
+the information H of the shared variables, so the covariance after them is (H + A)^-1.
 
-While two registrations fit equally well a shot also separates them. A virtual pair that fits the better registration
+While two registrations fit equally well a shot also separates them. A virtual shot that fits the better registration
 raises the chi square of the other by D (at its own optimum). The probability of choosing the wrong one is then at most
 sqrt(p q) exp(-D / 8) (Chernoff), p and q their posterior weights. Candidates are ranked by the expected squared error,
 which includes both.
@@ -66,8 +67,9 @@ class Candidates:
         camera_p_spot_mm: (n, 3) spot to aim at. camera_d: (n, 3) unit direction of the beam.
         camera_T_marker: (n, 4, 4) expected marker pose. trus_p_mm: (n, 3) expected PM.
         tilt_rad: (n, 2) tilt from the mean beam towards the image's right and its lower edge.
-        scan_rad: (n,) plane angle of the PM's first detection. sweep: +1 or -1 (plane), 0 where not swept.
-        pairs: the noise-free virtual pairs, each of a PM of its own.
+        sweeps: the K sweeps of each shot: +1 or -1 (plane), 0 where not swept.
+        scan_rad: (n, K) plane angles of the PM's first detection.
+        shots: the noise-free virtual pairs, K for each candidate: looks at one PM with one marker observation.
     """
 
     camera_p_spot_mm: FloatArray
@@ -75,9 +77,21 @@ class Candidates:
     camera_T_marker: FloatArray
     trus_p_mm: FloatArray
     tilt_rad: FloatArray
+    sweeps: tuple[int, ...]
     scan_rad: FloatArray
+    shots: tuple[tuple[Pair, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AdvisedLook:
+    """One look of an advised shot.
+
+    Attributes:
+        device_rad: stage angle of the PM's first detection. sweep: +1 or -1, direction of the device's sweep; 0: none.
+    """
+
+    device_rad: float
     sweep: int
-    pairs: tuple[Pair, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,8 +103,8 @@ class AdvisedShot:
         camera_p_spot_mm: (3,) spot to aim at. camera_d: (3,) direction of the beam.
         tilt_right_rad, tilt_down_rad: tilt from the mean of the beams up to now, to the image's right and lower edge.
         trus_p_mm: (3,) expected PM.
-        device_rad: stage angle of its first detection. sweep: +1 or -1, direction of the device's sweep; 0: none.
-        expected_mm: predicted TRE after it (mean over targets of the root of the expected square).
+        looks: at the PM, by stage angle: one from either side, or one only.
+        expected_mm: predicted TRE after all of them (mean over targets of the root of the expected square).
         separation: chi square by which it would separate the rival registration; None without a rival.
     """
 
@@ -100,8 +114,7 @@ class AdvisedShot:
     tilt_right_rad: float
     tilt_down_rad: float
     trus_p_mm: FloatArray
-    device_rad: float
-    sweep: int
+    looks: tuple[AdvisedLook, ...]
     expected_mm: float
     separation: float | None
 
@@ -126,13 +139,15 @@ class Advice:
     notes: tuple[str, ...]
 
 
-def advise(registration: Registration, *, epoch: int | None = None, count: int = 5) -> Advice:
+def advise(registration: Registration, *, epoch: int | None = None, count: int = 5, both_sides: bool = True) -> Advice:
     """Rank the candidates for the next shot.
 
     Args:
         registration: of the session up to now.
         epoch: the session's camera epoch to advise on; None: the last one with a registration.
         count: number of shots to list.
+        both_sides: detect each PM from both sides; else from the side that the session has used less (from none where
+            it does not sweep).
 
     Raises:
         EstimationError: the epoch has no registration, or there is no candidate.
@@ -145,11 +160,11 @@ def advise(registration: Registration, *, epoch: int | None = None, count: int =
     mine = [pair for pair in registration.measurements.pairs if pair.epoch == place]
     if not mine:
         raise EstimationError(f"camera epoch {epoch} has no pairs of its own to advise on")
-    found = propose(registration, place)
+    found = propose(registration, place, (1, -1) if both_sides else (_sweep_side(registration, place),))
     state = registration.optimum.state
     transform = state.trus_T_camera(place)[0]
     block = slice(6 * place, 6 * place + 6)
-    problem = pack_more(found.pairs, model, registration.problem.columns)
+    problem = pack_more([pair for shot in found.shots for pair in shot], model, registration.problem.columns)
     added = _contributions(problem, state, found.trus_p_mm)[2]
     after = np.linalg.inv(registration.optimum.evaluation.hessian[0] + added)[:, block, block]
     expected = expected_tre_mm(after, transform, model.targets_mm).mean(axis=-1)
@@ -170,8 +185,7 @@ def advise(registration: Registration, *, epoch: int | None = None, count: int =
             tilt_right_rad=float(found.tilt_rad[i, 0]),
             tilt_down_rad=float(found.tilt_rad[i, 1]),
             trus_p_mm=found.trus_p_mm[i],
-            device_rad=model.stage.device_from_scan(float(found.scan_rad[i])),
-            sweep=model.stage.direction * found.sweep,
+            looks=_looks(found, int(i), model),
             expected_mm=float(expected[i]),
             separation=None if separation is None else float(separation.chi2[i]),
         )
@@ -179,6 +193,14 @@ def advise(registration: Registration, *, epoch: int | None = None, count: int =
     )
     pms = len({pair.pm for pair in mine})
     return Advice(epoch, pms, before, shots, found, np.asarray(order), _notes(pms, separation, found))
+
+
+def _looks(found: Candidates, i: int, model: SessionModel) -> tuple[AdvisedLook, ...]:
+    looks = [
+        AdvisedLook(model.stage.device_from_scan(float(scan)), model.stage.direction * sweep)
+        for scan, sweep in zip(found.scan_rad[i], found.sweeps, strict=True)
+    ]
+    return tuple(sorted(looks, key=lambda look: look.device_rad))
 
 
 def _notes(pms: int, separation: _Separation | None, found: Candidates) -> tuple[str, ...]:
@@ -193,7 +215,12 @@ def _notes(pms: int, separation: _Separation | None, found: Candidates) -> tuple
             f"{pms} pairs are few: the registration may be a wrong one, and with it the figures here; take "
             f"{FEW_PAIRS - pms} more before trusting it"
         )
-    if found.sweep:
+    if len(found.sweeps) > 1:
+        notes.append(
+            "take two looks at each spot, with the fibre held still (one pm): sweep the stage up to the first "
+            "detection, then down to the first one from the other side"
+        )
+    elif found.sweeps[0]:
         notes.append("sweep the stage from the side given: sweeps from both sides make the window's edge known")
     return tuple(notes)
 
@@ -218,8 +245,8 @@ def _distinct(found: Candidates, order: IntArray, count: int) -> list[int]:
 # ---- candidates ----
 
 
-def propose(registration: Registration, place: int) -> Candidates:
-    """All candidates in one of the solved epochs (``place`` is its index among them).
+def propose(registration: Registration, place: int, sweeps: tuple[int, ...]) -> Candidates:
+    """All candidates in one of the solved epochs (``place`` is its index among them), with these sweeps each.
 
     Raises:
         EstimationError: none is within the reach of probe, stage and camera.
@@ -248,43 +275,43 @@ def propose(registration: Registration, place: int) -> Candidates:
     on_beam = state.beam_origin()[0] + lambda_mm * state.beam_direction()[0]
     bias = state.constants[0, Constant.MARKER_BIAS_X : Constant.MARKER_BIAS_Z + 1]
     camera_T_marker = make_transform(turned, camera_p - turned @ on_beam + bias)
-    sweep = _sweep_side(registration, place)
-    scan = np.array([_first_detection(p, sweep, model) for p in trus_p_spot])
+    scan = np.array([[_first_detection(p, sweep, model) for sweep in sweeps] for p in trus_p_spot])
     low, high = sorted(model.stage.scan_from_device(limit) for limit in model.stage.limits_device_rad)
     aperture = model.probe.element_x_mm
-    keep = (scan >= low) & (scan <= high) & (trus_p_spot[:, 0] > aperture.min()) & (trus_p_spot[:, 0] < aperture.max())
+    keep = ((scan >= low) & (scan <= high)).all(axis=1)
+    keep &= (trus_p_spot[:, 0] > aperture.min()) & (trus_p_spot[:, 0] < aperture.max())
     if model.camera is not None:
         keep &= _in_view(model.camera.left, camera_p) & _in_view(model.camera.left, camera_T_marker[:, :3, 3])
     index = np.flatnonzero(keep)
     if index.size == 0:
-        raise EstimationError("no spot within the reach of probe, stage and camera is left to advise on")
+        within = ", from both sides," if len(sweeps) > 1 else ""
+        raise EstimationError(f"no spot within the reach of probe, stage and camera{within} is left to advise on")
     marker_covariance = problem.beams.covariance[beams].mean(axis=0)
     look_covariance = np.linalg.inv(problem.looks.weight[looks][:, :2, :2]).mean(axis=0)
+    seen = {pair.pm: pair.marker.dependence for pair in registration.measurements.pairs if pair.epoch == place}
     scan_sigma = float(np.mean([p.look.scan_sigma_rad for p in registration.measurements.pairs if p.epoch == place]))
-    pairs = tuple(
-        Pair(
-            t=0.0,
-            pm=number,
-            epoch=place,
-            marker=MarkerObservation(
-                camera_T_marker=as_float_array(camera_T_marker[i], 4, 4),
-                covariance=as_float_array(right_from_parent_covariance(turned[i], marker_covariance), 6, 6),
-                id=number,
-            ),
-            look=_exact_look(trus_p_spot[i], float(scan[i]), sweep, scan_sigma, look_covariance, model),
-            beam_offset_mm=model.noise_per_pm.beam_offset_mm,
+    shots = []
+    for number, i in enumerate(index):
+        marker = MarkerObservation(
+            camera_T_marker=as_float_array(camera_T_marker[i], 4, 4),
+            covariance=as_float_array(right_from_parent_covariance(turned[i], marker_covariance), 6, 6),
+            id=number,
+            dependence=seen[problem.pms[problem.beam_pm[nearest[i]]]],
         )
-        for number, i in enumerate(index)
-    )
+        both = (
+            _exact_look(trus_p_spot[i], float(at), sweep, scan_sigma, look_covariance, model)
+            for at, sweep in zip(scan[i], sweeps, strict=True)
+        )
+        shots.append(tuple(Pair(0.0, number, place, marker, look, model.noise_per_pm.beam_offset_mm) for look in both))
     return Candidates(
         camera_p_spot_mm=camera_p[index],
         camera_d=d[index],
         camera_T_marker=camera_T_marker[index],
         trus_p_mm=trus_p_spot[index],
         tilt_rad=np.tile(tilts, (len(spots), 1))[index],
+        sweeps=sweeps,
         scan_rad=scan[index],
-        sweep=sweep,
-        pairs=pairs,
+        shots=tuple(shots),
     )
 
 
@@ -435,7 +462,9 @@ def _separate(registration: Registration, epoch: int, found: Candidates) -> _Sep
     # Laplace: weight ~ exp(-cost / 2) / sqrt(det H).
     log_ratio = -0.5 * (rival_cost - cost) - 0.5 * (np.linalg.slogdet(rival_hessian)[1] - np.linalg.slogdet(hessian)[1])
     weight = float(1.0 / (1.0 + np.exp(-np.clip(log_ratio, -30.0, 30.0))))
-    virtual = pack(Measurements((), tuple(replace(pair, epoch=0) for pair in found.pairs), (EpochStart(0.0),)), model)
+    virtual = pack(
+        Measurements((), tuple(replace(p, epoch=0) for s in found.shots for p in s), (EpochStart(0.0),)), model
+    )
     # The looks are those that the best registration predicts, so the rival's PMs start there, too.
     c, g, a = _contributions(virtual, rival.state, found.trus_p_mm)
     chi2 = c - np.sum(g * np.linalg.solve(rival_hessian + a, g[..., None])[..., 0], axis=-1)
