@@ -240,7 +240,9 @@ class Rehearsal:
         assert look.range_mm is not None
         assert look.covariance is not None
         noise = self.model.noise
-        made = Look(look.scan_rad, noise.scan_rad, look.x_mm, look.range_mm, look.covariance, 0, look.amplitude)
+        made = Look(
+            look.scan_rad, noise.scan_rad, look.x_mm, look.range_mm, look.covariance, look.sweep, look.amplitude
+        )
         self.engine.add(Pair(self.now_s, pm, 0, self._observation(pm, pose), made))
 
     def error_mm(self) -> float:

@@ -118,7 +118,14 @@ class Recording:
         else:
             look, stage = event.look, self._session.journal.model.stage
             device = math.degrees(stage.device_from_scan(look.scan_rad))
-            trus = TrusRecord(device, look.x_mm, look.range_mm, covariance=look.covariance, amplitude=look.amplitude)
+            trus = TrusRecord(
+                device,
+                look.x_mm,
+                look.range_mm,
+                covariance=look.covariance,
+                amplitude=look.amplitude,
+                sweep=stage.direction * look.sweep,
+            )
             recorded = PairEvent(event.t, 0, event.pm, marker, trus)
         with suppress(EventRefused):
             self._told.take(recorded, self._session.add(recorded), None)

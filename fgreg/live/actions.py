@@ -22,6 +22,7 @@ class LocatedPulse:
         marker: ``camera_T_marker`` at the pulse; None if it is unknown, and then ``unpaired`` gives the reason.
         x_mm, range_mm, covariance, amplitude: of the located source; None if no source was located.
         others: other positions at which it may be.
+        sweep: +1 or -1 where the plane stepped towards larger or smaller angles up to this first detection, else 0.
     """
 
     pulse_s: float
@@ -33,6 +34,7 @@ class LocatedPulse:
     covariance: FloatArray | None = None
     amplitude: float | None = None
     others: tuple[OtherPosition, ...] = ()
+    sweep: int = 0
 
 
 @dataclass(frozen=True, slots=True)

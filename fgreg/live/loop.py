@@ -392,14 +392,15 @@ class LiveLoop:
     def _pair(self, pm: int, pose: TimedPose, look: LocatedPulse) -> None:
         if look.scan_rad is None:
             raise AssertionError("a look without a plane angle")
-        device = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
+        stage = self._model.stage
         trus = TrusRecord(
-            device,
+            math.degrees(stage.device_from_scan(look.scan_rad)),
             look.x_mm,
             look.range_mm,
             covariance=look.covariance,
             amplitude=look.amplitude,
             others=tuple(OtherRecord(other.x_mm, other.range_mm, other.covariance) for other in look.others),
+            sweep=stage.direction * look.sweep,
         )
         marker = MarkerRecord(pose.parent_T_child, pose.covariance)
         self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))

@@ -1,15 +1,21 @@
-"""The search for one PM while the fibre is held still: the planner's positions, and a pulse at each."""
+"""The search for one PM while the fibre is held still: the planner's positions, and a pulse at each.
+
+Once the PM is found, it is looked at from both sides: the first detections of a sweep towards larger angles and of one
+towards smaller angles. They and the looks of the search are recorded as looks at one PM.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.actions import LocatedPulse, StageView
 from fgreg.model.session_model import SessionModel
+from fgreg.search.detection_model import DetectionModel
 from fgreg.search.planner import Found, NotFound, SearchPlanner, Turn
+from fgreg.search.window_edges import WindowEdges
 
 ARRIVED_RAD = 0.004
 """The stage has arrived when it is this close to its goal."""
@@ -30,7 +36,10 @@ class PmSearch:
         held: ``camera_T_marker`` (4, 4) at the beginning.
         cold: whether the search covers the whole field, without a prediction.
         threshold: least amplitude of a detection.
-        looks: pulses with a detection.
+        model: session model. detection: detection model of the session. field_rad: plane angles that may be searched.
+        both_sides: whether a found PM is looked at from both sides.
+        looks: the planner's pulses with a detection. first_hits: the first detections from either side.
+        found: the planner's result, from which on the window's edges are looked for.
         wants_pulses: whether the next pulse counts, because the stage stands at its goal.
     """
 
@@ -38,8 +47,15 @@ class PmSearch:
     held: FloatArray
     cold: bool
     threshold: float
-    looks: list[LocatedPulse]
+    model: SessionModel
+    detection: DetectionModel
+    field_rad: tuple[float, float]
+    both_sides: bool = True
+    looks: list[LocatedPulse] = field(default_factory=list)
+    first_hits: list[LocatedPulse] = field(default_factory=list)
+    found: Found | None = None
     wants_pulses: bool = False
+    _edges: WindowEdges | None = None
     _goal: Turn | None = None
     _waits_s: float = 0.0
     _stood_s: float | None = None
@@ -56,21 +72,59 @@ class PmSearch:
             if pulse is None or pulse.scan_rad is None:
                 if now_s - self._waits_s < PATIENCE_S:
                     return None
+                if self.found is not None:
+                    return self.found
                 what = "no laser pulse" if there else "the stage has not arrived"
                 return NotFound(f"{what} within {PATIENCE_S:.0f} s", len(self.looks))
             loud = pulse.amplitude is not None and pulse.amplitude >= self.threshold
-            self.planner.add_look(pulse.scan_rad, pulse.amplitude if loud else None)
-            if loud:
-                self.looks.append(pulse)
+            amplitude = pulse.amplitude if loud else None
+            if self._edges is not None:
+                if sweep := self._edges.add_look(amplitude):
+                    self.first_hits.append(replace(pulse, sweep=sweep))
+            else:
+                self.planner.add_look(pulse.scan_rad, amplitude)
+                if loud:
+                    self.looks.append(pulse)
             self._goal = None
-        step = self.planner.next()
+        step = self._next(stage.scan_rad)
         if isinstance(step, Turn):
             self._goal, self._waits_s, self._stood_s, self.wants_pulses = step, now_s, None, False
         return step
 
-    def best_looks(self, found: Found, model: SessionModel) -> tuple[LocatedPulse, ...]:
-        """At most ``MOST_LOOKS`` looks, all surely inside the sensitivity window and most informative on the angle."""
-        table = model.probe.sensitivity
+    def _next(self, stands_rad: float) -> Turn | Found | NotFound:
+        if self.found is None:
+            step = self.planner.next()
+            if not isinstance(step, Found):
+                return step
+            self.found = step
+            self._edges = self._window_edges(step, stands_rad) if self.both_sides else None
+        turn = None if self._edges is None else self._edges.next()
+        return self.found if turn is None else turn
+
+    def _window_edges(self, found: Found, stands_rad: float) -> WindowEdges | None:
+        """The sweeps from both sides; None where the PM is too weak to be detected at its window's edge."""
+        near = [look for look in self.looks if look.scan_rad is not None and look.range_mm is not None]
+        if not near:
+            return None
+        table = self.model.probe.sensitivity
+        width = float(table.half_width_at(float(np.median([look.range_mm for look in near if look.range_mm]))))
+        rotation = np.array([found.scan_rad - look.scan_rad for look in near if look.scan_rad is not None])
+        log_peak = np.log([look.amplitude or self.threshold for look in near]) - self.detection.gain_log(rotation)
+        at_edge = float(np.median(log_peak) + np.mean(self.detection.gain_log([-width, width])))
+        if np.exp(at_edge) < self.threshold:
+            return None
+        spread = float(np.hypot(table.edge_sigma_rad, self.model.noise_per_pm.window_rad))
+        step = self.model.stage.step_rad
+        return WindowEdges(
+            found.scan_rad, found.sigma_rad, width, spread, step, float(np.exp(at_edge)), *self.field_rad, stands_rad
+        )
+
+    def best_looks(self, found: Found) -> tuple[LocatedPulse, ...]:
+        """At most ``MOST_LOOKS`` looks: the first detections, and looks surely inside the sensitivity window.
+
+        Of those the ones that are most informative on the angle.
+        """
+        table = self.model.probe.sensitivity
         inside = []
         for look in self.looks:
             if look.scan_rad is None or look.range_mm is None:
@@ -78,13 +132,12 @@ class PmSearch:
             width = float(np.interp(look.range_mm, table.depth_mm, table.half_width_rad))
             if abs(look.scan_rad - found.scan_rad) < width - 2.0 * found.sigma_rad:
                 inside.append(look)
-        if len(inside) <= MOST_LOOKS:
-            return tuple(inside)
         # The outermost look on either side determines the angle; the loudest ones determine position and range.
+        chosen = list(self.first_hits)
         by_side = sorted(inside, key=lambda look: look.scan_rad or 0.0)
-        chosen = [by_side[0], by_side[-1]]
-        rest = sorted(by_side[1:-1], key=lambda look: -(look.amplitude or 0.0))
-        chosen += rest[: MOST_LOOKS - 2]
+        if len(chosen) + len(by_side) > MOST_LOOKS and not chosen:
+            chosen, by_side = [by_side[0], by_side[-1]], by_side[1:-1]
+        chosen += sorted(by_side, key=lambda look: -(look.amplitude or 0.0))[: MOST_LOOKS - len(chosen)]
         return tuple(sorted(chosen, key=lambda look: look.pulse_s))
 
 

@@ -141,7 +141,8 @@ class RerunFeed(ViewerFeed):
             return None
         scan = model.stage.scan_from_device(math.radians(trus.scan_deg))
         spread = np.eye(2) if trus.covariance is None else trus.covariance
-        look = Look(scan, model.noise.scan_rad, trus.x_mm, trus.range_mm, spread, trus.sweep, trus.amplitude)
+        sweep = model.stage.direction * trus.sweep
+        look = Look(scan, model.noise.scan_rad, trus.x_mm, trus.range_mm, spread, sweep, trus.amplitude)
         return Pair(event.t, event.pm, epoch, marker, look)
 
     def _put(self, drawing: _Drawing) -> None:

@@ -84,6 +84,7 @@ class WorkflowSettings:
             example="20.0",
         ),
     ] = 0.0
+    both_sides: Annotated[bool, Key("whether each PM that was found is looked at from both sides")] = True
     follow: Annotated[bool, Key("whether the stage follows the beam at all")] = True
 
     def __post_init__(self) -> None:
@@ -260,12 +261,16 @@ class Workflow:
             self._waits_s = inputs.now_s
             self._search = self._begin(inputs, stage, held, cold=False)
         elif (slipped := self._slipped(inputs, self._search)) is not None:
-            self._search = None
-            if slipped:
-                out.append(Tell(f"{slipped}: hold it still"))
+            search, self._search = self._search, None
+            out.append(Tell(f"{slipped}: hold it still"))
+            if search.found is not None:  # the PM is known, and only a look from one side is missing
+                self._found(inputs.now_s, search, search.found, out)
             return
+        known = self._search.found is not None
         step = self._search.step(inputs.now_s, stage, inputs.pulses)
         if isinstance(step, Turn):
+            if self._search.found is not None and not known:
+                out.append(Tell("PM detected: hold the fibre still until it was looked at from both sides"))
             out.append(Sweep(step.scan_rad, step.reason))
         elif isinstance(step, Found):
             self._found(inputs.now_s, self._search, step, out)
@@ -295,11 +300,20 @@ class Workflow:
                 prediction = Prediction(at, sigma)
         stands = min(max(stage.scan_rad, low), high)
         planner = SearchPlanner(self._detection_model, low, high, stands, prediction)
-        return PmSearch(planner, held, prediction is None, self._settings.hearing_threshold, [])
+        return PmSearch(
+            planner,
+            held,
+            prediction is None,
+            self._settings.hearing_threshold,
+            self._model,
+            self._detection_model,
+            self._field,
+            self._settings.both_sides,
+        )
 
     def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
         self._search, self._done_at, self._waits_s = None, search.held, now_s
-        looks = tuple(look for look in search.best_looks(found, self._model) if look.marker is not None)
+        looks = tuple(look for look in search.best_looks(found) if look.marker is not None)
         if not looks:
             off_window = "the looks were outside the sensitivity window"
             why = next((look.unpaired for look in search.looks if look.unpaired), off_window)
@@ -309,8 +323,10 @@ class Workflow:
         self._next_pm += 1
         self._pms += 1
         turn, sigma = math.degrees(found.scan_rad), math.degrees(found.sigma_rad)
-        text = f"PM detected at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions: go on to the next spot"
-        out.append(Tell(text, done=True))
+        text = f"PM detected at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions"
+        if self._settings.both_sides:
+            text += ("", ", with a look from one side only", ", with looks from both sides")[len(search.first_hits)]
+        out.append(Tell(f"{text}: go on to the next spot", done=True))
 
     def _not_found(self, inputs: Inputs, stage: StageView, search: PmSearch, why: NotFound, out: list[Action]) -> None:
         if not search.cold:

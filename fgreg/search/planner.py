@@ -37,6 +37,7 @@ class Phase(StrEnum):
     SWEEP = "sweep"
     PREDICTED = "predicted"
     REFINE = "refine"
+    EDGES = "edges"
 
 
 @dataclass(frozen=True, slots=True)
