@@ -83,7 +83,7 @@ def test_looks_at_a_pm_are_within_its_window_and_paired_at_their_pulse(whole: Re
 
 
 def test_each_pm_is_looked_at_from_both_sides_by_default(whole: Rehearsal) -> None:
-    searched = [a for _, a in whole.asked if isinstance(a, TakePairs) and len(a.looks) > 1]
+    searched = [a for _, a in whole.actions if isinstance(a, TakePairs) and len(a.looks) > 1]
     both = [a for a in searched if {1, -1} <= {look.sweep for look in a.looks}]
     assert len(both) >= 0.8 * len(searched) > 0
     step, edge = whole.model.stage.step_rad, math.radians(6.0) + whole.room.scene.window_edge_rad
@@ -92,7 +92,7 @@ def test_each_pm_is_looked_at_from_both_sides_by_default(whole: Rehearsal) -> No
         ahead = look.sweep * (whole.room.plane_rad(look.pulse_s) - look.scan_rad)
         # The hand trembles, and amplitudes have noise of 5 %.
         assert edge - step - math.radians(0.8) < ahead < edge + math.radians(0.8)
-    told = [tell.text for _, tell in whole.told]
+    told = [tell.text for _, tell in whole.messages]
     assert sum("with looks from both sides: go on" in text for text in told) == len(both)
     assert any("hold the fibre still until it was looked at from both sides" in text for text in told)
 
@@ -102,23 +102,23 @@ def test_looks_from_both_sides_can_be_turned_off_and_a_weak_pm_has_none() -> Non
         session = rehearsal(aims=0, threshold=0.7 if "hearing_threshold" in options else 0.45)
         settings = WorkflowSettings(**{"aims": 0, "hearing_threshold": session.threshold, **options})  # type: ignore[arg-type]
         session.workflow = Workflow(session.model, settings)
-        while session.now_s < 60.0 and not any(isinstance(a, TakePairs) for _, a in session.asked):
+        while session.now_s < 60.0 and not any(isinstance(a, TakePairs) for _, a in session.actions):
             session.run(0.5)
-        taken = [a for _, a in session.asked if isinstance(a, TakePairs)]
+        taken = [a for _, a in session.actions if isinstance(a, TakePairs)]
         assert len(taken) == 1
         assert all(look.sweep == 0 for look in taken[0].looks)
 
 
 def test_a_fibre_that_moves_while_the_edges_are_searched_keeps_the_pm() -> None:
     session = rehearsal(aims=0)
-    while not any("until it was looked at from both sides" in tell.text for _, tell in session.told):
+    while not any("until it was looked at from both sides" in tell.text for _, tell in session.messages):
         session.run(0.1)
     session.room.proceed(session.now_s)
     session.run(1.5)
-    taken = [a for _, a in session.asked if isinstance(a, TakePairs)]
+    taken = [a for _, a in session.actions if isinstance(a, TakePairs)]
     assert len(taken) == 1
     assert all(look.sweep == 0 for look in taken[0].looks)
-    assert any("the fibre has moved during the search" in tell.text for _, tell in session.told)
+    assert any("the fibre has moved during the search" in tell.text for _, tell in session.messages)
 
 
 def test_a_stage_that_was_not_asked_to_turn_does_not() -> None:
