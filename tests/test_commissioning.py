@@ -20,6 +20,7 @@ from fgreg.registration.commissioning import (
     commission,
     common_constants,
     control_chart,
+    noise_slope,
     session_evidence,
 )
 from fgreg.registration.register import Registration
@@ -41,6 +42,8 @@ def test_one_session_alone_is_its_registration(root: Path) -> None:
     columns = [registration.problem.columns.first_constant + k for k in places(registration, found.constants)]
     sigma = np.sqrt(np.diag(registration.covariance))[columns]
     value = registration.optimum.state.constants[0, list(found.constants)]
+    # ... but for how noise scales with the constants.
+    value = value + registration.covariance[np.ix_(columns, columns)] @ noise_slope(registration)
     assert found.value == pytest.approx(value, abs=1e-3 * float(sigma.min()))
     assert found.sigma == pytest.approx(sigma, rel=1e-4)
 
@@ -55,10 +58,29 @@ def test_the_optimum_is_that_of_one_graph(root: Path) -> None:
         information, means = prior.information.copy(), prior.mean.copy()
         information[np.ix_(at, at)] = np.linalg.inv(covariance)
         means[at] = mean
+        means = means + np.linalg.solve(information, noise_slope(registration))
         problem = replace(registration.problem, prior=ConstantsPrior(means, information))
         optimum = optimize(problem, registration.optimum.state, tolerance=1e-9)
         again = optimum.state.constants[0, list(found.constants)]
         assert np.abs((again - found.value) / found.sigma).max() < 5e-3
+
+
+def test_noise_slopes_are_those_of_the_fitted_residuals(root: Path) -> None:
+    """Half the chi square with the noise of x, range and spots multiplied by (1 + c), by differences."""
+    ((registration, _),) = rigs.registrations(root, (1,))
+    problem, at = registration.problem, registration.optimum.evaluation
+    residual, shift = at.look_residual[0, :, :2], at.private.aim_shift[0]
+    slope = dict(zip(problem.columns.constants, noise_slope(registration), strict=True))
+    for constant, column in ((Constant.PITCH, 0), (Constant.SOUND_SPEED, 1)):
+        scale = np.ones(2)
+        scale[column] = 1.0 + 1e-6
+        weight = problem.looks.weight[:, :2, :2]
+        chi_square = [np.einsum("ni,nij,nj->", r, weight, r) for r in (residual, residual / scale)]
+        assert slope[constant] == pytest.approx(0.5 * (chi_square[0] - chi_square[1]) / 1e-6, rel=1e-4)
+        assert 0.0 < slope[constant] < len(residual)
+    # Without a camera section a spot moves by itself times the scale: its error is multiplied as a range's is.
+    spots = np.einsum("ni,nij,nj->", shift, np.linalg.inv(problem.aim_spot_covariance), shift)
+    assert slope[Constant.CAMERA_SCALE] == pytest.approx(spots, rel=1e-3)
 
 
 def test_the_sessions_agree_with_the_truth_and_sharpen_it(root: Path) -> None:

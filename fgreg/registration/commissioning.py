@@ -6,6 +6,8 @@ together, by Gauss-Newton on the one graph, until they settle: its optimum.
 
     minimise  (c - m)' P (c - m) + sum over sessions of F_i(x_i, c)
 
+What pooling needs and one session does not is how noise scales with the constants (:func:`noise_slope`).
+
 The marker's bias stays each session's own: it comes from light, focus and window of the day. All other constants belong
 to probe, stage, cameras and prints.
 
@@ -27,13 +29,14 @@ import numpy as np
 from scipy.special import chdtrc, ndtri
 
 from fgreg.errors import EstimationError
-from fgreg.geometry.rig import Constant
+from fgreg.geometry.rig import CAMERA, COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, hat
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem, constants_prior, least_sigmas
+from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.model.camera_dependence import nominal_point_gain
+from fgreg.model.camera_dependence import nominal_point_gain, nominal_spot_gain
 from fgreg.model.measurements import Check
 from fgreg.model.session_model import SessionModel
 from fgreg.registration.error_budget import scanner_displacement
@@ -48,6 +51,8 @@ OBSERVED = 0.5
 """Share of a constant's prior variance that is gone where the sessions alone know it as well as its prior does."""
 NOTE_P, ALARM_P = 0.02, 0.002
 """False alarms of a control chart: of a session of the same rig, all tests together."""
+STRETCH_MM = 1.0
+"""Step of the differences that tell how a spot's gain changes with the spot."""
 SEEN = 0.1
 """A direction counts in the chi square where the session's information is at least this share of the prior's."""
 
@@ -113,6 +118,7 @@ class _Session:
     problem: PackedProblem
     common: BoolArray
     checks: _Checks | None
+    slope: FloatArray
     state: SharedState
     at: Evaluation
 
@@ -121,7 +127,7 @@ class _Session:
         points = self.at.private.trus_p_pm + (self.at.point_gain @ step[:, None])[..., 0]
         state = self.state.retract(step[None], self.problem.columns)
         _, private = refine(self.problem, state, replace(self.at.private, trus_p_pm=points))
-        return replace(self, state=state, at=_evaluated(self.problem, state, private, self.checks))
+        return replace(self, state=state, at=_evaluated(self.problem, state, private, self.checks, self.slope))
 
     @property
     def value(self) -> FloatArray:
@@ -203,8 +209,37 @@ class _Checks:
         return replace(at, cost=cost, gradient=gradient, hessian=hessian)
 
 
-def _evaluated(problem: PackedProblem, state: SharedState, private: object, checks: _Checks | None) -> Evaluation:
-    at = evaluate(problem, state, private)  # type: ignore[arg-type]
+def noise_slope(registration: Registration) -> FloatArray:
+    """(K,) by how much half the chi square falls per unit of each constant, since noise is the measurement's own.
+
+    The graph compares a measurement m times (1 + c) with a residual of fixed noise s. But the noise of m (1 + c) is
+    s (1 + c): the chi square r^2 / s^2 is r^2 / (s (1 + c))^2, which falls by 2 r^2 / s^2 per c. Left out, all such c
+    would be too small: by 0.1 prior sigmas of the sound speed in one session, but by as much as the standard deviation
+    once ten are pooled. It concerns x, range, and the spots of aims; poses have next to no residual.
+    """
+    problem, at, model = registration.problem, registration.optimum.evaluation, registration.model
+    out = np.zeros(COUNT)
+    residual = at.look_residual[0, :, :2]
+    weighted = np.einsum("nij,nj->ni", problem.looks.weight[:, :2, :2], residual)
+    out[[Constant.PITCH, Constant.SOUND_SPEED]] = np.sum(residual * weighted, axis=0)
+    shift = at.private.aim_shift[0]
+    weighted = np.linalg.solve(problem.aim_spot_covariance, shift[..., None])[..., 0]
+    for axis in range(3):
+        step = STRETCH_MM * np.eye(3)[axis]
+        ends = [nominal_spot_gain(model, problem.aim_spot_mm + sign * step) for sign in (1.0, -1.0)]
+        by_spot = (ends[0] - ends[1]) / (2.0 * STRETCH_MM)
+        out[CAMERA] += np.einsum("ni,nik,n->k", weighted, by_spot, shift[:, axis])
+    return out[list(problem.columns.constants)]
+
+
+def _evaluated(
+    problem: PackedProblem, state: SharedState, private: PrivateState, checks: _Checks | None, slope: FloatArray
+) -> Evaluation:
+    at = evaluate(problem, state, private)
+    gradient = at.gradient.copy()
+    gradient[0, problem.columns.rig] -= slope
+    cost = at.cost - 2.0 * slope @ state.constants[0, list(problem.columns.constants)]
+    at = replace(at, cost=cost, gradient=gradient)
     return at if checks is None else checks.add_to(at, state)
 
 
@@ -219,8 +254,9 @@ def _session(registration: Registration, constants: Sequence[Constant], checks: 
     common = np.zeros(columns.size, dtype=bool)
     common[columns.rig] = np.isin(columns.constants, constants)
     points, state = _Checks.of(checks, registration), registration.optimum.state
-    at = _evaluated(problem, state, registration.optimum.evaluation.private, points)
-    return _Session(problem, common, points, state, at)
+    slope = noise_slope(registration)
+    at = _evaluated(problem, state, registration.optimum.evaluation.private, points, slope)
+    return _Session(problem, common, points, slope, state, at)
 
 
 def session_evidence(
