@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.geometry.rig import Constant
+from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.packing import ConstantsPrior
 from fgreg.graph.reduced_solver import optimize
@@ -69,7 +69,9 @@ def test_noise_slopes_are_those_of_the_fitted_residuals(root: Path) -> None:
     """Half the chi square with the noise of x, range and spots multiplied by (1 + c), by differences."""
     ((registration, _),) = rigs.registrations(root, (1,))
     problem, at = registration.problem, registration.optimum.evaluation
-    residual, shift = at.look_residual[0, :, :2], at.private.aim_shift[0]
+    residual = at.look_residual[0, :, :2]
+    by_constants = problem.aim_spot_by_constants @ registration.optimum.state.constants[0, CAMERA]
+    shift = at.private.aim_shift[0] - by_constants
     slope = dict(zip(problem.columns.constants, noise_slope(registration), strict=True))
     for constant, column in ((Constant.PITCH, 0), (Constant.SOUND_SPEED, 1)):
         scale = np.ones(2)

@@ -222,7 +222,8 @@ def noise_slope(registration: Registration) -> FloatArray:
     residual = at.look_residual[0, :, :2]
     weighted = np.einsum("nij,nj->ni", problem.looks.weight[:, :2, :2], residual)
     out[[Constant.PITCH, Constant.SOUND_SPEED]] = np.sum(residual * weighted, axis=0)
-    shift = at.private.aim_shift[0]
+    constants = registration.optimum.state.constants[0, CAMERA]
+    shift = at.private.aim_shift[0] - problem.aim_spot_by_constants @ constants  # what the constants do is no residual
     weighted = np.linalg.solve(problem.aim_spot_covariance, shift[..., None])[..., 0]
     for axis in range(3):
         step = STRETCH_MM * np.eye(3)[axis]
