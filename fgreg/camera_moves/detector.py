@@ -5,7 +5,7 @@ A split point is the first PM after a move. There are three steps; usually only 
 1. Screening, in closed form, over all split points (fgreg.graph.split_points). Outliers take part, since PMs after a
    move look like outliers. Where the sum of the Bayes factors is below its gate there is no move.
 2. The full test, by a Gaussian sum filter (fgreg.camera_moves.bayes_filter), over the split points that screening
-   selects. For each of them the filter starts from the side with more PMs and adds the PMs of the other side one by
+   selects. For each of them the filter starts from the side with more inliers and adds the PMs of the other side one by
    one: forward in time for late moves, backward for early ones. The prior of a move is symmetric, with zero mean.
 3. Loop closure: the same filter about an earlier epoch's registration (fgreg.camera_moves.loop_closure).
 
@@ -43,7 +43,9 @@ from fgreg.registration.outliers import pm_limits
 from fgreg.registration.register import pack_session
 
 MIN_KNOWN = 6
-"""PMs needed for a registration: with fewer on both sides of a split point a move cannot be tested there."""
+"""Inliers needed for a registration: with fewer on both sides of a split point a move cannot be tested there."""
+MOST_OUTLIERS = 0.5
+"""Largest share of outliers among the PMs that the filter starts from: more of them have no sound registration."""
 MARGIN, MOST_SPLITS = 6.0, 24
 """The full test uses split points whose log Bayes factor is this close to the best one's; largest number of them."""
 
@@ -144,12 +146,13 @@ def _camera_move(case: MoveCase, packed: Pack, settings: MoveSettings) -> Camera
     if logsumexp(screened) < GATE:
         return None
     before = np.arange(1, count)
-    testable = np.maximum(before, count - before) >= MIN_KNOWN
+    inliers = np.cumsum(case.inlier)[:-1]
+    testable = np.maximum(inliers, case.inlier.sum() - inliers) >= MIN_KNOWN
     if not testable[np.argmax(screened)]:
         return None  # evidence for that split point would be attributed to another one
     likeliest = np.argsort(-screened)[:MOST_SPLITS]
     splits = np.sort(before[likeliest[testable[likeliest] & (screened[likeliest] > screened.max() - MARGIN)]])
-    late = 2 * splits >= count
+    late = 2 * inliers[splits - 1] >= case.inlier.sum()
     forward = _full_test(case, known, parts, splits[late], packed, settings)
     backward = _full_test(case, known, parts, splits[~late], packed, settings, backward=True)
     log_bayes = np.concatenate([backward, forward])
@@ -201,7 +204,9 @@ def _full_test(
     at = count - splits[::-1] if backward else splits
     first, following = order[: at[0]], order[at[0] :]
     inlier = case.inlier[first]
-    counting = first[inlier] if inlier.sum() >= MIN_KNOWN else first
+    if inlier.sum() < MIN_KNOWN or np.mean(~inlier) > MOST_OUTLIERS:
+        return np.full(len(splits), -np.inf)  # the estimate is not theirs
+    counting = first[inlier]
     known = _without_pose(known) if backward else known
     stream = packed([case.pms[i] for i in following], shapes=True)
     before = gaussian_of(
