@@ -53,7 +53,7 @@ def solve(
     out: str | Path | None = None,
     rrd: str | Path | None = None,
     redetect: bool = False,
-    detect_moves: bool = False,
+    detect_moves: bool = True,
 ) -> SolveReport:
     """Solve a recorded session as a whole, as ``fgreg solve`` does.
 

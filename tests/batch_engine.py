@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
+from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
 from fgreg.errors import EstimationError, EventRefused
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import TrackEstimate, Verdict
@@ -12,7 +13,7 @@ from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, OnlineEvent
+from fgreg.online.events import CameraMoved, OnlineEvent
 from fgreg.registration.register import register
 from fgreg.registration.solve import Solution, solve
 

@@ -13,18 +13,20 @@ import numpy as np
 import pytest
 
 from fgreg.camera_moves.detector import CameraMove, find_camera_move
+from fgreg.camera_moves.recorded_session import find_moves, split_epochs
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import exp_so3, make_transform
-from fgreg.graph.split_points import ALARM, GATE, logsumexp, move_odds_in_epoch
+from fgreg.graph.split_points import ALARM, GATE, logsumexp, moves_in_epoch
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.recorded_moves import events_in_order, find_moves, split_epochs
+from fgreg.online.events import events_in_order
+from fgreg.registration.move_doubt import MoveDoubt, move_doubt, outliers_in_a_row
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
-from fgreg.registration.verdict import ABOUT_EVEN, CLEARLY_MOVED, FEW_PMS, possible_camera_move
+from fgreg.registration.verdict import ABOUT_EVEN, CLEARLY_MOVED, FEW_PMS, MOST_WRONG, possible_camera_move
 from tests.camera_move_cases import move_case, moved_session
 from tests.forward import Truth, make_measurements
 from tests.online_streams import unreported_move
@@ -74,7 +76,7 @@ def test_few_pairs_before_a_move_lead_no_registration_astray() -> None:
 def test_online_and_batch_find_the_same_early_move() -> None:
     model, measurements, _, engine = _ran(4)
     moves = find_moves(measurements, model, SolveConfig())
-    assert [(m.since, m.since_t, m.alarm_t) for m in moves] == [(m.since, m.since_t, m.alarm_t) for m in engine.moves]
+    assert [(m.since, m.since_t) for m in moves] == [(m.since, m.since_t) for m in engine.moves]
     split, online = split_epochs(measurements, moves), engine.measurements()
     assert [pair.epoch for pair in split.pairs] == [pair.epoch for pair in online.pairs]
 
@@ -97,9 +99,9 @@ def test_steady_sessions_raise_no_alarm_and_few_warnings() -> None:
             np.random.default_rng([seed, 40]), pairs=12, first_hit=bool(seed % 2)
         )
         found = register(measurements, model, FAST)
-        pms, log = move_odds_in_epoch(found.problem, found.optimum, found.covariance, 0)
-        assert len(log) == len(pms) - 1
-        scores.append(float(logsumexp(log)))
+        pms, moved = moves_in_epoch(found.problem, found.optimum, found.covariance, 0)
+        assert len(moved.log) == len(pms) - 1
+        scores.append(float(logsumexp(moved.log)))
     assert max(scores) < ALARM
     assert sorted(scores)[4] < GATE
 
@@ -130,6 +132,14 @@ def test_as_few_pms_on_both_sides_as_no_registration_takes_are_not_tested() -> N
     assert find_camera_move(move_case(measurements, model), model, SolveConfig()) is None
 
 
+def test_a_side_of_outliers_has_no_registration_to_test_the_other_against() -> None:
+    model, measurements, _ = moved_session(3, BUMP, 4, 12)
+    case = move_case(measurements, model)
+    assert isinstance(find_camera_move(case, model, SolveConfig()), CameraMove)
+    few = np.arange(16) >= 11
+    assert find_camera_move(replace(case, inlier=few), model, SolveConfig()) is None
+
+
 def test_without_an_estimate_there_is_nothing_to_test() -> None:
     model, measurements, _ = moved_session(3, BUMP, 4, 12)
     case = replace(move_case(measurements, model), known=None)
@@ -142,23 +152,65 @@ def test_screening_passes_over_a_steady_epoch() -> None:
 
 
 @pytest.mark.parametrize(
-    ("log_odds", "pms", "verdicts"),
+    ("log_odds", "pms", "wrong", "verdicts"),
     [
-        (math.log(7 * ABOUT_EVEN) - 0.1, 8, []),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 8, [Verdict.WARNING]),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 12, []),
-        (math.log(7 * ABOUT_EVEN) + 0.1, 5, []),
-        (math.log(7 * CLEARLY_MOVED) - 0.1, 8, [Verdict.WARNING]),
-        (math.log(7 * CLEARLY_MOVED) + 0.1, 8, [Verdict.REFUSED]),
-        (math.log(40.0), 9, [Verdict.REFUSED]),
-        (math.log(40.0), FEW_PMS + 1, []),
-        (ALARM + 0.1, 5, [Verdict.REFUSED]),
-        (ALARM + 0.1, 8, [Verdict.REFUSED]),
-        (math.log(FEW_PMS * ABOUT_EVEN) + 0.1, FEW_PMS + 1, []),
-        (ALARM + 0.1, FEW_PMS + 1, [Verdict.WARNING]),
+        (math.log(7 * ABOUT_EVEN) - 0.1, 8, 0.0, []),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 8, 0.0, [Verdict.WARNING]),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 12, 0.0, []),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 5, 0.0, []),
+        (math.log(7 * ABOUT_EVEN) - 0.1, 8, MOST_WRONG + 0.001, []),
+        (math.log(7 * ABOUT_EVEN) + 0.1, 8, MOST_WRONG + 0.001, [Verdict.REFUSED]),
+        (math.log(FEW_PMS * ABOUT_EVEN) + 0.1, FEW_PMS + 1, 0.0, []),
+        (math.log(FEW_PMS * CLEARLY_MOVED) + 0.1, FEW_PMS + 1, 0.0, [Verdict.WARNING]),
+        (ALARM + 0.1, 5, 0.0, [Verdict.WARNING]),
+        (ALARM + 0.1, FEW_PMS + 1, MOST_WRONG + 0.001, [Verdict.REFUSED]),
     ],
 )
-def test_odds_of_a_move_become_a_verdict(log_odds: float, pms: int, verdicts: list[Verdict]) -> None:
-    found = possible_camera_move(log_odds, 3, 4, pms)
+def test_odds_of_a_move_become_a_verdict(log_odds: float, pms: int, wrong: float, verdicts: list[Verdict]) -> None:
+    found = possible_camera_move(MoveDoubt(log_odds, 3, 4, pms, wrong), 3.0)
     assert [condition.verdict for condition in found] == verdicts
     assert all("up to PM 3 and those from PM 4" in condition.text for condition in found)
+
+
+@pytest.mark.parametrize(
+    ("outliers", "row"),
+    [
+        ((), None),
+        ((7,), None),
+        ((2, 7, 12), None),
+        ((8, 9), slice(8, 10)),
+        ((1, 7, 8, 9), slice(7, 10)),
+        ((5, 6, 8, 9), slice(5, 10)),
+        ((0, 3, 6, 9), None),
+    ],
+)
+def test_outliers_in_a_row_may_be_one_side_of_a_move(outliers: tuple[int, ...], row: slice | None) -> None:
+    inlier = np.ones(10, dtype=bool)
+    inlier[[i for i in outliers if i < 10]] = False
+    assert outliers_in_a_row(inlier) == row
+
+
+def test_the_probability_of_a_large_error_is_that_of_the_move() -> None:
+    model, measurements, _ = moved_session(3, BUMP, 5, 5)
+    found = register(measurements, model, FAST)
+    near, far = (move_doubt(found, 0, limit_mm) for limit_mm in (1.0, 1000.0))
+    assert near is not None
+    assert far is not None
+    assert near.wrong > 0.5
+    assert far.wrong < MOST_WRONG
+    assert near.before in (3, 4, 5)
+    steady, clean, _ = make_measurements(np.random.default_rng([1, 40]), pairs=12)
+    calm = move_doubt(register(clean, steady, FAST), 0, 3.0)
+    assert calm is not None
+    assert calm.wrong < MOST_WRONG
+
+
+def test_last_pairs_that_fit_one_other_registration_are_refused_and_scattered_outliers_are_not() -> None:
+    model, measurements, _ = moved_session(3, BUMP, 16, 3)
+    solution = solve(measurements, [], model, replace(FAST, limit_mm=1000.0))
+    assert solution.verdict is Verdict.REFUSED
+    assert any("in a row, PM 16 to 18" in reason for reason in solution.reasons)
+    order = [16, *range(4), 17, *range(4, 10), 18, *range(10, 16)]
+    mixed = tuple(replace(measurements.pairs[k], t=measurements.pairs[i].t) for i, k in enumerate(order))
+    scattered = solve(replace(measurements, pairs=mixed), [], model, replace(FAST, limit_mm=1000.0))
+    assert scattered.verdict is not Verdict.REFUSED

@@ -9,6 +9,7 @@ import pytest
 
 from fgreg.camera_moves.detector import LoopClosure
 from fgreg.camera_moves.loop_closure import back_to
+from fgreg.camera_moves.recorded_session import find_epochs, split_epochs
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, inverse, make_transform
 from fgreg.model.estimate import Verdict
@@ -16,7 +17,7 @@ from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.recorded_moves import events_in_order, find_epochs, split_epochs
+from fgreg.online.events import events_in_order
 from fgreg.registration.register import register
 from fgreg.registration.solve import distance_to_explicit
 from tests.forward import make_measurements, random_marker_T_laser, random_trus_T_camera
@@ -109,7 +110,7 @@ def test_the_engine_closes_the_loop_and_the_batch_does_too() -> None:
     assert estimate.trus_T_camera is not None
     assert tre_mm(estimate.trus_T_camera, truths[2], model.targets_mm).mean() < 2.5
     found = find_epochs(measurements, model, CONFIG)
-    assert [(b.epoch, b.to, b.t) for b in found.loop_closures] == [(back.epoch, back.to, back.t)]
+    assert [(b.epoch, b.to) for b in found.loop_closures] == [(back.epoch, back.to)]
     assert split_epochs(measurements, found.moves, found.loop_closures).epochs[2].after == 0
 
 

@@ -11,6 +11,7 @@ import pytest
 
 import fgreg.smoother.updates as updates_module
 from fgreg.camera_moves.detector import LoopClosure
+from fgreg.camera_moves.found import DetectedLoopClosure
 from fgreg.errors import EventRefused, JournalError
 from fgreg.geometry.transforms import make_transform
 from fgreg.model.events import AimEvent, CameraMovedEvent, NoteEvent, PairEvent, RefusedEvent
@@ -19,7 +20,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, DetectedLoopClosure, LoopClosed, OnlineEvent
+from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.online.live_session import LiveSession
 from fgreg.session.session_reader import check_session, read_session
 from tests.forward import make_measurements

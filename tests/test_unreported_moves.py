@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fgreg.camera_moves.found import DetectedMove
+from fgreg.camera_moves.recorded_session import find_epochs, find_moves, placed, renumbered, split_epochs
 from fgreg.cli.main import main
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, make_transform
@@ -18,13 +21,14 @@ from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.events import DetectedMove
 from fgreg.online.live_session import LiveSession
-from fgreg.online.recorded_moves import find_moves, renumbered, split_epochs
 from fgreg.pipeline.replay import ReplayRequest, replay_session
+from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.registration.move_doubt import move_doubt
 from fgreg.registration.register import register
+from fgreg.registration.verdict import MOST_WRONG
 from fgreg.session.result_file import read_result
-from fgreg.session.session_reader import read_session
+from fgreg.session.session_reader import read_ground_truth, read_session
 from fgreg.simulation.presets import PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
@@ -114,19 +118,20 @@ def _run(monkeypatch: pytest.MonkeyPatch, *words: str | Path) -> int:
     return exit_.value.code
 
 
-def test_without_the_option_nothing_is_detected(
+def test_switched_off_nothing_is_detected_and_the_session_is_refused(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _run(monkeypatch, "solve", recorded, "--json", "--out", tmp_path / "result.yaml")
+    _run(monkeypatch, "solve", recorded, "--no-detect-moves", "--json", "--out", tmp_path / "result.yaml")
     document = json.loads(capsys.readouterr().out)
     assert len(document["epochs"]) == 1
+    assert document["verdict"] == "refused"
     assert not any("the camera moved between" in reason for reason in document["reasons"])
 
 
 def test_solve_and_replay_of_the_session_find_the_same_epochs_and_name_the_move(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _run(monkeypatch, "solve", recorded, "--detect-moves", "--json", "--out", tmp_path / "solved.yaml")
+    _run(monkeypatch, "solve", recorded, "--json", "--out", tmp_path / "solved.yaml")
     document = json.loads(capsys.readouterr().out)
     assert any("the camera moved between pair 11 and 12" in reason for reason in document["reasons"])
     solved = read_result(tmp_path / "solved.yaml")
@@ -167,3 +172,44 @@ def test_a_session_recorded_while_the_engine_looks_for_moves_has_the_move_as_an_
     assert before.trus_T_camera is not None
     assert after.epoch == before.epoch == 1
     assert sigmas_between(after, before) < 0.05
+
+
+@pytest.mark.parametrize("late", [-2, 0, 2])
+def test_a_boundary_is_placed_where_the_two_registrations_have_it(late: int) -> None:
+    model, measurements, _ = unreported_move(7, _shift(10.0), after=10, before=12)
+    (move,) = find_moves(measurements, model, CONFIG)
+    assert move.since == 12
+    misplaced = replace(move, since=12 + late, since_t=measurements.pairs[12 + late].t)
+    registration = register(split_epochs(measurements, [misplaced]), model, CONFIG)
+    assert [m.since for m in placed(measurements, [misplaced], registration, CONFIG)] == [12]
+
+
+def test_the_error_against_the_truth_is_that_of_the_camera_now(recorded: Path, tmp_path: Path) -> None:
+    truth = tmp_path / "truth"
+    shutil.copytree(recorded, truth)
+    found = solve_session(SolveRequest(truth))
+    assert found.errors is not None
+    assert len(found.errors.tre_mm) == 2
+    assert found.errors.tre_mm[1] is not None
+    assert found.errors.tre_mm[1].max() < 5.0
+    whole = solve_session(SolveRequest(truth, detect_moves=False))
+    assert whole.errors is not None
+    (error,) = whole.errors.tre_mm
+    assert error is not None
+    now = read_ground_truth(truth)
+    assert now is not None
+    estimate = whole.estimate.epochs[0].trus_T_camera
+    assert estimate is not None
+    targets = whole.session.model.targets_mm
+    np.testing.assert_array_equal(error, tre_mm(estimate, now.trus_T_camera[1], targets))
+
+
+def test_steady_sessions_are_neither_split_nor_refused_for_a_move() -> None:
+    for seed in range(4):
+        model, measurements, _ = make_measurements(np.random.default_rng([seed, 9]), pairs=15)
+        found = find_epochs(measurements, model, CONFIG)
+        assert found.moves == ()
+        assert found.registration is not None
+        doubt = move_doubt(found.registration, 0, CONFIG.limit_mm)
+        assert doubt is not None
+        assert doubt.wrong < MOST_WRONG

@@ -8,7 +8,7 @@ Each room is run as by `fgreg live`, without the viewer. For every event: the es
 of replay: verdict, epoch, pairs, and the difference of the registrations in sigma of the live one, in degrees and in
 mm. By design, live runs its full solves in worker processes, whose results come some events later than in replay. So
 both are settled at the end; then epochs, verdict and rejected pairs have to be the same and the registrations within
-0.05 sigma. A solve with --detect-moves is compared as well, and for each the true error at the targets with the
+0.05 sigma. A solve is compared as well, and for each the true error at the targets with the
 predicted one. Every figure with a target is printed beside it.
 """
 
@@ -210,7 +210,7 @@ def compare(folder: Path, told: Told | None, *, every: bool) -> bool:
 
     request = ReplayRequest(folder, folder / "replay.yaml")
     replayed = replay_session(request, on_step=steps.append, make_engine=make_engine)
-    solved = solve_session(SolveRequest(folder, folder / "moves.yaml", detect_moves=True))
+    solved = solve_session(SolveRequest(folder, folder / "moves.yaml"))
     met = True
     if told is not None:
         # Moves that live detected are events of the recording, not of its input.
@@ -272,7 +272,7 @@ def report_truth(
     ends: list[tuple[str, OnlineEstimate | EpochEstimate | None]] = []
     if told is not None:
         ends += [("live, as reported last", told.estimates[-1] if told.estimates else None), ("live", told.settled)]
-    ends += [("replay", replayed), ("solve --detect-moves", epochs[-1])]
+    ends += [("replay", replayed), ("solve", epochs[-1])]
     for name, known in ends:
         claim = stood.claim(known, last)
         if known is None or not claim:

@@ -25,6 +25,7 @@ from functools import partial
 
 import numpy as np
 
+from fgreg.camera_moves.found import DetectedMove
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.reduced_blocks import initial_private
@@ -33,8 +34,7 @@ from fgreg.graph.shared_state import make_state
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.events import DetectedMove
-from fgreg.online.recorded_moves import events_in_order
+from fgreg.online.events import events_in_order
 from fgreg.registration.register import pack_session
 from move_streams import CONFIG, shift_of, two_epochs
 from pm_selection import select_pms

@@ -32,7 +32,7 @@ from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform
 from fgreg.model.measurements import EpochStart, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.online.engine import OnlineRegistration
-from fgreg.online.recorded_moves import events_in_order
+from fgreg.online.events import events_in_order
 from fgreg.registration.register import register
 from move_streams import CONFIG, ideal_covariance, ideal_tre, many_aims, shift_of, two_epochs
 from tests.forward import Truth

@@ -140,8 +140,9 @@ def solve(
     ] = False,
     estimate: EstimateOption = "",
     detect_moves: Annotated[
-        bool, typer.Option("--detect-moves", help="Find unreported camera moves, by the pairs.")
-    ] = False,
+        bool,
+        typer.Option("--detect-moves/--no-detect-moves", help="Find unreported camera moves, by the pairs."),
+    ] = True,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:

@@ -169,3 +169,9 @@ def in_columns(quadratic: Quadratic, columns: Columns, other: Columns) -> Quadra
 def gaussian_prior(state: SharedState, covariance: FloatArray) -> Quadratic:
     """The prior of a Gaussian about a state (one hypothesis) with a covariance (D, D)."""
     return Quadratic(state, 0.0, np.zeros(len(covariance)), np.asarray(np.linalg.inv(covariance)))
+
+
+def one_epoch(state: SharedState, place: int) -> SharedState:
+    """The shared variables with one of the registrations."""
+    index = [place % state.rotation.shape[1]]
+    return replace(state, rotation=state.rotation[:, index], translation_mm=state.translation_mm[:, index])

@@ -88,10 +88,10 @@ def log_move_odds(
     return logsumexp(_log_factors(scales.covariance, information, pull) + np.log(scales.share), axis=1)
 
 
-def move_odds_in_epoch(
+def moves_in_epoch(
     problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
-) -> tuple[tuple[int, ...], FloatArray]:
-    """Move odds within an epoch: its n PMs in the order of time, and their :func:`log_move_odds` (n - 1,).
+) -> tuple[tuple[int, ...], MovedRegistrations]:
+    """Possible moves within an epoch: its n PMs in the order of time, and their :func:`moved_registrations`.
 
     Args:
         problem: of the inliers. optimum: one hypothesis. covariance: (D, D) there.
@@ -100,8 +100,46 @@ def move_odds_in_epoch(
     mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
     parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
     pose = slice(6 * epoch, 6 * epoch + 6)
-    log = log_move_odds(parts.gradient[mine], parts.hessian[mine], covariance, pose)
-    return tuple(problem.pms[pm] for pm in mine), log
+    moved = moved_registrations(parts.gradient[mine], parts.hessian[mine], covariance, pose)
+    return tuple(problem.pms[pm] for pm in mine), moved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovedRegistrations:
+    """The registration after a move, for each split point and scale of the prior.
+
+    Attributes:
+        log: (n - 1, K) log Bayes factors against no move; the shares of the scales are in them.
+        mean: (n - 1, K, 6) step from the optimum of all PMs. covariance: (n - 1, K, 6, 6).
+    """
+
+    log: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+
+
+def moved_registrations(
+    gradient: FloatArray, hessian: FloatArray, covariance: FloatArray, pose: slice, scales: MoveScales | None = None
+) -> MovedRegistrations:
+    """The registration that the PMs from a split point on have, if the camera moved there.
+
+    With F and h as above, ``C`` the covariance of the shared variables and ``B`` the rows of the registration in the
+    PMs' Hessian, a move has the mean ``V h`` and the covariance ``V = (S^-1 + F)^-1``. The registration before it then
+    changes by ``-C B'`` times the move.
+
+    Args: as of :func:`log_move_odds`.
+    """
+    scales = scales or default_scales()
+    prior = scales.covariance
+    across = np.cumsum(hessian[::-1, pose], axis=0)[-2::-1]
+    pull = -np.cumsum(gradient[::-1, pose], axis=0)[-2::-1]
+    information = across[:, :, pose] - across @ covariance @ np.swapaxes(across, -1, -2)
+    log = _log_factors(prior, information, pull) + np.log(scales.share)
+    spread = np.linalg.inv(information[:, None] + np.linalg.inv(prior))
+    rest = np.eye(6) - covariance[pose] @ np.swapaxes(across, -1, -2)
+    along = rest[:, None] @ spread
+    mean = (along @ pull[:, None, :, None])[..., 0]
+    return MovedRegistrations(log, mean, covariance[pose, pose] + along @ np.swapaxes(rest, -1, -2)[:, None])
 
 
 def _log_factors(prior: FloatArray, information: FloatArray, pull: FloatArray) -> FloatArray:

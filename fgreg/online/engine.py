@@ -20,6 +20,7 @@ from types import TracebackType
 import numpy as np
 
 from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase
+from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
 from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
 from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
 from fgreg.errors import EventRefused
@@ -32,7 +33,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.event_checks import check
-from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, LoopClosed, OnlineEvent, StaticTags
+from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
 from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver

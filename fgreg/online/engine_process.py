@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Any
 
+from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
 from fgreg.errors import EventRefused, FgregError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import TrackEstimate
@@ -22,7 +23,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import DetectedLoopClosure, DetectedMove, OnlineEvent
+from fgreg.online.events import OnlineEvent
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import Layout
 from fgreg.tracking.query import track

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
+from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
 from fgreg.detection.check_points import check_measurement
 from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.errors import EventRefused, InputError, JournalError
@@ -35,7 +36,7 @@ from fgreg.online.checks import CheckPoints
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.events import CameraMoved, DetectedLoopClosure, DetectedMove, LoopClosed, OnlineEvent
+from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal

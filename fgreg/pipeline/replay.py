@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fgreg.camera_moves.recorded_session import EpochsFound
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.errors import EventRefused, InputError
 from fgreg.model.estimate import Quantiles, Timing, TrackEstimate, Verdict
@@ -24,7 +25,6 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.online.checks import CheckPoints
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import Engine, EpochFeed, MakeEngine, online_engine
-from fgreg.online.recorded_moves import EpochsFound
 from fgreg.pipeline.solve import (
     RESULT_FILE,
     Progress,

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fgreg.camera_moves.found import DetectedMove
+from fgreg.camera_moves.recorded_session import EpochsFound, find_epochs, renumbered, split_epochs
 from fgreg.detection.camera import project
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.detection.results import MarkerFit, NoSignal, PaFind
@@ -42,8 +44,6 @@ from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 
 if TYPE_CHECKING:
-    from fgreg.online.events import DetectedMove
-    from fgreg.online.recorded_moves import EpochsFound
     from fgreg.viewer.recording import Viewer
     from fgreg.viewer.scene import ShotKind
 
@@ -69,7 +69,7 @@ class SolveRequest:
     out: Path | None = None
     rrd: Path | None = None
     redetect: bool = False
-    detect_moves: bool = False
+    detect_moves: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,23 +144,21 @@ def solve_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        moves: tuple[DetectedMove, ...] = ()
-        conditions = detection_conditions(extracted)
+        found = EpochsFound()
         if request.detect_moves:
-            from fgreg.online.recorded_moves import find_epochs  # loads the online engine
-
             found = find_epochs(extracted.measurements, session.model, config)
-            extracted, moves = with_moves(extracted, found), found.moves
-            conditions = [*move_conditions(found), *conditions]
+            extracted = with_moves(extracted, found)
+        conditions = [*move_conditions(found), *detection_conditions(extracted)]
         solution = solve(
             extracted.measurements,
             extracted.tracks,
             session.model,
             config,
             conditions,
+            registration=found.registration,
         )
         estimate = session_estimate(session, extracted, solution, config)
-        errors = errors_where_known(estimate, truth, moves, session.model.targets_mm)
+        errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         show(viewer, session, extracted, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
@@ -180,8 +178,6 @@ def remove_older_result(folder: Path, result_path: Path) -> None:
 
 def with_moves(extracted: ExtractedMeasurements, found: EpochsFound) -> ExtractedMeasurements:
     """The session's measurements with detected camera moves: pairs and tracks get their new epochs."""
-    from fgreg.online.recorded_moves import renumbered, split_epochs
-
     if not found.texts:
         return extracted
     epoch_of = renumbered(extracted.epoch_of, extracted.pair_events, found.moves)
@@ -250,20 +246,25 @@ def session_estimate(
 def errors_where_known(
     estimate: SessionEstimate, truth: GroundTruth | None, moves: Sequence[DetectedMove], targets_mm: FloatArray
 ) -> TruthErrors | None:
-    """:func:`truth_errors`; None without a truth, or where detected moves give other epochs than it has."""
-    if truth is None or (moves and len(truth.trus_T_camera) != len(estimate.epochs)):
+    """:func:`truth_errors`; None without a truth, or where detected moves give more epochs than it has."""
+    if truth is None or (moves and len(truth.trus_T_camera) < len(estimate.epochs)):
         return None
     return truth_errors(estimate, truth, targets_mm)
 
 
 def truth_errors(estimate: SessionEstimate, truth: GroundTruth, targets_mm: FloatArray) -> TruthErrors:
-    """Errors of an estimate against the session's ground truth."""
+    """Errors of an estimate against the session's ground truth.
+
+    Where a move went unreported the camera now is compared: the last epoch with the last true registration.
+    """
+    same = len(estimate.epochs) >= len(truth.trus_T_camera)
     tre: list[FloatArray | None] = []
-    for epoch in estimate.epochs:
-        if epoch.trus_T_camera is None or epoch.index >= len(truth.trus_T_camera):
+    for left, epoch in zip(range(len(estimate.epochs))[::-1], estimate.epochs, strict=True):
+        known = epoch.index if same else len(truth.trus_T_camera) - 1
+        if epoch.trus_T_camera is None or known >= len(truth.trus_T_camera) or (left and not same):
             tre.append(None)
             continue
-        tre.append(tre_mm(epoch.trus_T_camera, truth.trus_T_camera[epoch.index], targets_mm))
+        tre.append(tre_mm(epoch.trus_T_camera, truth.trus_T_camera[known], targets_mm))
     angle = offset = None
     if estimate.laser is not None and truth.marker_T_laser is not None:
         angle, offset = beam_error(estimate.laser.marker_T_laser, truth.marker_T_laser)

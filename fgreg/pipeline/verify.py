@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgreg.camera_moves.recorded_session import find_epochs
 from fgreg.camera_moves.validity import Validity, Verification, verify
 from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import InputError
@@ -146,10 +147,9 @@ def _solved_again(
         session.model,
         progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
     )
-    if len(epochs) != len(extracted.measurements.epochs):
-        from fgreg.online.recorded_moves import find_epochs  # loads the online engine
-
-        extracted = with_moves(extracted, find_epochs(extracted.measurements, session.model, config))
+    found = find_epochs(extracted.measurements, session.model, config)
+    if len(epochs) == len(extracted.measurements.epochs) + len(found.moves):  # else solved without looking for moves
+        extracted = with_moves(extracted, found)
     conditions = detection_conditions(extracted)
     solution = solve(extracted.measurements, (), session.model, config, conditions)
     wanted = "that of the session as it is now: solve it again (with the same options here and there)"

@@ -117,6 +117,22 @@ class Registration:
 READINGS = 3
 """Outlier PMs are read in another way at most this many times: with each PM that fits, the next are told better."""
 
+
+def labels_and_inliers(found: Registration, measurements: Measurements) -> tuple[tuple[int, ...], tuple[bool, ...]]:
+    """Of each pair of the measurements that were registered: the number of its PM, and whether it is an inlier.
+
+    An outlier look that was split off its PM has a number of its own.
+    """
+    shots = found.shots
+    look_pm = iter(shots.problem.look_pm.tolist())
+    labels, inlier = [], []
+    for pair in measurements.pairs:
+        pm = next(look_pm) if pair.epoch in found.epochs else None
+        labels.append(pair.pm if pm is None else shots.problem.pms[pm])
+        inlier.append(pm is not None and bool(shots.pm_inlier[pm]))
+    return tuple(labels), tuple(inlier)
+
+
 Pack = Callable[[Measurements], PackedProblem]
 
 

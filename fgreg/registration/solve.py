@@ -14,7 +14,6 @@ from fgreg.graph.gtsam_graph import GraphOptions, Rig, build_graph
 from fgreg.graph.gtsam_values import PrivateValues, SharedValues, newton_step, values_at
 from fgreg.graph.reduced_blocks import moved_markers
 from fgreg.graph.shared_state import SharedState
-from fgreg.graph.split_points import logsumexp, move_odds_in_epoch
 from fgreg.model.estimate import (
     AimEstimate,
     EpochEstimate,
@@ -33,6 +32,7 @@ from fgreg.registration.camera_conditions import camera_conditions
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
 from fgreg.registration.error_budget import Budget, error_budget, largest_causes, random_errors_only
 from fgreg.registration.group_tests import group_conditions
+from fgreg.registration.move_doubt import may_share_a_registration, move_doubt, outliers_in_a_row
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.outliers import free_variables
 from fgreg.registration.posterior import Posterior
@@ -58,6 +58,7 @@ from fgreg.registration.verdict import (
     possible_camera_move,
     repeated_markers,
     sampling,
+    side_of_a_move,
     spread,
     sweeps,
     too_few_to_tell,
@@ -128,6 +129,7 @@ def solve(
     known: Mapping[int, EpochSearch] | None = None,
     finished: FinishedEpochs | None = None,
     before: Sequence[EpochReport] = (),
+    registration: Registration | None = None,
 ) -> Solution:
     """Calibrate, register, decide on the verdict, and answer the tracking queries from the whole session.
 
@@ -140,11 +142,12 @@ def solve(
         known: search results of epochs that are not searched again.
         finished: earlier epochs as a prior; only the last epoch is solved then, and only its pairs are in the solution.
         before: reports of the finished epochs.
+        registration: of these measurements, where there is one already.
     """
     if finished is not None:
         measurements = last_epoch(measurements)
     try:
-        registration = register(measurements, model, config, known, finished)
+        registration = registration or register(measurements, model, config, known, finished)
     except EstimationError as error:
         seen = camera_conditions(measurements, model, config)
         return _no_solution(measurements, tracks, [*conditions, *seen, Condition(Verdict.REFUSED, str(error))])
@@ -166,7 +169,7 @@ def solve(
         *_variable_conditions(centred, config),
         *budget.conditions,
     ]
-    steady = {k: _steadiness(registration, place) for place, k in enumerate(registration.epochs)}
+    steady = {k: _steadiness(registration, place, config.limit_mm) for place, k in enumerate(registration.epochs)}
     reports = _epoch_verdicts(measurements, centred, posterior, budget, pairs, model, config, common, steady, before)
     epochs, several = tuple(report.estimate for report in reports), len(reports) > 1
     found = [f"epoch {k}: {c.text}" if several else c.text for k, of in enumerate(reports) for c in of.conditions]
@@ -325,7 +328,7 @@ def _epoch_verdicts(
             estimate = EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None)
         else:
             place = registration.epochs.index(k)
-            found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
+            found = [*steady[k], *_epoch_conditions(measurements, registration, pairs, k, model, config)]
             tre = budget.predicted[place]
             causes = causes_of_error(registration, place, model.targets_mm)
             both = two_sided(pair for pair in measurements.pairs if pair.epoch == k)
@@ -345,6 +348,7 @@ def _epoch_verdicts(
 
 
 def _epoch_conditions(
+    measurements: Measurements,
     registration: Registration,
     pairs: Sequence[PairEstimate],
     epoch: int,
@@ -365,7 +369,7 @@ def _epoch_conditions(
         config=config,
     )
     found.extend(hypotheses(search, config))
-    found.extend(_outlier_conditions(registration, place))
+    found.extend(_outlier_conditions(registration, place, measurements, config))
     if mine:
         directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
         points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.used and e.trus_p_pm_mm is not None])
@@ -375,22 +379,16 @@ def _epoch_conditions(
     return found
 
 
-def _steadiness(registration: Registration, place: int) -> list[Condition]:
+def _steadiness(registration: Registration, place: int, limit_mm: float) -> list[Condition]:
     """Whether all PMs of an epoch have one registration: over all split points in time, and by groups."""
     groups = group_conditions(registration.problem, registration.optimum, registration.covariance, place)
-    return [*_move_odds(registration, place), *groups]
+    doubt = move_doubt(registration, place, limit_mm)
+    return [*([] if doubt is None else possible_camera_move(doubt, limit_mm)), *groups]
 
 
-def _move_odds(registration: Registration, place: int) -> list[Condition]:
-    """Camera-move condition of one epoch: whether its inliers fit one registration, over all split points."""
-    pms, log = move_odds_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
-    if not len(log):
-        return []
-    best = int(np.argmax(log))
-    return possible_camera_move(float(logsumexp(log)), pms[best], pms[best + 1], len(pms))
-
-
-def _outlier_conditions(registration: Registration, place: int) -> list[Condition]:
+def _outlier_conditions(
+    registration: Registration, place: int, measurements: Measurements, config: SolveConfig
+) -> list[Condition]:
     """Conditions on the outliers of one epoch, and on PMs that do not fit but were not left out."""
     shots = registration.shots
     mine = np.zeros(len(shots.problem.pms), dtype=bool)
@@ -398,11 +396,17 @@ def _outlier_conditions(registration: Registration, place: int) -> list[Conditio
     if not mine.any():
         return []
     kept, nis = shots.pm_inlier[mine], shots.innovations.pm[mine]
-    names = [f"PM {pm}" for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
-    return [
-        *left_out(kept, nis, "pairs", SURE_OF_PAIRS),
-        *too_few_to_tell(shots.pm_beyond_limit[mine], kept, nis, names),
-    ]
+    pms = [pm for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
+    out = left_out(kept, nis, "pairs", SURE_OF_PAIRS)
+    row = outliers_in_a_row(kept)
+    if row is not None and (out or row.stop == len(pms)):
+        looks = [pair for pair in measurements.pairs if pair.epoch in registration.epochs]
+        of_row = set(np.flatnonzero(mine)[row].tolist())
+        pairs = [pair for pair, pm in zip(looks, shots.problem.look_pm.tolist(), strict=True) if pm in of_row]
+        if may_share_a_registration(measurements, pairs, registration.model, config):
+            out = side_of_a_move(pms[row.start], pms[row.stop - 1], int(np.sum(~kept[row])))
+    names = [f"PM {pm}" for pm in pms]
+    return [*out, *too_few_to_tell(shots.pm_beyond_limit[mine], kept, nis, names)]
 
 
 def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:

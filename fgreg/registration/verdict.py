@@ -15,6 +15,7 @@ from fgreg.graph.split_points import ALARM
 from fgreg.model.estimate import PredictedTre, Verdict, worst_verdict
 from fgreg.model.measurements import Pair
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.move_doubt import MoveDoubt
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.outliers import OUTLIER_P
 from fgreg.registration.register import Registration
@@ -46,8 +47,11 @@ ABOUT_EVEN = 0.6
 warning. One in twelve sessions of 10 to 20 PMs without a move reaches it, and so does a move of 2 deg between 5 PMs and
 6."""
 CLEARLY_MOVED = 2.0
-"""The same Bayes factor from which the registration is refused. One in fifty registrations from 6 to 21 PMs without a
-move reaches it, mostly for one PM or two (first-hit pairs; none in 160 with windows only)."""
+"""The same Bayes factor from which there is a warning among any number of PMs. One in fifty registrations from 6 to 21
+PMs without a move reaches it, mostly for one PM or two (first-hit pairs; none in 160 with windows only)."""
+MOST_WRONG = 0.02
+"""Probability of an error beyond twice the limit, for a camera move, from which the registration is refused, where a
+move is about as likely as none: reached in 1 of 120 steady sessions of 15 and 25 pairs."""
 DOMINANT = 0.5
 """Share of the error's variance above which a cause is named."""
 LEAST_EFFECTIVE = 60.0
@@ -176,6 +180,15 @@ def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Con
     ]
 
 
+def side_of_a_move(first: int, last: int, out: int) -> list[Condition]:
+    """Outliers in a row, which one other registration may fit."""
+    text = (
+        f"{out} pairs nearly in a row, PM {first} to {last}, do not fit the others and are left out: they may be one "
+        "side of a camera move; if the camera was moved there, report it (camera_moved), else take them again"
+    )
+    return [Condition(Verdict.REFUSED, text)]
+
+
 def understated_noise(beyond_limit: BoolArray, nis: FloatArray) -> list[Condition]:
     """Several shots slightly beyond their limit: noise that is larger than stated, rather than outliers."""
     mild = beyond_limit & (nis < MILD_NIS)
@@ -208,27 +221,27 @@ def too_few_to_tell(beyond_limit: BoolArray, kept: BoolArray, nis: FloatArray, n
     ]
 
 
-def possible_camera_move(log_odds: float, before: int, after: int, pms: int) -> list[Condition]:
-    """A camera move among ``pms`` PMs, by its log odds (fgreg.graph.split_points), most likely between two PMs.
+def possible_camera_move(doubt: MoveDoubt, limit_mm: float) -> list[Condition]:
+    """A camera move among the inliers of an epoch: a refusal where the registration could be far off for it.
 
-    One registration cannot fit both sides of a move. It lies somewhere between them, and the predicted error does not
-    include that. Few PMs do not show a move clearly, so there is a warning where a move at any split point is about as
-    likely as none, and a refusal where it is much likelier. Among many PMs those on the wrong side become outliers, or
-    --detect-moves finds the move.
+    One registration cannot fit both sides of a move, and the predicted error does not include that. Few PMs do not show
+    a move clearly, so among them there is a warning already where a move, at any split point, is about as likely as
+    none.
     """
-    few, alarm = pms <= FEW_PMS, log_odds > ALARM
-    somewhere = math.exp(min(log_odds, 50.0)) / max(pms - 1, 1) if few and pms >= TELLING_PMS else 0.0
-    if not (alarm or somewhere > ABOUT_EVEN):
+    few, alarm = doubt.pms <= FEW_PMS, doubt.log_odds > ALARM
+    somewhere = math.exp(min(doubt.log_odds, 50.0)) / max(doubt.pms - 1, 1) if doubt.pms >= TELLING_PMS else 0.0
+    far = doubt.wrong > MOST_WRONG and (alarm or somewhere > ABOUT_EVEN)
+    if not (far or alarm or somewhere > (ABOUT_EVEN if few else CLEARLY_MOVED)):
         return []
-    clearly = alarm or somewhere > CLEARLY_MOVED
-    return [
-        Condition(
-            Verdict.REFUSED if few and clearly else Verdict.WARNING,
-            f"the pairs up to PM {before} and those from PM {after} {'do' if clearly else 'may'} not fit one "
-            f"registration (odds {math.exp(min(log_odds, 20.0)):.0f} to 1): if the camera was moved between them, "
-            "report it (camera_moved) or solve with --detect-moves; where it was not, take more pairs",
-        )
-    ]
+    text = (
+        f"the pairs up to PM {doubt.before} and those from PM {doubt.after} "
+        f"{'do' if alarm or somewhere > CLEARLY_MOVED else 'may'} not fit one registration (odds "
+        f"{math.exp(min(doubt.log_odds, 20.0)):.0f} to 1)"
+    )
+    if far:
+        text += f", which could be off by more than {2.0 * limit_mm:.1f} mm"
+    advice = "if the camera was moved between them, report it (camera_moved); where it was not, take more pairs"
+    return [Condition(Verdict.REFUSED if far else Verdict.WARNING, f"{text}: {advice}")]
 
 
 def spread(directions: FloatArray, points: FloatArray, config: SolveConfig) -> list[Condition]:

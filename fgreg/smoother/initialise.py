@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.shared_state import Quadratic, SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState, one_epoch
 from fgreg.model.measurements import Look, Measurements
-from fgreg.registration.register import Registration
+from fgreg.registration.register import Registration, labels_and_inliers
 from fgreg.smoother.innovation import sigma_distance
 from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare
-from fgreg.smoother.marginal_prior import one_epoch
 from fgreg.smoother.shared_variables import Layout
 from fgreg.smoother.state import Epoch, Setting, Shot, State, carried_prior, looks_by_pm, own_prior, total_prior
 from fgreg.smoother.updates import LEAVE, MOST, settled, with_aim, with_pair
@@ -53,20 +52,15 @@ def initial_of(found: Registration, measurements: Measurements, first: int = 0) 
     ``measurements``: what was registered. ``first``: place of their first pair.
     """
     shots = found.shots
-    look_pm = iter(shots.problem.look_pm.tolist())
-    labels, inlier = [], []
-    for pair in measurements.pairs:
-        pm = next(look_pm) if pair.epoch in found.epochs else None
-        labels.append(pair.pm if pm is None else shots.problem.pms[pm])
-        inlier.append(pm is not None and bool(shots.pm_inlier[pm]))
+    labels, inlier = labels_and_inliers(found, measurements)
     return Initial(
         found.epochs,
         found.optimum.state,
         found.covariance,
         first,
         found.looks_of(measurements),
-        tuple(labels),
-        tuple(inlier),
+        labels,
+        inlier,
         tuple(bool(kept) for kept in shots.aim_inlier),
         found.ambiguous,
         bool(shots.pm_inlier.all() and not shots.pm_beyond_limit.any()),

@@ -14,7 +14,7 @@ from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
-from fgreg.graph.shared_state import Quadratic, SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState, one_epoch
 from fgreg.model.measurements import EpochStart
 from fgreg.model.systematic import TEXTS
 from fgreg.smoother.shared_variables import small_step
@@ -127,12 +127,6 @@ def _limits(problem: PackedProblem) -> FloatArray:
         text = TEXTS[constant]
         limits[place] = FAR_PX if text.unit == "px" else FAR_MM if text.unit == "mm" else FAR_RATIO
     return limits
-
-
-def one_epoch(state: SharedState, place: int) -> SharedState:
-    """The shared variables with one of the registrations."""
-    index = [place % state.rotation.shape[1]]
-    return replace(state, rotation=state.rotation[:, index], translation_mm=state.translation_mm[:, index])
 
 
 def with_registrations(common: SharedState, each: list[SharedState]) -> SharedState:

@@ -13,14 +13,14 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import ConstantsPrior, PackedProblem, evidence
-from fgreg.graph.shared_state import Quadratic, SharedState
+from fgreg.graph.shared_state import Quadratic, SharedState, one_epoch
 from fgreg.model.measurements import Aim, EpochStart, Look, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import restrict_epochs
 from fgreg.registration.register import pack_session
 from fgreg.smoother.isam_window import ActiveWindow
-from fgreg.smoother.marginal_prior import has_moved, marginal_prior, one_epoch, with_registrations
+from fgreg.smoother.marginal_prior import has_moved, marginal_prior, with_registrations
 from fgreg.smoother.shared_variables import Layout
 
 

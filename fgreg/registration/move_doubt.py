@@ -1,0 +1,107 @@
+"""How wrong a registration could be if the camera moved unreported: among its inliers, or where outliers begin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgreg.errors import EstimationError
+from fgreg.geometry.target_error import target_jacobians
+from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.graph.split_points import MovedRegistrations, logsumexp, moves_in_epoch
+from fgreg.model.measurements import EpochStart, Measurements, Pair
+from fgreg.model.session_model import SessionModel
+from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.outliers import plausible_cost
+from fgreg.registration.register import Registration, register
+
+MOVE_PRIOR = 0.5
+"""Probability of an unreported camera move, equally likely before each PM but the first: even odds, since of steady
+sessions hardly any is refused for it."""
+NEGLIGIBLE = 1e-4
+"""Share of the hypotheses' weight that is left out."""
+MOSTLY = 0.75
+"""Share of outliers among pairs that count as outliers in a row."""
+LEAST_IN_A_ROW = 2
+TELLING = 7
+"""PMs that show whether they have one registration: one more than determine it."""
+
+_NORMAL = np.random.default_rng(0).standard_normal((256, 6))
+
+
+@dataclass(frozen=True, slots=True)
+class MoveDoubt:
+    """Possible unreported camera moves of an epoch.
+
+    Attributes:
+        log_odds: log of the sum of the Bayes factors of a move before each of ``pms`` PMs but the first.
+        before, after: PMs between which it is likeliest.
+        wrong: probability that the registration's error at some target is beyond twice the limit, since it moved.
+    """
+
+    log_odds: float
+    before: int
+    after: int
+    pms: int
+    wrong: float
+
+
+def move_doubt(registration: Registration, place: int, limit_mm: float) -> MoveDoubt | None:
+    """Doubt of one of the registration's epochs; None where it has one PM."""
+    pms, moved = moves_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
+    if len(pms) < 2:
+        return None
+    by_split = logsumexp(moved.log, axis=1)
+    best = int(np.argmax(by_split))
+    trus_T_camera = registration.optimum.state.trus_T_camera(place)[0]
+    jacobian = target_jacobians(trus_T_camera, registration.model.targets_mm)
+    wrong = _probability_beyond(moved, jacobian, 2.0 * limit_mm)
+    return MoveDoubt(float(logsumexp(by_split)), pms[best], pms[best + 1], len(pms), wrong)
+
+
+def _probability_beyond(moved: MovedRegistrations, jacobian: FloatArray, limit_mm: float) -> float:
+    """Probability of a move after which some target, of Jacobian (n, 3, 6), is off by more than a limit."""
+    odds = MOVE_PRIOR / (1.0 - MOVE_PRIOR) / len(moved.log) * np.exp(np.minimum(moved.log, 100.0))
+    weight = (odds / (1.0 + odds.sum())).reshape(-1)
+    mean, covariance = moved.mean.reshape(-1, 6), moved.covariance.reshape(-1, 6, 6)
+    heavy = weight > NEGLIGIBLE
+    beyond = np.zeros(len(weight))
+    value, vector = np.linalg.eigh(covariance[heavy])
+    root = vector * np.sqrt(np.maximum(value, 0.0))[:, None]
+    step = mean[heavy][:, None] + _NORMAL @ np.swapaxes(root, 1, 2)
+    error = np.linalg.norm(np.einsum("nij,hsj->hsni", jacobian, step), axis=-1)
+    beyond[heavy] = np.mean(error.max(axis=-1) > limit_mm, axis=-1)
+    return float(weight @ beyond)
+
+
+def outliers_in_a_row(inlier: BoolArray) -> slice | None:
+    """The PMs, among those of an epoch in the order of time, that are nearly all outliers, and most of the outliers.
+
+    They may be one side of a camera move. None where the outliers are scattered, or a single one.
+    """
+    where = np.flatnonzero(~inlier)
+    best: slice | None = None
+    for i, first in enumerate(where):
+        for count, last in enumerate(where[i:], 1):
+            size = last + 1 - first
+            most = 2 * count > len(where) and count >= LEAST_IN_A_ROW and count >= MOSTLY * size
+            if most and (best is None or size > best.stop - best.start):
+                best = slice(int(first), int(last) + 1)
+    return best
+
+
+def may_share_a_registration(
+    measurements: Measurements, pairs: Sequence[Pair], model: SessionModel, config: SolveConfig
+) -> bool:
+    """Whether some pairs may have a registration of their own: too few to tell, or one that fits nearly all of them."""
+    if len({pair.pm for pair in pairs}) < TELLING:
+        return True
+    alone = tuple(replace(pair, epoch=0) for pair in pairs)
+    try:
+        found = register(Measurements(measurements.aims, alone, (EpochStart(0.0),)), model, config)
+    except EstimationError:
+        return False
+    shots, cost = found.shots, float(found.optimum.evaluation.cost[0])
+    return bool(np.mean(shots.pm_inlier) >= MOSTLY and cost <= plausible_cost(found.problem))
