@@ -88,14 +88,19 @@ def mother() -> None:
     template(source)
     for line in sys.stdin:
         kind, folder = line.rstrip("\n").split(" ", 1)
+        told, tell = os.pipe()
         child = os.fork()
         if child == 0:
+            os.close(tell)
+            os.read(told, 1)  # its first event comes after its process id
             try:
                 record(Path(folder), source, estimate=kind == "estimate")
             except BaseException as error:  # printed, not raised: the forked copy must not continue
                 os.write(1, f"failed {error!r}\n".encode())
             os._exit(1)
         os.write(1, f"born {child}\n".encode())
+        os.close(told)
+        os.close(tell)
         os.waitpid(child, 0)
         os.write(1, f"dead {child}\n".encode())
 

@@ -55,7 +55,7 @@ def test_sessions_become_a_rig_that_a_session_takes_up(root: Path) -> None:
     assert "radius_mm" in held.split("Each session")[0]
     assert done.stdout.count("pass") == 2
     rig = read_rig(root / "rig.yaml")
-    assert len(rig.names) == len(rig.stored_covariance) == 27
+    assert len(rig.names) == len(rig.stored_covariance) == 26
     assert [set(hashes) >= {"session.yaml", "events.jsonl", "probe"} for hashes in rig.sessions] == [True, True]
     (root / "2" / "rig.yaml").write_bytes((root / "rig.yaml").read_bytes())
     bounds = []
@@ -67,7 +67,7 @@ def test_sessions_become_a_rig_that_a_session_takes_up(root: Path) -> None:
     assert bounds[1] < bounds[0]
     # A rig that is taken up already is not counted again.
     again = commission(root / "2", "--out", root / "again.yaml", "--json")
-    assert json.loads(again.stdout)["constants"][0]["prior_sigma"] == pytest.approx(0.3)
+    assert json.loads(again.stdout)["constants"][0]["prior_sigma"] == pytest.approx(0.2)
 
 
 def test_the_json_report_says_which_constants_the_prior_holds(root: Path) -> None:

@@ -43,7 +43,7 @@ def test_one_session_alone_is_its_registration(root: Path) -> None:
     sigma = np.sqrt(np.diag(registration.covariance))[columns]
     value = registration.optimum.state.constants[0, list(found.constants)]
     # ... but for how noise scales with the constants.
-    value = value + registration.covariance[np.ix_(columns, columns)] @ noise_slope(registration)
+    value = value + registration.covariance[columns, registration.problem.columns.rig] @ noise_slope(registration)
     assert found.value == pytest.approx(value, abs=1e-3 * float(sigma.min()))
     assert found.sigma == pytest.approx(sigma, rel=1e-4)
 

@@ -60,6 +60,8 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
                 typer.echo(json.dumps(report_dict(report), indent=2))
             elif not quiet:
                 print_report(report)
+            if any(one.chart is not None and one.chart.verdict is ChartVerdict.ALARM for one in report.sessions):
+                raise typer.Exit(EXIT_ALARM)
             return
         assert check is not None
         rig = read_rig(check)

@@ -18,8 +18,7 @@ import numpy.typing as npt
 from scipy import ndimage, optimize
 
 from fgreg.detection.channels import check_frame
-from fgreg.detection.photoacoustic import LEAST_RANGE_MM
-from fgreg.detection.results import NoSignal, OtherWave, PaFind
+from fgreg.detection.results import LEAST_RANGE_MM, NoSignal, OtherWave, PaFind
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import ImageModel, ProbeModel
 

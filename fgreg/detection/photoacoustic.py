@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.channels import Channels, check_frame, muted, prepare_channels, without_flat_wave
-from fgreg.detection.results import NoSignal, OtherWave, PaFind
+from fgreg.detection.results import LEAST_RANGE_MM, NoSignal, OtherWave, PaFind
 from fgreg.detection.wavefront_fit import WavefrontFit, fit_wavefront, path_mm
 from fgreg.detection.wavefront_search import (
     COARSE_RANGE_MM,
@@ -50,8 +50,6 @@ OTHER_SIGMA_MM = (0.05, 0.08)
 """Standard deviations (x, range) of a wave that is searched, not fitted."""
 INDEPENDENT = 15.0
 """Independent points per grid point near the threshold, measured on frames of noise (tools/study_photoacoustic.py)."""
-LEAST_RANGE_MM = 3.0
-"""Sound from nearer than this is made at the probe's face, by light that falls on it."""
 FLAT_PERIODS = 0.9
 FLAT_SHARE = 0.4
 """A flat wave (light, interference) fits a spherical one only where the latter is flat to half a period. A source is

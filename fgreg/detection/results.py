@@ -15,6 +15,9 @@ from fgreg.model.camera_dependence import corner_dependence
 from fgreg.model.measurements import CameraDependence, Wavefront
 from fgreg.model.session_model import BoardModel
 
+LEAST_RANGE_MM = 3.0
+"""Sound from nearer than this is made at the probe's face, by light that falls on it."""
+
 
 @dataclass(frozen=True, slots=True)
 class NotFound:

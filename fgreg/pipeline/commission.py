@@ -22,6 +22,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import TEXTS
 from fgreg.pipeline.solve import detection_conditions
+from fgreg.registration.checks import with_checks
 from fgreg.registration.commissioning import (
     OBSERVED,
     Chart,
@@ -35,7 +36,7 @@ from fgreg.registration.error_budget import conflicts
 from fgreg.registration.register import Registration
 from fgreg.registration.solve import solve
 from fgreg.session.input_hashes import input_hashes
-from fgreg.session.rig_file import same_rig, section_hashes, write_rig
+from fgreg.session.rig_file import read_rig, same_rig, section_hashes, write_rig
 from fgreg.session.session_reader import SETUP_FILE, Session, read_session
 
 TOGETHER = 0.5
@@ -124,6 +125,11 @@ def commission_sessions(
     """
     if not out.parent.is_dir():
         raise InputError(str(out.parent), "no such folder", f"a folder to write {out.name} to")
+    if out.exists():
+        try:
+            read_rig(out)
+        except InputError:
+            raise InputError(str(out), "a file that is no commissioned rig", "a new file, or a rig.yaml") from None
     sessions = [read_session(folder) for folder in folders]
     hashes = [input_hashes(session) for session in sessions]
     _check_alike(sessions, hashes)
@@ -215,8 +221,9 @@ def _solved(session: Session, model: SessionModel, use_checks: bool, done: Calla
     solution = solve(extracted.measurements, (), model, config, detection_conditions(extracted))
     done()
     checks = tuple(extracted.checks.values()) if use_checks else ()
-    if solution.verdict is Verdict.REFUSED or solution.registration is None:
-        return _Solved(session, None, "; ".join(solution.reasons), checks)
+    estimate = with_checks(solution.as_session(session.model.name), [*extracted.checks.values()], config.limit_mm)
+    if estimate.verdict is Verdict.REFUSED or solution.registration is None:
+        return _Solved(session, None, "; ".join(estimate.reasons), checks)
     registration = solution.registration
     return _Solved(session, registration, "", checks)
 

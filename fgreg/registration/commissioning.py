@@ -42,8 +42,9 @@ from fgreg.model.session_model import SessionModel
 from fgreg.registration.error_budget import scanner_displacement
 from fgreg.registration.register import Registration
 
-OWN = (Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
-"""Constants that each session has for itself."""
+OWN = (Constant.WINDOW_EDGE, Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
+"""Constants that each session has for itself: the window's width changes with tissue and gain, the marker's bias with
+the light of the day."""
 SETTLED = 1e-6
 """Newton decrement (chi square) of the whole graph below which it is at its optimum."""
 ROUNDS, HALVINGS = 50, 12

@@ -157,12 +157,12 @@ def solve(
     readout = read_laser(centred, model)
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
     aims = read_aims(measurements, centred, readout.origin_shift_mm)
-    budget = error_budget(registration, posterior, config)
+    registrations = [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
+    pictures = camera_conditions(measurements, model, config, registrations)
+    budget = error_budget(registration, posterior, config, cameras_named=bool(pictures))
     common = [
         *conditions,
-        *camera_conditions(
-            measurements, model, config, [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
-        ),
+        *pictures,
         *random_errors_only(model),
         *_common_conditions(registration, pairs, aims),
         *sampling(posterior.effective),

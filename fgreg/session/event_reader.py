@@ -158,7 +158,7 @@ def _misfits(event: Event, setup: Setup | None) -> Iterator[Problem]:
             yield Problem(("event",), f"line {line}", "an earlier line of this file")
     if setup is None:
         return
-    if isinstance(event, CheckEvent) and event.left is not None and "camera.right" not in setup.present:
+    if isinstance(event, CheckEvent) and event.left is not None and not {"camera", "camera.right"} <= setup.present:
         yield Problem(
             ("left",), "pixels, but no camera with camera.right in session.yaml", "them there, or camera_p_mm"
         )
