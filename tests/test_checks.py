@@ -127,8 +127,17 @@ def test_the_mean_error_with_its_own_95_percent_has_to_stay_below_the_limit() ->
     assert "locate the checks more accurately" in rough
     (near,) = texts(checks_at(np.array([0.9, 0.0, 0.0])), limit_mm=1.0)
     assert "at most 1.4 mm" in near
-    many = checks_at(np.array([0.9, 0.0, 0.0]), points=np.repeat(POINTS, 10, axis=0))
+    places = np.repeat(POINTS, 10, axis=0)
+    many = checks_at(np.array([0.9, 0.0, 0.0]), points=places + 1e-6 * np.arange(len(places))[:, None])
     assert texts(many, limit_mm=1.2) == []
+
+
+def test_a_check_written_down_many_times_counts_once() -> None:
+    (check,) = checks_at(np.zeros((1, 3)), sigma_mm=2.0, points=POINTS[:1])
+    (once,) = texts([check])
+    assert "the mean error at the check is 0.0 mm, at most" in once
+    (often,) = texts([check] * 40)
+    assert once.split("at most")[1] == often.split("at most")[1]
 
 
 def test_far_beyond_the_limit_the_checks_refuse() -> None:

@@ -41,6 +41,8 @@ from fgreg.tracking.snapshot import EpochSnapshot, Snapshot
 FALSE_ALARMS = 0.01
 POWER = 0.9
 """Probability with which a change is shown that is said to be."""
+MOVED_LOG_ODDS = math.log(3.0)
+"""Odds of a move, against wrong detections, above which the camera counts as moved."""
 VALID_LOG_ODDS = math.log(20.0)
 """Log odds against a camera that is elsewhere from which the registration is valid."""
 SPARE = 3
@@ -228,9 +230,11 @@ def _verdict(fit: _Fit, log_odds: float, shown: str, shots: Sequence[NewShot]) -
         look = "look at what was detected, check fibre, marker and probe"
         if fit.rest_p < fit.level:
             return Validity.DEGRADED, f"{wrong}, and no other registration explains that: {look}, and register again"
-        if log_odds > 0.0:
+        if log_odds > MOVED_LOG_ODDS:
             return Validity.MOVED, f"{wrong}; odds {odds_text(log_odds)} that the camera has moved: register again"
         text = f"odds {odds_text(-log_odds)} for a wrong detection against a camera move: {look}, take another shot"
+        if log_odds > 0.0:
+            text = f"wrong detections explain that about as well as a camera move: {look}, take another shot"
         return Validity.DEGRADED, f"{wrong}; {text}"
     agree = f"the {f'{count} shots agree' if many else 'shot agrees'} with the registration ({figures}); odds"
     agree += f" {odds_text(-log_odds)} that the camera has not moved"

@@ -195,9 +195,9 @@ def _check_alike(sessions: Sequence[Session], hashes: Sequence[Mapping[str, str]
     own, sigmas = section_hashes(first.model), _prior_sigmas(first.model)
     for i, session in enumerate(sessions):
         label = str(session.folder / SETUP_FILE)
-        if hashes[i] in hashes[:i]:
-            earlier = sessions[hashes.index(hashes[i])].folder
-            raise InputError(str(session.folder), f"the same files as in {earlier}", "each session once")
+        for earlier, other in zip(sessions[:i], hashes[:i], strict=True):
+            if other["events.jsonl"] == hashes[i]["events.jsonl"]:
+                raise InputError(str(session.folder), f"the same events as in {earlier.folder}", "each session once")
         if not session.model.systematic.declared:
             raise InputError(f"{label}: systematic", "none", "how well the rig is known: its priors")
         same_rig(session.model, [own], label)

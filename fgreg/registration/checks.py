@@ -72,8 +72,10 @@ def check_registration(
     predicted = own + gain @ covariance @ gain.swapaxes(1, 2)
     nis = np.einsum("ni,ni->n", error, np.linalg.solve(predicted, error[..., None])[..., 0])
     alone = chdtrc(3, nis) < ALONE_P / n
-    # The mean, each check weighted by its own precision.
-    weight = np.linalg.inv(own)
+    # The mean, each check weighted by its own precision; one that was written down several times counts once.
+    points = np.concatenate([camera_p, trus_p], axis=1)
+    times = (points[:, None] == points).all(axis=-1).sum(axis=1)
+    weight = np.linalg.inv(own) / times[:, None, None]
     own_mean = np.linalg.inv(weight.sum(axis=0))
     share = own_mean @ weight
     mean = np.einsum("nij,nj->i", share, error)
@@ -178,7 +180,7 @@ def with_checks(estimate: SessionEstimate, checks: Sequence[Check | CheckEstimat
         found = check_registration([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm)
         results.update(zip(mine, found.checks, strict=True))
         conditions[epoch.index] = found.conditions
-        if epoch.index == current and found.covers:
+        if epoch.index == current and found.covers and epoch.verdict is not Verdict.REFUSED:
             covered += mine
     for i, at in enumerate(checks):
         if i not in results:
