@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fgreg.errors import InputError
-from fgreg.model.plausible import RADIUS, WINDOW, implausible_setup
+from fgreg.model.plausible import RADIUS, WINDOW, implausible_distances, implausible_setup
 from fgreg.model.session_model import SESSION
 from fgreg.session.session_reader import check_session, read_session
 from tests import session_files
@@ -101,3 +102,11 @@ def test_poses_and_ranges_in_metres(tmp_path: Path) -> None:
     assert "median of camera_T_marker" in warnings[0]
     assert "in metres it would be" in warnings[0]
     assert "median of range_mm: 0.0314 mm is hardly the range of a PM" in warnings[1]
+
+
+def test_poses_behind_the_camera_are_doubted() -> None:
+    ahead, behind = np.eye(4), np.eye(4)
+    ahead[2, 3], behind[2, 3] = 120.0, -120.0
+    assert implausible_distances([ahead] * 3, [], []) == ()
+    (found,) = implausible_distances([ahead, behind], [], [])
+    assert "1 of 2 marker poses lie behind the camera" in found

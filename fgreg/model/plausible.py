@@ -215,12 +215,22 @@ def implausible_measurements(measurements: Measurements) -> tuple[str, ...]:
 def implausible_distances(
     camera_T_marker: Sequence[FloatArray], camera_p_spot_mm: Sequence[FloatArray], range_mm: Sequence[float]
 ) -> tuple[str, ...]:
-    """Doubts about the unit of marker poses (4, 4), spots (3,) and ranges, by their medians."""
+    """Doubts about the unit of marker poses (4, 4), spots (3,) and ranges, by their medians, and about their side."""
     return (
+        *_behind("marker poses", [float(pose[2, 3]) for pose in camera_T_marker]),
+        *_behind("spots", [float(spot[2]) for spot in camera_p_spot_mm]),
         *_median(DISTANCE, "camera_T_marker", (_length(pose) for pose in camera_T_marker)),
         *_median(DISTANCE, "camera_p_spot_mm", (float(np.linalg.norm(spot)) for spot in camera_p_spot_mm)),
         *_median(RANGE, "range_mm", range_mm),
     )
+
+
+def _behind(what: str, depth_mm: Sequence[float]) -> list[str]:
+    """Points behind the camera, which it cannot have seen."""
+    count = sum(depth < 0.0 for depth in depth_mm)
+    if not count:
+        return []
+    return [f"{count} of {len(depth_mm)} {what} lie behind the camera: check the direction of the transforms, and z"]
 
 
 def _length(a_T_b: FloatArray) -> float:
