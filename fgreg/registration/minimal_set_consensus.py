@@ -13,7 +13,7 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray, inverse, make_transform, transform_points
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import arc_points, perpendicular_basis
-from fgreg.model.measurements import Aim
+from fgreg.model.measurements import FLOOR_MM, Aim
 from fgreg.registration.initialization import distinct_rotations
 from fgreg.registration.minimal_solver import poses_of_three
 
@@ -106,7 +106,8 @@ def consensus_beams(aims: tuple[Aim, ...], keep: int = 4) -> list[tuple[FloatArr
     start, along = marker_p[first[long]], apart[long] / length[long, None]
     variance = np.array(
         [
-            (np.trace(a.covariance) + np.trace(a.marker.covariance[3:, 3:])) / 3
+            FLOOR_MM**2  # noise of zero is no weight
+            + (np.trace(a.covariance) + np.trace(a.marker.covariance[3:, 3:])) / 3
             + p @ p * np.trace(a.marker.covariance[:3, :3]) / 3
             for a, p in zip(aims, marker_p, strict=True)
         ]
@@ -118,7 +119,7 @@ def consensus_beams(aims: tuple[Aim, ...], keep: int = 4) -> list[tuple[FloatArr
     for index in np.argsort(score):
         towards = along[index] if along[index] @ marker_p.mean(axis=0) >= 0 else -along[index]
         if all(towards @ other < np.cos(0.05) for _, other in out):
-            inside = offset[index][square[index] < SCORE_LIMIT * variance]
+            inside = offset[index][square[index] < SCORE_LIMIT * variance]  # the two spots that define it, at least
             centre = start[index] + inside.mean(axis=0)
             out.append((centre - (centre @ towards) * towards, towards))
         if len(out) == keep:
