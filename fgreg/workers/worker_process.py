@@ -11,14 +11,15 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
+    from types import FrameType
 
 NICENESS = 5
 """Added to the owner's niceness, so that a worker gives way to its owner, and its own workers to it."""
@@ -220,6 +221,26 @@ class WorkerProcess(Generic[Request, Answer]):
         self._child = self._awaited = None
 
 
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C takes effect when the block ends: a process that is half started would end with a traceback.
+
+    The mask of one thread is not enough: the signal may reach another thread, and is then handled in the main one.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    held: list[FrameType | None] = []
+    signal.signal(signal.SIGINT, lambda _number, frame: held.append(frame))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        before(signal.SIGINT, held[0])
+
+
 class _Child:
     """A process, its connection, and a thread that writes to it, so that a process that does not read blocks nothing.
 
@@ -238,7 +259,7 @@ class _Child:
         resource_tracker.ensure_running()
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with theirs:
+            with theirs, _interrupts_held():
                 self.process.start()
         except OSError:
             self.connection.close()
