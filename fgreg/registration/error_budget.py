@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.geometry.rig import CAMERA, Constant
+from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
@@ -51,7 +51,6 @@ CERTAIN_SIGMAS = 4.0
 """A constant that the shots measure is noted where it is off by this many of its prior's sigmas, and of its own."""
 FAR_SIGMAS = 30.0
 """Prior standard deviations beyond which no figure is given."""
-_OF_CAMERA = frozenset(text.name for text in TEXTS[CAMERA])
 CAUSES = 3
 """Number of causes that are named."""
 
@@ -71,9 +70,7 @@ class Budget:
     conditions: tuple[Condition, ...]
 
 
-def error_budget(
-    registration: Registration, posterior: Posterior, config: SolveConfig, *, cameras_named: bool = False
-) -> Budget:
+def error_budget(registration: Registration, posterior: Posterior, config: SolveConfig) -> Budget:
     """The budget of a registration at the optimum of the graph (before it is centred on the posterior's mean)."""
     model, columns = registration.model, registration.problem.columns
     sigmas, mean = constants_of(model, config)
@@ -103,9 +100,7 @@ def error_budget(
                 worst_target_mm=float(causes[place]),
             )
         )
-    return Budget(
-        tuple(constants), predicted, tuple(conflicts(constants, cameras_named=cameras_named) or measured(constants))
-    )
+    return Budget(tuple(constants), predicted, tuple(conflicts(constants) or measured(constants)))
 
 
 def random_errors_only(model: SessionModel) -> list[Condition]:
@@ -127,14 +122,8 @@ def largest_causes(constants: Sequence[SystematicEstimate], count: int = CAUSES)
     return ", ".join(parts)
 
 
-def conflicts(constants: Sequence[SystematicEstimate], *, cameras_named: bool = False) -> list[Condition]:
-    """Constants that the data contradict: the one with the largest score, and those that cannot be told apart.
-
-    ``cameras_named``: whether the pictures' own tests have named what is wrong with cameras or prints. They tell these
-    apart, which the shots do not.
-    """
-    if cameras_named:
-        constants = [c for c in constants if c.name not in _OF_CAMERA]
+def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
+    """Constants that the data contradict: the one with the largest score, and those that cannot be told apart."""
     beyond = sorted((c for c in constants if abs(c.score) >= CONFLICT_Z), key=lambda c: -abs(c.score))
     if not beyond:
         return []

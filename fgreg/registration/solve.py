@@ -159,7 +159,7 @@ def solve(
     aims = read_aims(measurements, centred, readout.origin_shift_mm)
     registrations = [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
     pictures = camera_conditions(measurements, model, config, registrations)
-    budget = error_budget(registration, posterior, config, cameras_named=bool(pictures))
+    budget = error_budget(registration, posterior, config)
     common = [
         *conditions,
         *pictures,
@@ -167,7 +167,8 @@ def solve(
         *_common_conditions(registration, pairs, aims),
         *sampling(posterior.effective),
         *_variable_conditions(centred, config),
-        *budget.conditions,
+        # A camera that is not as declared makes the shots contradict any other constant, too: it is to be mended first.
+        *(() if pictures else budget.conditions),
     ]
     steady = {k: _steadiness(registration, place, config.limit_mm) for place, k in enumerate(registration.epochs)}
     reports = _epoch_verdicts(measurements, centred, posterior, budget, pairs, model, config, common, steady, before)
