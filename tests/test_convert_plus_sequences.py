@@ -209,6 +209,7 @@ def test_a_header_with_its_pixels_in_a_file_beside_it(tmp_path: Path) -> None:
         (b"DimSize = 4 5 3", b"DimSize = 4 x 3", "DimSize: found '4 x 3'"),
         (b"DimSize = 4 5 3", b"DimSize = 4 50 3", "found 60 bytes of pixels, expected 600"),
         (b"DimSize = 4 5 3", b"DimSize = 99999999 99999999 3", "DimSize: found"),
+        (b"DimSize = 4 5 3", b"DimSize = 2097152 4194304 2097152", "DimSize: found 18446744073709551616 bytes"),
         (b"MET_UCHAR", b"MET_STRING", "ElementType: found 'MET_STRING'"),
         (b"CompressedData = False", b"CompressedData = True", "compressed data that are damaged"),
         (b"Frame0001_Timestamp = 8151.75", b"Frame0001_Timestamp = soon", "Seq_Frame0001_Timestamp: found 'soon'"),

@@ -175,6 +175,13 @@ def test_a_bad_table_is_one_line_that_names_its_own_and_leaves_nothing(tmp_path:
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["setup.yaml", "shots.csv"]
 
 
+def test_a_number_that_its_scale_makes_infinite_is_one_line(tmp_path: Path) -> None:
+    path, mapping = table(tmp_path, ROW + f"1,{POSE},2,3,30,1e308\n"), tmp_path / "map.yaml"
+    mapping.write_text("format: fgreg-mapping/1\ncolumns: {pm: {column: pm, scale: 100}}\n")
+    said = refused(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", str(mapping))
+    assert "line 2: pm: found '1e308' times 100 plus 0, expected a finite number" in said
+
+
 def test_a_bad_setup_or_mapping_is_reported_by_its_own_name(tmp_path: Path) -> None:
     path = table(tmp_path, ROW + f"1,{POSE},2,3,30,0\n")
     assert "--setup: found nothing" in refused(path, tmp_path / "s")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import secrets
 import shutil
@@ -11,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fgreg.errors import InputError
+from fgreg.session.atomic_file import write_atomically
 from fgreg.session.session_reader import SETUP_FILE
 
 _SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml", "result.yaml"})
@@ -28,20 +28,7 @@ def write_whole(path: Path, text: str, *, overwrite: bool = False) -> None:
         raise InputError(str(path), "a folder", "the name of a file")
     if os.path.lexists(path) and not overwrite:
         raise InputError(str(path), "a file of this name", "a new name, or --overwrite")
-    part = path.with_name(f".{path.name[:100]}.{secrets.token_hex(8)}.tmp")
-    try:
-        try:
-            with part.open("x", encoding="utf-8", newline="\n") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            part.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise InputError(str(path), f"a place that refuses files ({error.strerror})", "a writable one") from None
+    write_atomically(path, text)
 
 
 @contextmanager

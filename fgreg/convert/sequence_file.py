@@ -6,6 +6,7 @@ frame 12 are called ``Seq_Frame0012_...``.
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from collections.abc import Mapping
@@ -119,7 +120,7 @@ def _images(fields: Mapping[str, str], data: bytes, path: Path, shape: tuple[int
             raise InputError(f"{name}: ElementDataFile", shown(stored), "LOCAL, or a file beside it")
         data = read_bounded(path.with_name(stored), stored, _MAX_BYTES)
     item = np.dtype(kind).newbyteorder(">" if _big(fields) else "<")
-    needed = item.itemsize * int(np.prod(shape, dtype=np.int64))
+    needed = item.itemsize * math.prod(shape)
     if needed > _MAX_BYTES:
         raise InputError(f"{name}: DimSize", f"{needed} bytes", f"at most {_MAX_BYTES}")
     if fields.get("CompressedData", "False").lower() == "true":

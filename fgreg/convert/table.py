@@ -156,7 +156,11 @@ class _Row:
         if not math.isfinite(value):
             raise InputError(f"{self.where}: {role}", shown(text), "a finite number, with a decimal point")
         column = self._table.columns[role]
-        return value * column.scale + column.offset
+        converted = value * column.scale + column.offset
+        if not math.isfinite(converted):
+            found = f"{shown(text)} times {column.scale:g} plus {column.offset:g}"
+            raise InputError(f"{self.where}: {role}", found, "a finite number")
+        return converted
 
     def need(self, role: str) -> float:
         """A required number."""
