@@ -6,6 +6,7 @@ Files hold degrees where a name ends with ``_deg``; in memory they are radians.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -28,7 +29,7 @@ _OTHER_UNITS = {"mm": ("metres", 1000.0), "MHz": ("Hz", 1e-6)}
 JsonSchema = dict[str, Any]
 
 
-class Kind:
+class Kind(ABC):
     """A kind of value: how it is read, written and described."""
 
     __slots__ = ()
@@ -36,6 +37,7 @@ class Kind:
     takes_text = False
     """Whether a number that other YAML readers treat as text (``1e5``) is read as text."""
 
+    @abstractmethod
     def read(self, value: object, folder: Path | None = None, /) -> Any:
         """Convert a value of a document to its form in memory.
 
@@ -46,7 +48,6 @@ class Kind:
         Raises:
             FieldError: the value is invalid.
         """
-        raise NotImplementedError
 
     def write(self, value: Any, folder: Path | None = None, /) -> Any:
         """Convert a value in memory to plain data for a document, the inverse of :meth:`read`."""
@@ -54,13 +55,13 @@ class Kind:
         return value
 
     @property
+    @abstractmethod
     def expected(self) -> str:
         """Description of valid values for messages and tables."""
-        raise NotImplementedError
 
+    @abstractmethod
     def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
         """The JSON Schema of a value; schemas of mappings go to ``definitions`` by name."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True)
