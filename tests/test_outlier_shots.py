@@ -26,7 +26,7 @@ from fgreg.registration.register import Registration, register
 from fgreg.registration.solve import distance_to_explicit, solve
 from tests.forward import Truth, make_measurements
 
-STUDY = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "study_junk.py"))
+STUDY = runpy.run_path(str(Path(__file__).parents[1] / "tools" / "study_outliers.py"))
 
 
 def _flipped(marker: MarkerObservation) -> MarkerObservation:
@@ -47,14 +47,14 @@ def _elsewhere(pair: Pair, rng: np.random.Generator) -> Pair:
 
 
 def _spoiled(
-    seed: int, junk: tuple[int, ...], flips: tuple[int, ...] = (), **scene: object
+    seed: int, false_pms: tuple[int, ...], flips: tuple[int, ...] = (), **scene: object
 ) -> tuple[SessionModel, Measurements, Measurements, Truth]:
-    """A session with false PMs at ``junk`` and flipped markers at ``flips``, and the same without either."""
+    """A session with false PMs at ``false_pms`` and flipped markers at ``flips``, and the same without either."""
     model, clean, truth = make_measurements(np.random.default_rng(seed), **scene)  # type: ignore[arg-type]
     rng = np.random.default_rng([seed, 1])
-    pairs = [_elsewhere(p, rng) if i in junk else p for i, p in enumerate(clean.pairs)]
+    pairs = [_elsewhere(p, rng) if i in false_pms else p for i, p in enumerate(clean.pairs)]
     pairs = [replace(p, marker=_flipped(p.marker)) if i in flips else p for i, p in enumerate(pairs)]
-    rest = tuple(p for i, p in enumerate(clean.pairs) if i not in (*junk, *flips))
+    rest = tuple(p for i, p in enumerate(clean.pairs) if i not in (*false_pms, *flips))
     return model, replace(clean, pairs=tuple(pairs)), replace(clean, pairs=rest), truth
 
 
@@ -65,7 +65,7 @@ def _moved(first: Registration, second: Registration, model: SessionModel) -> fl
 
 @pytest.mark.parametrize("seed", range(3))
 def test_outliers_are_named_and_the_result_is_that_without_them(seed: int) -> None:
-    model, spoiled, rest, _ = _spoiled(seed, junk=(2, 9, 16), flips=(5, 20), pairs=25)
+    model, spoiled, rest, _ = _spoiled(seed, false_pms=(2, 9, 16), flips=(5, 20), pairs=25)
     found, reference = register(spoiled, model, SolveConfig()), register(rest, model, SolveConfig())
     assert list(np.flatnonzero(~found.shots.pm_inlier)) == [2, 5, 9, 16, 20]
     assert _moved(found, reference, model) < 1e-3
@@ -73,15 +73,15 @@ def test_outliers_are_named_and_the_result_is_that_without_them(seed: int) -> No
 
 
 def test_outliers_of_two_fifths_are_rejected() -> None:
-    junk, flips = (0, 3, 7, 11, 14, 19), (1, 8, 17, 22)
-    model, spoiled, rest, _ = _spoiled(4, junk=junk, flips=flips, pairs=25)
+    false_pms, flips = (0, 3, 7, 11, 14, 19), (1, 8, 17, 22)
+    model, spoiled, rest, _ = _spoiled(4, false_pms=false_pms, flips=flips, pairs=25)
     found, reference = register(spoiled, model, SolveConfig()), register(rest, model, SolveConfig())
-    assert set(np.flatnonzero(~found.shots.pm_inlier)) == {*junk, *flips}
+    assert set(np.flatnonzero(~found.shots.pm_inlier)) == {*false_pms, *flips}
     assert _moved(found, reference, model) < 1e-3
 
 
 def test_left_out_pairs_say_why_and_keep_their_figures() -> None:
-    model, spoiled, _, _ = _spoiled(0, junk=(2, 9), flips=(5,), pairs=25)
+    model, spoiled, _, _ = _spoiled(0, false_pms=(2, 9), flips=(5,), pairs=25)
     solution = solve(spoiled, [], model, SolveConfig())
     assert [i for i, pair in enumerate(solution.pairs) if not pair.used] == [2, 5, 9]
     for i in (2, 5, 9):
@@ -122,7 +122,7 @@ def test_flipped_markers_in_calibration_are_left_out() -> None:
 
 
 def test_the_explicit_graph_has_only_inliers() -> None:
-    model, spoiled, _, _ = _spoiled(1, junk=(2, 9), pairs=16)
+    model, spoiled, _, _ = _spoiled(1, false_pms=(2, 9), pairs=16)
     found = register(spoiled, model, SolveConfig())
     assert len(found.measurements.pairs) == 14
     assert distance_to_explicit(found) < 0.05
@@ -141,14 +141,14 @@ def test_one_outlier_look_of_several_is_rejected_alone() -> None:
 
 
 def test_outliers_in_one_epoch_do_not_affect_the_other() -> None:
-    model, spoiled, _, _ = _spoiled(2, junk=(1, 4), pairs=24, epochs=2)
+    model, spoiled, _, _ = _spoiled(2, false_pms=(1, 4), pairs=24, epochs=2)
     solution = solve(spoiled, [], model, SolveConfig())
     assert [i for i, pair in enumerate(solution.pairs) if not pair.used] == [1, 4]
     assert [epoch.pairs for epoch in solution.epochs] == [10, 12]
 
 
 def test_too_few_pairs_to_identify_the_outlier_are_refused_and_the_suspect_named() -> None:
-    model, spoiled, _, _ = _spoiled(0, junk=(3,), pairs=7)
+    model, spoiled, _, _ = _spoiled(0, false_pms=(3,), pairs=7)
     solution = solve(spoiled, [], model, SolveConfig(limit_mm=1000.0))
     assert all(pair.used for pair in solution.pairs)
     assert solution.verdict is Verdict.REFUSED
@@ -157,7 +157,7 @@ def test_too_few_pairs_to_identify_the_outlier_are_refused_and_the_suspect_named
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.32, Verdict.WARNING), (0.6, Verdict.REFUSED)])
 def test_many_pairs_left_out_lower_the_verdict(share: float, verdict: Verdict) -> None:
-    model, spoiled, _, _ = _spoiled(0, junk=tuple(range(0, round(25 * share))), pairs=25)
+    model, spoiled, _, _ = _spoiled(0, false_pms=tuple(range(0, round(25 * share))), pairs=25)
     solution = solve(spoiled, [], model, SolveConfig(limit_mm=1000.0))
     assert any("do not fit the others and are left out" in reason for reason in solution.reasons)
     assert solution.verdict is verdict
@@ -191,13 +191,13 @@ def test_good_pairs_innovations_follow_their_chi_square() -> None:
 
 
 def test_consensus_finds_the_registration_among_outliers() -> None:
-    model, spoiled, _, truth = _spoiled(3, junk=(0, 2, 4, 6, 8, 10, 12), flips=(14, 16, 18), pairs=25)
+    model, spoiled, _, truth = _spoiled(3, false_pms=(0, 2, 4, 6, 8, 10, 12), flips=(14, 16, 18), pairs=25)
     starts = consensus_starts(pack(spoiled, model), truth.marker_T_laser, 45.0)
     far = [targets_moved(truth.trus_T_camera[0], start, model.targets_mm) for start in starts]
     assert min(far) < 10.0
 
 
-def _mixed_junk(seed: int, share: float) -> tuple[SessionModel, Measurements, Truth, set[int]]:
+def _mixed_outliers(seed: int, share: float) -> tuple[SessionModel, Measurements, Truth, set[int]]:
     """25 window-only pairs with false PMs, flipped markers and wrong markers in turn, anywhere within reach."""
     model, clean, truth = make_measurements(np.random.default_rng(seed), pairs=25, first_hit=False)
     rng = np.random.default_rng([seed, 1])
@@ -220,14 +220,14 @@ def _mixed_junk(seed: int, share: float) -> tuple[SessionModel, Measurements, Tr
 
 def test_a_pair_whose_beam_has_no_place_on_its_arc_is_left_out() -> None:
     # Seed 39 has a beam that grazes its arc: its private optimum wanders, and may seem to fit on its way.
-    model, spoiled, _, bad = _mixed_junk(39, 0.4)
+    model, spoiled, _, bad = _mixed_outliers(39, 0.4)
     found = register(spoiled, model, SolveConfig())
     assert set(np.flatnonzero(~found.shots.pm_inlier)) == bad
     assert float(found.optimum.evaluation.cost[0]) < plausible_cost(found.problem)
 
 
 def test_the_density_of_a_doubtful_pm_is_the_mixture_of_inlier_and_outlier() -> None:
-    model, spoiled, _, _ = _spoiled(0, junk=(2,), pairs=12)
+    model, spoiled, _, _ = _spoiled(0, false_pms=(2,), pairs=12)
     found = posterior_mean(register(spoiled, model, SolveConfig()), SolveConfig())
     doubted = found.modes[0].mixture
     assert doubted is not None
@@ -248,7 +248,7 @@ def test_an_outlier_that_bends_the_estimate_until_it_fits_widens_the_posterior()
     # In these sessions one or two outlier PMs are within their limits at the optimum.
     squares = []
     for seed in (12, 28, 56):
-        model, spoiled, truth, _ = _mixed_junk(seed, 0.4)
+        model, spoiled, truth, _ = _mixed_outliers(seed, 0.4)
         registration = register(spoiled, model, SolveConfig())
         for found in (registration, posterior_mean(registration, SolveConfig()).registration):
             there = found.optimum.state.trus_T_camera()[0]
@@ -258,7 +258,7 @@ def test_an_outlier_that_bends_the_estimate_until_it_fits_widens_the_posterior()
 
 
 def _with_outliers_of_all_kinds(seed: int, *, first_hit: bool) -> tuple[SessionModel, Measurements, list[int]]:
-    """A session of 25 pairs with ten outliers of the kinds that tools/study_junk.py makes, and which they are."""
+    """A session of 25 pairs with ten outliers of the kinds that tools/study_outliers.py makes, and which they are."""
     model, clean, _ = make_measurements(np.random.default_rng(seed), pairs=25, first_hit=first_hit)
     where = np.random.default_rng([seed, 1])
     outliers = [int(index) for index in where.permutation(25)[:10]]

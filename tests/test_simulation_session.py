@@ -231,13 +231,13 @@ def test_wrong_sound_speed_scales_ranges() -> None:
 
 
 def test_outlier_pairs_are_elsewhere_and_the_truth_lists_them() -> None:
-    simulated = simulate(without_noise(pairs=20, junk_pairs=6), 5)
-    junk = set(simulated.truth["x_junk_pms"])
-    assert len(junk) == 6
+    simulated = simulate(without_noise(pairs=20, outlier_pairs=6), 5)
+    outliers = set(simulated.truth["x_outlier_pms"])
+    assert len(outliers) == 6
     for _, event in events(simulated, "pair"):
         p, trus = simulated.truth["pms"][event["pm"]], event["trus"]
         off = math.hypot(trus["x_mm"] - p[0], trus["range_mm"] - distance_to_element_mm(p, trus["scan_deg"]))
-        assert (off > 1e-3) == (event["pm"] in junk)
+        assert (off > 1e-3) == (event["pm"] in outliers)
 
 
 def test_camera_moves_chain_the_registrations() -> None:
@@ -394,7 +394,7 @@ def test_reversed_elements_reverse_the_channels() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"epochs": 0}, {"pairs": -1}, {"junk_pairs": 11}, {"frames": True}, {"looks_per_pm": 0}]
+    "changes", [{"epochs": 0}, {"pairs": -1}, {"outlier_pairs": 11}, {"frames": True}, {"looks_per_pm": 0}]
 )
 def test_impossible_configurations_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"have to be|expected|need"):

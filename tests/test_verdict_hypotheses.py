@@ -96,11 +96,11 @@ def test_a_beam_that_dominates_the_error_is_to_be_calibrated_with_roll() -> None
 
 def test_one_shot_far_off_is_an_outlier_but_several_a_little_off_are_noise() -> None:
     nis = np.array([1.0, 2.0, 300.0, 16.0, 20.0] + [1.5] * 30)
-    none, junk, several = (np.zeros(35, dtype=bool) for _ in range(3))
-    junk[2] = True
+    none, single, several = (np.zeros(35, dtype=bool) for _ in range(3))
+    single[2] = True
     several[[3, 4]] = True
     assert understated_noise(none, nis) == []
-    assert understated_noise(junk, nis) == []
+    assert understated_noise(single, nis) == []
     assert understated_noise(several, nis)[0].verdict is Verdict.WARNING
     # Among many gross outliers two that are only a little off are outliers, too.
     nis[5:13], several[5:13] = 500.0, True

@@ -58,7 +58,7 @@ def _first_pairs(measurements: Any, count: int) -> Any:
 
 def _cases(checkout: Path, sizes: list[int], seeds: int, *, phantom: bool) -> Iterator[tuple[str, Any, Any]]:
     """Name, model and measurements of each case; the same whatever the checkout."""
-    forward, junk = importlib.import_module("tests.forward"), importlib.import_module("tools.study_junk")
+    forward, outliers = importlib.import_module("tests.forward"), importlib.import_module("tools.study_outliers")
     for name in ("paper", "phantom") if phantom else ("paper",):
         session = _named("read_session")(checkout / "sessions" / name)
         measurements = _named("extract_measurements")(session.events, session.model).measurements
@@ -77,7 +77,7 @@ def _cases(checkout: Path, sizes: list[int], seeds: int, *, phantom: bool) -> It
         model, measurements, _ = forward.make_measurements(rng, pairs=OUTLIER_PAIRS)
         pairs = list(measurements.pairs)
         for number, index in enumerate(rng.permutation(OUTLIER_PAIRS)[: round(OUTLIER_SHARE * OUTLIER_PAIRS)]):
-            pairs[index] = junk.spoil(pairs[index], junk.KINDS[number % len(junk.KINDS)], rng)
+            pairs[index] = outliers.spoil(pairs[index], outliers.KINDS[number % len(outliers.KINDS)], rng)
         spoiled = replace(measurements, pairs=tuple(pairs))
         for count in (*(n for n in sizes if n >= 8), OUTLIER_PAIRS):
             yield f"outliers {count}", model, _first_pairs(spoiled, count)

@@ -38,7 +38,7 @@ from fgreg.online.events import events_in_order
 from fgreg.registration.register import pack_session
 from move_streams import CONFIG, shift_of, two_epochs
 from pm_selection import select_pms
-from study_junk import KINDS, spoil
+from study_outliers import KINDS, spoil
 from tests.forward import Truth, make_measurements
 
 STEADY = 15

@@ -4,7 +4,7 @@ Two thirds of the sessions have something wrong, of these kinds in turn:
 
   few pairs          3 to 7 pairs                      parallel beams   within 0.5 to 3 deg of one direction
   collinear spots    all on one line                   no roll          aims and pairs without roll about the beam
-  wrong noise        2 to 5 times what is declared     junk pairs       20 to 60 % of the PMs are outliers
+  wrong noise        2 to 5 times what is declared     outlier pairs    20 to 60 % of the PMs are outliers
   flipped marker     10 to 50 % of the pairs and aims have the mirrored planar pose
   swapped marker     the pairs' marker is another rigid body than the aims'
   sweep sign         every sweep is recorded the other way round, in a two-way session
@@ -70,7 +70,7 @@ BAD = (
     "collinear spots",
     "no roll",
     "wrong noise",
-    "junk pairs",
+    "outlier pairs",
     "flipped marker",
     "swapped marker",
     "sweep sign",
@@ -118,8 +118,8 @@ def configuration(kind: str, rng: np.random.Generator) -> SimulationConfig:
             factor = float(rng.uniform(2.0, 5.0))
             true = NoiseModel()
             return replace(base, noise=scaled(true, factor), declared_noise=true)
-        case "junk pairs":
-            return replace(base, junk_pairs=round(float(rng.uniform(0.2, 0.6)) * base.pairs))
+        case "outlier pairs":
+            return replace(base, outlier_pairs=round(float(rng.uniform(0.2, 0.6)) * base.pairs))
         case "sweep sign":
             return replace(base, sweep=Sweep.ALTERNATING)
         case "reversed stage":

@@ -34,7 +34,7 @@ class TrueArray:
 
     @staticmethod
     def of(probe: ProbeModel, deviations: Mapping[Constant, float]) -> TrueArray:
-        """The array of a declared probe whose constants deviate by so much (true less declared)."""
+        """The array of a declared probe whose constants deviate (true less declared)."""
 
         def by(constant: Constant) -> float:
             return float(deviations.get(constant, 0.0))

@@ -102,7 +102,7 @@ class SimulationConfig:
             and of the TRUS side.
 
     Errors that the session does not declare:
-        junk_pairs: number of outlier PMs: their looks are at another source, anywhere in the image.
+        outlier_pairs: number of outlier PMs: their looks are at another source, anywhere in the image.
         reversed_stage, reversed_elements: wired with the other sign than the session states.
         deviations: true less declared value of the rig's constants. Absent: none; but the window's edge and the
             marker's bias are drawn from their standard deviations.
@@ -156,7 +156,7 @@ class SimulationConfig:
     checks: int = 0
     check_sigma_mm: tuple[float, float] = (0.35, 0.35)
 
-    junk_pairs: int = 0
+    outlier_pairs: int = 0
     reversed_stage: bool = False
     reversed_elements: bool = False
     deviations: Mapping[Constant, float] = field(default_factory=dict)
@@ -212,8 +212,8 @@ class SimulationConfig:
             raise ValueError("aims, pairs, tracks and checks have to be 0 or more")
         if not (self.water_mm >= 0.0 and self.water_index >= 1.0):
             raise ValueError("water_mm has to be 0 or more, water_index at least 1")
-        if not 0 <= self.junk_pairs <= self.pairs:
-            raise ValueError(f"junk_pairs is {self.junk_pairs}, expected 0 to {self.pairs}")
+        if not 0 <= self.outlier_pairs <= self.pairs:
+            raise ValueError(f"outlier_pairs is {self.outlier_pairs}, expected 0 to {self.pairs}")
         if self.frames and self.probe.channels is None:
             raise ValueError("raw frames need probe.channels")
 

@@ -125,10 +125,10 @@ class _Recorder:
         if config.beam_offset_mm:
             shots = self._beside_their_beams(shots, np.concatenate([pair_epochs, track_epochs]))
         pms, tracks = _part(shots, slice(0, config.pairs)), _part(shots, slice(config.pairs, None))
-        junk = np.zeros(config.pairs, dtype=bool)
-        junk[self.misc_rng.permutation(config.pairs)[: config.junk_pairs]] = True
+        outlier = np.zeros(config.pairs, dtype=bool)
+        outlier[self.misc_rng.permutation(config.pairs)[: config.outlier_pairs]] = True
         slipped = (np.arange(config.pairs) >= config.stage_slip_at * config.pairs).astype(np.float64)
-        pm_looks = self._looks(config, pms.spot_mm, config.looks_per_pm, 1, junk, config.stage_slip_rad * slipped)
+        pm_looks = self._looks(config, pms.spot_mm, config.looks_per_pm, 1, outlier, config.stage_slip_rad * slipped)
         once = replace(config, sweep=Sweep.ALTERNATING) if config.sweep is Sweep.TWO_SIDED else config
         clean = np.zeros(kinds.size, dtype=bool)
         after = np.full(kinds.size, config.stage_slip_rad)
@@ -156,7 +156,7 @@ class _Recorder:
             self.seed,
             session_document(config, self._rough_laser() if config.initial_laser else None),
             self.events,
-            self._truth(pms, answers, junk),
+            self._truth(pms, answers, outlier),
             self.frames,
             scene,
             self.true_markers,
@@ -177,7 +177,7 @@ class _Recorder:
                     raise
         raise AssertionError
 
-    def _truth(self, pms: Shots, answers: list[Document], junk: BoolArray) -> Document:
+    def _truth(self, pms: Shots, answers: list[Document], outlier: BoolArray) -> Document:
         config, scene = self.config, self.scene
         truth = {
             "trus_T_camera": [rows(transform) for transform in scene.trus_T_camera],
@@ -190,7 +190,7 @@ class _Recorder:
             "x_sound_speed_ratio": config.array.sound_speed_ratio,
             "x_reversed_stage": config.reversed_stage,
             "x_reversed_elements": config.reversed_elements,
-            "x_junk_pms": [int(i) for i in np.flatnonzero(junk)],
+            "x_outlier_pms": [int(i) for i in np.flatnonzero(outlier)],
             "x_lambda_mm": rows(pms.lambda_mm),
         }
         if config.deviations:
@@ -237,7 +237,7 @@ class _Recorder:
         trus_p_pm_mm: FloatArray,
         looks: int,
         first_sign: int,
-        junk: BoolArray,
+        outlier: BoolArray,
         slip_rad: FloatArray,
     ) -> _Looks:
         rng, noise, array = self.look_rng, config.noise, config.array
@@ -247,14 +247,14 @@ class _Recorder:
         looks = stops.scan_rad.shape[1]
         device = stops.device_rad + noise.scan_rad * self.stage_rng.standard_normal((n, looks))
         source = np.repeat(trus_p_pm_mm[:, None], looks, axis=1)
-        junk_x: FloatArray = rng.uniform(-config.pm_x_mm, config.pm_x_mm, (n, 1))
-        junk_rho: FloatArray = config.probe.radius_mm + rng.uniform(*config.pm_depth_mm, (n, 1))
+        outlier_x: FloatArray = rng.uniform(-config.pm_x_mm, config.pm_x_mm, (n, 1))
+        outlier_rho: FloatArray = config.probe.radius_mm + rng.uniform(*config.pm_depth_mm, (n, 1))
         strength = np.exp(rng.uniform(-0.7, 0.7, n))[:, None]
-        if junk.any():
-            scan = stops.scan_rad[junk]
-            rho = junk_rho[junk]
-            x = np.broadcast_to(junk_x[junk], scan.shape)
-            source[junk] = np.stack([x, rho * np.sin(scan), rho * np.cos(scan)], axis=-1)
+        if outlier.any():
+            scan = stops.scan_rad[outlier]
+            rho = outlier_rho[outlier]
+            x = np.broadcast_to(outlier_x[outlier], scan.shape)
+            source[outlier] = np.stack([x, rho * np.sin(scan), rho * np.cos(scan)], axis=-1)
         mirror = -1.0 if config.reversed_elements else 1.0
         offset = array.rotation_rad(source, stops.scan_rad)
         amplitude = strength * config.elevation.amplitude(offset, stops.half_width_rad)

@@ -108,8 +108,8 @@ class Figures:
 
     with_mm: list[float] = field(default_factory=list)
     without_mm: list[float] = field(default_factory=list)
-    junk: int = 0
-    junk_named: int = 0
+    outliers: int = 0
+    outliers_named: int = 0
     gross: int = 0
     gross_named: int = 0
     good: int = 0
@@ -120,7 +120,7 @@ class Figures:
         """Add those of another session."""
         self.with_mm += other.with_mm
         self.without_mm += other.without_mm
-        for name in ("junk", "junk_named", "gross", "gross_named", "good", "good_lost"):
+        for name in ("outliers", "outliers_named", "gross", "gross_named", "good", "good_lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for kind, (named, all_of_it) in other.by_kind.items():
             self.by_kind[kind] = [self.by_kind[kind][0] + named, self.by_kind[kind][1] + all_of_it]
@@ -157,8 +157,8 @@ def one(seed: int, share: float, args: argparse.Namespace) -> Figures:
             figures.good += 1
             figures.good_lost += bool(named[i])
             continue
-        figures.junk += 1
-        figures.junk_named += bool(named[i])
+        figures.outliers += 1
+        figures.outliers_named += bool(named[i])
         figures.by_kind[kind_of[i]][0] += bool(named[i])
         figures.by_kind[kind_of[i]][1] += 1
         if misfit[i] > GROSS:
@@ -204,19 +204,19 @@ def main() -> None:
         limit = {0.2: 1.08, 0.4: 1.15}.get(share)
         result = {
             "rms_tre_mm": rms(figures.with_mm),
-            "rms_tre_without_junk_mm": rms(figures.without_mm),
+            "rms_tre_without_outliers_mm": rms(figures.without_mm),
             "ratio": ratio,
             "worst_mm": max(figures.with_mm),
-            "junk_named": figures.junk_named / max(figures.junk, 1),
+            "outliers_named": figures.outliers_named / max(figures.outliers, 1),
             "gross_named": figures.gross_named / max(figures.gross, 1),
-            "gross_of_junk": figures.gross / max(figures.junk, 1),
+            "gross_of_outliers": figures.gross / max(figures.outliers, 1),
             "good_lost": figures.good_lost / max(figures.good, 1),
         }
         result |= {f"named, {kind}": named / n for kind, (named, n) in figures.by_kind.items() if n}
         out[str(share)] = result
         print(f"{share:.0%} outliers" + (f" (ratio at most {limit})" if limit else ""))
         for key, value in result.items():
-            print(f"  {key:26s}{value:.4f}")
+            print(f"  {key:30s}{value:.4f}")
     if args.json:
         print(json.dumps(out, indent=2))
 
