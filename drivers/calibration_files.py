@@ -27,7 +27,7 @@ import numpy as np
 from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, as_float_array, is_rigid, make_transform, nearest_rotation
-from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.schema.kinds import Integer, Kind, Numbers, Text
 from fgreg.schema.matrices import Matrix
 from fgreg.schema.problems import FieldError, Problem, input_error, shown

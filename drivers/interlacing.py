@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
 
 Picture = npt.NDArray[np.uint8]
 

@@ -16,7 +16,7 @@ import numpy as np
 from fgreg.drivers.interlacing import Picture
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, log_so3, make_transform
-from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,8 @@ from fgreg.geometry.transforms import (
     rotation_to_direction,
     transform_points,
 )
-from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig, TagModel
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import MarkerModel, TagModel
 from fgreg.simulation.lens import project_points
 from fgreg.simulation.render import Optics, render_frame
 from fgreg.simulation.surfaces import Background, Surface, TagSurface

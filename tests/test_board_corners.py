@@ -11,7 +11,8 @@ from fgreg.detection.board import detect_board, find_board_corners, order_corner
 from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner, board_covariance
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform, transform_points
-from fgreg.model.session_model import BoardModel, CharucoModel, StereoRig
+from fgreg.model.camera_model import StereoRig
+from fgreg.model.session_model import BoardModel, CharucoModel
 from fgreg.simulation.surfaces import BoardSurface, PatchSurface
 from tests.marker_scene import LEFT, RIG, Frame, frames_of, left_pixels, pose_error, rotation_error_deg
 

@@ -13,7 +13,7 @@ import yaml
 from fgreg.drivers.calibration_files import read_calibration
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, as_float_array
-from fgreg.model.session_model import StereoRig
+from fgreg.model.camera_model import StereoRig
 
 # Left turned by asin(0.6) about z against the rectified frame, right not at all: figures one can check by hand.
 CAMERA_INFO = """\

@@ -15,7 +15,8 @@ from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import BoardFit, MarkerFit, NotFound, marker_covariance
 from fgreg.drivers.calibration_files import read_calibration
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import BoardModel, CameraModel, CharucoModel, SessionModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import BoardModel, CharucoModel, SessionModel
 from fgreg.session.session_reader import read_session
 from tests.marker_scene import pose_error
 

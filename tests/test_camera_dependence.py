@@ -22,7 +22,8 @@ from fgreg.model.camera_dependence import (
     nominal_spot_gain,
     plausible_share,
 )
-from fgreg.model.session_model import BoardModel, CameraModel, SessionModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import BoardModel, SessionModel
 from fgreg.model.systematic import CAREFUL_LAB, Systematic
 from tests.forward import make_session
 from tests.marker_scene import LEFT, ONE_TAG, RIG, RIGHT, RIGHT_T_LEFT, facing_pose

@@ -13,7 +13,8 @@ from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
 from fgreg.geometry.transforms import as_float_array, log_so3, make_transform
-from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig, TagModel
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import MarkerModel, TagModel
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bard_aruco"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the real frames are not here")

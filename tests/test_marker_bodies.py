@@ -14,7 +14,8 @@ from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import dictionary_named, find_tags
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, make_transform
-from fgreg.model.session_model import MarkerModel, StereoRig, TagModel
+from fgreg.model.camera_model import StereoRig
+from fgreg.model.session_model import MarkerModel, TagModel
 from fgreg.simulation.render import Optics, render_frame
 from fgreg.simulation.surfaces import TagSurface
 from tests.marker_scene import (

@@ -18,7 +18,7 @@ from fgreg.detection.camera import (
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.geometry.transforms import as_float_array
-from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.simulation.lens import project_points
 from fgreg.simulation.render import Optics, render_frame
 from tests.marker_scene import LEFT, ONE_TAG, facing_pose, rotation_error_deg, surfaces_of

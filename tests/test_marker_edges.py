@@ -9,7 +9,7 @@ from scipy.special import ndtr
 from fgreg.detection.corners import square_corners
 from fgreg.detection.edges import _Band, _step_model, fit_edges
 from fgreg.geometry.transforms import FloatArray, as_float_array
-from fgreg.model.session_model import CameraModel
+from fgreg.model.camera_model import CameraModel
 
 PLAIN = CameraModel((400, 300), as_float_array([[800, 0, 0], [0, 800, 0], [0, 0, 1]]), as_float_array(np.zeros(5)))
 

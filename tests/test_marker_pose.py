@@ -12,7 +12,7 @@ from fgreg.detection.marker import detect_marker
 from fgreg.detection.pose_least_squares import CornerSet, common_covariance, corner_residuals, fit_pose
 from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
-from fgreg.model.session_model import StereoRig
+from fgreg.model.camera_model import StereoRig
 from tests.marker_scene import (
     LEFT,
     ONE_TAG,

@@ -14,8 +14,9 @@ from fgreg.geometry.transforms import as_float_array, inverse, transform_points
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.measurements import Measurements
-from fgreg.model.session_model import CameraModel, SessionModel, StereoRig
+from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.next_shot import TILT_RAD, advise
 from fgreg.registration.register import Registration, register

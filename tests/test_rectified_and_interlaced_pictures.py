@@ -11,7 +11,7 @@ from fgreg.drivers.interlacing import Fields, field_camera, field_rig, split
 from fgreg.drivers.rectification import rectification
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
-from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
 
 SIZE = (640, 480)
 LEFT_P = np.array([[-20.0, -12.0, 100.0], [5.0, 3.0, 80.0], [22.0, 15.0, 110.0], [10.0, -14.0, 90.0]])

@@ -19,8 +19,8 @@ from fgreg.cli.report import (
     laser_sigmas,
     pm_rotation_sigma_rad,
     print_summary,
-    summary_dict,
 )
+from fgreg.cli.report_document import summary_dict
 from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.model.estimate import (
     AimEstimate,

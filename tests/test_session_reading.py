@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import as_float_array
+from fgreg.model.camera_model import STEREO_RIG, CameraModel, StereoRig
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
@@ -23,7 +24,7 @@ from fgreg.model.events import (
     StageEvent,
     TrackEvent,
 )
-from fgreg.model.session_model import STEREO_RIG, CameraModel, NoiseModel, StereoRig, default_targets_mm
+from fgreg.model.session_model import NoiseModel, default_targets_mm
 from fgreg.session.session_reader import read_ground_truth, read_session
 from tests import session_files
 

@@ -15,7 +15,8 @@ from fgreg.cli.main import app
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, log_so3, make_transform
 from fgreg.model.camera_dependence import nominal_pose_gain
-from fgreg.model.session_model import CameraModel, NoiseModel, StereoRig, TagModel
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import NoiseModel, TagModel
 from fgreg.model.systematic import NONE, Systematic
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.array import TrueArray

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fgreg.geometry.transforms import FloatArray, exp_so3, make_transform, transform_points
-from fgreg.model.session_model import BoardModel, CameraModel, CharucoModel
+from fgreg.model.camera_model import CameraModel
+from fgreg.model.session_model import BoardModel, CharucoModel
 from fgreg.simulation.config import default_rig
 from fgreg.simulation.lens import project_points, undistorted_rays
 from fgreg.simulation.render import Optics, render_frame

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
+from fgreg.model.camera_model import CameraModel
 from fgreg.model.measurements import Look, Measurements
-from fgreg.model.session_model import CameraModel
 from fgreg.viewer import scene as scene
 from fgreg.viewer.result import measured_pairs
 from tests.answers import answer_from_truth, random_covariance

@@ -16,17 +16,10 @@ from PIL import Image
 
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import as_float_array, inverse
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.estimate import SessionEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
-from fgreg.model.session_model import (
-    CameraModel,
-    ChannelModel,
-    MarkerModel,
-    SessionModel,
-    StageModel,
-    StereoRig,
-    TagModel,
-)
+from fgreg.model.session_model import ChannelModel, MarkerModel, SessionModel, StageModel, TagModel
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
 from tests.answers import REGISTRATION_COVARIANCE, answer_from_truth

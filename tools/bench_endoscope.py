@@ -21,7 +21,7 @@ from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Lay
 from fgreg.drivers.interlacing import Fields, split
 from fgreg.drivers.rectification import rectification
 from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
-from fgreg.model.session_model import CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
 
 SIZE, FPS, POLL_S = (1280, 720), 30.0, 0.002
 

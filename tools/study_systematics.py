@@ -52,7 +52,8 @@ import fgreg
 from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.target_error import target_jacobians, tre_mm
 from fgreg.geometry.transforms import FloatArray, as_float_array, inverse, log_so3, transform_points
-from fgreg.model.session_model import NoiseModel, StereoRig
+from fgreg.model.camera_model import StereoRig
+from fgreg.model.session_model import NoiseModel
 from fgreg.model.systematic import NONE, Systematic
 from fgreg.simulation.array import map_by_declared
 from fgreg.simulation.config import SimulationConfig, Sweep, default_rig

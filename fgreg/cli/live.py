@@ -114,7 +114,8 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
 
             typer.echo(example(), nl=False)
             return
-        from fgreg.cli.report import print_summary, summary_dict
+        from fgreg.cli.report import print_summary
+        from fgreg.cli.report_document import summary_dict
         from fgreg.live.launch import default_folder
         from fgreg.model.estimate import Verdict
         from fgreg.pipeline.solve import SolveRequest, solve_session

@@ -165,7 +165,8 @@ def solve(
 
 def _show(report: "SolveReport", as_json: bool) -> None:
     """Print the summary of a solve, with the reader's warnings."""
-    from fgreg.cli.report import print_summary, summary_dict
+    from fgreg.cli.report import print_summary
+    from fgreg.cli.report_document import summary_dict
 
     extras = _summary_extras(report)
     if as_json:

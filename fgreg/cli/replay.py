@@ -65,7 +65,8 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         Watch it in real time: fgreg replay SESSION --speed 1 --live. Or record it: --rrd FILE.
         """
-        from fgreg.cli.report import print_summary, summary_dict
+        from fgreg.cli.report import print_summary
+        from fgreg.cli.report_document import summary_dict
         from fgreg.model.estimate import Verdict
         from fgreg.pipeline.replay import ReplayRequest, replay_session
 

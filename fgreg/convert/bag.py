@@ -49,7 +49,7 @@ from fgreg.drivers.ros_messages import (
 from fgreg.drivers.ros_recordings import Recording
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, inverse, log_so3
-from fgreg.model.session_model import StereoRig
+from fgreg.model.camera_model import StereoRig
 from fgreg.model.time_sync import PairRefused, TimedPose, interpolate, pose_at
 
 MARK_GAP_S = 1.0

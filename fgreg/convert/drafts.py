@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import StereoRig
+from fgreg.model.camera_model import StereoRig
 
 Document = dict[str, Any]
 

@@ -25,7 +25,8 @@ from fgreg.detection.results import BoardFit, NotFound
 from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_named, halved
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
-from fgreg.model.session_model import BoardModel, CameraModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import BoardModel
 
 CORNER_SIGMA_PX = 0.03
 """Sigma of a refined inner corner. Four squares meet there: the image is symmetric, so blur does not bias it."""

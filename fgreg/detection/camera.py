@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import CameraModel
+from fgreg.model.camera_model import CameraModel
 
 UNDISTORT_ITERATIONS = 20
 UNDISTORT_TOLERANCE = 1e-9

@@ -8,9 +8,10 @@ import numpy as np
 
 from fgreg.detection.camera import focal_px, normalized_from_pixels
 from fgreg.geometry.transforms import FloatArray
+from fgreg.model.camera_model import StereoRig
 from fgreg.model.events import CheckEvent, PlaneRecord
 from fgreg.model.measurements import FLOOR_MM, Check, usable_covariance
-from fgreg.model.session_model import SessionModel, StereoRig
+from fgreg.model.session_model import SessionModel
 
 PIXEL_SIGMA = 0.5
 """Standard deviation of a point in a picture, each axis, px: a well-defined point, found by hand or by a program."""

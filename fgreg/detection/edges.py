@@ -31,7 +31,7 @@ from fgreg.detection.camera import (
     pixels_from_ideal,
 )
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
-from fgreg.model.session_model import CameraModel
+from fgreg.model.camera_model import CameraModel
 
 Image = npt.NDArray[np.uint8]
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.float32]

@@ -23,6 +23,7 @@ from fgreg.detection.marker import detect_marker
 from fgreg.detection.photoacoustic import locate_in_frame
 from fgreg.detection.results import FrameResults
 from fgreg.errors import InputError
+from fgreg.model.camera_model import StereoRig
 from fgreg.model.events import (
     Event,
     MarkerRecord,
@@ -33,7 +34,7 @@ from fgreg.model.events import (
     needs_board,
     needs_marker_frames,
 )
-from fgreg.model.session_model import SessionModel, StereoRig
+from fgreg.model.session_model import SessionModel
 from fgreg.session.frame_files import check_camera_frame, check_trus_frame
 
 Progress = Callable[[int, int], None]

@@ -22,7 +22,8 @@ from fgreg.detection.spoilt_tags import find_spoilt_tags
 from fgreg.detection.tags import FoundTag, find_tags, tag_cells
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import CameraModel, MarkerModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import MarkerModel
 
 LARGE_WIDTH_PX = 1000
 """In images of at least this width a single tag is first searched at half resolution."""

@@ -7,7 +7,8 @@ import numpy.typing as npt
 
 from fgreg.detection.marker import ViewCorners, Window, view_corners
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import CameraModel, MarkerModel
+from fgreg.model.camera_model import CameraModel
+from fgreg.model.session_model import MarkerModel
 
 EVERYWHERE = 10
 """The whole image is searched once in this many images: a second tag of the same id makes both unusable."""

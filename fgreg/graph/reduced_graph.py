@@ -24,8 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.geometry.rig import CAMERA, Constant
-from fgreg.geometry.transforms import FloatArray, hat, log_so3
-from fgreg.graph.packing import BeamArrays, EpochLink, PackedProblem
+from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.packing import BeamArrays, PackedProblem
 from fgreg.graph.reduced_blocks import (
     Chart,
     Groups,
@@ -44,7 +44,8 @@ from fgreg.graph.reduced_blocks import (
     times,
     transposed,
 )
-from fgreg.graph.shared_state import SharedState, step_between
+from fgreg.graph.reduced_priors import add_priors, prior_cost
+from fgreg.graph.shared_state import SharedState
 from fgreg.graph.window_likelihood import log_shape_ratios
 
 DIVERGED_MM = 1.0
@@ -196,7 +197,7 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState, *
         point_step=point_step,
         pm_cost=pm_cost,
         aim_cost=line_cost[count:],
-        prior_cost=_prior_cost(problem, state),
+        prior_cost=prior_cost(problem, state),
         private=refined,
     )
 
@@ -355,7 +356,7 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
     look_gradient = np.einsum("nkis,nks->nis", look[:, :, 4:], look[:, :, 0])
     gradient[..., rig] += outer(system.looks.sum(look_gradient))
     prior_gradient, prior_hessian = np.zeros((state.count, size)), np.zeros((state.count, size, size))
-    _add_priors(problem, state, prior_gradient, prior_hessian)
+    add_priors(problem, state, prior_gradient, prior_hessian)
     return Parts(
         pm=Contributions(outer(system.pm_cost), gradient, hessian),
         aim=Contributions(outer(system.aim_cost), line_gradient[:, pms:], line_hessian[:, pms:]),
@@ -427,7 +428,7 @@ def evaluate(
     gradient = _stacked(line, outer(system.line[:, 0])[..., None])
     gradient = (gradient + _stacked(h_ps, outer(system.point_step)[..., None]))[..., 0]
     gradient[:, rig] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
-    _add_priors(problem, state, gradient, hessian)
+    add_priors(problem, state, gradient, hessian)
     lambda_mm = outer(along_beam(state, system.laser_p))
     return Evaluation(
         cost=weights.cost,
@@ -450,55 +451,3 @@ def _stacked(left: FloatArray, right: FloatArray) -> FloatArray:
     """Sum over entries and rows of left' right, (S, n, k, a) and (S, n, k, b): one matrix product a hypothesis."""
     count, rows = left.shape[0], left.shape[1] * left.shape[2]
     return np.asarray(transposed(left.reshape(count, rows, left.shape[3])) @ right.reshape(count, rows, right.shape[3]))
-
-
-def _prior_deviation(problem: PackedProblem, state: SharedState) -> FloatArray:
-    """(S, K) constants that are variables, less their prior means."""
-    return np.asarray(state.constants[:, problem.columns.constants] - problem.prior.mean)
-
-
-def _prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
-    deviation = _prior_deviation(problem, state)
-    cost = np.sum(deviation * (deviation @ problem.prior.information), axis=1)
-    for link in problem.links:
-        residual, _ = _link_residual(link, state)
-        cost = cost + np.sum(residual * (residual @ link.information), axis=1)
-    if problem.anchor is not None:
-        anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
-        cost = cost + anchor.cost + np.sum(step * (2.0 * anchor.gradient + step @ anchor.hessian), axis=1)
-    return np.asarray(cost)
-
-
-def _add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray, hessian: FloatArray) -> None:
-    """Gaussian priors of the shared variables and links between epochs, added in place."""
-    rig = problem.columns.rig
-    gradient[:, rig] += _prior_deviation(problem, state) @ problem.prior.information
-    hessian[:, rig, rig] += problem.prior.information
-    for link in problem.links:
-        residual, jacobian = _link_residual(link, state)
-        weighted = link.information @ jacobian
-        columns = np.r_[6 * link.old : 6 * link.old + 6, 6 * link.new : 6 * link.new + 6]
-        hessian[:, columns[:, None], columns] += transposed(jacobian) @ weighted
-        gradient[:, columns] += times(transposed(weighted), residual)
-    if problem.anchor is not None:
-        anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
-        hessian += anchor.hessian
-        gradient += anchor.gradient + step @ anchor.hessian
-
-
-def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:
-    """Error (S, 6) on the right of ``old_T_new`` in ``new = old * old_T_new``, and its derivative (S, 6, 12)."""
-    old, new, new_R_old = link.old, link.new, link.old_T_new[:3, :3].T
-    back = transposed(state.rotation[:, old])
-    relative_R = back @ state.rotation[:, new]
-    relative_t = times(back, state.translation_mm[:, new] - state.translation_mm[:, old])
-    turn = log_so3(new_R_old @ relative_R)
-    residual = np.concatenate([turn, times(new_R_old, relative_t - link.old_T_new[:3, 3])], axis=1)
-    by_turn = np.eye(3) + 0.5 * hat(turn)  # inverse right Jacobian of SO(3), to first order in the error
-    jacobian = np.zeros((state.count, 6, 12))
-    jacobian[:, :3, :3] = -by_turn @ transposed(relative_R)
-    jacobian[:, 3:, :3] = new_R_old @ hat(relative_t)
-    jacobian[:, 3:, 3:6] = -new_R_old
-    jacobian[:, :3, 6:9] = by_turn
-    jacobian[:, 3:, 9:] = new_R_old @ relative_R
-    return residual, jacobian

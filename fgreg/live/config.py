@@ -24,7 +24,8 @@ from fgreg.live.scope_holder import HolderSettings
 from fgreg.live.simulated_room import HEARING_THRESHOLD, room_truth
 from fgreg.live.status import Devices
 from fgreg.live.workflow import WorkflowSettings
-from fgreg.model.session_model import SessionModel, StereoRig
+from fgreg.model.camera_model import StereoRig
+from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.time_sync import Latencies
 from fgreg.schema.problems import FieldError, input_error, nearest, place_text

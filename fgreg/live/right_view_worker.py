@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from fgreg.detection.marker import ViewCorners
 from fgreg.detection.marker_roi import MarkerRoi
-from fgreg.model.session_model import MarkerModel, StereoRig
+from fgreg.model.camera_model import StereoRig
+from fgreg.model.session_model import MarkerModel
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S = 0.3

@@ -23,8 +23,9 @@ import numpy as np
 
 from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, hat, rotation_to_direction, transform_points
+from fgreg.model.camera_model import StereoRig
 from fgreg.model.measurements import CameraDependence
-from fgreg.model.session_model import SessionModel, StereoRig
+from fgreg.model.session_model import SessionModel
 
 CONSTANTS = COUNT - Constant.MARKER_BIAS_X
 """Number of constants of ``CAMERA``: columns of all derivatives."""

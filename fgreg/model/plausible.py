@@ -13,16 +13,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
+from fgreg.model.camera_model import StereoRig
 from fgreg.model.measurements import Aim, Measurements, Pair
-from fgreg.model.session_model import (
-    BoardModel,
-    MarkerModel,
-    NoiseModel,
-    ProbeModel,
-    SessionModel,
-    StageModel,
-    StereoRig,
-)
+from fgreg.model.session_model import BoardModel, MarkerModel, NoiseModel, ProbeModel, SessionModel, StageModel
 from fgreg.model.systematic import Systematic
 
 _LENGTHS = (("metres", 1000.0), ("cm", 10.0), ("micrometres", 1e-3))

@@ -36,8 +36,9 @@ from fgreg.graph.packing import PackedProblem, pack, pack_more
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate, pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
+from fgreg.model.camera_model import CameraModel
 from fgreg.model.measurements import EpochStart, Look, MarkerObservation, Measurements, Pair
-from fgreg.model.session_model import CameraModel, SessionModel
+from fgreg.model.session_model import SessionModel
 from fgreg.model.tissue_surface import REACH_MM, TissueSurface, fit_surface
 from fgreg.registration.epochs import restrict_epochs
 from fgreg.registration.multistart import Minimum

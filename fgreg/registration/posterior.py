@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, exp_so3, hat, inverse, log_so3, transform_points
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem, only_aims, without_aims
@@ -25,9 +24,8 @@ from fgreg.graph.reduced_solver import Optimum
 from fgreg.graph.shared_state import Quadratic, SharedState, step_between
 from fgreg.graph.split_points import logsumexp
 from fgreg.model.estimate import PredictedTre
+from fgreg.registration.proposals import Conditional, Students, cholesky, effective_samples, refitted, split_columns
 
-DEGREES_OF_FREEDOM = 6.0
-"""Of the Student proposals: tails heavier than the posterior's, else rare samples would have all the weight."""
 QUANTILE = 0.95
 MOST_TRANSLATION_MM = 2000.0
 """Largest distance from camera to probe (the session format's bound): beyond it rounding may look like a fit."""
@@ -37,10 +35,6 @@ REFINED_PMS = 8
 """With fewer PMs the samples spread so widely that the private variables are refined once more for each."""
 FITTING, TAILS = 0.4, 4.0
 """Share of effective samples in the first round below which the posterior has long tails; factor on the goal then."""
-KERNELS = 40
-"""Number of kernels of a later proposal that are centred on samples of earlier rounds."""
-WIDE, SHARES = 1.8, (0.4, 0.1, 0.5)
-"""Scale of the wide component, which finds curved tails; shares of draws: about the mean, wide, and on samples."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,146 +178,6 @@ def moved_private(mode: Mode, step: FloatArray) -> PrivateState:
     return replace(private, trus_p_pm=at.private.trus_p_pm + (at.point_gain @ step[:, None, :, None])[..., 0])
 
 
-def _split(columns: Columns) -> tuple[IntArray, IntArray]:
-    """Columns that are sampled, and those of the constants that enter (nearly) linearly, all but the window's edge."""
-    linear = [columns.at(Constant(c)) for c in columns.constants if c != Constant.WINDOW_EDGE]
-    rest = np.setdiff1d(np.arange(columns.size), np.array(linear, dtype=np.int64))
-    return rest, np.array(linear, dtype=np.int64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Conditional:
-    """Gaussian of the linear constants (C,) given the sampled variables (X,), about a mode: ``origin + gain x``."""
-
-    origin: FloatArray
-    gain: FloatArray
-    root: FloatArray
-
-    @classmethod
-    def of(cls, centre: FloatArray, covariance: FloatArray, sampled: IntArray, linear: IntArray) -> _Conditional:
-        """From a mode's tangent (D,) and its covariance (D, D)."""
-        cross = covariance[np.ix_(linear, sampled)]
-        gain = np.asarray(np.linalg.solve(covariance[np.ix_(sampled, sampled)], cross.T).T, dtype=np.float64)
-        left = covariance[np.ix_(linear, linear)] - gain @ cross.T
-        return cls(centre[linear] - gain @ centre[sampled], gain, _root(0.5 * (left + left.T)))
-
-    def log(self, x: FloatArray, c: FloatArray) -> FloatArray:
-        """(S,) log density of constants (S, C) at (S, X), up to a constant common to all modes."""
-        off = np.linalg.solve(self.root, (c - self.origin - x @ self.gain.T).T)
-        return np.asarray(-0.5 * np.sum(off**2, axis=0) - np.log(np.diag(self.root)).sum())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Students:
-    """Mixture of K multivariate Student densities of the sampled variables, grouped by shape.
-
-    The linear constants are drawn given these. Conditional on a sample their density is nearly Gaussian, so that they
-    cost no effective samples, however many they are.
-
-    Attributes:
-        sampled (X,), linear (C,): columns.
-        centre: (K, X). group: (K,) number of each one's root. scale: (K,) factor on it. share: (K,).
-        root: (G, X, X) lower triangular Cholesky factors of the shapes.
-        mode: (K,) whose conditional holds for each one. conditional: one for each mode.
-    """
-
-    sampled: IntArray
-    linear: IntArray
-    centre: FloatArray
-    group: IntArray
-    scale: FloatArray
-    share: FloatArray
-    root: FloatArray
-    mode: IntArray
-    conditional: tuple[_Conditional, ...]
-
-    def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """(count, D) samples of all variables."""
-        which = rng.choice(len(self.share), count, p=self.share)
-        normal = rng.standard_normal((count, self.centre.shape[1]))
-        stretch = self.scale[which] * np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, count))
-        x = self.centre[which]
-        for group, root in enumerate(self.root):
-            mine = self.group[which] == group
-            x[mine] += (normal[mine] * stretch[mine, None]) @ root.T
-        out = np.empty((count, len(self.sampled) + len(self.linear)))
-        out[:, self.sampled] = x
-        noise = rng.standard_normal((count, len(self.linear)))
-        for mode, given in enumerate(self.conditional):
-            rows = np.flatnonzero(self.mode[which] == mode)
-            out[np.ix_(rows, self.linear)] = given.origin + x[rows] @ given.gain.T + noise[rows] @ given.root.T
-        return out
-
-    def log(self, samples: FloatArray) -> FloatArray:
-        """(S,) log density of all variables (S, D), up to a constant common to all mixtures."""
-        x, c = samples[:, self.sampled], samples[:, self.linear]
-        size = x.shape[1]
-        out = []
-        for mode, group in sorted({*zip(self.mode.tolist(), self.group.tolist(), strict=True)}):
-            root = self.root[group]
-            mine = np.flatnonzero((self.group == group) & (self.mode == mode))
-            # Distances from the group's first centre keep the squares small, which is more accurate.
-            origin = self.centre[mine[0]]
-            at = np.linalg.solve(root, (x - origin).T)
-            centre = np.linalg.solve(root, (self.centre[mine] - origin).T)
-            square = np.sum(centre**2, axis=0)[:, None] - 2.0 * centre.T @ at + np.sum(at**2, axis=0)
-            square = np.maximum(square, 0.0) / (DEGREES_OF_FREEDOM * self.scale[mine, None] ** 2)
-            kernel = np.exp(-0.5 * (DEGREES_OF_FREEDOM + size) * np.log(1.0 + square))
-            log = np.log((self.share[mine] * self.scale[mine] ** -size) @ kernel) - np.log(np.diag(root)).sum()
-            out.append(log + self.conditional[mode].log(x, c))
-        return logsumexp(np.array(out), axis=0)
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-
-
-def _effective(log_weight: FloatArray) -> float:
-    return float(np.exp(2.0 * logsumexp(log_weight) - logsumexp(2.0 * log_weight)))
-
-
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights (S,), tempered by a power where their effective number of samples is below ``least``."""
-    power = 1.0
-    while _effective(power * log_weight) < min(least, 0.5 * len(log_weight)) and power > 1e-3:
-        power *= 0.8
-    return np.asarray(np.exp(power * log_weight - logsumexp(power * log_weight)))
-
-
-def _refitted(
-    first: _Students, x: FloatArray, log_weight: FloatArray, nearest: IntArray, rng: np.random.Generator
-) -> _Students:
-    """The next round's proposal: Students about the samples' mean and about some of the samples.
-
-    Args:
-        first: the first round's proposal; the shape of its first component is used as far as samples are few.
-        x: (S, D) samples. log_weight: (S,). nearest: (S,) mode of each.
-        rng: random numbers.
-    """
-    x = x[:, first.sampled]
-    size = x.shape[1]
-    weight = _tempered(log_weight, 3.0 * size)
-    effective = 1.0 / float(np.sum(weight**2))
-    centre = weight @ x
-    spread = x - centre
-    trust = effective / (effective + size)
-    fallback = first.root[0] @ first.root[0].T
-    moment = trust * (spread * weight[:, None]).T @ spread + (1.0 - trust) * fallback
-    # Kernel width of a density estimate from this many samples (Silverman).
-    width = (4.0 / (size + 2.0)) ** (1.0 / (size + 4.0)) * effective ** (-1.0 / (size + 4.0))
-    chosen = rng.choice(len(x), KERNELS, p=weight)
-    main = int(np.argmax(np.bincount(nearest, weight)))
-    return replace(
-        first,
-        centre=np.concatenate([centre[None], centre[None], x[chosen]]),
-        group=np.zeros(2 + KERNELS, dtype=np.int64),
-        scale=np.concatenate([[1.0, WIDE], np.full(KERNELS, width)]),
-        share=np.concatenate([SHARES[:2], np.full(KERNELS, SHARES[2] / KERNELS)]),
-        root=_root(moment)[None],
-        mode=np.concatenate([[main, main], nearest[chosen]]),
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Target:
     """The density to sample, over tangents about the first mode."""
@@ -346,7 +200,7 @@ class _Target:
             state = _repeat(self.modes[0].optimum.state, len(tangent)).retract(steps[0], columns)
             steps += [step_between(mode.optimum.state, state, columns) for mode in self.modes[1:]]
             far = [
-                np.sum(np.linalg.solve(_root(mode.covariance), step.T) ** 2, axis=0)
+                np.sum(np.linalg.solve(cholesky(mode.covariance), step.T) ** 2, axis=0)
                 for mode, step in zip(self.modes, steps, strict=True)
             ]
             nearest = np.argmin(far, axis=0)
@@ -376,21 +230,20 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         tangent_of_step(step_between(modes[0].optimum.state, mode.optimum.state, columns), columns)
         for mode in modes[1:]
     ]
-    sampled, linear = _split(columns)
+    sampled, linear = split_columns(columns)
     at = np.concatenate(starts)
     proposals = [
-        _Students(
+        Students(
             sampled=sampled,
             linear=linear,
             centre=at[:, sampled],
             group=np.arange(len(modes)),
             scale=np.ones(len(modes)),
             share=np.full(len(modes), 1.0 / len(modes)),
-            root=np.stack([_root(mode.covariance[np.ix_(sampled, sampled)]) for mode in modes]),
+            root=np.stack([cholesky(mode.covariance[np.ix_(sampled, sampled)]) for mode in modes]),
             mode=np.arange(len(modes)),
             conditional=tuple(
-                _Conditional.of(centre, mode.covariance, sampled, linear)
-                for centre, mode in zip(at, modes, strict=True)
+                Conditional.of(centre, mode.covariance, sampled, linear) for centre, mode in zip(at, modes, strict=True)
             ),
         )
     ]
@@ -414,13 +267,13 @@ def sample_posterior(modes: tuple[Mode, ...], *, goal: float, most: int, seed: i
         log_weight = log_target - logsumexp(log_proposal + share[:, None], axis=0)
         if not np.isfinite(log_weight).any():  # the optimum itself is where no camera can be
             break
-        if len(counts) == 1 and _effective(log_weight) < FITTING * draws:
+        if len(counts) == 1 and effective_samples(log_weight) < FITTING * draws:
             goal = TAILS * goal  # far from Gaussian: tails not drawn yet do not lower the effective number
-        if _effective(log_weight) >= goal or len(x) >= most:
+        if effective_samples(log_weight) >= goal or len(x) >= most:
             break
-        proposals.append(_refitted(proposals[0], x, log_weight, nearest, rng))
+        proposals.append(refitted(proposals[0], x, log_weight, nearest, rng))
         draws = min(max(300, len(x) // 2), max(most - len(x), 100))
-    effective = _effective(log_weight) if np.isfinite(log_weight).any() else 0.0
+    effective = effective_samples(log_weight) if np.isfinite(log_weight).any() else 0.0
     if effective < LEAST_SAMPLES:
         return replace(gaussian_posterior(modes[0], count=round(goal), seed=seed), effective=effective)
     weight = np.exp(log_weight - logsumexp(log_weight))
@@ -441,8 +294,8 @@ def gaussian_posterior(mode: Mode, *, count: int, seed: int) -> Posterior:
     x = np.concatenate([x, -x])  # in pairs about the mode, so that it is the mean
     weight = np.full(len(x), 1.0 / len(x))
     # Scaled to have exactly the mode's covariance.
-    x = np.linalg.solve(_root(x.T @ x / len(x)), x.T).T @ _root(mode.covariance).T
-    log = -0.5 * np.sum(np.linalg.solve(_root(mode.covariance), x.T) ** 2, axis=0)
+    x = np.linalg.solve(cholesky(x.T @ x / len(x)), x.T).T @ cholesky(mode.covariance).T
+    log = -0.5 * np.sum(np.linalg.solve(cholesky(mode.covariance), x.T) ** 2, axis=0)
     return _about_mean(_Target((mode,)), x, weight, weight, log, float(count))
 
 

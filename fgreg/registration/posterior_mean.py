@@ -20,6 +20,7 @@ from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.joint_solve import Shots
 from fgreg.registration.multistart import targets_moved
 from fgreg.registration.outliers import log_outlier
 from fgreg.registration.posterior import (
@@ -30,7 +31,7 @@ from fgreg.registration.posterior import (
     gaussian_posterior,
     sample_posterior,
 )
-from fgreg.registration.register import Registration, Shots
+from fgreg.registration.register import Registration
 
 RIVALS = 3
 """Largest number of other minima that enter the posterior."""

@@ -12,9 +12,9 @@ import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.session_model import (
     BoardModel,
-    CameraModel,
     ChannelModel,
     CharucoModel,
     MarkerModel,
@@ -22,7 +22,6 @@ from fgreg.model.session_model import (
     ProbeModel,
     SensitivityModel,
     StageModel,
-    StereoRig,
     TagModel,
 )
 from fgreg.model.systematic import Systematic

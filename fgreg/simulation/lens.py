@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import CameraModel
+from fgreg.model.camera_model import CameraModel
 
 STEP = 1e-6
 """For derivatives by differences."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from fgreg.geometry.rig import CAMERA, Constant
 from fgreg.geometry.transforms import FloatArray, IntArray, as_float_array, exp_so3, make_transform, transform_points
-from fgreg.model.session_model import BoardModel, CameraModel, MarkerModel, StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import BoardModel, MarkerModel
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.lens import project_points
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray, make_transform, transform_points
-from fgreg.model.session_model import CameraModel
+from fgreg.model.camera_model import CameraModel
 from fgreg.simulation.acoustics import Hearing, quantised, simulate_channels
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.disturbances import Disturbances, SpoiltView

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.session_model import CameraModel
+from fgreg.model.camera_model import CameraModel
 from fgreg.simulation.disturbances import SpoiltView
 from fgreg.simulation.lens import project_points, undistorted_rays
 from fgreg.simulation.surfaces import Background, Sheet, Surface

@@ -18,7 +18,8 @@ from fgreg.geometry.transforms import (
     make_transform,
     transform_points,
 )
-from fgreg.model.session_model import CameraModel, StereoRig, TagModel
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.session_model import TagModel
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.lens import project_points
 

@@ -13,10 +13,11 @@ from typing import Literal
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
+from fgreg.model.camera_model import CameraModel
 from fgreg.model.estimate import SessionEstimate
 from fgreg.model.measurements import Look
 from fgreg.model.sensitivity import arc_of_rotation
-from fgreg.model.session_model import CameraModel, MarkerModel, ProbeModel
+from fgreg.model.session_model import MarkerModel, ProbeModel
 
 ShotKind = Literal["aim", "pair", "track"]
 CHI2_95_3 = 7.814728

@@ -15,7 +15,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from fgreg.geometry.transforms import FloatArray, inverse
-from fgreg.model.session_model import CameraModel, SessionModel
+from fgreg.model.camera_model import CameraModel
+from fgreg.model.session_model import SessionModel
 from fgreg.viewer.pa_frame import PaPicture
 from fgreg.viewer.scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
 
