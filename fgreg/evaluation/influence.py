@@ -13,6 +13,7 @@ import numpy as np
 from fgreg.geometry.target_error import expected_tre_mm, moved_mm
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.reduced_graph import pm_contributions
+from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.registration.register import Registration
 
 
@@ -49,11 +50,9 @@ def influences(registration: Registration, targets_mm: FloatArray) -> tuple[Infl
         block = slice(6 * place, 6 * place + 6)
         rest = hessian - parts.hessian[index]
         expected = float(expected_tre_mm(registration.covariance[block, block], transform, targets_mm).mean())
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest), 1e-12))
-        scaled = rest * scale * scale[:, None]
+        covariance = inverse_hessian(rest)
         step, without, moved = np.full(6, np.inf), np.inf, np.full(1, np.inf)
-        if np.linalg.eigvalsh(scaled)[0] > 1e-9:
-            covariance = np.linalg.inv(scaled) * scale * scale[:, None]
+        if covariance is not None:
             step = (covariance @ parts.gradient[index])[block]
             moved = moved_mm(step, transform, targets_mm)
             without = float(expected_tre_mm(covariance[block, block], transform, targets_mm).mean())

@@ -17,6 +17,7 @@ from fgreg.graph.packing import PackedProblem, RotationShapes, edge_sigma_rad
 from fgreg.graph.reduced_blocks import look_block, times
 from fgreg.graph.reduced_graph import Evaluation, evaluate
 from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import SharedState
 from fgreg.graph.window_likelihood import LEAST_PRECISION
 from fgreg.model.sensitivity import interval_moments, log_interval
@@ -122,17 +123,6 @@ def _step(problem: PackedProblem, state: SharedState, at: Evaluation) -> tuple[S
             return moved, there
         step = 0.5 * step
     return None
-
-
-def inverse_hessian(hessian: FloatArray) -> FloatArray | None:
-    """The inverse (D, D) of a Hessian whose units differ by orders of magnitude; None where it is not positive."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    try:
-        inverse = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
-        np.linalg.cholesky(inverse)
-    except np.linalg.LinAlgError:
-        return None
-    return np.asarray(inverse, dtype=np.float64)
 
 
 def _look_marginals(

@@ -35,6 +35,7 @@ from fgreg.graph.columns import Columns
 from fgreg.graph.packing import PackedProblem, constants_prior, least_sigmas
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
+from fgreg.graph.scaled_inverse import scaled_inverse, scaled_solve
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.camera_dependence import nominal_point_gain, nominal_spot_gain
 from fgreg.model.measurements import Check
@@ -106,8 +107,8 @@ class Commissioned:
 
     def without(self, place: int) -> tuple[FloatArray, FloatArray]:
         """Mean (K,) and covariance (K, K) without one of the sessions."""
-        rest = np.linalg.inv(self.covariance) - self.evidence[place].information
-        covariance = _inverse(rest)
+        rest = scaled_inverse(self.covariance) - self.evidence[place].information
+        covariance = scaled_inverse(rest)
         pull = np.sum([found.pull for found in self.evidence], axis=0) - self.evidence[place].pull
         return covariance @ pull, covariance
 
@@ -143,7 +144,7 @@ class _Session:
         hessian, gradient = self.at.hessian[0], self.at.gradient[0]
         own, common = ~self.common, self.common
         cross = hessian[np.ix_(own, common)]
-        back = _solved(hessian[np.ix_(own, own)], np.column_stack([cross, gradient[own]]))
+        back = scaled_solve(hessian[np.ix_(own, own)], np.column_stack([cross, gradient[own]]))
         information = hessian[np.ix_(common, common)] - cross.T @ back[:, :-1]
         information = 0.5 * (information + information.T)
         return Evidence(information, information @ self.value - (gradient[common] - cross.T @ back[:, -1]))
@@ -155,7 +156,7 @@ class _Session:
         step = np.zeros(len(gradient))
         step[common] = value - self.value
         pull = gradient[own] + hessian[np.ix_(own, common)] @ step[common]
-        step[own] = -_solved(hessian[np.ix_(own, own)], pull[:, None])[:, 0]
+        step[own] = -scaled_solve(hessian[np.ix_(own, own)], pull[:, None])[:, 0]
         return step
 
 
@@ -302,7 +303,7 @@ def commission(registrations: Sequence[Registration], checks: Sequence[Sequence[
     for rounds in range(1, ROUNDS + 1):
         evidence = [one.evidence for one in sessions]
         total = prior + np.sum([found.information for found in evidence], axis=0)
-        wanted = _solved(total, np.sum([found.pull for found in evidence], axis=0)[:, None])[:, 0]
+        wanted = scaled_solve(total, np.sum([found.pull for found in evidence], axis=0)[:, None])[:, 0]
         steps = [one.step_to(wanted) for one in sessions]
         if value is None:  # each is at its own optimum, with constants of its own
             sessions = [one.moved(step) for one, step in zip(sessions, steps, strict=True)]
@@ -311,7 +312,7 @@ def commission(registrations: Sequence[Registration], checks: Sequence[Sequence[
         decrement = -sum(float(step @ one.at.gradient[0]) for one, step in zip(sessions, steps, strict=True))
         decrement -= float((wanted - value) @ prior @ value)
         if decrement < SETTLED:
-            return Commissioned(constants, value, _inverse(total), prior_sigma, tuple(evidence), rounds)
+            return Commissioned(constants, value, scaled_inverse(total), prior_sigma, tuple(evidence), rounds)
         before = cost(sessions, value)
         for halving in range(HALVINGS):
             share = 0.5**halving
@@ -363,7 +364,7 @@ def control_chart(evidence: Evidence, mean: FloatArray, covariance: FloatArray, 
     outer = np.outer(scale, scale)
     information, spread = outer * evidence.information, covariance / outer
     score = scale * (evidence.pull - evidence.information @ mean)
-    gain = _solved(information + _inverse(spread), np.column_stack([information, score]))
+    gain = scaled_solve(information + scaled_inverse(spread), np.column_stack([information, score]))
     whole = information - information @ gain[:, :-1]
     tested = score - information @ gain[:, -1]
     values, vectors = np.linalg.eigh(information)
@@ -390,15 +391,3 @@ def control_chart(evidence: Evidence, mean: FloatArray, covariance: FloatArray, 
 def z_limit(chance: float, count: int) -> float:
     """Of the z of one of ``count`` constants: half of the false alarms are the chi square's."""
     return float(-ndtri(0.25 * chance / max(count, 1)))
-
-
-def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution (n, m) of a positive definite system whose rows have different units."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-    return np.asarray(scale[:, None] * np.linalg.solve(matrix * np.outer(scale, scale), scale[:, None] * right))
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a positive definite matrix whose rows have different units."""
-    inverse = _solved(matrix, np.eye(len(matrix)))
-    return np.asarray(0.5 * (inverse + inverse.T))

@@ -13,11 +13,12 @@ import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.expectation_propagation import inverse_hessian, propagate
+from fgreg.graph.expectation_propagation import propagate
 from fgreg.graph.packing import PackedProblem
 from fgreg.graph.reduced_blocks import PrivateState, initial_private
 from fgreg.graph.reduced_graph import evaluate, refine
 from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import SharedState, make_state
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.joint_solve import Shots

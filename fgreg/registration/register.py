@@ -18,6 +18,7 @@ from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.graph.packing import PackedProblem, pack
 from fgreg.graph.reduced_solver import Optimum, optimize
+from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import Quadratic, SharedState, make_state, nominal_frame, stack_states
 from fgreg.model.measurements import Look, Measurements
 from fgreg.model.session_model import SessionModel
@@ -353,13 +354,9 @@ def _registration(
         EstimationError: the Hessian is singular.
     """
     kept, problem, optimum, shots = found
-    hessian = optimum.evaluation.hessian[0]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    try:
-        covariance = np.linalg.inv(hessian * scale * scale[:, None]) * scale * scale[:, None]
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError as error:
-        raise EstimationError("these shots leave the registration undetermined; take more pairs") from error
+    covariance = inverse_hessian(optimum.evaluation.hessian[0])
+    if covariance is None:
+        raise EstimationError("these shots leave the registration undetermined; take more pairs")
     return Registration(
         model=model,
         measurements=kept,
@@ -368,6 +365,6 @@ def _registration(
         optimum=optimum,
         searches=searches,
         ambiguous=ambiguous,
-        covariance=np.asarray(covariance, dtype=np.float64),
+        covariance=covariance,
         shots=shots,
     )

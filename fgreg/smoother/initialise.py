@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
+from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import Quadratic, SharedState, one_epoch
 from fgreg.model.measurements import Look, Measurements
 from fgreg.registration.register import Registration, labels_and_inliers
@@ -18,6 +19,7 @@ from fgreg.smoother.updates import LEAVE, MOST, settled, with_aim, with_pair
 
 SAME_SIGMA = 0.02
 """Largest distance of two estimates, in their standard deviations, that count as the same."""
+UNDETERMINED = "these pairs leave the registration undetermined: take more"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +171,9 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
     carried, covariance = state.carried, state.now.covariance
     assert carried is not None
     assert covariance is not None
-    information = _inverse(covariance)
+    information = inverse_hessian(covariance)
+    if information is None:
+        return replace(state, why_none=UNDETERMINED)
     rest = Quadratic(here, 0.0, -carried.gradient, information - carried.hessian)
     state = replace(state, marginalised=older, older=rest)
     try:
@@ -177,13 +181,7 @@ def _taken_over(state: State, found: Initial, setting: Setting) -> State:
             state, open_active_window((), total_prior(state, here, setting), layout, state.epoch)
         )
     except ArithmeticError:  # possible with three pairs
-        return replace(state, why_none="these pairs leave the registration undetermined: take more")
-
-
-def _inverse(covariance: FloatArray) -> FloatArray:
-    scale = np.outer(1.0 / np.sqrt(np.diag(covariance)), 1.0 / np.sqrt(np.diag(covariance)))
-    information = np.linalg.inv(covariance * scale) * scale
-    return np.asarray(0.5 * (information + information.T))
+        return replace(state, why_none=UNDETERMINED)
 
 
 def _with_active_window(state: State, active: ActiveWindow) -> State:
