@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from fgreg.graph.packing import pack
 from fgreg.live.launch import make_folder
 from fgreg.model.commissioned_rig import CommissionedRig
 from fgreg.model.solve_config import SolveConfig
+from fgreg.pipeline.commission import check_session_against
 from fgreg.registration.register import register
 from fgreg.registration.solve import distance_to_explicit
 from fgreg.session.rig_file import read_rig, section_hashes, write_rig
@@ -179,3 +181,34 @@ def test_a_live_session_gets_its_rig(tmp_path: Path) -> None:
     assert (tmp_path / "to" / "rig.yaml").is_file()
     (tmp_path / "to" / "events.jsonl").touch()
     assert read_session(tmp_path / "to").model.rig is not None
+
+
+def test_values_that_no_rig_has_are_doubted_by_file_and_key(tmp_path: Path) -> None:
+    absurd = rig(stored_values=np.array([1540.0, 0.5, 0.4]), prior_sigmas=np.array([0.2, 40.0, 0.003]))
+    radius, tag, prior = read_session(taken_up(rigs.write(tmp_path / "s", 1), absurd)).warnings
+    assert radius.startswith("rig.yaml: values, radius_mm: 1540 mm is hardly the difference of a constant from what is")
+    assert tag.startswith("rig.yaml: values, tag_size: 0.4 is hardly")
+    assert prior == "rig.yaml: prior_sigmas, array_tilt_deg[1]: 40 deg is hardly a standard deviation (0 to 10 deg)"
+    assert read_session(taken_up(rigs.write(tmp_path / "t", 1), rig())).warnings == ()
+
+
+def test_a_rig_beside_systematic_none_is_an_error(tmp_path: Path) -> None:
+    """One says that all constants are exact, the other how exact."""
+    folder = taken_up(rigs.write(tmp_path / "s", 1), rig())
+    document = yaml.safe_load((folder / "session.yaml").read_text())
+    (folder / "session.yaml").write_text(yaml.safe_dump({**document, "systematic": "none"}))
+    with pytest.raises(InputError, match="found none beside a rig, expected one of the two"):
+        read_session(folder)
+
+
+def test_a_rig_that_was_made_from_the_session_is_an_error(tmp_path: Path) -> None:
+    folder = rigs.write(tmp_path / "s", 1)
+    digest = hashlib.sha256((folder / "events.jsonl").read_bytes()).hexdigest()
+    made = rig(sessions=({"events.jsonl": digest},))
+    with pytest.raises(InputError, match="found a rig that was made from this session, expected one of other sessions"):
+        check_session_against(made, folder)
+    with pytest.raises(InputError, match=r"session\.yaml: rig: found a rig that was made from this session"):
+        read_session(taken_up(folder, made))
+    with (folder / "events.jsonl").open("a") as file:  # another session now
+        file.write('{"type": "note", "t": 1e6, "text": "more"}\n')
+    assert read_session(folder).model.rig is not None

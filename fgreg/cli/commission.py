@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -45,6 +45,7 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
         With --check: pass, note or alarm for each session, as on a control chart. Exit status 1 where there is an
         alarm, or where a session to compare is refused.
         """
+        from fgreg.model.plausible import implausible_rig
         from fgreg.pipeline.commission import check_session_against, commission_sessions
         from fgreg.registration.commissioning import ChartVerdict
         from fgreg.session.rig_file import read_rig
@@ -55,7 +56,7 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
         if out is not None:
             with progress_bar(quiet or as_json) as progress:
                 report = commission_sessions(sessions, out, use_checks=checks, progress=progress)
-            _warn(report.sessions)
+            _warn(report.sessions, implausible_rig(report.rig, str(out)))
             if as_json:
                 typer.echo(json.dumps(report_dict(report), indent=2))
             elif not quiet:
@@ -67,7 +68,7 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
         rig = read_rig(check)
         with progress_bar(quiet or as_json) as progress:
             compared = [check_session_against(rig, folder, use_checks=checks, progress=progress) for folder in sessions]
-        _warn(compared)
+        _warn(compared, implausible_rig(rig, str(check)))
         names = list(rig.names)
         if as_json:
             typer.echo(json.dumps({"sessions": [session_dict(one, names) for one in compared]}, indent=2))
@@ -78,7 +79,9 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
             raise typer.Exit(EXIT_ALARM)
 
 
-def _warn(sessions: "list[CommissionedSession] | tuple[CommissionedSession, ...]") -> None:
+def _warn(sessions: "Iterable[CommissionedSession]", of_rig: Iterable[str]) -> None:
+    for warning in of_rig:
+        sys.stderr.write(f"fgreg: warning: {warning}\n")
     for session in sessions:
         for warning in session.warnings:
             sys.stderr.write(f"fgreg: warning: {session.folder}: {warning}\n")

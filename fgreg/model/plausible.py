@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import StereoRig
+from fgreg.model.commissioned_rig import CommissionedRig
 from fgreg.model.measurements import Aim, Measurements, Pair
 from fgreg.model.session_model import BoardModel, MarkerModel, NoiseModel, ProbeModel, SessionModel, StageModel
 from fgreg.model.systematic import Systematic
@@ -153,18 +154,31 @@ def implausible_noise(noise: NoiseModel) -> Iterator[str]:
 def implausible_systematic(systematic: Systematic) -> Iterator[str]:
     """Doubts about standard deviations of the rig's constants."""
     for each in fields(systematic):
-        value = getattr(systematic, each.name)
         if each.name == "declared":
             continue
-        largest = float(np.max(value))
-        if each.name.endswith("_rad"):
-            yield from NOISE_ANGLE.doubt(f"systematic.{each.name[:-4]}_deg", math.degrees(largest))
-        elif each.name.endswith("_mm"):
-            yield from NOISE_LENGTH.doubt(f"systematic.{each.name}", largest)
-        elif each.name.endswith("_px"):
-            yield from NOISE_PIXELS.doubt(f"systematic.{each.name}", largest)
-        else:
-            yield from SMALL_RATIO.doubt(f"systematic.{each.name}", largest)
+        largest = float(np.max(getattr(systematic, each.name)))
+        key, factor = (f"{each.name[:-4]}_deg", math.degrees(1.0)) if each.name.endswith("_rad") else (each.name, 1.0)
+        yield from _of_constant(key).doubt(f"systematic.{key}", largest * factor)
+
+
+def implausible_rig(rig: CommissionedRig, label: str = "rig") -> Iterator[str]:
+    """Doubts about a commissioned rig, by constant; ``label``: how sentences name its file."""
+    for what, values in (
+        ("values", rig.stored_values),
+        ("covariance (its root)", np.sqrt(np.diag(rig.stored_covariance))),
+        ("prior_sigmas", rig.prior_sigmas),
+    ):
+        for name, value in zip(rig.names, values.tolist(), strict=True):
+            plausible = _of_constant(name)
+            if what == "values":
+                plausible = replace(plausible, what="the difference of a constant from what is declared")
+            yield from plausible.doubt(f"{label}: {what}, {name}", value)
+
+
+def _of_constant(key: str) -> Plausible:
+    """Of a standard deviation of one of the rig's constants, by the unit of its key (which may have an index)."""
+    units = (("_deg", NOISE_ANGLE), ("_mm", NOISE_LENGTH), ("_px", NOISE_PIXELS))
+    return next((plausible for unit, plausible in units if key.split("[")[0].endswith(unit)), SMALL_RATIO)
 
 
 def implausible_targets(targets_mm: FloatArray) -> Iterator[str]:
@@ -192,7 +206,12 @@ def implausible(*parts: object) -> tuple[str, ...]:
 def implausible_setup(model: SessionModel) -> tuple[str, ...]:
     """Doubts about a session's set-up."""
     parts = (model.probe, model.stage, model.camera, model.marker, model.board, model.noise, model.systematic)
-    return (*implausible(*parts), *implausible_targets(model.targets_mm))
+    return (*implausible(*parts), *implausible_targets(model.targets_mm), *_of_rig(model))
+
+
+def _of_rig(model: SessionModel) -> Iterator[str]:
+    if model.rig is not None:
+        yield from implausible_rig(model.rig, "rig" if model.rig_file is None else model.rig_file.name)
 
 
 def implausible_measurements(measurements: Measurements) -> tuple[str, ...]:

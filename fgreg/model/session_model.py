@@ -417,6 +417,11 @@ class SessionModel:
     def __post_init__(self) -> None:
         if not len(self.targets_mm):
             object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
+        if not self.systematic.declared and (self.rig_file is not None or self.rig is not None):
+            # All constants exact, and some of them with the rig's covariance: one of the two is not meant.
+            raise FieldError.of(
+                "none beside a rig", "one of the two, since a rig has standard deviations", "systematic"
+            )
 
     @property
     def noise_per_pm(self) -> NoiseModel:

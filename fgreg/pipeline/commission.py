@@ -36,8 +36,8 @@ from fgreg.registration.error_budget import conflicts
 from fgreg.registration.register import Registration
 from fgreg.registration.solve import solve
 from fgreg.session.input_hashes import input_hashes
-from fgreg.session.rig_file import read_rig, same_rig, section_hashes, write_rig
-from fgreg.session.session_reader import SETUP_FILE, Session, read_session
+from fgreg.session.rig_file import not_made_from, read_rig, same_rig, section_hashes, write_rig
+from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session
 
 TOGETHER = 0.5
 """Correlation from which a constant is named that the sessions do not tell apart from another one."""
@@ -178,10 +178,11 @@ def check_session_against(
     """Compare a session with a rig; without a chart, with the reason, where the session is refused.
 
     Raises:
-        InputError: the session is not valid, or has another probe, camera or marker than the rig.
+        InputError: the session is not valid, has another probe, camera or marker than the rig, or is part of it.
     """
     session = read_session(folder)
     same_rig(session.model, rig.sessions, str(folder / SETUP_FILE))
+    not_made_from(rig, folder / EVENTS_FILE, f"{folder}: --check")
     # With the priors from before the commissioning the session speaks for itself.
     solved = _solved(session, replace(session.model, rig=rig.widened()), use_checks, _step(progress, 0, 1))
     if solved.registration is None:

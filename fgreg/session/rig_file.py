@@ -15,6 +15,7 @@ from fgreg.model.session_model import SESSION, SessionModel
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.schema.yaml_writer import yaml_text
 from fgreg.session.atomic_file import why_refused, write_atomically
+from fgreg.session.file_hash import file_hash
 from fgreg.session.yaml_loader import load_yaml
 
 _ABSENT = ""
@@ -71,6 +72,22 @@ def section_hashes(model: SessionModel) -> dict[str, str]:
         for name in SHARED_SECTIONS
         if name in document
     }
+
+
+def not_made_from(rig: CommissionedRig, events: Path, label: str) -> None:
+    """Whether a session may take up, or be compared with, a rig: its shots would count twice if it is part of it.
+
+    Args:
+        rig: commissioned.
+        events: the session's ``events.jsonl``; without any it is part of no rig.
+        label: what messages name.
+
+    Raises:
+        InputError: the rig was made from the session.
+    """
+    if events.is_file() and file_hash(events) in [session.get(events.name) for session in rig.sessions]:
+        expected = "one of other sessions: its shots would count twice"
+        raise InputError(label, "a rig that was made from this session", expected)
 
 
 def same_rig(model: SessionModel, others: Iterable[Mapping[str, str]], label: str) -> None:

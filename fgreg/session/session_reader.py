@@ -19,6 +19,7 @@ from fgreg.schema.problems import FieldError, input_error
 from fgreg.session.event_reader import EventLog, frames_of, read_events
 from fgreg.session.frame_files import check_frames
 from fgreg.session.ground_truth import GROUND_TRUTH, GroundTruth
+from fgreg.session.rig_file import not_made_from
 from fgreg.session.setup_reader import Setup, read_setup
 from fgreg.session.yaml_loader import load_yaml
 
@@ -127,6 +128,8 @@ def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, Event
     try:
         data = load_yaml(folder / SETUP_FILE, SETUP_FILE)
         setup = read_setup(data, SETUP_FILE, resolved.name or "session", problems, resolved)
+        if setup.model is not None and setup.model.rig is not None:
+            not_made_from(setup.model.rig, resolved / EVENTS_FILE, f"{SETUP_FILE}: rig")
     except InputError as error:
         problems.append(error)
     return setup, read_events(folder / EVENTS_FILE, EVENTS_FILE, resolved, setup, problems)

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from fgreg.errors import InputError
 from fgreg.model.camera_model import StereoRig
-from fgreg.model.plausible import implausible, implausible_setup
+from fgreg.model.plausible import implausible, implausible_rig, implausible_setup
 from fgreg.model.session_model import NAME, SESSION, BoardModel, MarkerModel, ProbeModel, SessionModel
 from fgreg.schema.problems import FieldError, Problem, input_error
 from fgreg.session.rig_file import read_rig, same_rig
@@ -65,14 +65,16 @@ def read_setup(
 
     probe, camera, board = part("probe", ProbeModel), part("camera", StereoRig), part("board", BoardModel)
     marker = part("marker", MarkerModel)
-    doubts = implausible(*parts.values()) if model is None else implausible_setup(model)
+    doubts = implausible(*parts.values()) if model is None else implausible_setup(replace(model, rig=None))
+    rig_file = "" if model is None or model.rig_file is None else model.rig_file.name
+    of_rig = () if model is None or model.rig is None else tuple(implausible_rig(model.rig, rig_file))
     return Setup(
         model=model,
         present=_present(data) | {problem.meant for problem in found if problem.meant and len(problem.path) == 1},
         probe=probe,
         camera=camera,
         board=board,
-        warnings=tuple(f"{file}: {text}" for text in (*doubts, *_shared_ids(marker, board))),
+        warnings=(*(f"{file}: {text}" for text in (*doubts, *_shared_ids(marker, board))), *of_rig),
     )
 
 

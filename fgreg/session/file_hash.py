@@ -1,0 +1,22 @@
+"""SHA-256 of a file."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.session.atomic_file import why_refused
+
+
+def file_hash(path: Path) -> str:
+    """64 hexadecimal digits.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(str(path), f"a file that cannot be read ({why_refused(error)})", "a session's file") from None
