@@ -122,6 +122,7 @@ def test_one_print_of_another_size_is_named_alone() -> None:
         assert name in found.text
         assert other not in found.text
         assert "stereo calibration" not in found.text
+        assert f"({found.effect_mm:.1f} mm at the worst target)" in found.text
 
 
 def test_a_print_far_off_is_refused() -> None:
@@ -245,7 +246,12 @@ def test_frames_measure_the_printed_size(tmp_path: Path, percent: int) -> None:
 
 def test_solve_says_that_the_prints_are_smaller(tmp_path: Path) -> None:
     report = solve_session(SolveRequest(phantom(tmp_path, print_scale(1.03))))
-    assert report.estimate.verdict is Verdict.WARNING
+    assert report.estimate.verdict is Verdict.REFUSED
+    assert report.errors is not None
+    (error,), (epoch,) = report.errors.tre_mm, report.estimate.epochs
+    assert error is not None
+    assert epoch.predicted_tre is not None
+    assert error.max() < epoch.predicted_tre.worst_mm  # which includes what is named
     assert "the stereo views measure the tag 3.0 +- 0.5 % smaller than size_mm" in report.estimate.reasons[0]
     for size in sizes(report.extracted.measurements, report.session.model):
         assert size.ratio == pytest.approx(1.03, abs=0.001)

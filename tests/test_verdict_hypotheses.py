@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
 from fgreg.model.estimate import PredictedTre, Verdict
 from fgreg.model.solve_config import SolveConfig
@@ -65,12 +66,21 @@ def test_a_wrong_sound_speed_shows_where_pairs_are_many() -> None:
     declared = make_session(systematic=replace(EXACT, sound_speed=0.001))
     model, right, _ = make_measurements(np.random.default_rng(0), pairs=400, session=declared)
     assert not [reason for reason in solve(right, [], model, SolveConfig()).reasons if "sound speed" in reason]
-    model, wrong, _ = make_measurements(np.random.default_rng(0), pairs=400, session=declared, sound_speed_ratio=1.02)
+    model, wrong, truth = make_measurements(
+        np.random.default_rng(0), pairs=400, session=declared, sound_speed_ratio=1.02
+    )
     found = solve(wrong, [], model, SolveConfig())
     assert found.verdict is not Verdict.OK
     assert any("contradict the sound speed" in reason and "larger than declared" in reason for reason in found.reasons)
     (speed,) = (constant for constant in found.systematic if constant.name == "sound_speed")
     assert speed.value / speed.observed == pytest.approx(0.02, abs=0.01)
+    # The predicted error includes that of what is named: without it, it would be below the true one.
+    (epoch,), (report,) = found.epochs, found.reports
+    assert epoch.trus_T_camera is not None
+    assert epoch.predicted_tre is not None
+    named = sum(condition.effect_mm for condition in report.conditions)
+    worst = tre_mm(epoch.trus_T_camera, truth.trus_T_camera[0], model.targets_mm).max()
+    assert epoch.predicted_tre.worst_mm - named < worst < epoch.predicted_tre.worst_mm
 
 
 def test_the_beams_share_of_the_error_grows_as_aims_are_taken_away() -> None:
@@ -92,6 +102,8 @@ def test_a_beam_that_dominates_the_error_is_to_be_calibrated_with_roll() -> None
     known = accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6), both_sides=True)[0].text
     assert "both sides" not in known
     assert "measure the window's half width" in known
+    named = accuracy(tre, SolveConfig(), Causes(beam=0.7, edge=0.1), named_mm=3.0)[0].text
+    assert "3.0 mm of it by what is named above" in named
 
 
 def test_one_shot_far_off_is_an_outlier_but_several_a_little_off_are_noise() -> None:

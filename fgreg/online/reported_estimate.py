@@ -12,6 +12,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate, gaussian_tre
 from fgreg.online.full_solve import Report
+from fgreg.registration.error_budget import with_effects
 from fgreg.registration.verdict import accuracy
 from fgreg.smoother.shared_variables import POSE
 from fgreg.smoother.state import State
@@ -61,6 +62,8 @@ def reported(
             pose = optimum @ gtsam.Pose3.Expmap(shift).matrix()
         verdict, reasons = report.verdict, report.reasons
     tre = gaussian_tre(covariance, pose, model.targets_mm)
+    if report is not None:
+        tre = with_effects(tre, report.epochs[-1].conditions if report.epochs else ())
     if not (math.isfinite(tre.worst_mm) and np.isfinite(pose).all()):
         raise ArithmeticError("the reported registration is not finite")
     for condition in accuracy(tre, config):

@@ -133,7 +133,7 @@ def _print_condition(
     # A wrong baseline makes all prints look wrong alike.
     other = ", or the stereo calibration's scale is wrong" if len(named) == len(sizes) else ""
     text = f"the stereo views measure {' and '.join(said)}{_meaning(error)}: measure the printed {' and '.join(which)}"
-    return [Condition(_severity(error, config), text + other)]
+    return [Condition(_severity(error, config), text + other, error)]
 
 
 def _group_condition(
@@ -169,7 +169,7 @@ def _group_condition(
         f"the corners of tags and board fit better with {', '.join(said)} (declared to {scale * sigmas[columns[0]]:.2g}"
         f"{unit}){_meaning(error)}: the camera's calibration does not hold, {text.remedy}"
     )
-    return [Condition(_severity(error, config), sentence)]
+    return [Condition(_severity(error, config), sentence, error)]
 
 
 def _misfit_condition(corners: CornerInformation) -> list[Condition]:

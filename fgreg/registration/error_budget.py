@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -51,6 +52,7 @@ CERTAIN_SIGMAS = 4.0
 """A constant that the shots measure is noted where it is off by this many of its prior's sigmas, and of its own."""
 FAR_SIGMAS = 30.0
 """Prior standard deviations beyond which no figure is given."""
+Part = TypeVar("Part", PredictedPart, PredictedTre)
 CAUSES = 3
 """Number of causes that are named."""
 
@@ -136,7 +138,28 @@ def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
         for c in named
     )
     remedies = "; ".join(dict.fromkeys(texts[c.name].remedy for c in named))
-    return [Condition(Verdict.WARNING, f"the shots contradict {which}: {remedies}")]
+    effect = max(_remaining_mm(c) for c in named)
+    return [Condition(Verdict.WARNING, f"the shots contradict {which}: {remedies}", effect)]
+
+
+def with_effects(predicted: PredictedTre, conditions: Sequence[Condition]) -> PredictedTre:
+    """The predicted error with that of constants which tests name, in its systematic part.
+
+    An error of m mm beside one whose 95 % quantile is q has a quantile of at most q + m.
+    """
+    effect = sum(condition.effect_mm for condition in conditions)
+    if not effect:
+        return predicted
+
+    def more(part: Part) -> Part:
+        mean = float(np.hypot(part.mean_mm, effect))
+        return replace(part, mean_mm=mean, p95_mm=part.p95_mm + effect, worst_mm=part.worst_mm + effect)
+
+    return replace(
+        more(predicted),
+        systematic=None if predicted.systematic is None else more(predicted.systematic),
+        seen=None if predicted.seen is None else more(predicted.seen),
+    )
 
 
 def measured(constants: Sequence[SystematicEstimate]) -> list[Condition]:
@@ -146,8 +169,7 @@ def measured(constants: Sequence[SystematicEstimate]) -> list[Condition]:
     """
     found = []
     for constant in constants:
-        root = float(np.sqrt(constant.observed))
-        pulled = abs(constant.score) * constant.prior_sigma * root  # from what was expected
+        pulled = abs(_pulled(constant)[0])
         off = pulled > NOTED_SIGMAS * constant.prior_sigma * constant.observed
         if constant.name in _MEASURED and off and pulled > CERTAIN_SIGMAS * constant.sigma:
             text = {text.name: text for text in TEXTS}[constant.name]
@@ -161,10 +183,21 @@ def measured(constants: Sequence[SystematicEstimate]) -> list[Condition]:
     return found
 
 
+def _pulled(constant: SystematicEstimate) -> tuple[float, float]:
+    """By how much the shots move a constant from what was expected, and how much more they would without its prior."""
+    pulled = constant.score * constant.prior_sigma * float(np.sqrt(constant.observed))
+    return pulled, pulled * (1.0 / max(constant.observed, 1e-6) - 1.0)
+
+
+def _remaining_mm(constant: SystematicEstimate) -> float:
+    """Error at the worst target where a constant is what the shots alone say, and not what its prior pulls it to."""
+    more = min(abs(_pulled(constant)[1]), FAR_SIGMAS * constant.prior_sigma)
+    return constant.worst_target_mm * more / constant.sigma
+
+
 def _amount(constant: SystematicEstimate) -> str:
     """By how much a constant differs from the declared one."""
-    pulled = constant.score * constant.prior_sigma * np.sqrt(constant.observed)  # from what was expected
-    value = constant.value + pulled * (1.0 / max(constant.observed, 1e-6) - 1.0)  # without the pull of its prior
+    value = constant.value + _pulled(constant)[1]
     if abs(value) > FAR_SIGMAS * constant.prior_sigma:
         return "far off"  # where it does not enter linearly, and its figure means nothing
     unit = {text.name: text for text in TEXTS}[constant.name].unit

@@ -30,7 +30,13 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import fit_surface
 from fgreg.registration.camera_conditions import camera_conditions
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
-from fgreg.registration.error_budget import Budget, error_budget, largest_causes, random_errors_only
+from fgreg.registration.error_budget import (
+    Budget,
+    error_budget,
+    largest_causes,
+    random_errors_only,
+    with_effects,
+)
 from fgreg.registration.group_tests import group_conditions
 from fgreg.registration.move_doubt import may_share_a_registration, move_doubt, outliers_in_a_row
 from fgreg.registration.multistart import EpochSearch
@@ -330,10 +336,12 @@ def _epoch_verdicts(
         else:
             place = registration.epochs.index(k)
             found = [*steady[k], *_epoch_conditions(measurements, registration, pairs, k, model, config)]
-            tre = budget.predicted[place]
+            tre = with_effects(budget.predicted[place], common)
             causes = causes_of_error(registration, place, model.targets_mm)
             both = two_sided(pair for pair in measurements.pairs if pair.epoch == k)
-            found.extend(accuracy(tre, config, causes, largest_causes(budget.constants), both_sides=both))
+            named_mm = sum(condition.effect_mm for condition in common)
+            largest = largest_causes(budget.constants)
+            found.extend(accuracy(tre, config, causes, largest, both_sides=both, named_mm=named_mm))
             block = slice(6 * place, 6 * place + 6)
             estimate = EpochEstimate(
                 index=k,

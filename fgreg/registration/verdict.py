@@ -61,10 +61,14 @@ SUSPICIOUS_SIGMAS = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """One missed condition: its severity, and the sentence for ``reasons``."""
+    """One missed condition: its severity, and the sentence for ``reasons``.
+
+    ``effect_mm``: error at the worst target of what the sentence names, which the posterior does not include.
+    """
 
     verdict: Verdict
     text: str
+    effect_mm: float = 0.0
 
 
 def verdict_of(conditions: Iterable[Condition]) -> Verdict:
@@ -365,17 +369,20 @@ def accuracy(
     largest: str = "",
     *,
     both_sides: bool = False,
+    named_mm: float = 0.0,
 ) -> list[Condition]:
     """Predicted error at the worst target against the limit, with the advice that would lower it most.
 
     ``largest``: the systematic causes with the largest part in it, as text. ``both_sides``: most PMs have looks from
-    both sides already.
+    both sides already. ``named_mm``: the part that is named by other conditions.
     """
     if tre.worst_mm <= config.limit_mm:
         return []
     far = tre.worst_mm > 2.0 * config.limit_mm
     advice = "take more pairs, spread over the field, with looks from both sides at each PM"
-    if largest and tre.systematic is not None and tre.systematic.worst_mm > math.sqrt(DOMINANT) * tre.worst_mm:
+    if named_mm > DOMINANT * tre.worst_mm:
+        advice = f"{named_mm:.1f} mm of it by what is named above: correct that"
+    elif largest and tre.systematic is not None and tre.systematic.worst_mm > math.sqrt(DOMINANT) * tre.worst_mm:
         also = "" if both_sides else ", and take looks from both sides at each PM"
         advice = f"most of it is systematic ({largest}): measure these{also}"
     elif causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
