@@ -126,7 +126,7 @@ def solve_measurements(
     """
     config = config or SolveConfig()
     solved = solve_batch(measurements, tracks, model, config).as_session(model.name)
-    return with_checks(solved, checks, config.limit_mm)
+    return with_checks(solved, checks, config.limit_mm, model.targets_mm)
 
 
 def _path(path: str | Path | None) -> Path | None:

@@ -21,6 +21,7 @@ from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transfo
 from fgreg.model.estimate import EpochEstimate, SessionEstimate, Verdict
 from fgreg.model.events import AimEvent, CheckEvent, PairEvent, PlaneRecord, TrackEvent
 from fgreg.model.measurements import Check
+from fgreg.model.session_model import default_targets_mm
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import LiveSession
@@ -29,8 +30,10 @@ from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.registration.checks import (
     ASSUMPTIONS,
     CHECKS_REFUSE,
+    COVERED_POWER,
     check_registration,
     direction_text,
+    powers,
     with_checks,
 )
 from fgreg.session.result_file import read_result
@@ -41,6 +44,7 @@ from tests.session_files import diagonal
 PAPER = Path(__file__).parents[1] / "sessions" / "paper"
 TRUS_T_CAMERA = make_transform(exp_so3(np.array([3.0, 0.2, -0.1])), np.array([5.0, -8.0, 160.0]))
 COVARIANCE = np.diag(np.square([0.004, 0.003, 0.005, 0.2, 0.3, 0.25]))
+TARGETS = default_targets_mm(10.0)
 POINTS = np.array([[0.0, 0.0, 40.0], [15.0, -12.0, 35.0], [-15.0, 10.0, 45.0], [5.0, 20.0, 30.0]])
 
 
@@ -75,9 +79,8 @@ def test_error_and_its_prediction_are_those_of_a_thousand_perturbed_registration
     assert found.nis == pytest.approx(found.error_mm @ np.linalg.solve(spread, found.error_mm), rel=0.05)
 
 
-def test_good_checks_cover_the_assumptions_and_change_nothing() -> None:
+def test_good_checks_change_nothing() -> None:
     found = check_registration(checks_at(0.3 * np.ones((4, 3))), TRUS_T_CAMERA, COVARIANCE, 3.0)
-    assert found.covers
     assert found.conditions == ()
     assert {check.verdict for check in found.checks} == {Verdict.OK}
 
@@ -99,8 +102,38 @@ def test_a_common_shift_is_named_by_its_axis(axis: list[float], text: str) -> No
     assert "the checks are off by 2.5 mm" in found.conditions[0].text
     assert text in found.conditions[0].text
     assert found.conditions[0].verdict is Verdict.WARNING
-    assert not found.covers
     assert {check.verdict for check in found.checks} == {Verdict.WARNING}
+
+
+def test_checks_show_an_error_as_large_as_the_limit_as_often_as_they_say() -> None:
+    """A turn of the registration about the probe's axis, by 3 mm at the farthest target."""
+    rng, draws = np.random.default_rng(5), 600
+    checks = [replace(check, covariance=0.7 * np.eye(3)) for check in checks_at(np.zeros(3))[:3]]
+    _, turn = powers(checks, TRUS_T_CAMERA, COVARIANCE, 3.0, TARGETS)
+    angle = 3.0 / np.linalg.norm(TARGETS[:, 1:], axis=1).max()
+    turned = make_transform(exp_so3(np.array([angle, 0.0, 0.0])), np.zeros(3)) @ TRUS_T_CAMERA
+    shown = 0
+    for xi in rng.multivariate_normal(np.zeros(6), COVARIANCE, draws):
+        truth = turned @ make_transform(exp_so3(xi[:3]), xi[3:])
+        camera_p = transform_points(inverse(truth), POINTS[:3]) + rng.normal(0.0, 0.7**0.5, (3, 3))
+        trus_p = POINTS[:3] + rng.normal(0.0, 0.5 / 2.0**0.5, (3, 3))
+        drawn = [
+            replace(check, camera_p_mm=camera_p[i], trus_p_mm=trus_p[i], trus_covariance=check.trus_covariance)
+            for i, check in enumerate(checks)
+        ]
+        found = check_registration(drawn, TRUS_T_CAMERA, COVARIANCE, 30.0)
+        shown += any(check.verdict is Verdict.WARNING for check in found.checks)
+    assert 0.2 < turn < 0.8
+    assert turn - 0.06 < shown / draws < turn + 0.1  # either of the tests is enough: a little more than the better one
+
+
+def test_a_check_on_the_probes_axis_does_not_show_a_turned_window() -> None:
+    points = np.array([[-20.0, 0.0, 0.0], [0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
+    shift, turn = powers(checks_at(np.zeros(3), 0.3, points), TRUS_T_CAMERA, 0.25 * COVARIANCE, 3.0, TARGETS)
+    assert shift > COVERED_POWER
+    assert turn < 0.01
+    # Nor do any checks that are too rough.
+    assert max(powers(checks_at(np.zeros(3), 4.0), TRUS_T_CAMERA, COVARIANCE, 3.0, TARGETS)) < COVERED_POWER
 
 
 def test_axes_turn_with_the_stage_angle_of_the_point() -> None:
@@ -299,13 +332,18 @@ def test_a_check_belongs_to_its_camera_epoch() -> None:
         for k, (pose, covariance) in enumerate([(TRUS_T_CAMERA, COVARIANCE), (TRUS_T_CAMERA, COVARIANCE)])
     )
     estimate = SessionEstimate("two", Verdict.OK, (), None, epochs, (), ())
-    far, near = checks_at(np.array([0.0, 0.0, 9.0]))[:2], checks_at(np.zeros(3))[2:]
-    found = with_checks(estimate, [*far, *(replace(check, epoch=1) for check in near)], 3.0)
+    far, near = checks_at(np.array([0.0, 0.0, 9.0]))[:2], checks_at(np.zeros(3), 0.3)[2:]
+    found = with_checks(estimate, [*far, *(replace(check, epoch=1) for check in near)], 3.0, TARGETS)
     assert [epoch.verdict for epoch in found.epochs] == [Verdict.REFUSED, Verdict.OK]
     assert found.verdict is Verdict.WARNING
     assert found.reasons[0].startswith("epoch 0: the checks are off by 9.0 mm")
     assert {entry.checks for entry in found.assumptions} == {(2, 3)}
+    on_axis = np.array([[-15.0, 0.0, 0.0], [15.0, 0.0, 0.0]])
+    axis = [replace(check, epoch=1) for check in checks_at(np.zeros(3), 0.3, on_axis)]
+    sure = replace(estimate, epochs=(epochs[0], replace(epochs[1], covariance=0.25 * COVARIANCE)))
+    layer, window = with_checks(sure, axis, 3.0, TARGETS).assumptions
+    assert (layer.checks, window.checks) == ((0, 1), ())
     open_epochs = (epochs[0], replace(epochs[1], trus_T_camera=None, covariance=None))
-    (lost,) = with_checks(replace(estimate, epochs=open_epochs), [replace(near[0], epoch=1)], 3.0).checks
+    (lost,) = with_checks(replace(estimate, epochs=open_epochs), [replace(near[0], epoch=1)], 3.0, TARGETS).checks
     assert (lost.error_mm, lost.nis, lost.verdict) == (None, None, Verdict.WARNING)
     assert lost.reason == "there is no registration of its camera epoch"

@@ -222,7 +222,9 @@ def _solved(session: Session, model: SessionModel, use_checks: bool, done: Calla
     solution = solve(extracted.measurements, (), model, config, detection_conditions(extracted))
     done()
     checks = tuple(extracted.checks.values()) if use_checks else ()
-    estimate = with_checks(solution.as_session(session.model.name), [*extracted.checks.values()], config.limit_mm)
+    estimate = with_checks(
+        solution.as_session(session.model.name), [*extracted.checks.values()], config.limit_mm, model.targets_mm
+    )
     if estimate.verdict is Verdict.REFUSED or solution.registration is None:
         return _Solved(session, None, "; ".join(estimate.reasons), checks)
     registration = solution.registration

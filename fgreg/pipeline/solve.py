@@ -228,7 +228,7 @@ def session_estimate(
         elif isinstance(event, CheckEvent) and index not in checks:
             checks[index] = not_compared(event.t, reason)
     solved = solution.as_session(session.model.name)
-    checked = with_checks(solved, [checks[i] for i in sorted(checks)], config.limit_mm)
+    checked = with_checks(solved, [checks[i] for i in sorted(checks)], config.limit_mm, session.model.targets_mm)
     if checked.epochs and checked.epochs[-1].verdict is Verdict.REFUSED is not solved.epochs[-1].verdict:
         for index in extracted.track_events:
             if extracted.epoch_of[index] == checked.epochs[-1].index:

@@ -9,6 +9,9 @@ whose false alarms together are 0.3 % of sessions:
 - each of them alone;
 - the mean error has to stay below the limit with its own 95 %: a bound that does not use the registration's covariance,
   since that does not include what the checks are for.
+
+What line and arc cannot show is *covered* where the first two tests would show it: an error of the registration, of the
+assumption's own kind and as large as the limit at the worst target, with probability ``COVERED_POWER``.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri, chndtr
 
 from fgreg.geometry.target_error import gaussian_quantile_mm, offset_quantile_mm
 from fgreg.geometry.transforms import FloatArray, hat
@@ -27,6 +30,8 @@ from fgreg.registration.verdict import Condition, verdict_of
 
 SHIFT_P, ALONE_P = 2e-3, 1e-3
 """False alarms of the common shift, and of all checks of an epoch taken alone."""
+COVERED_POWER = 0.8
+"""Probability of showing an error as large as the limit from which checks cover an assumption that could cause it."""
 MAIN_SHARE = 0.8
 """Share of the error's length from which one axis alone is named."""
 NOT_REGISTERED = "there is no registration of its camera epoch"
@@ -38,19 +43,31 @@ ASSUMPTIONS = (
     "the sensitivity window is centred on the image plane: where it is not, the registration is turned about the "
     "probe's axis",
 )
-"""What line and arc cannot show."""
+"""What line and arc cannot show, in the order of :func:`powers`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedEpoch:
-    """The checks of one camera epoch: an estimate for each, and the conditions of the verdict.
-
-    ``covers``: whether they agree with the registration, and bound its mean error below the limit.
-    """
+    """The checks of one camera epoch: an estimate for each, and the conditions of the verdict."""
 
     checks: tuple[CheckEstimate, ...]
     conditions: tuple[Condition, ...]
-    covers: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Errors:
+    """Errors at n checks: ``each`` (n, 3), ``covariance`` (n, 3, 3) with the registration's, ``own`` without it.
+
+    Of the mean, each check weighted by its own precision: ``share`` (n, 3, 3), ``mean`` (3,), ``mean_own`` and
+    ``mean_covariance`` (3, 3). All along the TRUS axes.
+    """
+
+    each: FloatArray
+    covariance: FloatArray
+    share: FloatArray
+    mean: FloatArray
+    mean_own: FloatArray
+    mean_covariance: FloatArray
 
 
 def check_registration(
@@ -63,6 +80,24 @@ def check_registration(
         trus_T_camera: (4, 4). covariance: (6, 6) over its right tangent.
         limit_mm: of the error.
     """
+    errors, n = _errors(checks, trus_T_camera, covariance), len(checks)
+    nis = np.einsum("ni,ni->n", errors.each, np.linalg.solve(errors.covariance, errors.each[..., None])[..., 0])
+    alone = chdtrc(3, nis) < ALONE_P / n
+    shift_p = float(chdtrc(3, errors.mean @ np.linalg.solve(errors.mean_covariance, errors.mean)))
+    bound_mm = offset_quantile_mm(errors.mean, errors.mean_own)
+    quantiles = gaussian_quantile_mm(errors.covariance)
+    off = alone | (shift_p < SHIFT_P)
+    found = _conditions(checks, errors, alone, shift_p, bound_mm, limit_mm)
+    estimates = tuple(
+        CheckEstimate(
+            check.t, errors.each[i], float(quantiles[i]), float(nis[i]), Verdict.WARNING if off[i] else Verdict.OK
+        )
+        for i, check in enumerate(checks)
+    )
+    return CheckedEpoch(estimates, tuple(found))
+
+
+def _errors(checks: Sequence[Check], trus_T_camera: FloatArray, covariance: FloatArray) -> _Errors:
     rotation, n = trus_T_camera[:3, :3], len(checks)
     camera_p = np.stack([check.camera_p_mm for check in checks])
     trus_p = np.stack([check.trus_p_mm for check in checks])
@@ -70,9 +105,7 @@ def check_registration(
     own = np.stack([rotation @ check.covariance @ rotation.T + check.trus_covariance for check in checks])
     gain = np.concatenate([-rotation @ hat(camera_p), np.broadcast_to(rotation, (n, 3, 3))], axis=-1)
     predicted = own + gain @ covariance @ gain.swapaxes(1, 2)
-    nis = np.einsum("ni,ni->n", error, np.linalg.solve(predicted, error[..., None])[..., 0])
-    alone = chdtrc(3, nis) < ALONE_P / n
-    # The mean, each check weighted by its own precision; one that was written down several times counts once.
+    # One that was written down several times counts once.
     points = np.concatenate([camera_p, trus_p], axis=1)
     times = (points[:, None] == points).all(axis=-1).sum(axis=1)
     weight = np.linalg.inv(own) / times[:, None, None]
@@ -81,34 +114,52 @@ def check_registration(
     mean = np.einsum("nij,nj->i", share, error)
     mean_gain = np.einsum("nij,njk->ik", share, gain)
     spread = own_mean + mean_gain @ covariance @ mean_gain.T
-    shift_p = float(chdtrc(3, mean @ np.linalg.solve(spread, mean)))
-    bound_mm = offset_quantile_mm(mean, own_mean)
-    quantiles = gaussian_quantile_mm(predicted)
-    off = alone | (shift_p < SHIFT_P)
-    found = _conditions(checks, error, alone, mean, shift_p, bound_mm, spread, limit_mm)
-    estimates = tuple(
-        CheckEstimate(check.t, error[i], float(quantiles[i]), float(nis[i]), Verdict.WARNING if off[i] else Verdict.OK)
-        for i, check in enumerate(checks)
-    )
-    return CheckedEpoch(estimates, tuple(found), not found)
+    return _Errors(error, predicted, share, mean, own_mean, spread)
+
+
+def powers(
+    checks: Sequence[Check],
+    trus_T_camera: FloatArray,
+    covariance: FloatArray,
+    limit_mm: float,
+    targets_mm: FloatArray,
+) -> tuple[float, ...]:
+    """With which probability the checks show an error as large as the limit at the worst target, per ``ASSUMPTIONS``.
+
+    That of a layer shifts all points alike, in the direction in which it shows least, since its normal is not known.
+    That of a window turns them about the probe's axis.
+
+    Args:
+        checks, trus_T_camera, covariance, limit_mm: as of :func:`check_registration`.
+        targets_mm: (m, 3) TRUS.
+    """
+    errors = _errors(checks, trus_T_camera, covariance)
+    trus_p = np.stack([check.trus_p_mm for check in checks])
+    least = np.linalg.eigh(errors.mean_covariance)[1][:, -1]
+    reach_mm = float(np.linalg.norm(targets_mm[:, 1:], axis=1).max())
+    turned = np.cross([1.0, 0.0, 0.0], trus_p) / max(reach_mm, 1e-9)
+    return tuple(_power(limit_mm * moved, errors) for moved in (np.broadcast_to(least, trus_p.shape), turned))
+
+
+def _power(moved: FloatArray, errors: _Errors) -> float:
+    """With which probability one of the tests shows that the registration is off by (n, 3) at the checks."""
+    mean = np.einsum("nij,nj->i", errors.share, moved)
+    together = mean @ np.linalg.solve(errors.mean_covariance, mean)
+    alone = np.einsum("ni,ni->n", moved, np.linalg.solve(errors.covariance, moved[..., None])[..., 0])
+    shown = [chndtr(chdtri(3, SHIFT_P), 3, together), *chndtr(chdtri(3, ALONE_P / len(moved)), 3, alone)]
+    return 1.0 - float(min(shown))
 
 
 def _conditions(
-    checks: Sequence[Check],
-    error: FloatArray,
-    alone: FloatArray,
-    mean: FloatArray,
-    shift_p: float,
-    bound_mm: float,
-    spread: FloatArray,
-    limit_mm: float,
+    checks: Sequence[Check], errors: _Errors, alone: FloatArray, shift_p: float, bound_mm: float, limit_mm: float
 ) -> list[Condition]:
     found = []
+    error, mean = errors.each, errors.mean
     norm = float(np.linalg.norm(mean))
     several = len(checks) > 1
     middle = np.mean([check.trus_p_mm for check in checks], axis=0)
     if shift_p < SHIFT_P:
-        expected = float(gaussian_quantile_mm(spread[None])[0])
+        expected = float(gaussian_quantile_mm(errors.mean_covariance[None])[0])
         surely_mm = 2.0 * norm - bound_mm
         text = (
             f"the check{'s are' if several else ' is'} off by {norm:.1f} mm {direction_text(mean, middle)}, "
@@ -156,21 +207,19 @@ def direction_text(error_mm: FloatArray, trus_p_mm: FloatArray) -> str:
     return "(" + " and ".join(named) + ")"
 
 
-def assumptions(covered: Sequence[int] = ()) -> tuple[Assumption, ...]:
-    """The assumptions of every result; ``covered``: places of the checks that have covered them."""
-    return tuple(Assumption(text, tuple(covered)) for text in ASSUMPTIONS)
-
-
-def with_checks(estimate: SessionEstimate, checks: Sequence[Check | CheckEstimate], limit_mm: float) -> SessionEstimate:
+def with_checks(
+    estimate: SessionEstimate, checks: Sequence[Check | CheckEstimate], limit_mm: float, targets_mm: FloatArray
+) -> SessionEstimate:
     """The estimate with its checks, their effect on the verdicts, and the assumptions that they cover.
 
     Args:
         estimate: of the session, without checks.
         checks: in event order; those that are not usable with the reason.
         limit_mm: of the error.
+        targets_mm: (m, 3) TRUS points at which it matters.
     """
     results: dict[int, CheckEstimate] = {}
-    covered: list[int] = []
+    covered: tuple[tuple[int, ...], ...] = ((),) * len(ASSUMPTIONS)
     conditions: dict[int, tuple[Condition, ...]] = {}
     current = len(estimate.epochs) - 1
     for epoch in estimate.epochs:
@@ -180,15 +229,16 @@ def with_checks(estimate: SessionEstimate, checks: Sequence[Check | CheckEstimat
         found = check_registration([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm)
         results.update(zip(mine, found.checks, strict=True))
         conditions[epoch.index] = found.conditions
-        if epoch.index == current and found.covers and epoch.verdict is not Verdict.REFUSED:
-            covered += mine
+        if epoch.index == current and not found.conditions and epoch.verdict is not Verdict.REFUSED:
+            shown = powers([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm, targets_mm)
+            covered = tuple(tuple(mine) if power >= COVERED_POWER else () for power in shown)
     for i, at in enumerate(checks):
         if i not in results:
             results[i] = at if isinstance(at, CheckEstimate) else not_compared(at.t, NOT_REGISTERED)
     return replace(
         with_conditions(estimate, conditions),
         checks=tuple(results[i] for i in range(len(checks))),
-        assumptions=assumptions(covered),
+        assumptions=tuple(Assumption(text, by) for text, by in zip(ASSUMPTIONS, covered, strict=True)),
     )
 
 
