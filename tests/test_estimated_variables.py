@@ -15,6 +15,7 @@ from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel, SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import EXACT
+from fgreg.online.engine import OnlineRegistration
 from fgreg.registration.posterior_mean import (
     estimated_radius,
     estimated_sound_speed,
@@ -23,6 +24,7 @@ from fgreg.registration.posterior_mean import (
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
 from tests.forward import Truth, make_measurements, make_session
+from tests.online_streams import first, restored
 
 QUIET = NoiseModel(
     marker_translation_mm=(0.02, 0.02, 0.05),
@@ -48,6 +50,21 @@ def test_a_wrong_sound_speed_is_found_where_the_noise_lets_it() -> None:
     assert any("contradict the sound speed" in reason for reason in solution.reasons)
     (speed,) = solution.systematic[1:]
     assert abs(speed.value / speed.observed - 0.05) < 3.5 * speed.sigma / speed.observed
+
+
+def test_the_error_that_a_full_solve_names_stays_in_the_estimates_after_it() -> None:
+    declared = make_session(noise_model=QUIET, systematic=replace(EXACT, sound_speed=0.01))
+    model, measurements, _ = make_measurements(
+        np.random.default_rng(1), pairs=32, session=declared, sound_speed_ratio=1.05
+    )
+    engine = restored(OnlineRegistration(model, find_moves=False), first(measurements, 30))
+    solved, later = engine.settle(), engine.add(measurements.pairs[30])
+    assert any("contradict the sound speed" in reason for reason in solved.reasons)
+    assert solved.settled
+    assert not later.settled
+    assert solved.predicted_tre is not None
+    assert later.predicted_tre is not None
+    assert later.predicted_tre.worst_mm == pytest.approx(solved.predicted_tre.worst_mm, rel=0.2)
 
 
 def test_estimating_the_sound_speed_takes_its_error_out() -> None:

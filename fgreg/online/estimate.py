@@ -20,7 +20,7 @@ class OnlineEstimate:
         epoch: index of the camera epoch.
         trus_T_camera: (4, 4) as reported: the graph's optimum moved to the posterior mean; None where there is none.
         covariance: (6, 6), GTSAM's tangent (rotation rad, translation mm), right perturbation.
-        predicted_tre: from that covariance.
+        predicted_tre: from that covariance, with the error of what the last full solve names.
         nis: innovation of the pair just added: its squared deviation from what all others predict, over the predicted
             covariance; None for other events, and where the others predict nothing.
         used: whether the pair just added is an inlier.
