@@ -20,6 +20,7 @@ from fgreg.model.events import MarkerRecord as MarkerRecord
 from fgreg.model.events import PairEvent as PairEvent
 from fgreg.model.events import TrackEvent as TrackEvent
 from fgreg.model.events import TrusRecord as TrusRecord
+from fgreg.model.measurement_checks import problems_of_all
 from fgreg.model.measurements import Aim as Aim
 from fgreg.model.measurements import Check as Check
 from fgreg.model.measurements import EpochStart as EpochStart
@@ -123,7 +124,12 @@ def solve_measurements(
         config: limit of the verdict, and settings of the estimate.
         tracks: queries, answered from all measurements; they never enter the estimate.
         checks: points known to both devices; nor do they.
+
+    Raises:
+        InputError: a number that is no measurement: not finite, no covariance, beyond reason.
     """
+    for where, problem in problems_of_all(measurements, checks):
+        raise InputError(where, problem, "numbers that are a measurement")
     config = config or SolveConfig()
     solved = solve_batch(measurements, tracks, model, config).as_session(model.name)
     return with_checks(solved, checks, config.limit_mm, model.targets_mm)

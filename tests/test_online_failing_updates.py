@@ -265,7 +265,7 @@ def _spoil(pair: Pair, what: str) -> Any:
     ("what", "said"),
     [
         ("a pose that is not finite", "camera_T_marker has an entry that is not finite"),
-        ("a pose that is not rigid", "camera_T_marker is not a rigid transform"),
+        ("a pose that is not rigid", "camera_T_marker is a matrix that is not rigid"),
         ("a covariance that is not finite", "covariance of the marker has an entry"),
         ("a covariance of the wrong shape", "shape"),
         ("a covariance that is not symmetric", "not symmetric"),

@@ -212,26 +212,37 @@ def _summary_extras(report: "SolveReport") -> Any:
 
 
 @app.command()
-def check(session: SessionArgument, as_json: JsonOption = False) -> None:
+def check(
+    session: SessionArgument,
+    frames: Annotated[
+        bool, typer.Option("--frames/--headers-only", help="Detect in the frames, or read only their headers.")
+    ] = True,
+    as_json: JsonOption = False,
+) -> None:
     """Check a session's files and report all problems at once.
 
-    Checks session.yaml, events.jsonl, ground_truth.yaml and the headers of all frames. Exit status 2 where there are
-    problems; warnings alone are 0.
+    Checks session.yaml, events.jsonl, ground_truth.yaml and all frames, and detects in the frames as solve does: each
+    shot that a solve would leave out is named with the reason. Exit status 2 where there are problems; warnings alone
+    are 0.
     """
-    from fgreg.session.session_reader import check_session
+    from fgreg.pipeline.check import check as check_all
 
-    problems, warnings = check_session(session)
+    with _progress(as_json) as progress:
+        found = check_all(session, frames=frames, progress=progress)
     if as_json:
-        found = [{"where": p.where, "found": p.found, "expected": p.expected} for p in problems]
-        typer.echo(json.dumps({"session": str(session), "problems": found, "warnings": warnings}, indent=2))
+        problems = [{"where": p.where, "found": p.found, "expected": p.expected} for p in found.problems]
+        unused = [{"line": u.line, "type": u.kind, "reason": u.reason} for u in found.unused]
+        document = {"session": str(session), "problems": problems, "warnings": [*found.warnings], "unused": unused}
+        typer.echo(json.dumps(document, indent=2))
     else:
-        for problem in problems:
+        for problem in found.problems:
             sys.stderr.write(f"fgreg: error: {' '.join(str(problem).split())}\n")
+        warnings = [*found.warnings, *(shot.text for shot in found.unused)]
         for warning in warnings:
             sys.stderr.write(f"fgreg: warning: {warning}\n")
-        if not problems:
+        if not found.problems:
             typer.echo(f"{session}: no problems" + (f", {len(warnings)} warnings" if warnings else ""))
-    if problems:
+    if found.problems:
         raise typer.Exit(EXIT_BAD_INPUT)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from fgreg.detection.camera import focal_px, normalized_from_pixels
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import StereoRig
 from fgreg.model.events import CheckEvent, PlaneRecord
+from fgreg.model.measurement_checks import problem_of
 from fgreg.model.measurements import FLOOR_MM, Check, usable_covariance
 from fgreg.model.session_model import SessionModel
 
@@ -44,13 +46,11 @@ def check_measurement(event: CheckEvent, epoch: int, model: SessionModel) -> Che
     else:
         raise AssertionError("the reader requires the point in the TRUS frame")
     floor = (FLOOR_MM,) * 3
-    return Check(
-        event.t,
-        epoch,
-        camera_p,
-        usable_covariance(covariance, floor),
-        trus_p,
-        usable_covariance(trus_covariance, floor),
+    check = Check(event.t, epoch, camera_p, covariance, trus_p, trus_covariance)
+    return problem_of(check) or replace(
+        check,
+        covariance=usable_covariance(covariance, floor),
+        trus_covariance=usable_covariance(trus_covariance, floor),
     )
 
 

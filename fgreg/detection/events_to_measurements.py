@@ -42,6 +42,7 @@ from fgreg.model.events import (
     needs_marker_frames,
     refused_lines,
 )
+from fgreg.model.measurement_checks import look_problem, marker_problem, spot_problem
 from fgreg.model.measurements import (
     Aim,
     CameraDependence,
@@ -271,7 +272,9 @@ class _Builder:
             self.ids[key] = self.next_id
             self.next_id += 1
         number = self.ids[key]
-        return MarkerObservation(as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6), number, dependence)
+        pose, covariance = as_float_array(transform, 4, 4), as_float_array(covariance, 6, 6)
+        marker = MarkerObservation(pose, covariance, number, dependence)
+        return marker_problem(marker) or marker
 
     def _spot(self, index: int, event: AimEvent) -> tuple[FloatArray, FloatArray, CameraDependence | None] | str:
         """The aimed-at spot (3,) mm, camera frame, its covariance (3, 3), which includes the laser's error, and how
@@ -280,7 +283,8 @@ class _Builder:
         if event.camera_p_spot_mm is not None:
             spot = event.camera_p_spot_mm
             dependence = nominal_spot_dependence(self.model, spot) if self.camera_matters else None
-            return spot, laser if event.covariance is None else event.covariance, dependence
+            given = laser if event.covariance is None else event.covariance
+            return spot_problem(spot, given) or (spot, given, dependence)
         fit = self.found.boards[index]
         if isinstance(fit, NotFound):
             return fit.reason
@@ -289,7 +293,8 @@ class _Builder:
         spot, covariance = board_corner(fit, event.corner[0], event.corner[1], self.board_noise)
         camera_R_board = fit.camera_T_board[:3, :3]
         dependence = board_corner_dependence(fit, event.corner[0], event.corner[1])
-        return spot, covariance + camera_R_board @ laser @ camera_R_board.T, dependence
+        whole = covariance + camera_R_board @ laser @ camera_R_board.T
+        return spot_problem(spot, whole) or (spot, whole, dependence)
 
     def _look(self, index: int, number: int, record: TrusRecord) -> Look | str:
         noise, stage = self.model.noise, self.model.stage
@@ -310,7 +315,7 @@ class _Builder:
             amplitude = find.amplitude if amplitude is None else amplitude
             others = tuple(OtherPosition(other.x_mm, other.range_mm, other.covariance) for other in find.others)
             wavefront = find.wavefront
-        return Look(
+        look = Look(
             scan_rad=stage.scan_from_device(math.radians(record.scan_deg)),
             scan_sigma_rad=noise.scan_rad,
             x_mm=x_mm,
@@ -322,6 +327,7 @@ class _Builder:
             others=others,
             wavefront=wavefront,
         )
+        return look_problem(look) or look
 
 
 class MeasurementExtractor:

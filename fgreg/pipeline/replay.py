@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgreg.camera_moves.recorded_session import EpochsFound
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.errors import EventRefused, InputError
 from fgreg.model.estimate import Quantiles, Timing, TrackEstimate, Verdict
@@ -29,15 +28,12 @@ from fgreg.pipeline.solve import (
     RESULT_FILE,
     Progress,
     SolveReport,
-    detection_conditions,
     errors_where_known,
-    move_conditions,
     remove_older_result,
-    session_estimate,
     show_frames,
+    solve_extracted,
 )
 from fgreg.registration.checks import CHECKS_REFUSE
-from fgreg.registration.solve import solve
 from fgreg.session.result_file import write_result
 from fgreg.session.session_reader import Session, read_ground_truth, read_session
 from fgreg.version import __version__
@@ -146,16 +142,8 @@ def replay_session(
         engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config)
         player = _Player(session, extracted, engine, viewer, request.speed, config)
         player.play(on_step)
-        taken, found = player.taken(), player.found()
-        solution = solve(
-            taken.measurements,
-            (),
-            session.model,
-            config,
-            [*move_conditions(found), *detection_conditions(extracted)],
-        )
+        taken, found, solution, estimate = solve_extracted(session, player.taken(), config)
         settled = engine.settle() if player.estimate is not None else None
-        estimate = session_estimate(session, replace(taken, track_events=()), solution, config)
         estimate = replace(estimate, timing=player.timing(), tracks=player.answers(estimate.tracks))
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         viewer.result(session.model, taken.measurements, estimate, truth, extracted.tracks)
@@ -271,28 +259,23 @@ class _Player:
         )
 
     def taken(self) -> ExtractedMeasurements:
-        """The engine's measurements, the events they come from, and the reasons of unused events."""
-        extracted, measurements = self._extracted, self._engine.measurements()
-        epoch_of = extracted.epoch_of
-        if self._engine.moves:
-            began = [start.t for start in measurements.epochs[1:]]
-            epoch_of = tuple(sum(t <= event.t for t in began) for event in self._session.events)
+        """The session's measurements without the events that the engine refused, and without its queries."""
+        extracted, measurements = self._extracted, self._extracted.measurements
+        aims = [i for i, event in enumerate(extracted.aim_events) if event not in self._unused]
+        pairs = [i for i, event in enumerate(extracted.pair_events) if event not in self._unused]
         return replace(
             extracted,
-            measurements=measurements,
-            epoch_of=epoch_of,
-            checks={index: replace(check, epoch=epoch_of[index]) for index, check in extracted.checks.items()},
-            aim_events=tuple(i for i in extracted.aim_events if i not in self._unused),
-            pair_events=tuple(i for i in extracted.pair_events if i not in self._unused),
+            measurements=replace(
+                measurements,
+                aims=tuple(measurements.aims[i] for i in aims),
+                pairs=tuple(measurements.pairs[i] for i in pairs),
+            ),
+            aim_events=tuple(extracted.aim_events[i] for i in aims),
+            pair_events=tuple(extracted.pair_events[i] for i in pairs),
             tracks=(),
+            track_events=(),
             unused=self._unused,
         )
-
-    def found(self) -> EpochsFound:
-        """Camera moves detected by the engine that the session does not report, and loop closures."""
-        reported = {event.since_t for event in self._session.events if isinstance(event, CameraMovedEvent)}
-        moves = tuple(move for move in self._engine.moves if move.since_t not in reported)
-        return EpochsFound(moves, self._engine.loop_closures)
 
     def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
         """One result per track event, in order; ``unanswered`` has those that the engine did not receive."""

@@ -144,25 +144,35 @@ def solve_session(
             redetect=request.redetect,
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
-        found = EpochsFound()
-        if request.detect_moves:
-            found = find_epochs(extracted.measurements, session.model, config)
-            extracted = with_moves(extracted, found)
-        conditions = [*move_conditions(found), *detection_conditions(extracted)]
-        solution = solve(
-            extracted.measurements,
-            extracted.tracks,
-            session.model,
-            config,
-            conditions,
-            registration=found.registration,
-        )
-        estimate = session_estimate(session, extracted, solution, config)
+        extracted, found, solution, estimate = solve_extracted(session, extracted, config, request.detect_moves)
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         show(viewer, session, extracted, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
     return SolveReport(session, extracted, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
+
+
+def solve_extracted(
+    session: Session, extracted: ExtractedMeasurements, config: SolveConfig, detect_moves: bool = True
+) -> tuple[ExtractedMeasurements, EpochsFound, Solution, SessionEstimate]:
+    """A session's measurements to its estimate: camera moves, one solve, every shot and check.
+
+    Returns:
+        The measurements in the epochs that were found, these epochs, the solution, and the estimate.
+    """
+    found = EpochsFound()
+    if detect_moves:
+        found = find_epochs(extracted.measurements, session.model, config)
+        extracted = with_moves(extracted, found)
+    solution = solve(
+        extracted.measurements,
+        extracted.tracks,
+        session.model,
+        config,
+        [*move_conditions(found), *detection_conditions(extracted)],
+        registration=found.registration,
+    )
+    return extracted, found, solution, session_estimate(session, extracted, solution, config)
 
 
 def remove_older_result(folder: Path, result_path: Path) -> None:

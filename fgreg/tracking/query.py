@@ -23,6 +23,7 @@ from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.scaled_inverse import inverse_hessian
 from fgreg.graph.shared_state import SharedState, gaussian_prior
 from fgreg.model.estimate import TrackEstimate, Verdict
+from fgreg.model.measurement_checks import problem_of
 from fgreg.model.measurements import POSE_FLOOR, MarkerObservation, Pair, Track, usable_covariance
 from fgreg.model.sensitivity import wrap_angle
 from fgreg.model.tissue_surface import GRAZING
@@ -74,6 +75,8 @@ def track(query: Track, snapshot: Snapshot) -> TrackEstimate:
     if epoch.verdict is Verdict.REFUSED:
         why = f": {epoch.reason}" if epoch.reason else ""
         return _refused(query, snapshot, f"the registration of camera epoch {query.epoch} is refused{why}")
+    if (problem := problem_of(query)) is not None:
+        return _refused(query, snapshot, problem)
     placed = _from_looks(query, snapshot, epoch) if query.looks else _from_surface(query, snapshot, epoch)
     if isinstance(placed, str):
         return _refused(query, snapshot, placed)

@@ -1,0 +1,69 @@
+"""Checks a session as ``fgreg check`` does: its files, and which shots a solve would leave out and why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fgreg.detection.events_to_measurements import extract_measurements
+from fgreg.errors import InputError
+from fgreg.session.event_writer import type_of
+from fgreg.session.session_reader import EVENTS_FILE, check_session, read_session
+
+
+@dataclass(frozen=True, slots=True)
+class UnusedShot:
+    """A shot that a solve would leave out.
+
+    Attributes:
+        line: in events.jsonl. kind: its type there. reason: as in the result.
+    """
+
+    line: int
+    kind: str
+    reason: str
+
+    @property
+    def text(self) -> str:
+        return f"{EVENTS_FILE}: line {self.line}: this {self.kind} cannot be used: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class SessionCheck:
+    """What is wrong with a session.
+
+    Attributes:
+        problems: for which a solve ends with one line. warnings: sentences.
+        unused: shots that a solve leaves out, by the numbers and the frames alone.
+    """
+
+    problems: tuple[InputError, ...]
+    warnings: tuple[str, ...]
+    unused: tuple[UnusedShot, ...] = ()
+
+
+def check(
+    folder: Path, *, frames: bool = True, progress: Callable[[str, int, int], None] | None = None
+) -> SessionCheck:
+    """Check a session's files and, with ``frames``, detect in its frames as a solve does.
+
+    A session with problems is not looked at further.
+    """
+    problems, warnings = check_session(folder)
+    if problems or not frames:
+        return SessionCheck(tuple(problems), tuple(warnings))
+    session = read_session(folder)
+    try:
+        extracted = extract_measurements(
+            session.events,
+            session.model,
+            progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
+        )
+    except InputError as error:
+        return SessionCheck((error,), tuple(warnings))
+    unused = tuple(
+        UnusedShot(session.events[index].line, type_of(session.events[index]), reason)
+        for index, reason in sorted(extracted.unused.items())
+    )
+    return SessionCheck((), tuple(warnings), unused)
