@@ -6,14 +6,15 @@ and there is a checksum. So a reader never blocks the writer, and a writer that 
 the one before. On processors that reorder stores the checksum detects what the versions alone might miss.
 
 The memory belongs to this user only (mode 0600); its name cannot be guessed. The writer removes it when it is closed
-or its process ends, and multiprocessing's resource tracker removes it when the process is killed. Readers map it
-read-only and are not tracked, else the first reader to exit would remove it for all others. A mapping stays valid after
-removal, so that readers still have the last estimate and its age.
+or its process ends, and multiprocessing's resource tracker removes it when the process is killed; where both were
+killed, the next writer does. Readers map it read-only and are not tracked, else the first reader to exit would remove
+it for all others. A mapping stays valid after removal, so that readers still have the last estimate and its age.
 """
 
 from __future__ import annotations
 
 import _posixshmem
+import contextlib
 import copy
 import mmap
 import os
@@ -22,6 +23,7 @@ import time
 import weakref
 from dataclasses import dataclass
 from multiprocessing.shared_memory import SharedMemory
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
@@ -75,7 +77,8 @@ class SharedSnapshot:
         record_type = layout.dtype()
         words = _slot_words(record_type.itemsize)
         header = -(-_HEADER // 8) * 8
-        name = f"fgreg-{secrets.token_hex(10)}"
+        remove_left_behind()
+        name = f"{_prefix()}{os.getpid()}-{secrets.token_hex(6)}"
         self._memory = SharedMemory(name, create=True, size=_WORD * (header + SLOTS * words))
         self._record = np.zeros((), dtype=record_type)
         self._words: IntArray = self._record.reshape(1).view(np.int64)
@@ -134,6 +137,23 @@ class SharedSnapshot:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _prefix() -> str:
+    """Beginning of the names of memory whose writers have their process number in this namespace."""
+    try:
+        return f"fgreg-{os.stat('/proc/self/ns/pid').st_ino}-"
+    except OSError:  # not Linux
+        return "fgreg-0-"
+
+
+def remove_left_behind() -> None:
+    """Remove the memory of writers that were killed together with the tracker of their resources (Linux)."""
+    for path in Path("/dev/shm").glob(f"{_prefix()}*-*"):
+        writer = path.name.split("-")[2]
+        if writer.isdigit() and not Path("/proc", writer).exists():
+            with contextlib.suppress(OSError):  # another user's, or removed meanwhile
+                path.unlink()
 
 
 def _remove(memory: SharedMemory, owner: int) -> None:
