@@ -142,7 +142,7 @@ class SharedSnapshot:
 def _prefix() -> str:
     """Beginning of the names of memory whose writers have their process number in this namespace."""
     try:
-        return f"fgreg-{os.stat('/proc/self/ns/pid').st_ino}-"
+        return f"fgreg-{Path('/proc/self/ns/pid').stat().st_ino}-"
     except OSError:  # not Linux
         return "fgreg-0-"
 
