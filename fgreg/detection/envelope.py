@@ -1,5 +1,7 @@
 """Position of the photoacoustic source in a beamformed envelope image: sub-pixel peak with covariance.
 
+Log-compressed images (``probe.image.log_db``) are made linear first.
+
 Power (envelope squared) is divided by the background at the same depth and smoothed at a few scales. Its maximum is
 tested against the tail of the image's own distribution: an exponential fitted between two high quantiles and
 extrapolated to the false-alarm rate, further where few independent speckle grains determine the tail. That needs no
@@ -58,8 +60,9 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     """Find the photoacoustic source in one envelope image.
 
     Args:
-        frame: (depth, lateral) envelope pixels, linear (not log-compressed), >= 0. Rows are range, columns
-            TRUS x, both increasing; ``probe.flip`` is the order of channels and does not flip the image.
+        frame: (depth, lateral) pixels of the envelope, >= 0, or log-compressed where ``probe.image.log_db`` says so.
+            Rows are range, columns TRUS x, both increasing; ``probe.flip`` is the order of channels and does not flip
+            the image.
         probe: with ``image``: pixel pitch and centre of pixel [0, 0], (range, x) mm.
 
     Returns:
@@ -71,7 +74,7 @@ def locate_in_image(frame: npt.NDArray[Any], probe: ProbeModel) -> PaFind | NoSi
     """
     if probe.image is None:
         raise ValueError("the probe has no image geometry (probe.image)")
-    image = check_frame(frame).astype(np.float64)
+    image = probe.image.linear(check_frame(frame))
     if float(image.min()) < 0.0:
         raise ValueError("an envelope image with negative pixels, expected values >= 0")
     if min(image.shape) < 8:

@@ -139,16 +139,41 @@ class ChannelModel:
 
 @dataclass(frozen=True, slots=True)
 class ImageModel:
-    """Scan-converted envelope images (depth, lateral)."""
+    """Scan-converted images (depth, lateral): envelopes, or log-compressed ones."""
 
     pixel_mm: Annotated[tuple[float, float], Key("pitch along depth and lateral", NumberTuple(2, POSITIVE_MM))]
     origin_mm: Annotated[
         tuple[float, float],
         Key("centre of pixel [0, 0]: range from the element face, x", NumberTuple(2, COORDINATE_MM)),
     ]
+    log_db: Annotated[
+        float | None,
+        Key(
+            "where the pictures are log-compressed: the range between their blackest and their whitest value",
+            Number(0.0, 200.0, above=True, unit="dB"),
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
-        _positive(dz=self.pixel_mm[0], dx=self.pixel_mm[1])
+        _positive(dz=self.pixel_mm[0], dx=self.pixel_mm[1], log_db=1.0 if self.log_db is None else self.log_db)
+
+    def linear(self, frame: npt.NDArray[np.generic]) -> FloatArray:
+        """Pixels in proportion to the envelope: log-compressed ones are taken back, others stay as they are.
+
+        0 is ``log_db`` below the largest value that a pixel can have: of 8-bit pixels 255; of others the least of 1
+        (floating-point numbers only), 255, 1023, 4095, 16383 and 65535 that none exceeds, since 16 bits are seldom
+        filled. Numbers of which none is above 0, and some are below, are dB.
+        """
+        pixels = np.asarray(frame, dtype=np.float64)
+        if self.log_db is None or not pixels.size:
+            return pixels
+        top = float(pixels.max())
+        if top <= 0.0 and float(pixels.min()) < 0.0:
+            below_db = pixels
+        else:
+            sizes = (1.0 if frame.dtype.kind == "f" else 0.0, *(2.0**bits - 1.0 for bits in (8, 10, 12, 14, 16)))
+            below_db = self.log_db * (pixels / next((size for size in sizes if size >= max(top, 1e-9)), top) - 1.0)
+        return np.asarray(np.power(10.0, below_db / 20.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +191,7 @@ class ProbeModel:
     ]
     sensitivity: Annotated[SensitivityModel, Key("the window in which a source is detected")]
     channels: Annotated[ChannelModel | None, Key("of channel data")] = None
-    image: Annotated[ImageModel | None, Key("of envelope images")] = None
+    image: Annotated[ImageModel | None, Key("of images")] = None
 
     def __post_init__(self) -> None:
         _positive(elements=self.elements, pitch_mm=self.pitch_mm, radius_mm=self.radius_mm)

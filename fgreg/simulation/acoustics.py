@@ -299,6 +299,12 @@ def quantised(channels: ChannelArray, counts_per_unit: float = 12.0) -> npt.NDAr
     return np.asarray(np.clip(np.rint(channels * counts_per_unit), -32768, 32767).astype(np.int16))
 
 
+def log_compressed(image: ChannelArray, range_db: float) -> npt.NDArray[np.uint8]:
+    """An envelope image as on a scanner's screen: 255 for its maximum, 0 from ``range_db`` below that on."""
+    level_db = 20.0 * np.log10(np.maximum(image / float(image.max()), 1e-12))
+    return np.asarray(np.rint(255.0 * np.clip(1.0 + level_db / range_db, 0.0, 1.0)), dtype=np.uint8)
+
+
 def simulate_envelope_image(
     probe: ProbeModel,
     trus_p_source_mm: FloatArray,

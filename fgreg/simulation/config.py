@@ -84,7 +84,8 @@ class SimulationConfig:
 
     Recorded:
         name: of the session.
-        frames: raw frames (images and channel data) instead of poses and (x, range).
+        frames: raw frames of the cameras, and channel data of the probe (of a probe without channels: images)
+            instead of poses and (x, range).
         aims, pairs: calibration shots and PMs of the registration, over all epochs.
         looks_per_pm: looks at each PM, at different stage angles with a detection; one ``pair`` event each.
         amplitudes: record the amplitude of each look, and the curve in the session.
@@ -214,7 +215,10 @@ class SimulationConfig:
         if not 0 <= self.outlier_pairs <= self.pairs:
             raise ValueError(f"outlier_pairs is {self.outlier_pairs}, expected 0 to {self.pairs}")
         if self.frames and self.probe.channels is None:
-            raise ValueError("raw frames need probe.channels")
+            if self.probe.image is None:
+                raise ValueError("raw frames need probe.channels or probe.image")
+            if self.deviations or self.artefacts or self.reversed_elements:
+                raise ValueError("images have no deviations, artefacts or reversed elements, channel data have")
 
     @property
     def array(self) -> TrueArray:

@@ -41,11 +41,11 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
         rotation = np.linspace(-1.4, 1.4, 29) * width
         amplitude = as_float_array(config.elevation.amplitude(rotation, width))
         sensitivity = replace(sensitivity, curve_rotation_rad=as_float_array(rotation), curve_amplitude=amplitude)
+    channels = config.probe.channels if config.frames else None
+    image = config.probe.image if config.frames and channels is None else None
     model = SessionModel(
         name=config.name,
-        probe=replace(
-            config.probe, sensitivity=sensitivity, channels=config.probe.channels if config.frames else None, image=None
-        ),
+        probe=replace(config.probe, sensitivity=sensitivity, channels=channels, image=image),
         stage=config.stage,
         camera=(config.declared_camera or config.camera) if config.has_camera else None,
         marker=config.marker if config.has_camera else None,

@@ -10,13 +10,21 @@ import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray, make_transform, transform_points
 from fgreg.model.camera_model import CameraModel
-from fgreg.simulation.acoustics import Hearing, quantised, simulate_channels
+from fgreg.simulation.acoustics import (
+    Hearing,
+    log_compressed,
+    quantised,
+    simulate_channels,
+    simulate_envelope_image,
+)
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.disturbances import Disturbances, SpoiltView
 from fgreg.simulation.lens import project_points
 from fgreg.simulation.misreading import true_board, true_marker, true_rig, view_shift_mm
 from fgreg.simulation.render import UInt8Image, render_frame
 from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Surface, TagSurface
+
+ProbeFrame = npt.NDArray[np.int16] | npt.NDArray[np.uint8] | npt.NDArray[np.float32]
 
 DRAPE_MM = 45.0
 """Distance of the drape behind the calibration board."""
@@ -143,8 +151,12 @@ class LookPicture:
     half_width_rad: float
     noise_seed: tuple[int, ...]
 
-    def record(self, config: SimulationConfig) -> npt.NDArray[np.int16]:
-        """Channel data (elements, samples)."""
+    def record(self, config: SimulationConfig) -> ProbeFrame:
+        """Channel data; of a probe without channels, an image."""
+        return self.image(config) if config.probe.channels is None else self.channel_data(config)
+
+    def channel_data(self, config: SimulationConfig) -> npt.NDArray[np.int16]:
+        """(elements, samples)."""
         channels = simulate_channels(
             config.probe,
             self.trus_p_source_mm,
@@ -160,3 +172,18 @@ class LookPicture:
             artefacts=config.artefacts,
         )
         return quantised(channels[::-1] if config.reversed_elements else channels)
+
+    def image(self, config: SimulationConfig) -> npt.NDArray[np.uint8] | npt.NDArray[np.float32]:
+        """(depth, lateral) pixels of the envelope, log-compressed where the probe's images are."""
+        image = simulate_envelope_image(
+            config.probe,
+            self.trus_p_source_mm,
+            self.scan_rad,
+            np.random.default_rng(self.noise_seed),
+            pulse=config.pulse,
+            snr_db=config.snr_db,
+            hearing=Hearing(elevation=config.elevation),
+            half_width_rad=self.half_width_rad,
+        )
+        log_db = None if config.probe.image is None else config.probe.image.log_db
+        return image if log_db is None else log_compressed(image, log_db)

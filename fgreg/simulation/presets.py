@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fgreg.model.session_model import BoardModel, ChannelModel, CharucoModel, NoiseModel
+from fgreg.model.session_model import BoardModel, ChannelModel, CharucoModel, ImageModel, NoiseModel
 from fgreg.simulation.config import SimulationConfig, Sweep, default_probe, default_rig
 
 _CHANNELS = ChannelModel(sampling_mhz=40.0, t0_us=13.0, pulse_delay_us=0.4)
@@ -36,6 +36,18 @@ PAPER = SimulationConfig(
 FIRST_HIT = SimulationConfig(name="first-hit", aims=12, pairs=15, tracks_heard=2, tracks_silent=2)
 """Poses; each PM found by stepping from alternating sides up to the first detection."""
 
+RAW_SMALL = replace(
+    PHANTOM,
+    name="raw-small",
+    aims=6,
+    pairs=6,
+    tracks_heard=1,
+    tracks_silent=1,
+    camera=default_rig(800),
+    board=BoardModel(6, 4, 13.0, CharucoModel("DICT_5X5_100", 9.75)),
+)
+"""Raw frames, few and small."""
+
 PRESETS: dict[str, SimulationConfig] = {
     "phantom": PHANTOM,
     "paper": PAPER,
@@ -43,14 +55,11 @@ PRESETS: dict[str, SimulationConfig] = {
     "one-way": replace(FIRST_HIT, name="one-way", sweep=Sweep.ONE_WAY),
     "camera-move": replace(FIRST_HIT, name="camera-move", pairs=24, epochs=2, tracks_heard=2, tracks_silent=2),
     "many-looks": replace(PAPER, name="many-looks", looks_per_pm=4, amplitudes=True),
-    "raw-small": replace(
-        PHANTOM,
-        name="raw-small",
-        aims=6,
-        pairs=6,
-        tracks_heard=1,
-        tracks_silent=1,
-        camera=default_rig(800),
-        board=BoardModel(6, 4, 13.0, CharucoModel("DICT_5X5_100", 9.75)),
+    "raw-small": RAW_SMALL,
+    "log-images": replace(
+        RAW_SMALL,
+        name="log-images",
+        probe=replace(default_probe(), image=ImageModel((0.1, 0.2), (5.0, -25.5), log_db=60.0)),
+        snr_db=25.0,
     ),
 }

@@ -322,7 +322,7 @@ class Room:
         config, source = self.config.scene, self.spot_mm(t_s)
         depth = config.array.distance_mm(source, np.asarray(scan_rad))
         width = float(sweeps.half_width_rad(config.probe.sensitivity, depth)) + self.scene.window_edge_rad
-        return LookPicture(source, scan_rad, width, (self.config.seed, index, 2)).record(config)
+        return LookPicture(source, scan_rad, width, (self.config.seed, index, 2)).channel_data(config)
 
     def bmode(self, scan_rad: float, index: int) -> tuple[UInt8Image, tuple[float, float], tuple[float, float]]:
         """What the scanner shows with its plane at ``scan_rad``: speckle up to the tissue's surface, nothing beyond.

@@ -43,7 +43,7 @@ from fgreg.simulation.misreading import marker_poses_read, points_read, spots_re
 from fgreg.simulation.pictures import LookPicture, ShotPicture
 from fgreg.simulation.scene import AimShots, Scene, Shots, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
-Frame = npt.NDArray[np.uint8] | npt.NDArray[np.int16]
+Frame = npt.NDArray[np.uint8] | npt.NDArray[np.int16] | npt.NDArray[np.float32]
 Document = dict[str, Any]
 
 SCENES = 6

@@ -82,7 +82,7 @@ def pa_picture(frame: npt.NDArray[np.generic], probe: ProbeModel, largest_side: 
         (dz, dx), (z0, x0) = probe.image.pixel_mm, probe.image.origin_mm
         x = np.asarray(x0 + dx * np.arange(data.shape[1]), dtype=np.float64)
         ranges = np.asarray(z0 + dz * np.arange(data.shape[0]), dtype=np.float64)
-        values, wavefront = np.abs(data), False
+        values, wavefront = np.abs(probe.image.linear(frame)), False
     else:
         return None
     kept = ranges >= 0.0
