@@ -14,6 +14,7 @@ import yaml
 from typer.testing import CliRunner
 
 from fgreg.cli.main import app
+from fgreg.convert.drafts import ImageKind
 from fgreg.convert.plus import oriented
 from fgreg.convert.sequence_file import read_sequence
 from fgreg.errors import FgregError, InputError
@@ -21,6 +22,7 @@ from tests import session_files
 
 RUNNER = CliRunner()
 POSE = "1 0 0 10 0 0 -1 20 0 1 0 150 0 0 0 1"
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 IMAGES = np.arange(3 * 5 * 4, dtype=np.uint8).reshape(3, 5, 4)
 HEADER = """\
 ObjectType = Image
@@ -83,9 +85,17 @@ def by_simpleitk(path: Path, fields: dict[str, str], images: Any = IMAGES, *, co
     return path
 
 
-def setup(folder: Path) -> Path:
+def setup(folder: Path, **image: object) -> Path:
+    data = session_files.setup()
+    data["probe"]["image"] |= image
     path = folder / "setup.yaml"
-    path.write_text(yaml.safe_dump(session_files.setup()), encoding="utf-8")
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")
+    return path
+
+
+def mapping(folder: Path, content: str) -> Path:
+    path = folder / "map.yaml"
+    path.write_text(f"format: fgreg-mapping/1\n{content}\n", encoding="utf-8")
     return path
 
 
@@ -108,7 +118,7 @@ def events(folder: Path) -> list[dict[str, Any]]:
 def test_each_frame_becomes_a_pair_with_its_image(tmp_path: Path, writer: str) -> None:
     make: Any = by_hand if writer.startswith("hand") else by_simpleitk
     path = make(tmp_path / "scan.mha", three(), compressed=writer.endswith("compressed"))
-    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path, log_db=60))
     assert done.exit_code == 0, done.output
     note, *pairs = events(tmp_path / "s")
     assert note["text"] == "converted from PLUS sequence scan.mha"
@@ -118,7 +128,7 @@ def test_each_frame_becomes_a_pair_with_its_image(tmp_path: Path, writer: str) -
     assert pairs[1]["marker"]["camera_T_marker"] == session_files.QUARTER
     stored = np.load(tmp_path / "s" / pairs[1]["trus"]["frame"])
     np.testing.assert_array_equal(stored, IMAGES[1])
-    assert stored.dtype == np.float32
+    assert stored.dtype == np.uint8  # the type that says what is white
 
 
 def test_fields_say_type_pm_sweep_and_position_and_a_mapping_names_others(tmp_path: Path) -> None:
@@ -128,6 +138,7 @@ def test_fields_say_type_pm_sweep_and_position_and_a_mapping_names_others(tmp_pa
     fields |= frame_fields(1, FgregType="track", StageAngle=-3)
     fields |= frame_fields(2, FgregType="note", FgregText="moved the table", MarkerToCameraTransform=None)
     fields["Seq_Frame0000_FgregSweep"] = "-1"
+    fields["Seq_Frame0000_StageAngleStatus"] = "MISSING"  # of a field that is not there
     path = by_hand(tmp_path / "scan.mha", fields)
     mapped = tmp_path / "map.yaml"
     mapped.write_text("format: fgreg-mapping/1\nfields: {pm: Spot}\nframes: [0, 1, 2]\n")
@@ -146,12 +157,12 @@ def test_fields_say_type_pm_sweep_and_position_and_a_mapping_names_others(tmp_pa
 
 def test_frames_in_which_the_marker_was_not_tracked_are_left_out_and_reported(tmp_path: Path) -> None:
     path = by_hand(tmp_path / "scan.mha", three(MarkerToCameraTransformStatus="MISSING"))
-    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path, log_db=60))
     assert done.exit_code == 0, done.output
     assert "2 pair" in done.stdout
     assert "frame 2 is left out: MarkerToCameraTransform is MISSING" in done.stderr
     path = by_hand(tmp_path / "scan.mha", three(ImageStatus="INVALID"))
-    done = convert(path, tmp_path / "t", "--setup", setup(tmp_path))
+    done = convert(path, tmp_path / "t", "--setup", setup(tmp_path, log_db=60))
     assert "frame 2 is left out: ImageStatus is INVALID" in done.stderr
 
 
@@ -167,19 +178,22 @@ def test_images_are_turned_to_depth_and_lateral_whatever_their_orientation() -> 
         "NM": depth_lateral[::-1].T,
     }
     for letters, stored in views.items():
-        np.testing.assert_array_equal(oriented(stored, letters, False, "f"), depth_lateral, err_msg=letters)
+        np.testing.assert_array_equal(
+            oriented(stored, letters, ImageKind.ENVELOPE, "f"), depth_lateral, err_msg=letters
+        )
     waves = np.arange(12, dtype=np.int16).reshape(3, 4)  # stored with x along the samples: elements, samples
-    channels = oriented(waves, "FMA", True, "f")
+    channels = oriented(waves, "FMA", ImageKind.CHANNELS, "f")
     np.testing.assert_array_equal(channels, waves)
     assert channels.dtype == np.int16
     with pytest.raises(InputError, match="UltrasoundImageOrientation: found 'XX'"):
-        oriented(stored, "XX", False, "f")
+        oriented(stored, "XX", ImageKind.ENVELOPE, "f")
 
 
-def test_radio_frequency_frames_become_channel_data(tmp_path: Path) -> None:
+def test_radio_frequency_frames_of_single_elements_become_channel_data(tmp_path: Path) -> None:
     waves = np.random.default_rng(1).integers(-999, 999, (3, 128, 20)).astype(np.int16)
     path = by_hand(tmp_path / "rf.mha", three(), waves, orientation="FMA", kind="RF_REAL")
-    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    elements = mapping(tmp_path, "images: channels")
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", elements)
     assert done.exit_code == 0, done.output
     stored = np.load(tmp_path / "s" / events(tmp_path / "s")[2]["trus"]["frame"])
     np.testing.assert_array_equal(stored, waves[1])
@@ -225,7 +239,7 @@ def test_a_bad_sequence_is_one_line_and_leaves_nothing(tmp_path: Path, old: byte
     data = path.read_bytes()
     assert old in data
     path.write_bytes(data.replace(old, new))
-    assert message in refused(path, tmp_path / "s", "--setup", setup(tmp_path))
+    assert message in refused(path, tmp_path / "s", "--setup", setup(tmp_path, log_db=60))
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["scan.mha", "setup.yaml"]
 
 
@@ -238,3 +252,144 @@ def test_a_mapping_of_an_absent_field_is_reported_with_the_fields_present(tmp_pa
     assert "StageAngle" in message
     mapped.write_text("format: fgreg-mapping/1\nframes: [1, 9]\n")
     assert "frame 9: found no such frame" in refused(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", mapped)
+
+
+@pytest.mark.parametrize("status", ["OUT_OF_VOLUME", "REQ_TIMEOUT", "UNKNOWN", "invalid", "SWITCH1_IS_ON", ""])
+@pytest.mark.parametrize("field", ["MarkerToCameraTransform", "StageAngle", "FgregRange"])
+def test_only_ok_counts_as_a_status_of_any_field_that_is_used(tmp_path: Path, field: str, status: str) -> None:
+    known: dict[str, Any] = {"FgregX": 1.0, "FgregRange": 30.0}
+    fields = frame_fields(0, **known) | frame_fields(1, **known) | frame_fields(2, **known) | frame_fields(3, **known)
+    fields["Seq_Frame0000_StageAngleStatus"] = "ok"
+    fields |= {f"Seq_Frame{index:04d}_{field}Status": status for index in (1, 2)}
+    path = by_hand(tmp_path / "scan.mha", fields, np.zeros((4, 5, 4), np.uint8))
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
+    assert done.exit_code == 0, done.output
+    assert [pair["t"] for pair in events(tmp_path / "s")[1:]] == [8151.5, 8152.25]
+    assert f"2 frames (1 to 2) are left out: {field} is {status or 'nothing'}" in done.stderr
+
+
+def test_a_recording_with_every_status_word_keeps_the_frame_that_is_ok(tmp_path: Path) -> None:
+    case = Path(__file__).parents[2] / "shared" / "cases" / "exchange" / "status.mha"
+    if not case.exists():
+        pytest.skip("no ../shared/cases")
+    done = convert(case, tmp_path / "s", "--setup", setup(tmp_path))
+    assert done.exit_code == 0, done.output
+    assert [event["t"] for event in events(tmp_path / "s")[1:]] == [0.0]
+    assert [f"frame {index} is left out" in done.stderr for index in range(12)] == [False] + [True] * 11
+
+
+def test_poses_in_a_trackers_frame_are_composed_and_those_stated_the_other_way_are_inverted(tmp_path: Path) -> None:
+    camera = "0 -1 0 5 1 0 0 6 0 0 1 7 0 0 0 1"  # tracker_T_camera, a quarter turn about z
+    known: dict[str, Any] = {"FgregX": 1.0, "FgregRange": 30.0, "MarkerToCameraTransform": None}
+    tracked = {"MarkerToTrackerTransform": POSE, "CameraToTrackerTransform": camera}
+    turned = math.radians(15.0)
+    probe = f"1 0 0 0 0 {math.cos(turned)} {math.sin(turned)} 0 0 {-math.sin(turned)} {math.cos(turned)} 0 0 0 0 1"
+    held: dict[str, Any] = {"ProbeToTrackerTransform": probe, "StageToTrackerTransform": IDENTITY, "StageAngle": None}
+    single = np.zeros((1, 5, 4), np.uint8)
+    path = by_hand(tmp_path / "scan.mha", frame_fields(0, **known, **tracked, **held), single)
+    assert convert(path, tmp_path / "s", "--setup", setup(tmp_path)).exit_code == 0
+    pair = events(tmp_path / "s")[1]
+    # By hand: R' (p - t) with R' = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], of (10, 20, 150) and the marker's axes.
+    expected = [[0, 0, -1, 14], [-1, 0, 0, -5], [0, 1, 0, 143], [0, 0, 0, 1]]
+    np.testing.assert_allclose(pair["marker"]["camera_T_marker"], expected, atol=1e-12)
+    assert pair["trus"]["scan_deg"] == pytest.approx(15.0)
+    unseen = frame_fields(0, **known, **tracked, CameraToTrackerTransformStatus="MISSING")
+    lost = by_hand(tmp_path / "lost.mha", unseen, single)
+    assert "CameraToTrackerTransform is MISSING" in refused(lost, tmp_path / "x", "--setup", setup(tmp_path))
+    other = by_hand(tmp_path / "other.mha", frame_fields(0, **known, MarkerToTrackerTransform=POSE), single)
+    assert "others that lead from Marker to Camera" in refused(other, tmp_path / "x", "--setup", setup(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("fields", "mapped", "expected", "told"),
+    [
+        ({"CameraToMarkerTransform": "1 0 0 -10 0 0 1 -150 0 -1 0 20 0 0 0 1"}, None, session_files.QUARTER, ""),
+        ({"CameraToPenTransform": "1 0 0 -10 0 0 1 -150 0 -1 0 20 0 0 0 1"}, "CameraToPen", session_files.QUARTER, ""),
+        (
+            {"TrackerToPenTransform": "1 0 0 -10 0 0 1 -150 0 -1 0 20 0 0 0 1"},
+            "TrackerToPen",
+            session_files.QUARTER,
+            "no",
+        ),
+        (
+            {"PenToTrackerTransform": POSE},
+            "PenToTracker",
+            session_files.QUARTER,
+            "no field leads from Tracker to Camera",
+        ),
+        ({"PenToCameraTransform": POSE}, "PenToCamera", session_files.QUARTER, ""),
+    ],
+)
+def test_a_field_is_taken_in_the_direction_that_its_name_states(
+    tmp_path: Path, fields: dict[str, str], mapped: str | None, expected: list[list[float]], told: str
+) -> None:
+    path = by_hand(tmp_path / "scan.mha", three(MarkerToCameraTransform=None, FgregX=1, FgregRange=30, **fields))
+    wanted = f"frames: [2]\nfields: {{marker: {mapped}Transform}}" if mapped else "frames: [2]"
+    if not mapped:
+        for index in (0, 1):
+            path.write_bytes(
+                path.read_bytes().replace(b"Seq_Frame%04d_MarkerToCamera" % index, b"Seq_Frame%04d_X" % index)
+            )
+    done = convert(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", mapping(tmp_path, wanted))
+    assert done.exit_code == 0, done.output
+    assert events(tmp_path / "s")[1]["marker"]["camera_T_marker"] == expected
+    assert (told in done.stderr) if told else ("is taken as" not in done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("kind", "wanted", "message"),
+    [
+        ("BRIGHTNESS", "", "found log-compressed images, expected probe.image.log_db in session.yaml"),
+        ("BRIGHTNESS", "images: channels", "UltrasoundImageType: found BRIGHTNESS, expected another type"),
+        ("RF_REAL", "", "UltrasoundImageType: found RF_REAL, expected images: channels in the mapping"),
+        ("RF_REAL", "images: channels", "found channels frames, float32 of shape [4, 5], expected"),
+        ("RF_IQ_LINE", "images: channels", "found 'RF_IQ_LINE', expected BRIGHTNESS, or RF_REAL"),
+        ("RF_I_LINE_Q_LINE", "", "found 'RF_I_LINE_Q_LINE'"),
+        ("RGB_COLOR", "images: envelope", "found 'RGB_COLOR'"),
+        ("Elastography", "", "found 'ELASTOGRAPHY'"),
+        ("XX", "", "UltrasoundImageType: found XX, expected images in the mapping"),
+    ],
+)
+def test_images_of_other_kinds_are_not_taken_for_envelopes(
+    tmp_path: Path, kind: str, wanted: str, message: str
+) -> None:
+    path = by_hand(tmp_path / "scan.mha", three(), kind=kind)
+    found = refused(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", mapping(tmp_path, wanted))
+    assert message in found
+    assert not (tmp_path / "s").exists()
+
+
+def test_the_mapping_says_what_images_are_that_are_linear(tmp_path: Path) -> None:
+    path = by_hand(tmp_path / "scan.mha", three(), kind="XX")
+    linear = mapping(tmp_path, "images: envelope")
+    assert convert(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", linear).exit_code == 0
+    assert np.load(tmp_path / "s" / events(tmp_path / "s")[2]["trus"]["frame"]).dtype == np.float32
+    message = refused(path, tmp_path / "t", "--setup", setup(tmp_path, log_db=60), "--map", linear)
+    assert "found linear images, expected log-compressed ones" in message
+    tall = by_hand(tmp_path / "tall.mha", three(), np.zeros((3, 128, 4), np.uint8), kind="XX")
+    message = refused(tall, tmp_path / "t", "--setup", setup(tmp_path), "--map", linear)
+    assert "found envelope frames, float32 of shape [128, 4]" in message  # it would be read as channel data
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"Spacing = 1 1 1", b"Spacing = 0.2 0.1 1", ""),
+        (b"Spacing = 1 1 1", b"Spacing = 0.1 0.2 1", "pixels of 0.2 x 0.1 mm (depth, lateral), expected 0.1 x 0.2 mm"),
+        (b"Spacing = 1 1 1", b"Spacing = 0 0.2 1", "ElementSpacing: found '0 0.2 1'"),
+        (b"TransformMatrix = 1 0 0 0 1", b"TransformMatrix = 0 1 0 1 0", "TransformMatrix: found '0 1 0 1 0 0 0 0 1'"),
+        (b"DimSize = 4 5 3", b"DimSize = 4 4 3", "found 60 bytes of pixels, expected 48"),
+        (b"UltrasoundImageOrientation = MFA\n", b"", "UltrasoundImageOrientation: found nothing"),
+        (b"ElementType", b"HeaderSize = 12\nElementType", "HeaderSize: found '12'"),
+    ],
+)
+def test_what_a_header_says_of_its_pixels_is_held_against_the_setup(
+    tmp_path: Path, old: bytes, new: bytes, message: str
+) -> None:
+    path = by_hand(tmp_path / "scan.mha", three())
+    assert old in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(old, new))
+    if message:
+        assert message in refused(path, tmp_path / "s", "--setup", setup(tmp_path, log_db=60))
+    else:
+        assert convert(path, tmp_path / "s", "--setup", setup(tmp_path, log_db=60)).exit_code == 0

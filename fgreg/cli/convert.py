@@ -39,6 +39,7 @@ Others are named in a mapping (--map):
   columns: {t: time_s, scan_deg: {column: angle_rad, scale: 57.29577951}}
   topics: {marker: /marker/pose, scan: /stage/joint_states, frame: /probe/channels}
   fields: {marker: NeedleToCameraTransform, scan: StageAngle}
+  images: envelope      (of PLUS; or log, or channels: data of the single elements)
 \b
 What lacks its marker or stage angle is left out with a warning. A result with the verdict
 refused is exported with --force only, and the file says so.
@@ -143,7 +144,7 @@ def _import(
     quiet: bool,
 ) -> None:
     from fgreg.convert.mapping import RecordingMapping, read_mapping
-    from fgreg.convert.write import write_session
+    from fgreg.convert.write import MOST_SAID, write_session
     from fgreg.drivers.calibration_files import read_calibration
     from fgreg.session.yaml_loader import load_yaml
 
@@ -160,10 +161,10 @@ def _import(
         raise InputError("--rectified" if rectified else "--calibration-unit", "it alone", "it with --calibration")
     imported = _read(source, RecordingMapping() if mapping is None else read_mapping(mapping))
     written = write_session(imported, setup, out, rig=rig, overwrite=overwrite)
-    for warning in [*written.left_out[:10], *written.warnings]:
+    for warning in [*written.left_out[:MOST_SAID], *written.warnings]:
         sys.stderr.write(f"fgreg: warning: {warning}\n")
-    if len(written.left_out) > 10:
-        sys.stderr.write(f"fgreg: warning: {len(written.left_out) - 10} more left out; events.jsonl begins with why\n")
+    if (more := len(written.left_out) - MOST_SAID) > 0:
+        sys.stderr.write(f"fgreg: warning: {more} more reasons why data were left out\n")
     if not quiet:
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(written.events.items()))
         typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {out}")

@@ -13,6 +13,7 @@ same_pm_s: 0.5
 camera_moved: {mm: 1.0, deg: 0.5, sigma_mm: 1.0, sigma_deg: 0.5, tip_T_camera: [[...]]}
 # PLUS
 fields: {marker: MarkerToCameraTransform, scan: StageAngle, pm: Pm}
+images: envelope
 frames: [3, 4, 17]
 """
 
@@ -23,6 +24,7 @@ from typing import Annotated
 
 import numpy as np
 
+from fgreg.convert.drafts import ImageKind
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.events import TrusRecord
 from fgreg.schema.kinds import Converted, Integer, JsonSchema, Kind, ListOf, Number, Text
@@ -167,6 +169,14 @@ class RecordingMapping:
     frames: Annotated[
         frozenset[int] | None,
         Key("numbers of the frames of a PLUS sequence to take", Converted(_FRAMES, frozenset, sorted)),
+    ] = None
+
+    images: Annotated[
+        ImageKind | None,
+        Key(
+            "what a PLUS sequence's images are: linear or log-compressed pixels, or the data of single elements",
+            Text.of(ImageKind, "a kind of images"),
+        ),
     ] = None
 
     @property

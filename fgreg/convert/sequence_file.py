@@ -114,6 +114,11 @@ def _images(fields: Mapping[str, str], data: bytes, path: Path, shape: tuple[int
         raise InputError(f"{name}: ElementNumberOfChannels", fields["ElementNumberOfChannels"], "1: grey images")
     if fields.get("BinaryData", "True").lower() != "true":
         raise InputError(f"{name}: BinaryData", shown(fields["BinaryData"]), "True")
+    if fields.get("HeaderSize", "0") != "0":
+        raise InputError(f"{name}: HeaderSize", shown(fields["HeaderSize"]), "0: pixels from the first byte on")
+    axes = fields.get("TransformMatrix", "1").split()
+    if axes != [str(int(i % (math.isqrt(len(axes)) + 1) == 0)) for i in range(len(axes))]:
+        raise InputError(f"{name}: TransformMatrix", shown(" ".join(axes)), "that of axes as stored: 1 0 0 0 1 0 0 0 1")
     stored = fields["ElementDataFile"]
     if stored.upper() != "LOCAL":
         if Path(stored).name != stored:
@@ -128,7 +133,7 @@ def _images(fields: Mapping[str, str], data: bytes, path: Path, shape: tuple[int
             data = zlib.decompressobj().decompress(data, needed + 1)
         except zlib.error as error:
             raise InputError(name, f"compressed data that are damaged ({error})", "a zlib stream") from None
-    if len(data) < needed:
+    if len(data) != needed:
         raise InputError(name, f"{len(data)} bytes of pixels", f"{needed}, as DimSize says")
     pixels = np.frombuffer(data, dtype=item, count=needed // item.itemsize).reshape(shape)
     return pixels.astype(item.newbyteorder("="), copy=False)

@@ -19,12 +19,14 @@ from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, check_session
 from fgreg.session.setup_reader import Setup, read_setup
 from fgreg.session.yaml_loader import load_yaml, read_bounded
 
+MOST_SAID = 20
+"""Sentences about what was left out, in the terminal and in the session's first note."""
 _MAX_SETUP = 4_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """Result of a conversion: number of events by type, of frames, and sentences about what was left out."""
+    """Result of a conversion: number of events by type and of frames; sentences on what was left out or is doubtful."""
 
     events: Mapping[str, int]
     frames: int
@@ -60,6 +62,8 @@ def write_session(
         read = _read_setup(folder / SETUP_FILE, str(file), out.resolve().name, file.parent.resolve())
         if read.model is not None and read.model.rig_file is not None:
             copy_rig(read.model.rig_file, folder / read.model.rig_file.relative_to(file.parent.resolve()))
+        if imported.images is not None and read.probe is not None:
+            imported.images.check(read.probe)
         imported.write_frames(folder)
         lines, frames = _lines(imported.drafts, folder, read)
         note = {"type": "note", "t": imported.drafts[0].t, "text": _summary(imported)}
@@ -71,13 +75,14 @@ def write_session(
     for draft in imported.drafts:
         kind = str(draft.document["type"])
         counts[kind] = counts.get(kind, 0) + 1
-    return Written(counts, frames, tuple(imported.left_out), tuple(warnings))
+    return Written(counts, frames, tuple(imported.left_out), (*imported.told, *warnings))
 
 
 def _summary(imported: Imported) -> str:
-    """Text of the first note: source of the session, and what was left out."""
-    missing = "; ".join(one_line(reason, 200) for reason in imported.left_out[:20])
-    more = len(imported.left_out) - 20
+    """Text of the first note: source of the session, what was taken for granted, and what was left out."""
+    said = [*imported.told, *imported.left_out]
+    missing = "; ".join(one_line(reason, 200) for reason in said[:MOST_SAID])
+    more = len(said) - MOST_SAID
     tail = f" and {more} more" if more > 0 else ""
     return f"converted from {one_line(imported.source, 300)}" + (f"; {missing}{tail}" if missing else "")
 
