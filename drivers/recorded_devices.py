@@ -137,7 +137,7 @@ class RecordedMotion(_RecordedDevice):
     ) -> None:
         recording = Recording(path)
         try:
-            name = topic or recording.endoscope_pose_topic() or f"/{ECM_POSE}"
+            name = topic or recording.endoscope_pose_topic()[0] or f"/{ECM_POSE}"
             recording.topic(name, POSE_TYPES, "the endoscope's pose")
             pace = pace or Pace(recording.start_ns / 1e9, host_now())
             self._player = _Player(path, recording, [name], pace, room)

@@ -15,7 +15,10 @@ from fgreg.errors import InputError, MissingExtraError
 
 STORAGE_SUFFIXES = (".mcap", ".db3")
 ECM_POSE = "ECM/measured_cp"
-"""CRTK's topic of the endoscope holder's pose, in any namespace."""
+"""CRTK's topic of the endoscope holder's pose, in any namespace but the setup joints' and ``local``."""
+_OLD_ECM_POSE = "ECM/position_cartesian_current"
+"""The same in versions of the dVRK before CRTK."""
+_ZSTD = b"\x28\xb5\x2f\xfd"
 
 _EXPECTED = "a ROS 2 recording: a rosbag2 folder, .mcap or .db3"
 
@@ -65,18 +68,25 @@ class Recording:
             raise InputError(
                 str(path), "a folder without metadata.yaml" if path.is_dir() else "another file", _EXPECTED
             )
-        # Files without message definitions use those of ROS 2.
         self._reader: Any = None
         try:
             reader: Any = AnyReader([path], default_typestore=_common_types())
             reader.open()
+            own = reader.typestore.fielddefs
+            if any(c.msgtype not in own for c in reader.connections):  # in the file without a definition: ROS 2's
+                common = _common_types().fielddefs
+                reader.typestore.register({name: fields for name, fields in common.items() if name not in own})
         except Exception as error:  # on a damaged file the underlying parsers may raise anything
             raise self._damaged(error) from None
         self._reader = reader
         connections: list[Any] = reader.connections
         self.topics: Mapping[str, Topic] = {
-            name: Topic(str(kind), sum(int(c.msgcount) for c in connections if c.topic == name))
-            for name, kind in sorted({(c.topic, c.msgtype) for c in connections})
+            name: Topic(
+                # A topic with messages of two types has neither.
+                " and ".join(sorted({str(c.msgtype) for c in connections if c.topic == name})),
+                sum(int(c.msgcount) for c in connections if c.topic == name),
+            )
+            for name in sorted({c.topic for c in connections})
         }
         self.start_ns: int = int(reader.start_time) if reader.message_count else 0
 
@@ -117,10 +127,16 @@ class Recording:
         Raises:
             InputError: its bytes do not fit its type.
         """
+        where = f"{self.path.name}: {recorded.topic}"
+        if bytes(recorded.raw[:4]) == _ZSTD:
+            expected = "the whole folder with its metadata.yaml, which says so"
+            raise InputError(where, "messages that are compressed one by one (zstd)", expected)
+        if recorded.kind not in self._reader.typestore.fielddefs:
+            expected = "its definition in the file, or a type of ROS 2's common ones"
+            raise InputError(where, f"{recorded.kind} without a definition", expected)
         try:
             return self._reader.deserialize(recorded.raw, recorded.kind)
         except Exception as error:
-            where = f"{self.path.name}: {recorded.topic}"
             raise InputError(where, f"a message that cannot be read ({_words(error)})", recorded.kind) from None
 
     def topic(self, name: str, kinds: Collection[str], what: str) -> str:
@@ -157,11 +173,30 @@ class Recording:
             raise InputError(f"{self.path.name}: {side} camera", ", ".join(best), "one, named in the mapping (topics)")
         return best[0]
 
-    def endoscope_pose_topic(self) -> str | None:
-        """The topic of the endoscope holder's pose (CRTK); None if there is none or more than one."""
-        found = [n for n, t in self.topics.items() if t.kind in POSE_TYPES and f"/{n}".endswith(f"/{ECM_POSE}")]
-        found = [name for name in found if "local" not in name]
-        return found[0] if len(found) == 1 else None
+    def endoscope_pose_topic(self) -> tuple[str | None, str]:
+        """The topic of the endoscope holder's pose (CRTK), or None, and what has to be said about that.
+
+        The setup joints' pose (``SUJ/ECM``) does not have the arm's own motion, ``local`` ones do not have theirs.
+
+        Raises:
+            InputError: several topics match.
+        """
+        poses = [name for name, topic in self.topics.items() if topic.kind in POSE_TYPES]
+        fixed = [name for name in poses if not {"SUJ", "local"} & set(name.split("/"))]
+        for ending in (ECM_POSE, _OLD_ECM_POSE):
+            found = [name for name in fixed if f"/{name}".endswith(f"/{ending}")]
+            if len(found) > 1:
+                where = f"{self.path.name}: the endoscope's pose"
+                raise InputError(where, ", ".join(found), "one, named (in a mapping: topics.ecm)")
+            if found:
+                old = ending != ECM_POSE
+                return found[0], f"camera moves are taken from {found[0]}, the older name of measured_cp" if old else ""
+        other = [
+            name for name in self.topics if ("ECM" in name.split("/") and "_cp" in name) or "ECM/position_c" in name
+        ]
+        if not other:
+            return None, ""
+        return None, f"camera moves are not known: there is no {ECM_POSE}, and of the ECM only {', '.join(other)}"
 
     def _damaged(self, error: Exception) -> InputError:
         hint = "; of a recorder that was cut off, mcap recover makes one" if self.path.suffix == ".mcap" else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -14,6 +15,8 @@ import yaml
 from typer.testing import CliRunner
 
 from fgreg.cli.main import app
+from fgreg.convert.bag import read_bag
+from fgreg.convert.mapping import read_mapping
 from fgreg.errors import FgregError
 from fgreg.geometry.quaternions import quaternion_from_rotation
 from fgreg.pipeline.solve import SolveRequest, solve_session
@@ -239,3 +242,143 @@ def test_a_file_that_is_no_recording_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + b"\1" * 100)
     assert str(path) in refused(path, tmp_path / "s", "--setup", setup(tmp_path))
+
+
+def shots(frame: str = "camera", late_s: float = 0.0, scale: float = 1.0) -> list[bags.Message]:
+    """Two looks with poses and angles near them: the marker's poses stated in ``frame``, by a clock that is late."""
+    messages: list[bags.Message] = []
+    for t in (1.0, 2.0):
+        for at in (t - 0.02, t + 0.02):
+            pose = bags.pose_stamped(at - late_s, (0.0, 0.0, 0.1 * scale))
+            messages.append(("/fgreg/marker", at, in_frame(pose, frame)))
+            messages.append(("/fgreg/scan", at, bags.joint_state(at, ["stage"], [0.1 * t])))
+        messages.append(("/fgreg/look", t, bags.point_stamped(t, (0.001, 0.0, 0.030))))
+    return messages
+
+
+def in_frame(message: Any, frame: str) -> Any:
+    return dataclasses.replace(message, header=dataclasses.replace(message.header, frame_id=frame))
+
+
+def held(topic: str, metres: float = 0.02) -> list[bags.Message]:
+    """Poses of the holder, which moves at 1.5 s."""
+    times = [0.1 * i for i in range(31)]
+    return [(topic, t, bags.pose_stamped(t, (metres * (t > 1.5), 0.0, 0.1))) for t in times]
+
+
+def kinds(tmp_path: Path, messages: list[bags.Message], **wanted: Any) -> tuple[list[str], str]:
+    """Types of the events that a recording becomes, and what is told and left out."""
+    path = bags.write_bag(tmp_path / f"bag{len(list(tmp_path.iterdir()))}", messages, mcap=True)
+    imported = read_bag(path, read_mapping(mapping(tmp_path, **wanted)))
+    return [draft.document["type"] for draft in imported.drafts], "; ".join([*imported.told, *imported.left_out])
+
+
+def test_the_cameras_motion_is_the_ecms_and_never_a_setup_joints(tmp_path: Path) -> None:
+    moved, still = ["pair", "camera_moved", "pair"], ["pair", "pair"]
+    both = [*held("/ECM/measured_cp"), *held("/SUJ/ECM/measured_cp", 0.0), *held("/ECM/local/measured_cp", 0.0)]
+    assert kinds(tmp_path, [*shots(), *both]) == (moved, "")
+    found, told = kinds(tmp_path, [*shots(), *held("/SUJ/ECM/measured_cp")])
+    assert found == still
+    assert "camera moves are not known: there is no ECM/measured_cp, and of the ECM only /SUJ/ECM/measured_cp" in told
+    found, told = kinds(tmp_path, [*shots(), *held("/SUJ/ECM/measured_cp")], topics={"ecm": "/SUJ/ECM/measured_cp"})
+    assert found == moved
+    assert "a setup joint's pose does not have the arm's own motion" in told
+    found, told = kinds(tmp_path, [*shots(), *held("/dvrk/ECM/position_cartesian_current")])
+    assert found == moved
+    assert "taken from /dvrk/ECM/position_cartesian_current, the older name of measured_cp" in told
+    two = bags.write_bag(tmp_path / "two", [*shots(), *held("/ECM/measured_cp"), *held("/sim/ECM/measured_cp")])
+    message = refused(two, tmp_path / "x", "--setup", setup(tmp_path))
+    assert "the endoscope's pose: found /ECM/measured_cp, /sim/ECM/measured_cp, expected one, named" in message
+    found, told = kinds(tmp_path, [*shots(), *held("/ECM/measured_cp")[:12]])
+    assert "1 events have no pose of the endoscope's holder near them" in told
+
+
+def test_a_recording_of_the_ecm_and_its_setup_joint_keeps_the_camera_move(tmp_path: Path) -> None:
+    case = Path(__file__).parents[2] / "shared" / "cases" / "exchange" / "ecm_suj_mcap"
+    if not case.exists():
+        pytest.skip("no ../shared/cases")
+    assert convert(case, tmp_path / "s", "--setup", setup(tmp_path)).exit_code == 0
+    found = events(tmp_path / "s")[1:]
+    assert [event["type"] for event in found] == ["pair", "pair", "camera_moved", "pair", "pair"]
+    assert np.array(found[2]["camera_new_T_camera_old"])[:3, 3].tolist() == pytest.approx([-20.0, 0.0, 0.0])
+
+
+def test_frames_units_and_stamps_that_contradict_each_other_are_told_or_refused(tmp_path: Path) -> None:
+    assert kinds(tmp_path, shots())[1] == ""
+    assert "'world', which is no camera's" in kinds(tmp_path, shots("world"))[1]
+    left = bags.image(1.0, "mono8", np.zeros((48, 64), np.uint8))
+    seen = [("/rig/left/image_raw", t, in_frame(left, "left_optical")) for t in (1.0, 2.0)]
+    assert "the left camera's images in 'left_optical'" in kinds(tmp_path, [*shots(), *seen])[1]
+    other = ("/fgreg/marker", 1.5, in_frame(bags.pose_stamped(1.5, (0, 0, 0.3)), "tracker"))
+    assert "1 messages on /fgreg/marker are not used: tracker is another frame" in kinds(tmp_path, [*shots(), other])[1]
+    assert "stamps on /fgreg/marker are 2.0" in kinds(tmp_path, shots(late_s=2.0), max_gap_s=3.0)[1]
+    unstamped = [(name, t, dataclasses.replace(m, header=bags.header(-1.7e9))) for name, t, m in shots()]
+    assert "4 of 4 messages on /fgreg/marker have no stamp" in kinds(tmp_path, unstamped)[1]
+    backwards = ("/fgreg/marker", 2.1, in_frame(bags.pose_stamped(0.9, (0, 0, 0.1)), "camera"))
+    assert "stamps on /fgreg/marker go back 1 times" in kinds(tmp_path, [*shots(), backwards])[1]
+    small = [m for m in shots() if m[0] != "/fgreg/scan"]
+    small += [("/fgreg/scan", t, bags.number(0.1 * t)) for t in (0.98, 1.02, 1.98, 2.02)]
+    assert "scan.unit: rad in the mapping, if they are radians" in kinds(tmp_path, small)[1]
+    where = setup(tmp_path)
+    millimetres = bags.write_bag(tmp_path / "mm", shots(scale=1000.0))
+    assert "found distances of 100 m, expected metres" in refused(millimetres, tmp_path / "x", "--setup", where)
+    degrees = [m for m in shots() if m[0] != "/fgreg/scan"]
+    degrees += [("/fgreg/scan", t, bags.joint_state(t, ["stage"], [30.0 * t])) for t in (0.98, 1.02, 1.98, 2.02)]
+    message = refused(bags.write_bag(tmp_path / "deg", degrees), tmp_path / "x", "--setup", where)
+    assert "expected radians; or scan.unit: deg in the mapping" in message
+
+
+def mcap_of(path: Path, messages: list[bags.Message], defined: bool = True, **options: Any) -> Path:
+    """An MCAP file of the mcap library, with its options, and its schemas' texts or none."""
+    writer_module = pytest.importorskip("mcap.writer", reason="mcap is not installed")
+    with path.open("wb") as file:
+        writer = writer_module.Writer(file, **options)
+        writer.start(profile="ros2", library="test")
+        channels: dict[str, int] = {}
+        for topic, t, message in sorted(messages, key=lambda m: m[1]):
+            kind = message.__msgtype__
+            if topic not in channels:
+                text = bags.STORE.generate_msgdef(kind)[0] if defined or "Pose" not in kind else ""
+                schema = writer.register_schema(kind, "ros2msg" if text else "", text.encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            ns = bags.START_NS + round(t * 1e9)
+            data = bytes(bags.STORE.serialize_cdr(message, kind))
+            writer.add_message(channels[topic], log_time=ns, data=data, publish_time=ns)
+        writer.finish()
+    return path
+
+
+def test_mcap_files_of_other_writers_are_read_or_refused_by_what_they_lack(tmp_path: Path) -> None:
+    writer_module = pytest.importorskip("mcap.writer", reason="mcap is not installed")
+    where, messages = setup(tmp_path), [*shots(), *held("/ECM/measured_cp")]
+    bare = {"use_statistics": False, "use_summary_offsets": False, "repeat_schemas": False, "repeat_channels": False}
+    layouts: dict[str, dict[str, Any]] = {
+        "zstd": {"compression": writer_module.CompressionType.ZSTD},
+        "no summary": {"index_types": writer_module.IndexType.NONE, **bare},
+        "some undefined": {"defined": False},
+    }
+    for name, options in layouts.items():
+        path = mcap_of(tmp_path / f"{name}.mcap", messages, **options)
+        done = convert(path, tmp_path / name, "--setup", where)
+        assert done.exit_code == 0, (name, done.exception, done.output)
+        assert [event["type"] for event in events(tmp_path / name)[1:]] == ["pair", "camera_moved", "pair"], name
+    chunks_only = mcap_of(tmp_path / "c.mcap", messages, index_types=writer_module.IndexType.CHUNK)
+    assert "found no messages, expected" in refused(chunks_only, tmp_path / "x", "--setup", where)
+    assert not (tmp_path / "x").exists()
+
+
+def test_messages_compressed_one_by_one_are_named_where_their_metadata_are_gone(tmp_path: Path) -> None:
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    writer = rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
+    writer.set_compression(rosbag2.CompressionMode.MESSAGE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, t, message in shots():
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=bags.STORE)
+            data = bags.STORE.serialize_cdr(message, kind)
+            writer.write(connections[topic], bags.START_NS + round(t * 1e9), data)
+    assert convert(tmp_path / "bag", tmp_path / "s", "--setup", setup(tmp_path)).exit_code == 0
+    message = refused(next((tmp_path / "bag").glob("*.db3")), tmp_path / "t", "--setup", setup(tmp_path))
+    assert "found messages that are compressed one by one (zstd), expected the whole folder" in message

@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.convert.bag_claims import TopicClaims, check_metres, told_of_angles, told_of_frames, told_of_stamps
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.detection.frame_files import png_bytes
@@ -84,6 +85,7 @@ class _Streams:
     ecm: list[tuple[float, tuple[FloatArray, FloatArray | None]]] = field(default_factory=list)
     infos: dict[str, Any] = field(default_factory=dict)
     bad: dict[str, list[str]] = field(default_factory=dict)
+    told: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +104,7 @@ def read_bag(path: Path, mapping: RecordingMapping) -> Imported:
         MissingExtraError: ``rosbags`` is not installed.
     """
     with Recording(path) as recording:
-        topics = _topics(recording, mapping)
+        topics, told = _topics(recording, mapping)
         streams = _read_streams(recording, topics, mapping)
         rig = _rig(path, streams)
     joined = _Join(path.name, streams, mapping)
@@ -115,11 +117,13 @@ def read_bag(path: Path, mapping: RecordingMapping) -> Imported:
     def write(folder: Path) -> None:
         _write_frames(path, topics, joined.frames, folder)
 
-    return Imported(drafts, write, source, [*left_out, *joined.left_out], rig)
+    told += [*streams.told, *joined.told]
+    return Imported(drafts, write, source, [*left_out, *joined.left_out], rig, told)
 
 
-def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
-    """The topic of each role in the recording: from the mapping, else by its default name."""
+def _topics(recording: Recording, mapping: RecordingMapping) -> tuple[dict[str, str], list[str]]:
+    """The topic of each role in the recording, from the mapping, else by its default name; sentences about that."""
+    told: list[str] = []
     found: dict[str, str] = {}
     for role, kinds in _KINDS.items():
         if role in mapping.topics:
@@ -139,8 +143,14 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
             raise InputError("topics", "look and frame, both", "one of them: each would be a look at the same PM")
         # The probe's data have more information than a position computed from them.
         del found["frame" if mapped == {"look"} else "look"]
-    if "ecm" not in found and (name := recording.endoscope_pose_topic()) is not None:
-        found["ecm"] = name
+    if "ecm" not in found:
+        name, remark = recording.endoscope_pose_topic()
+        told += [remark] if remark else []
+        found |= {"ecm": name} if name is not None else {}
+    elif "SUJ" in found["ecm"].split("/"):
+        told.append(
+            f"camera moves are taken from {found['ecm']}: a setup joint's pose does not have the arm's own motion"
+        )
     where = recording.path.name
     there = ", ".join(f"{name} ({topic.kind.rpartition('/')[2]})" for name, topic in recording.topics.items())
     if not found.keys() & {"look", "frame", "mark"}:
@@ -150,7 +160,7 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> dict[str, str]:
         raise InputError(f"{where}: topics", there[:300], "the marker's pose (topics.marker) or images (topics.left)")
     if found.keys() & {"look", "frame"} and "scan" not in found:
         raise InputError(f"{where}: topics", there[:300], "the stage's angle (topics.scan)")
-    return found
+    return found, told
 
 
 def _read_streams(recording: Recording, topics: dict[str, str], mapping: RecordingMapping) -> _Streams:
@@ -159,11 +169,14 @@ def _read_streams(recording: Recording, topics: dict[str, str], mapping: Recordi
     roles: dict[str, list[str]] = {}
     for role, name in topics.items():
         roles.setdefault(name, []).append(role)
-    counts = dict.fromkeys(roles, 0)
+    claims = {name: TopicClaims(name) for name in roles}
     for recorded in recording.messages(roles):
-        index = counts[recorded.topic]
-        counts[recorded.topic] += 1
+        index = claims[recorded.topic].count
         message = recording.decode(recorded)
+        strange = claims[recorded.topic].add(message, recorded.bag_ns)
+        if strange and {"marker", "ecm"} & set(roles[recorded.topic]):
+            streams.bad.setdefault(recorded.topic, []).append(strange)
+            continue
         time_ns = stamp_ns(message, recorded.bag_ns) if mapping.by_header else recorded.bag_ns
         for role in roles[recorded.topic]:
             try:
@@ -176,7 +189,43 @@ def _read_streams(recording: Recording, topics: dict[str, str], mapping: Recordi
     timed: tuple[list[Any], ...] = (streams.marker, streams.scan, streams.looks, streams.marks)
     for stream in (*timed, streams.left, streams.right, streams.ecm):
         stream.sort(key=lambda entry: entry[0])
+    _hold_against(recording, streams, {role: claims[name] for role, name in topics.items()}, mapping)
     return streams
+
+
+def _hold_against(
+    recording: Recording, streams: _Streams, claims: dict[str, TopicClaims], mapping: RecordingMapping
+) -> None:
+    """Check what the topics of each role say of themselves; what is doubtful goes to ``streams.told``.
+
+    Raises:
+        InputError: what cannot be.
+    """
+    for claim in {claim.topic: claim for claim in claims.values()}.values():
+        where, stated = f"{recording.path.name}: {claim.topic}", recording.topics[claim.topic].count
+        if stated and not claim.count:
+            expected = (
+                f"{stated}, as its index says; a file without a message index for each chunk needs one (mcap recover)"
+            )
+            raise InputError(where, "no messages", expected)
+        if claim.count != stated:
+            streams.told.append(f"there are {claim.count} messages on {claim.topic}, not {stated} as the index says")
+    distances: dict[str, list[float]] = {
+        "marker": [float(np.linalg.norm(pose[:3, 3])) for _, (pose, _) in streams.marker],
+        "ecm": [float(np.linalg.norm(pose[:3, 3])) for _, (pose, _) in streams.ecm],
+        "look": [abs(look.position_mm[1]) for _, look in streams.looks if look.position_mm is not None],
+    }
+    for role, found in distances.items():
+        if role in claims:
+            check_metres(role, f"{recording.path.name}: {claims[role].topic}", found)
+    if "scan" in claims:
+        topic = claims["scan"].topic
+        unit = mapping.angle_unit or ("deg" if recording.topics[topic].kind.startswith("std_msgs") else "rad")
+        angles = [scan_deg for _, scan_deg in streams.scan]
+        streams.told += told_of_angles(topic, angles, unit, mapping.angle_unit is not None)
+    streams.told += told_of_frames(claims)
+    if mapping.by_header:
+        streams.told += told_of_stamps({claim.topic: claim for claim in claims.values()}.values())
 
 
 def _take(streams: _Streams, role: str, message: Any, t: float, index: int, mapping: RecordingMapping) -> None:
@@ -231,6 +280,7 @@ class _Join:
     def __init__(self, file: str, streams: _Streams, mapping: RecordingMapping) -> None:
         self._file, self._streams, self._mapping = file, streams, mapping
         self.left_out: list[str] = []
+        self.told: list[str] = []
         self.frames: dict[tuple[str, int], str] = {}
 
     def drafts(self) -> list[Draft]:
@@ -328,10 +378,12 @@ class _Join:
         sigma = np.repeat([math.radians(moves.sigma_deg), moves.sigma_mm], 3)
         out: list[Draft] = []
         old: FloatArray | None = None
+        unknown = 0
         for draft in drafts:
             try:
                 now = _pose_between(self._streams.ecm, draft.t, 0.5)[0] @ moves.tip_T_camera
             except PairRefused:
+                unknown += 1
                 out.append(draft)
                 continue
             if old is None:
@@ -344,6 +396,10 @@ class _Join:
                 out.append(Draft(document | {"covariance": rows(np.diag(sigma**2))}, draft.where))
                 old = now
             out.append(draft)
+        if unknown:
+            self.told.append(
+                f"{unknown} events have no pose of the endoscope's holder near them: no camera move is known there"
+            )
         return out
 
 
