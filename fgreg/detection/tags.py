@@ -2,11 +2,15 @@
 
 Corner order is top left, top right, bottom right, bottom left *as OpenCV's generateImageMarker draws the tag*. For
 the AprilTag dictionaries OpenCV (4.x and 5.0) draws the official tags rotated by half a turn: for a tag printed from
-the official images, ``marker_T_tag`` must include that half turn about z.
+the official images, ``marker_T_tag`` must include that half turn about z. A version of OpenCV that reads tags in
+another orientation would turn every body: before a dictionary is used, its first tag is drawn from bits kept here and
+found.
 """
 
 from __future__ import annotations
 
+import functools
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +19,27 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.edges import Image
+from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
 
 BORDER_PX = 12
 """Padding of the image: a tag whose quiet zone is cut by the image's edge is then still a closed square."""
+
+CELL_PX = 8
+"""Side of a cell of the tags that the order of corners is checked on."""
+_FIRST_TAGS = {
+    "4X4": 0xB532,
+    "5X5": 0x145B2BC,
+    "6X6": 0x1E3DD82A6,
+    "7X7": 0x1BAB8D94B9415,
+    "ARUCO_ORIGINAL": 0x1084210,
+    "ARUCO_MIP_36H12": 0xD2B63A09D,
+    "APRILTAG_16H5": 0xD8C4,
+    "APRILTAG_25H9": 0x11FA755,
+    "APRILTAG_36H10": 0xE16549538,
+    "APRILTAG_36H11": 0x21A146BAB,
+}
+"""Tag 0 of each family: its cells within the border, row by row, white 1, as OpenCV 4.10 to 5.0 draws it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,16 +50,55 @@ class FoundTag:
     corners_px: FloatArray
 
 
+@functools.cache
 def dictionary_named(name: str) -> cv2.aruco.Dictionary:
     """The OpenCV dictionary of that name, e.g. ``DICT_4X4_50`` or ``DICT_APRILTAG_36h11``.
 
     Raises:
         ValueError: no such dictionary.
+        InputError: this version of OpenCV reads its tags turned.
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if not isinstance(number, int):
         raise ValueError(f"{name} is not an OpenCV dictionary, expected e.g. DICT_4X4_50 or DICT_APRILTAG_36h11")
-    return cv2.aruco.getPredefinedDictionary(number)
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    family = re.sub(r"(X\d)_\d+$", r"\1", name.removeprefix("DICT_")).upper()
+    if family in _FIRST_TAGS:
+        check_corner_order(dictionary, _FIRST_TAGS[family], name)
+    return dictionary
+
+
+def check_corner_order(dictionary: cv2.aruco.Dictionary, bits: int, name: str) -> None:
+    """Check that OpenCV finds tag 0 of a dictionary with its corners where they always were; takes under a millisecond.
+
+    Args:
+        dictionary: OpenCV's.
+        bits: the tag's cells within its border, row by row, white 1, as OpenCV 4.10 to 5.0 draws it.
+        name: for the message.
+
+    Raises:
+        InputError: it is not found, or its corners come in another order.
+    """
+    image, corners = drawn_tag(bits, int(dictionary.markerSize))
+    found, ids, _ = cv2.aruco.ArucoDetector(dictionary, detector_parameters()).detectMarkers(image)
+    turns = -1  # quarters; none fits
+    if ids is not None and np.ravel(ids).tolist() == [0]:
+        seen = np.asarray(found[0], dtype=np.float64).reshape(4, 2)
+        fits = [np.abs(np.roll(seen, k, axis=0) - corners).max() < CELL_PX / 2 for k in range(4)]
+        turns = fits.index(True) if True in fits else -1
+    if turns:
+        how = f"turned by {90 * turns} deg" if turns > 0 else "not where it is"
+        expected = "a version that reads it as it is drawn, such as 4.10 or 5.0"
+        raise InputError(f"OpenCV {cv2.__version__}", f"tag 0 of {name} {how}: poses would be wrong", expected)
+
+
+def drawn_tag(bits: int, cells: int) -> tuple[Image, FloatArray]:
+    """A tag in a white image, and its corners (4, 2) px from the top left clockwise."""
+    inner = np.array([int(bit) for bit in f"{bits:0{cells * cells}b}"], dtype=np.uint8).reshape(cells, cells)
+    tag = np.pad(np.pad(255 * inner, 1), 2, constant_values=255)
+    low, high = 2 * CELL_PX - 0.5, (4 + cells) * CELL_PX - 0.5
+    corners = np.array([[low, low], [high, low], [high, high], [low, high]])
+    return np.kron(tag, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), corners
 
 
 def tag_cells(name: str) -> int:
