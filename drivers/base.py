@@ -50,13 +50,13 @@ class StereoFrame:
 
     Attributes:
         stamp: the middle of the exposure, as precisely as the device knows it.
-        left, right: 8 bit, (h, w) grey or (h, w, 3) BGR; ``right`` None for one camera.
+        left, right: 8 or 16 bit, (h, w) grey or (h, w, 3) BGR; ``right`` None for one camera.
         index: counts the device's frames, so that gaps show dropped ones.
     """
 
     stamp: Stamp
-    left: npt.NDArray[np.uint8]
-    right: npt.NDArray[np.uint8] | None
+    left: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    right: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | None
     index: int
 
 

@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from fgreg.detection.frame_files import Picture
 from fgreg.drivers.base import DeviceLost, StereoFrame
 from fgreg.drivers.image_folder import FolderCapture
-from fgreg.drivers.interlacing import Fields, Picture, split
+from fgreg.drivers.interlacing import Fields, split
 from fgreg.drivers.rectification import Rectification
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Origin, Timing, VideoInput

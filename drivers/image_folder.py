@@ -35,7 +35,7 @@ class FolderCapture:
         """All pictures of a folder, or those that a pattern names, such as ``left/*.png``.
 
         Raises:
-            InputError: no folder, or no pictures in it.
+            InputError: no folder, no pictures in it, or none that can be used.
         """
         folder, pattern = (where, "*") if where.is_dir() else (where.parent, where.name)
         if not folder.is_dir():
@@ -43,6 +43,11 @@ class FolderCapture:
         found = [path for path in folder.glob(pattern) if path.suffix.lower() in SUFFIXES and path.is_file()]
         if not found:
             raise InputError(str(where), "no pictures", f"files that end in {', '.join(SUFFIXES)}")
+        first = min(found)
+        try:
+            read_picture(first)  # so that a kind that cannot be used is refused before anything is played
+        except OSError as error:
+            raise InputError(str(first), f"a file that cannot be read ({error.strerror})", "a picture") from None
         numbers = [int(match[1]) if (match := _NUMBER.search(path.stem)) else None for path in found]
         whole = [number for number in numbers if number is not None]
         spread = max(whole, default=0) - min(whole, default=0)
@@ -60,7 +65,7 @@ class FolderCapture:
         return True
 
     def read(self) -> tuple[bool, Any]:
-        """The next picture; pictures that cannot be decoded are left out."""
+        """The next picture; pictures that cannot be decoded are left out. Raises InputError as ``read_picture``."""
         while self._next < len(self.pictures):
             try:
                 picture = read_picture(self.pictures[self._next])

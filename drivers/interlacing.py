@@ -12,12 +12,10 @@ from dataclasses import replace
 from enum import StrEnum
 
 import numpy as np
-import numpy.typing as npt
 
+from fgreg.detection.frame_files import Picture, as_picture
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.camera_model import CameraModel, StereoRig
-
-Picture = npt.NDArray[np.uint8]
 
 
 class Fields(StrEnum):
@@ -38,7 +36,7 @@ _PARITY = {Fields.TOP: 0, Fields.BOTTOM: 1, Fields.BOTH: 0}
 
 def field_of(frame: Picture, parity: int) -> Picture:
     """One field, (h // 2, w[, 3]), of a frame: its lines ``parity``, ``parity + 2``, ..."""
-    return np.ascontiguousarray(frame[parity : 2 * (frame.shape[0] // 2) : 2])
+    return as_picture(np.ascontiguousarray(frame[parity : 2 * (frame.shape[0] // 2) : 2]))
 
 
 def bottom_on_top(frame: Picture) -> Picture:
@@ -46,9 +44,9 @@ def bottom_on_top(frame: Picture) -> Picture:
 
     Line 2k of the frame is half way between the odd lines 2k - 1 and 2k + 1; the first has no upper neighbour.
     """
-    odd = field_of(frame, 1).astype(np.uint16)
+    odd = field_of(frame, 1).astype(np.uint32)
     odd[1:] = (odd[:-1] + odd[1:] + 1) // 2
-    return odd.astype(np.uint8)
+    return as_picture(odd.astype(frame.dtype))
 
 
 def split(frame: Picture, fields: Fields) -> list[Picture]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgreg.drivers.interlacing import Picture
+from fgreg.detection.frame_files import Picture, as_picture
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, log_so3, make_transform
 from fgreg.model.camera_model import CameraModel, StereoRig
@@ -107,4 +107,4 @@ def _remapped(picture: Picture, maps: tuple[FloatArray, FloatArray], size: tuple
     if picture.shape[1::-1] != size:
         found = f"a picture of {picture.shape[1]} x {picture.shape[0]} px"
         raise InputError("endoscope", found, f"{size[0]} x {size[1]} px, as its calibration")
-    return np.asarray(cv2.remap(picture, maps[0], maps[1], cv2.INTER_LINEAR), dtype=np.uint8)
+    return as_picture(np.asarray(cv2.remap(picture, maps[0], maps[1], cv2.INTER_LINEAR)))

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.detection.frame_files import Picture, decode_picture
 from fgreg.drivers.calibration_files import CameraInfo
-from fgreg.drivers.interlacing import Picture
 from fgreg.errors import InputError
 from fgreg.geometry.quaternions import rotation_from_quaternion, turn_about_x
 from fgreg.geometry.transforms import FloatArray, as_float_array, make_transform, right_from_parent_covariance
@@ -112,10 +112,13 @@ def picture_of(message: Any) -> Picture:
         if "compresseddepth" in str(message.format).lower().replace(" ", ""):
             raise ValueError("a depth image")
         data = np.frombuffer(message.data, dtype=np.uint8)
-        decoded = cv2.imdecode(data, cv2.IMREAD_ANYCOLOR) if data.size else None
+        try:
+            decoded = decode_picture(data.tobytes(), "a compressed image")
+        except InputError as error:
+            raise ValueError(error.found) from None
         if decoded is None:
             raise ValueError(f"a compressed image that cannot be decoded ({message.format})")
-        return np.asarray(decoded, dtype=np.uint8)
+        return decoded
     encoding = str(message.encoding)
     if encoding in _BAYER:
         return np.asarray(cv2.cvtColor(_pixels(message, 1, "u1"), _BAYER[encoding]), dtype=np.uint8)

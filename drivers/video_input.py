@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import cv2
-import numpy as np
 
+from fgreg.detection.frame_files import Picture, as_picture
 from fgreg.drivers.base import DeviceLost, host_now
-from fgreg.drivers.interlacing import Picture
+from fgreg.errors import InputError
 from fgreg.model.time_sync import Stamp
 
 SILENCE_S = 0.7
@@ -183,6 +183,9 @@ class VideoInput:
                 continue
             try:
                 delivered = self._read_all(capture)
+            except (InputError, ValueError) as error:  # pictures that must not be used: opening again mends nothing
+                self._fail(str(error))
+                return
             finally:
                 capture.release()
             if self._timing.paced and delivered and not self._timing.loop and not self._stop.is_set():
@@ -204,7 +207,7 @@ class VideoInput:
         return None
 
     def _read_all(self, capture: Capture) -> bool:
-        """Read until the capture ends; whether any frame came."""
+        """Read until the capture ends; whether any frame came. InputError or ValueError: it has unusable pictures."""
         self._clock.restart()
         delivered = False
         while not self._stop.is_set():
@@ -219,7 +222,7 @@ class VideoInput:
             if due_s > 0.0 and self._stop.wait(due_s):
                 return delivered
             delivered = True
-            self._push(stamp if due_s <= 0.0 else Stamp(stamp.device_s, host_now()), np.asarray(picture, np.uint8))
+            self._push(stamp if due_s <= 0.0 else Stamp(stamp.device_s, host_now()), as_picture(picture))
         return delivered
 
     def _push(self, stamp: Stamp, picture: Picture) -> None:

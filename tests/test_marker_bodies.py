@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgreg.detection.corners import grey
-from fgreg.detection.frame_files import png_bytes, read_picture, to_display
+from fgreg.detection.frame_files import png_bytes, read_picture, to_display, white_level
 from fgreg.detection.marker import detect_marker
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.tags import dictionary_named, find_tags
@@ -113,6 +113,13 @@ def test_a_12_bit_picture_is_read_with_its_full_depth(tmp_path: Path, pair: tupl
     assert_right(detect_marker(read, None, RIG, ONE_TAG), TRUE)
     assert to_display(read).dtype == np.uint8
     assert to_display(read).max() == 255
+    # Hot pixels of the sensor, full in all 16 bits, darken nothing.
+    hot = deep.copy()
+    rng = np.random.default_rng(2)
+    hot[rng.integers(0, hot.shape[0], 40), rng.integers(0, hot.shape[1], 40)] = 65535
+    assert white_level(hot) == pytest.approx(white_level(deep), rel=0.1)
+    assert np.median(grey(hot)) == pytest.approx(np.median(levels), rel=0.1)
+    assert_right(detect_marker(hot, None, RIG, ONE_TAG), TRUE)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from fgreg.detection.frame_files import Picture
 from fgreg.drivers.interlacing import Fields, field_camera, field_rig, split
 from fgreg.drivers.rectification import rectification
 from fgreg.errors import InputError
@@ -39,7 +40,7 @@ def spots(pixels: npt.NDArray[np.float64], size: tuple[int, int], sigma: tuple[f
     return np.round(picture).astype(np.uint8)
 
 
-def centroid(picture: npt.NDArray[np.uint8], near: npt.NDArray[np.float64], reach: int = 16) -> npt.NDArray[np.float64]:
+def centroid(picture: Picture, near: npt.NDArray[np.float64], reach: int = 16) -> npt.NDArray[np.float64]:
     x0, y0 = (round(v) - reach for v in near)
     part = picture[y0 : y0 + 2 * reach + 1, x0 : x0 + 2 * reach + 1].astype(float)
     y, x = np.mgrid[y0 : y0 + 2 * reach + 1, x0 : x0 + 2 * reach + 1]

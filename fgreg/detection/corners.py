@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from fgreg.detection.camera import ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image, fit_edges, segment_frames
+from fgreg.detection.frame_files import white_level
 from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.camera_model import CameraModel
 
@@ -79,8 +80,9 @@ def grey(image: npt.NDArray[np.generic]) -> GreyImage:
         raise ValueError(f"image of type {image.dtype}, expected uint8 or uint16")
     picture: npt.NDArray[Any] = np.ascontiguousarray(image)
     if image.dtype == np.uint16:
-        # 10 and 12 bit images are stored in 16 bits: scale by the largest value.
-        picture = picture.astype(np.float32) * np.float32(255.0 / max(int(picture.max()), 1))
+        # 10 and 12 bit images are stored in 16 bits.
+        scale = np.float32(255.0 / white_level(picture))
+        picture = np.minimum(picture.astype(np.float32) * scale, np.float32(255.0))
     if picture.ndim == 3:
         code = cv2.COLOR_BGR2GRAY if picture.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
         picture = np.asarray(cv2.cvtColor(picture, code))

@@ -45,11 +45,14 @@ def load_picture(path: Path, line: int, key: str, rig: StereoRig | None) -> Pict
     """Read an endoscope frame that an event names.
 
     Raises:
-        InputError: missing, not a PNG image of the camera's size, or not decodable.
+        InputError: missing, not an upright, opaque PNG image of the camera's size, or not decodable.
     """
     where = f"events.jsonl: line {line}: {key}"
     check_camera_frame(path, path.name, where, None if rig is None else rig.left.image_size)
-    picture = read_picture(path)
+    try:
+        picture = read_picture(path)
+    except InputError as error:
+        raise InputError(where, f"{path.name}: {error.found}", error.expected) from None
     if picture is None:
         raise InputError(where, f"{path.name}, whose pixels cannot be decoded", "a PNG image")
     return picture

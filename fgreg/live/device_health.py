@@ -98,7 +98,7 @@ class Pictures:
     """Detects frozen and blank pictures of a camera."""
 
     def __init__(self) -> None:
-        self._before: tuple[npt.NDArray[np.uint8], ...] = ()
+        self._before: tuple[npt.NDArray[Any], ...] = ()
         self._came_s = self._new_s = self._showed_s = math.nan
         self._interval_s = math.inf
         self._side = ""
@@ -111,7 +111,8 @@ class Pictures:
         sides = [frame.left] if frame.right is None else [frame.left, frame.right]
         samples = tuple(side[::ROWS, ::COLUMNS].copy() for side in sides)
         repeated = self._repeated_side(samples)
-        flat = next((side for side, sample in zip(("left", "right"), samples, strict=False) if sample.std() < FLAT), "")
+        both = zip(("left", "right"), samples, strict=False)
+        flat = next((side for side, sample in both if sample.std() < FLAT * max(1.0, float(sample.max()) / 255.0)), "")
         if math.isnan(self._came_s):
             self._new_s = self._showed_s = now_s
         else:
@@ -125,7 +126,7 @@ class Pictures:
         self._side = repeated or flat
         return not repeated
 
-    def _repeated_side(self, samples: tuple[npt.NDArray[np.uint8], ...]) -> str:
+    def _repeated_side(self, samples: tuple[npt.NDArray[Any], ...]) -> str:
         if len(samples) != len(self._before):
             return ""
         both = zip(("left", "right"), samples, self._before, strict=False)

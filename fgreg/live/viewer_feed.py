@@ -165,6 +165,7 @@ class RerunFeed(ViewerFeed):
                 self.left_out += 1
 
     def _draw(self, drawing: _Drawing) -> None:
+        from fgreg.detection.frame_files import to_display  # loads OpenCV
         from fgreg.viewer.live import ViewerUpdate  # loads Rerun
 
         estimate, number, status, model = drawing.estimate, self._number, drawing.status, self._model
@@ -177,7 +178,8 @@ class RerunFeed(ViewerFeed):
             if isinstance(drawing.shot, Aim | Pair):
                 kind = "aim" if isinstance(drawing.shot, Aim) else "pair"
             right = None if kind == "track" else drawing.frame.right  # one view is enough between events
-            self._viewer.shot_images(drawing.t, kind, number, drawing.frame.left, right)
+            shown = to_display(drawing.frame.left), None if right is None else to_display(right)
+            self._viewer.shot_images(drawing.t, kind, number, *shown)
         self._viewer.bmode(drawing.t, number, None if status is None else status.bmode)
         self._viewer.update(
             ViewerUpdate(

@@ -18,6 +18,7 @@ from fgreg.errors import InputError
 from fgreg.model.session_model import ProbeModel
 from fgreg.schema.files import FrameKind
 from fgreg.schema.problems import shown
+from fgreg.session.exif import UPRIGHT, orientation_in
 from fgreg.session.yaml_loader import open_file
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -35,7 +36,7 @@ class FrameUse:
 
 
 def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int, int] | None) -> None:
-    """Check that a file is a complete PNG image of the camera's size, by its chunk headers.
+    """Check that a file is a complete, upright PNG image of the camera's size, by its chunk headers.
 
     Args:
         path: the file.
@@ -47,16 +48,20 @@ def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int,
         InputError: it is not.
     """
     with _open_frame(path, name, where) as file:
-        size = _png_size(file)
-        if size is None:
+        found = _png_size(file)
+        if found is None:
             raise InputError(where, f"{shown(name)}, which is not a complete PNG", "a PNG image")
+        size, turned = found
+        if turned != UPRIGHT:
+            text = f"{shown(name)} with EXIF orientation {turned}"
+            raise InputError(where, text, "pixels as the sensor has them: orientation 1")
         if image_size is not None and size != image_size:
             expected = f"camera.image_size, {image_size[0]} x {image_size[1]}"
             raise InputError(where, f"{shown(name)} with {size[0]} x {size[1]} px", expected)
 
 
-def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
-    """(width, height) of a complete PNG file, else None. Pixel data are not decoded."""
+def _png_size(file: IO[bytes]) -> tuple[tuple[int, int], int] | None:
+    """(width, height) and EXIF orientation of a complete PNG file, else None. Pixel data are not decoded."""
     header = file.read(33)
     if len(header) < 33 or header[:8] != _PNG_SIGNATURE or header[8:16] != b"\x00\x00\x00\x0dIHDR":
         return None
@@ -64,7 +69,7 @@ def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
     if checksum != zlib.crc32(header[12:29]) or not width or not height:
         return None
     end = os.fstat(file.fileno()).st_size
-    at, data = 33, False
+    at, data, turned = 33, False, UPRIGHT
     while True:
         file.seek(at)
         chunk = file.read(8)
@@ -79,7 +84,9 @@ def _png_size(file: IO[bytes]) -> tuple[int, int] | None:
         if zlib.crc32(body[:-4], zlib.crc32(kind)) != int.from_bytes(body[-4:], "big"):
             return None
         if kind == b"IEND":
-            return (width, height) if data else None
+            return ((width, height), turned) if data else None
+        if kind == b"eXIf":
+            turned = orientation_in(body[:-4])
         data = data or kind == b"IDAT"
 
 
