@@ -360,9 +360,10 @@ def test_images_of_other_kinds_are_not_taken_for_envelopes(
 
 
 def test_the_mapping_says_what_images_are_that_are_linear(tmp_path: Path) -> None:
-    path = by_hand(tmp_path / "scan.mha", three(), kind="XX")
     linear = mapping(tmp_path, "images: envelope")
-    assert convert(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", linear).exit_code == 0
+    for kind in ("BRIGHTNESS", "XX"):
+        path = by_hand(tmp_path / "scan.mha", three(), kind=kind)
+        assert convert(path, tmp_path / "s", "--setup", setup(tmp_path), "--map", linear, "--overwrite").exit_code == 0
     assert np.load(tmp_path / "s" / events(tmp_path / "s")[2]["trus"]["frame"]).dtype == np.float32
     message = refused(path, tmp_path / "t", "--setup", setup(tmp_path, log_db=60), "--map", linear)
     assert "found linear images, expected log-compressed ones" in message
@@ -377,6 +378,11 @@ def test_the_mapping_says_what_images_are_that_are_linear(tmp_path: Path) -> Non
         (b"Spacing = 1 1 1", b"Spacing = 0.2 0.1 1", ""),
         (b"Spacing = 1 1 1", b"Spacing = 0.1 0.2 1", "pixels of 0.2 x 0.1 mm (depth, lateral), expected 0.1 x 0.2 mm"),
         (b"Spacing = 1 1 1", b"Spacing = 0 0.2 1", "ElementSpacing: found '0 0.2 1'"),
+        (
+            b"Seq_Frame0000_Timestamp",
+            b"Seq_Frame0000_ImageToProbeTransform = 0 0.25 0 9 0.1 0 0 0 0 0 1 0 0 0 0 1\nSeq_Frame0000_Timestamp",
+            "pixels of 0.25 x 0.1 mm (depth, lateral), expected 0.1 x 0.2 mm",
+        ),
         (b"TransformMatrix = 1 0 0 0 1", b"TransformMatrix = 0 1 0 1 0", "TransformMatrix: found '0 1 0 1 0 0 0 0 1'"),
         (b"DimSize = 4 5 3", b"DimSize = 4 4 3", "found 60 bytes of pixels, expected 48"),
         (b"UltrasoundImageOrientation = MFA\n", b"", "UltrasoundImageOrientation: found nothing"),

@@ -13,6 +13,7 @@ status are filled with identities or old values.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,8 @@ _DEFAULTS = {
 }
 _ENDS = {"marker": ("Marker", "Camera"), "scan": ("Probe", "Stage")}
 """Coordinate frames, from and to, of the roles that may be transforms."""
+_IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+_OF_IMAGE = re.compile(r"ImageTo[A-Z]\w*Transform")
 _TYPES = {"BRIGHTNESS": ImageKind.LOG, "RF_REAL": ImageKind.CHANNELS}
 """What PLUS's image types may be: a scanner's B-mode is log-compressed, its RF lines are beamformed unless the mapping
 says that each is an element's."""
@@ -235,9 +238,8 @@ class _Frames:
         where = f"{self._sequence.name}: UltrasoundImageType"
         stated = self._sequence.fields.get("UltrasoundImageType", "").upper()
         if stated not in ("", "XX", *_TYPES):
-            raise InputError(
-                where, shown(stated), "BRIGHTNESS, or RF_REAL of single elements: no other type can be used"
-            )
+            expected = "BRIGHTNESS, or RF_REAL of single elements: no other type can be used"
+            raise InputError(where, shown(stated), expected)
         kind = _TYPES.get(stated)
         if self._kind is None and kind is not ImageKind.LOG:
             found = stated or "nothing"
@@ -258,20 +260,33 @@ def _valid(fields: Mapping[str, str], name: str) -> None:
 
 
 def _pixel_mm(sequence: SequenceFile) -> tuple[float, float] | None:
-    """Pitch (depth, lateral) in mm of the images, turned as they are; None where the file has PLUS's 1 x 1 for none."""
-    text = sequence.fields.get("ElementSpacing", "")
+    """Pitch (depth, lateral) in mm of the images, turned as they are; None where the file has PLUS's 1 x 1 for none.
+
+    It is ElementSpacing, or the scale of a transform from the image's pixels, such as ``ImageToProbeTransform``.
+    """
+    name, text = "ElementSpacing", sequence.fields.get("ElementSpacing", "1 1")
     try:
         along_x, along_y = (float(word) for word in text.split()[:2])
-    except ValueError:
-        if not text:
+        if along_x == along_y == 1.0:
+            name, text = next(filter(None, map(_scale_field, sequence.frames)), ("", _IDENTITY))
+            columns = np.array([float(word) for word in text.split()]).reshape(4, 4)[:3, :2]
+            along_x, along_y = (float(length) for length in np.linalg.norm(columns, axis=0))
+        if along_x == along_y == 1.0:
             return None
+    except ValueError:
         along_x = along_y = math.nan
     if not (0.0 < along_x < math.inf and 0.0 < along_y < math.inf):
-        raise InputError(f"{sequence.name}: ElementSpacing", shown(text), "numbers > 0")
-    if along_x == along_y == 1.0:
-        return None
+        raise InputError(f"{sequence.name}: {name}", shown(text), "pixels of a size > 0")
     lateral_is_x = sequence.fields.get("UltrasoundImageOrientation", "").upper()[:1] in ("M", "U")
     return (along_y, along_x) if lateral_is_x else (along_x, along_y)
+
+
+def _scale_field(fields: Mapping[str, str]) -> tuple[str, str] | None:
+    """A valid transform of a frame from the image's pixels, by its name."""
+    for name, text in fields.items():
+        if _OF_IMAGE.fullmatch(name) and fields.get(f"{name}Status", "OK").upper() == "OK":
+            return name, text
+    return None
 
 
 def oriented(image: npt.NDArray[Any], orientation: str, kind: ImageKind, name: str) -> npt.NDArray[Any]:
