@@ -95,6 +95,8 @@ def scan_deg_of(message: Any, joint: str | None, unit: str) -> float:
             raise ValueError(f"{len(message.position)} joints, and none is named in the mapping")
         if joint is not None and joint not in names:
             raise ValueError(f"no joint {joint}")
+        if joint is not None and len(names) != len(message.position):
+            raise ValueError(f"{len(message.position)} positions of {len(names)} joints")
         value = float(message.position[0 if joint is None else names.index(joint)])
         found = math.degrees(value) if unit == "rad" else value
     elif hasattr(message, "data"):

@@ -122,6 +122,12 @@ def test_samples_come_when_they_are_due_and_old_ones_are_dropped_where_not_fetch
     late.close()
 
 
+def test_a_joint_state_whose_names_and_positions_differ_in_number_is_named() -> None:
+    message = bags.joint_state(0.0, ["inner", "outer"], [0.5])
+    with pytest.raises(ValueError, match="1 positions of 2 joints"):
+        scan_deg_of(message, "outer", "rad")
+
+
 def shade(value: int) -> Any:
     return np.full((48, 64, 3), value, dtype=np.uint8)
 

@@ -88,8 +88,9 @@ def _counted(frames: list[int]) -> str:
     """``frame 3 is``, or ``4 frames (3, 7 to 9) are``; ``frames`` increase."""
     if len(frames) == 1:
         return f"frame {frames[0]} is"
-    starts = [n for n in frames if n - 1 not in set(frames)]
-    ends = [n for n in frames if n + 1 not in set(frames)]
+    all_of_them = set(frames)
+    starts = [n for n in frames if n - 1 not in all_of_them]
+    ends = [n for n in frames if n + 1 not in all_of_them]
     spans = [str(a) if a == b else f"{a} to {b}" for a, b in zip(starts, ends, strict=True)]
     more = ", ..." if len(spans) > 12 else ""
     return f"{len(frames)} frames ({', '.join(spans[:12])}{more}) are"

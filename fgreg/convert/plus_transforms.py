@@ -7,6 +7,7 @@ does not have is composed of those that it has, each as it is or inverted.
 from __future__ import annotations
 
 import re
+from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -42,18 +43,27 @@ class Chain:
 
 def chain(fields: Collection[str], child: str, parent: str) -> Chain | None:
     """The shortest way from frame ``child`` to frame ``parent``; None where there is none."""
-    ways: dict[str, tuple[Step, ...]] = {child: ()}
-    edges = [(found[1], found[2], name) for name in sorted(fields) if (found := _NAME.fullmatch(name))]
-    fresh = [child]
-    while fresh and parent not in ways:
-        here, fresh = fresh, []
-        for at in here:
-            for start, end, name in edges:
-                for old, new, against in ((start, end, False), (end, start, True)):
-                    if old == at and new not in ways:
-                        ways[new] = (*ways[at], Step(name, against))
-                        fresh.append(new)
-    return Chain(ways[parent]) if parent in ways else None
+    beside: dict[str, list[tuple[str, Step]]] = {}
+    for name in sorted(fields):
+        if found := _NAME.fullmatch(name):
+            beside.setdefault(found[1], []).append((found[2], Step(name)))
+            beside.setdefault(found[2], []).append((found[1], Step(name, inverted=True)))
+    came_by: dict[str, tuple[str, Step]] = {}
+    waiting = deque([child])
+    while waiting and parent not in came_by:
+        here = waiting.popleft()
+        for there, step in beside.get(here, ()):
+            if there not in came_by and there != child:
+                came_by[there] = here, step
+                waiting.append(there)
+    if parent not in came_by:
+        return None
+    steps: list[Step] = []
+    at = parent
+    while at != child:
+        at, step = came_by[at]
+        steps.append(step)
+    return Chain(tuple(reversed(steps)))
 
 
 def mapped_chain(name: str, fields: Collection[str], child: str, parent: str) -> Chain:

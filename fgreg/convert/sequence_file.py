@@ -68,6 +68,9 @@ def read_sequence(path: Path) -> SequenceFile:
     width, height, count = sizes
     if frames and max(frames) >= max(count, 1) and width and height:
         raise InputError(f"{name}: Seq_Frame{max(frames):04d}", "it", f"frames below {count}, as DimSize says")
+    stated = fields["DimSize"].split()
+    if fields.get("NDims", str(len(stated))) != str(len(stated)):
+        raise InputError(f"{name}: NDims", shown(fields["NDims"]), f"{len(stated)}, as many as in DimSize")
     images = _images(fields, data[start:], path, (count, height, width)) if width and height and count else None
     known = max(count if images is not None else 0, 1 + max(frames, default=-1))
     if known > 10_000_000:
@@ -90,8 +93,9 @@ def _header(data: bytes, name: str) -> tuple[dict[str, str], int]:
             continue
         if not equals or len(key) > 300 or b"\0" in key:
             raise InputError(name, "no header of key = value lines", "a PLUS sequence (MetaImage, .mha)")
-        field = key.strip().decode("latin-1")
-        fields[field] = value.strip().decode("latin-1")
+        field, text = key.strip().decode("latin-1"), value.strip().decode("latin-1")
+        if fields.setdefault(field, text) != text and field != "Comment":
+            raise InputError(f"{name}: {field[:100]}", f"{shown(fields[field])} and {shown(text)}", "one value")
         if field == "ElementDataFile":
             return fields, at
     raise InputError(name, "a header without ElementDataFile", "a whole PLUS sequence (MetaImage, .mha)")
