@@ -17,6 +17,8 @@ from fgreg.detection.wavefront_search import SEARCH_BANDS
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import Hearing, Pulse, log_compressed, simulate_channels, simulate_envelope_image
+from fgreg.simulation.presets import PRESETS
+from fgreg.simulation.simulate import simulate
 
 SHAPE = (300, 256)
 
@@ -195,3 +197,17 @@ def test_log_compressed_pictures_are_made_linear_and_give_the_same_position(stor
         # Taken as linear it is found elsewhere, or not known how well, or not at all.
         wrong = locate_in_image(np.abs(np.asarray(picture, dtype=np.float64)), probe)
         assert not (isinstance(wrong, PaFind) and np.allclose(wrong.covariance, was.covariance, rtol=0.3))
+
+
+def test_the_simulators_log_compressed_pictures_have_the_ranges_of_its_linear_ones() -> None:
+    log = PRESETS["log-images"]
+    assert log.probe.image is not None
+    linear = replace(log, probe=replace(log.probe, image=replace(log.probe.image, log_db=None)))
+    finds = []
+    for config in (log, linear):
+        frames = simulate(config, 3).frames
+        picture = frames[next(name for name in frames if name.endswith(".npy"))]()
+        assert picture.dtype == (np.float32 if config is linear else np.uint8)
+        finds.append(found(picture, config.probe))
+    assert finds[0].range_mm == pytest.approx(finds[1].range_mm, abs=0.002)
+    assert finds[0].x_mm == pytest.approx(finds[1].x_mm, abs=0.003)
