@@ -14,7 +14,7 @@ from fgreg.graph.packing import pack
 from fgreg.graph.reduced_graph import log_posterior, refine
 from fgreg.graph.reduced_solver import optimize
 from fgreg.model.estimate import Verdict
-from fgreg.model.measurements import Aim, MarkerObservation, Measurements, Pair
+from fgreg.model.measurements import Aim, MarkerObservation, Measurements, Pair, Wavefront
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.minimal_set_consensus import consensus_starts
@@ -242,6 +242,22 @@ def test_the_density_of_a_doubtful_pm_is_the_mixture_of_inlier_and_outlier() -> 
     # The outlier PM is far off and counts as an outlier for any misfit; the good ones count in full.
     assert log_posterior(without, state, private)[0] < kept - 100.0
     assert both == pytest.approx(kept + log_k[2], abs=0.05)
+
+
+def test_a_doubtful_pm_changes_nothing_of_what_the_others_say_of_the_constants() -> None:
+    model, spoiled, _, _ = _spoiled(0, false_pms=(2,), pairs=12)
+    # The false PM's wavefront has another sound speed than the others'.
+    pairs = [
+        replace(pair, look=replace(pair.look, wavefront=Wavefront(1.1 if pair.pm == 2 else 1.0, 1e-3)))
+        for pair in spoiled.pairs
+    ]
+    config = SolveConfig(estimate_sound_speed=True)
+    found = posterior_mean(register(replace(spoiled, pairs=tuple(pairs)), model, config), config)
+    (mode, *_) = found.modes
+    assert mode.mixture is not None
+    np.testing.assert_allclose(mode.mixture.problem.prior.mean, mode.problem.prior.mean)
+    np.testing.assert_allclose(mode.mixture.problem.prior.information, mode.problem.prior.information)
+    assert found.posterior.effective >= config.posterior_effective
 
 
 def test_an_outlier_that_bends_the_estimate_until_it_fits_widens_the_posterior() -> None:

@@ -38,7 +38,7 @@ class Shots:
     """All shots of the solved epochs, evaluated at the optimum of the inliers.
 
     Attributes:
-        problem: all shots, packed; the registration's own problem where all are inliers.
+        problem: all shots, packed, with the inliers' prior; the registration's own problem where all are inliers.
         looks: of each of its pairs, in order; some in another of their positions than measured first.
         evaluation: at the registration's optimum (one hypothesis).
         pm_inlier (J,), aim_inlier (A,): which of ``problem``'s PMs and aims are inliers.
@@ -189,6 +189,8 @@ def solve_jointly(
         kept = _enough(whole, selection.pm_inlier, selection.aim_inlier)
     chosen = only_inliers(measurements, whole.pms, *kept)
     problem = packed(chosen)
+    # Pictures and wavefronts of shots that are left out say nothing of the constants.
+    whole = replace(whole, prior=problem.prior)
     optimum = optimize(problem, selection.state, tolerance=1e-8)
     found = innovations_at(whole, optimum.state, *kept)
     deviants = beyond_limit(whole, found, kept[0])
