@@ -20,14 +20,14 @@ CONFIGURATION, PARSED = STUDY["configuration"], STUDY["parsed"]
 
 
 def made(**changes: Any) -> Any:
-    usual = STUDY["Outcome"]("tag-1%/frames/15", 0, "ok", 1, 1, 1.0, 1.5, 1.0, True, 0.5, 0.4, 1.0, 0.1, ())
+    usual = STUDY["Outcome"]("tag-1%/frames/15", 0, "ok", 1, 1, 1.0, 1.5, 1.0, 5.0, 0.5, 0.4, 0.4, 1.0, 0.1, ())
     return replace(usual, **changes)
 
 
 def test_figures_count_what_they_say() -> None:
     outcomes = [
         made(),
-        made(seed=1, worst=2.0, targets_in=0.5, in_region=False),
+        made(seed=1, worst=2.0, targets_in=0.5, nees=13.0),
         made(seed=2, worst=4.0, epochs=2, verdict="warning", true2=1.5),
         made(seed=3, worst=4.0, places=2, predicted2=0.8),
     ]
@@ -50,6 +50,8 @@ def test_figures_count_what_they_say() -> None:
     assert found["holds"].error == pytest.approx(math.sqrt(0.25 * 0.75 / 4.0))
     assert found["true_rms"].value == pytest.approx(math.sqrt((1.0 + 4.0 + 16.0 + 16.0) / 4.0))
     assert found["predicted_over_true"].value == pytest.approx(math.sqrt(2.0 / 3.0))
+    assert found["true_over_least"].value == pytest.approx(math.sqrt(3.0 / 1.6))
+    assert found["nees"].value == pytest.approx(7.0)
     assert found["bound"].value == pytest.approx(1.5)
 
 
@@ -85,6 +87,8 @@ def test_sessions_are_solved_and_compared_with_their_truth() -> None:
     assert as_declared.worst < 2.0 * as_declared.bound
     assert as_declared.seen == pytest.approx(as_declared.worst)
     assert as_declared.epochs == as_declared.places == 1
+    # One session's own Gaussian hardly differs from that of the exact measurements.
+    assert as_declared.least2 == pytest.approx(as_declared.predicted2, rel=0.15)
     assert STUDY["run"]((PARSED("print-3%/frames/15"), 3, Systematic())).worst > 3.0
     # Where the radius is wrong the scanner's own map is too: against what it shows, the registration is less off.
     radius = [STUDY["run"]((PARSED("radius-1mm/frames/15"), seed, Systematic())) for seed in range(4)]
