@@ -37,7 +37,8 @@ from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.deviations import deviations_of
 from fgreg.simulation.simulate import SimulatedSession, simulate
 from fgreg.simulation.write import write_session
-from study_systematics import NOISES, Cell, configuration, outcome
+from study_systematics import outcome
+from systematic_cells import NOISES, Cell, configuration
 
 CHANGES = {
     "tag 1 %": {"tag_size": 0.01},
