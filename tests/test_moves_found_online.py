@@ -312,3 +312,18 @@ def test_moves_that_were_detected_are_taken_from_the_record_when_restoring() -> 
     assert again.inliers == first.inliers
     assert sigmas_between(again.estimate, first.estimate) < 0.05
     assert [e.t for e in again.measurements().epochs] == [e.t for e in first.measurements().epochs]
+
+
+@pytest.mark.parametrize("late", [-1, 2])
+def test_a_move_that_was_placed_at_another_pair_is_placed_again_when_later_pairs_show_it(late: int) -> None:
+    model, measurements, _ = unreported_move(3, SHIFT, 14, BEFORE)
+    pairs = measurements.pairs
+    engine = _steady(OnlineRegistration(model, verdicts=False), measurements)
+    with engine.restoring():
+        for pair in pairs[BEFORE : BEFORE + 4]:
+            engine.add(pair)
+        engine.add(CameraMoved(pair.t, detected=True, since_t=pairs[BEFORE + late].t))
+    for pair in pairs[BEFORE + 4 :]:
+        estimate = engine.add(pair)
+    assert [pair.epoch for pair in engine.measurements().pairs] == [0] * BEFORE + [1] * 14
+    assert any(f"between pair {BEFORE} and {BEFORE + 1}" in reason for reason in estimate.reasons)

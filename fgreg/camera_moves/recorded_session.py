@@ -156,29 +156,38 @@ def placed(
     out = list(moves)
     for index, move in enumerate(moves):
         split = split_epochs(measurements, out)
-        epoch = split.pairs[move.since].epoch
-        if not {epoch - 1, epoch} <= set(registration.epochs):
-            continue
-        places = [registration.epochs.index(k) for k in (epoch - 1, epoch)]
-        before, after = (_case(split, registration, place, {}) for place in places)
-        pms = [*before.pms, *after.pms]
-        pairs = tuple(replace(pair, pm=number, epoch=0) for number, looks in enumerate(pms) for pair in looks)
-        problem = pack_session(
-            Measurements((), pairs, (EpochStart(0.0),)),
-            registration.model,
-            replace(config, window_shape=False),
-        )
-        columns = [_columns(registration, place) for place in places]
-        first, second = (registration.covariance[np.ix_(mine, mine)] for mine in columns)
-        at = likeliest_boundary(
-            problem,
-            (one_epoch(registration.optimum.state, places[0]), one_epoch(registration.optimum.state, places[1])),
-            (first, second),
-            np.concatenate([before.inlier, after.inlier]),
-            len(before.pms),
-        )
-        out[index] = _detected(measurements, (*before.places, *after.places)[at], move.log_bayes)
+        first = likeliest_first(split, split.pairs[move.since].epoch, registration, config)
+        if first is not None:
+            out[index] = _detected(measurements, first, move.log_bayes)
     return out
+
+
+def likeliest_first(split: Measurements, epoch: int, registration: Registration, config: SolveConfig) -> int | None:
+    """Index among the pairs of the first one of an epoch, at the likeliest boundary with the epoch before.
+
+    None where one of the two has no registration. ``registration``: of the measurements.
+    """
+    if not {epoch - 1, epoch} <= set(registration.epochs):
+        return None
+    places = [registration.epochs.index(k) for k in (epoch - 1, epoch)]
+    before, after = (_case(split, registration, place, {}) for place in places)
+    pms = [*before.pms, *after.pms]
+    pairs = tuple(replace(pair, pm=number, epoch=0) for number, looks in enumerate(pms) for pair in looks)
+    problem = pack_session(
+        Measurements((), pairs, (EpochStart(0.0),)),
+        registration.model,
+        replace(config, window_shape=False),
+    )
+    columns = [_columns(registration, place) for place in places]
+    first, second = (registration.covariance[np.ix_(mine, mine)] for mine in columns)
+    at = likeliest_boundary(
+        problem,
+        (one_epoch(registration.optimum.state, places[0]), one_epoch(registration.optimum.state, places[1])),
+        (first, second),
+        np.concatenate([before.inlier, after.inlier]),
+        len(before.pms),
+    )
+    return (*before.places, *after.places)[at]
 
 
 def _columns(registration: Registration, place: int) -> IntArray:

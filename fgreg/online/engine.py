@@ -34,7 +34,7 @@ from fgreg.model.tissue_surface import TissueSurface
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.event_checks import check
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
-from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, result_of
+from fgreg.online.full_solve import FullSolveCase, FullSolveResult, Report, full_solve, other_start, result_of
 from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
@@ -45,7 +45,15 @@ from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
 from fgreg.smoother.marginal_prior import has_moved
 from fgreg.smoother.state import Epoch, State, finished_prior, looks_by_pm, make_setting
-from fgreg.smoother.updates import FIRST_PAIRS, finished_prior_at_start, with_aim, with_motion, with_move, with_pair
+from fgreg.smoother.updates import (
+    FIRST_PAIRS,
+    finished_prior_at_start,
+    with_aim,
+    with_motion,
+    with_move,
+    with_pair,
+    without_move,
+)
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
@@ -287,7 +295,13 @@ class OnlineRegistration:
         if found.move_failure is not None:
             self._move_failure = found.move_failure
         if isinstance(found.move, CameraMove):
-            self._reassign(found.move, t)
+            before = {shot.label for shot in self._state.shots[self._state.now.first : found.move.first]}
+            if self._start_detected() and len(before) < LEAST_PMS:  # a move of which so few PMs show nothing
+                self._begin_again(found.move.first)
+            else:
+                self._reassign(found.move, t)
+        elif found.begins is not None:
+            self._begin_again(found.begins)
         elif isinstance(found.move, LoopClosure):
             self._close_loop(found.move, t)
         else:
@@ -308,7 +322,8 @@ class OnlineRegistration:
         finished = self._finished()
         measurements = self._state.measurements()
         if finished is None:
-            return FullSolveCase(self._serial, state.epoch, measurements, self._known(), move=move)
+            known, detected = self._known(), self._start_detected()
+            return FullSolveCase(self._serial, state.epoch, measurements, known, move=move, detected=detected)
         return FullSolveCase(
             self._serial,
             state.epoch,
@@ -410,6 +425,28 @@ class OnlineRegistration:
         self._divided()
         self._solve_wanted = True
         self._note_move(before, found.first, since_t, t, found.log_bayes)
+
+    def _start_detected(self) -> bool:
+        """Whether the current epoch began with a move that pairs showed (or a recorded one, where that is unknown)."""
+        state = self._state
+        mine = next((move for move in self._moves if move.since == state.now.first), None)
+        by_tags = mine is not None and mine.log_bayes is None
+        return state.epoch in self._noticed and not by_tags and not state.now.start.motion_known
+
+    def _begin_again(self, first: int) -> None:
+        """The current epoch, which began with a move that was detected, begins with another pair."""
+        state, old = self._state, self._state.now.first
+        known = next((move for move in self._moves if move.since == old), None)
+        before = without_move(state)
+        since_t = state.shots[first].pair.t
+        self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - first)
+        self._serial += 1
+        self._divided()
+        self._solve_wanted = True
+        if known is not None:
+            self._moves.remove(known)
+        t, log_bayes = (self._t, None) if known is None else (known.alarm_t, known.log_bayes)
+        self._note_move(before, first, since_t, t, log_bayes, recorded=known is None)
 
     def _close_loop(self, found: LoopClosure, t: float) -> None:
         """Close a loop: the earlier epoch's registration becomes a prior of the current epoch."""
@@ -519,9 +556,16 @@ class OnlineRegistration:
 
     def solution(self) -> Solution:
         """The full solve of everything, taken over as by :meth:`settle`."""
-        measurements = self.measurements()
-        solution = solve(measurements, [], self._model, self._config)
-        case = FullSolveCase(self._serial, self._state.epoch, measurements)
+        for left in range(MOST_ROUNDS)[::-1]:
+            measurements = self.measurements()
+            solution = solve(measurements, [], self._model, self._config)
+            detected = self._start_detected()
+            case = FullSolveCase(self._serial, self._state.epoch, measurements, detected=detected)
+            found = solution.registration
+            begins = None if found is None else other_start(case, measurements, found, self._config)
+            if begins is None or not left:
+                break
+            self._begin_again(begins)
         self._solver.failure = ""
         self._solve_wanted = False
         self._take_over(result_of(case, measurements, solution))

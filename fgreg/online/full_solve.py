@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgreg.camera_moves.detector import CameraMove, LoopClosure, MoveCase, find_camera_move
+from fgreg.camera_moves.recorded_session import likeliest_first
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import PredictedTre, Verdict
@@ -41,6 +42,7 @@ class FullSolveCase:
         finished: earlier epochs as a prior: only the current epoch is solved. before: what was reported of them.
         first: place of the first of the pairs in the session's order.
         move: for the camera-move test; None where none is looked for.
+        detected: whether the current epoch began with a move that was detected: it may have begun at another pair.
     """
 
     serial: int
@@ -51,6 +53,7 @@ class FullSolveCase:
     before: tuple[EpochReport, ...] = ()
     first: int = 0
     move: MoveCase | None = None
+    detected: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +103,7 @@ class FullSolveResult:
     Attributes:
         serial, epoch: of the case.
         move: an unreported camera move, or a loop closure; nothing else was computed then.
+        begins: place of the pair with which the current epoch begins, where it is another one; likewise.
         initial: the registration; None where there is none, for the reason ``why_none``, or none was wanted.
         report: None where none was wanted.
         move_failure: why the camera-move test failed, empty where it did not; None where no test was wanted.
@@ -108,6 +112,7 @@ class FullSolveResult:
     serial: int
     epoch: int
     move: CameraMove | LoopClosure | None = None
+    begins: int | None = None
     initial: Initial | None = None
     why_none: str = ""
     report: Report | None = None
@@ -147,12 +152,18 @@ def _solved(
 ) -> FullSolveResult:
     if case.measurements is None:
         return FullSolveResult(case.serial, case.epoch)
-    if not verdicts:
-        try:
-            found = register(case.measurements, model, config, case.known, case.finished)
-        except EstimationError as error:
+    found: Registration | None = None
+    try:
+        found = register(case.measurements, model, config, case.known, case.finished)
+    except EstimationError as error:
+        if not verdicts:
             return FullSolveResult(case.serial, case.epoch, why_none=str(error))
-        return _registered(case, case.measurements, found, None)
+    if found is not None:
+        begins = other_start(case, case.measurements, found, config)
+        if begins is not None:
+            return FullSolveResult(case.serial, case.epoch, begins=begins)
+        if not verdicts:
+            return _registered(case, case.measurements, found, None)
     solution = solve(
         case.measurements,
         [],
@@ -161,8 +172,20 @@ def _solved(
         known=case.known,
         finished=case.finished,
         before=case.before,
+        registration=found,
     )
     return result_of(case, case.measurements, solution)
+
+
+def other_start(
+    case: FullSolveCase, measurements: Measurements, found: Registration, config: SolveConfig
+) -> int | None:
+    """The pair with which the current epoch begins, if the registrations on both sides of its start have another."""
+    if not case.detected or case.finished is not None:
+        return None
+    now = min((index for index, pair in enumerate(measurements.pairs) if pair.epoch == case.epoch), default=None)
+    first = likeliest_first(measurements, case.epoch, found, config)
+    return None if first == now else first
 
 
 def result_of(case: FullSolveCase, measurements: Measurements, solution: Solution) -> FullSolveResult:

@@ -192,6 +192,15 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
     return moved if last else with_motion_prior(moved, setting)
 
 
+def without_move(state: State) -> State:
+    """The state without its last camera move: the current epoch's pairs are of the epoch before, not yet registered."""
+    first = state.now.first
+    shots = [replace(shot, pair=replace(shot.pair, epoch=state.epoch - 1)) for shot in state.shots[first:]]
+    return replace(
+        state, epochs=state.epochs[:-1], shots=(*state.shots[:first], *shots), active_window=None, why_none=""
+    )
+
+
 def with_motion_prior(state: State, setting: Setting) -> State:
     """The state whose current epoch, which has no pairs yet, is registered by the measured motion at its start.
 
