@@ -16,14 +16,14 @@ from fgreg.camera_moves.detector import CameraMove, find_camera_move
 from fgreg.camera_moves.recorded_session import find_moves, split_epochs
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import exp_so3, make_transform
-from fgreg.graph.split_points import ALARM, GATE, logsumexp, moves_in_epoch
+from fgreg.graph.split_points import ALARM, GATE, logsumexp
 from fgreg.model.estimate import Verdict
 from fgreg.model.measurements import Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.events import events_in_order
-from fgreg.registration.move_doubt import MoveDoubt, move_doubt, outliers_in_a_row
+from fgreg.registration.move_doubt import MoveDoubt, move_doubt, moves_in_epoch, outliers_in_a_row
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
 from fgreg.registration.verdict import ABOUT_EVEN, CLEARLY_MOVED, FEW_PMS, MOST_WRONG, possible_camera_move
@@ -99,7 +99,7 @@ def test_steady_sessions_raise_no_alarm_and_few_warnings() -> None:
             np.random.default_rng([seed, 40]), pairs=12, first_hit=bool(seed % 2)
         )
         found = register(measurements, model, FAST)
-        pms, moved = moves_in_epoch(found.problem, found.optimum, found.covariance, 0)
+        pms, moved = moves_in_epoch(found, 0, outliers=True)
         assert len(moved.log) == len(pms) - 1
         scores.append(float(logsumexp(moved.log)))
     assert max(scores) < ALARM
@@ -214,3 +214,26 @@ def test_last_pairs_that_fit_one_other_registration_are_refused_and_scattered_ou
     mixed = tuple(replace(measurements.pairs[k], t=measurements.pairs[i].t) for i, k in enumerate(order))
     scattered = solve(replace(measurements, pairs=mixed), [], model, replace(FAST, limit_mm=1000.0))
     assert scattered.verdict is not Verdict.REFUSED
+
+
+@pytest.mark.parametrize(("limit_mm", "refused"), [(1.5, True), (1000.0, False)])
+def test_outliers_in_a_row_between_pairs_that_fit_are_refused_only_beside_another_doubt(
+    limit_mm: float, refused: bool
+) -> None:
+    model, measurements, _ = moved_session(3, BUMP, 22, 2)
+    order = [*range(11), 22, 23, *range(11, 22)]
+    between = tuple(replace(measurements.pairs[k], t=measurements.pairs[i].t) for i, k in enumerate(order))
+    solution = solve(replace(measurements, pairs=between), [], model, replace(FAST, limit_mm=limit_mm))
+    assert (solution.verdict is Verdict.REFUSED) is refused
+    assert any("in a row, PM 22 to 23" in reason for reason in solution.reasons) is refused
+
+
+def test_outliers_count_in_the_doubt_of_a_move() -> None:
+    model, measurements, _ = moved_session(3, BUMP, 16, 3)
+    found = register(measurements, model, FAST)
+    assert not found.shots.pm_inlier[16:].any()
+    doubt = move_doubt(found, 0, 3.0)
+    assert doubt is not None
+    assert (doubt.before, doubt.after, doubt.pms) == (15, 16, 19)
+    assert doubt.log_odds > ALARM
+    assert doubt.wrong > MOST_WRONG

@@ -17,9 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.packing import PackedProblem
-from fgreg.graph.reduced_graph import pm_contributions
-from fgreg.graph.reduced_solver import Optimum
 
 GATE = 2.5
 """Log of that sum from which the full test (fgreg.camera_moves) runs."""
@@ -86,22 +83,6 @@ def log_move_odds(
     pull = -np.cumsum(gradient[::-1, pose], axis=0)[-2::-1]
     information = across[:, :, pose] - across @ covariance @ np.swapaxes(across, -1, -2)
     return logsumexp(_log_factors(scales.covariance, information, pull) + np.log(scales.share), axis=1)
-
-
-def moves_in_epoch(
-    problem: PackedProblem, optimum: Optimum, covariance: FloatArray, epoch: int
-) -> tuple[tuple[int, ...], MovedRegistrations]:
-    """Possible moves within an epoch: its n PMs in the order of time, and their :func:`moved_registrations`.
-
-    Args:
-        problem: of the inliers. optimum: one hypothesis. covariance: (D, D) there.
-        epoch: of ``problem.columns``.
-    """
-    mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
-    parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
-    pose = slice(6 * epoch, 6 * epoch + 6)
-    moved = moved_registrations(parts.gradient[mine], parts.hessian[mine], covariance, pose)
-    return tuple(problem.pms[pm] for pm in mine), moved
 
 
 @dataclass(frozen=True, slots=True, eq=False)

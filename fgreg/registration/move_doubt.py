@@ -10,11 +10,12 @@ import numpy as np
 from fgreg.errors import EstimationError
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import BoolArray, FloatArray
-from fgreg.graph.split_points import MovedRegistrations, logsumexp, moves_in_epoch
+from fgreg.graph.reduced_graph import pm_contributions
+from fgreg.graph.split_points import ALARM, MovedRegistrations, logsumexp, moved_registrations
 from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.registration.outliers import plausible_cost
+from fgreg.registration.outliers import plausible_cost, pm_limits
 from fgreg.registration.register import Registration, register
 
 MOVE_PRIOR = 0.5
@@ -25,6 +26,8 @@ NEGLIGIBLE = 1e-4
 MOSTLY = 0.75
 """Share of outliers among pairs that count as outliers in a row."""
 LEAST_IN_A_ROW = 2
+UNTESTED = 12
+"""Up to this number of PMs some split point has too few inliers on both sides for the full test."""
 TELLING = 7
 """PMs that show whether they have one registration: one more than determine it."""
 
@@ -49,8 +52,14 @@ class MoveDoubt:
 
 
 def move_doubt(registration: Registration, place: int, limit_mm: float) -> MoveDoubt | None:
-    """Doubt of one of the registration's epochs; None where it has one PM."""
-    pms, moved = moves_in_epoch(registration.problem, registration.optimum, registration.covariance, place)
+    """Doubt of one of the registration's epochs; None where it has one PM.
+
+    Outliers count where a move would be certain with them, or where PMs are too few for the full test, which weighs
+    false PMs against a move.
+    """
+    pms, moved = moves_in_epoch(registration, place, outliers=True)
+    if len(pms) > UNTESTED and logsumexp(moved.log) <= ALARM:
+        pms, moved = moves_in_epoch(registration, place, outliers=False)
     if len(pms) < 2:
         return None
     by_split = logsumexp(moved.log, axis=1)
@@ -59,6 +68,33 @@ def move_doubt(registration: Registration, place: int, limit_mm: float) -> MoveD
     jacobian = target_jacobians(trus_T_camera, registration.model.targets_mm)
     wrong = _probability_beyond(moved, jacobian, 2.0 * limit_mm)
     return MoveDoubt(float(logsumexp(by_split)), pms[best], pms[best + 1], len(pms), wrong)
+
+
+def moves_in_epoch(
+    registration: Registration, place: int, *, outliers: bool
+) -> tuple[tuple[int, ...], MovedRegistrations]:
+    """Possible moves within an epoch: its n PMs in the order of time, and the registration after a move before each.
+
+    ``outliers``: they take part, with the weight that reduces them to their limit (Huber's): PMs after a move look like
+    outliers.
+    """
+    shots, optimum = registration.shots, registration.optimum
+    problem = shots.problem
+    mine = np.unique(problem.beam_pm[problem.beam_epoch == place])
+    mine = mine if outliers else mine[shots.pm_inlier[mine]]
+    parts = pm_contributions(problem, optimum.state, shots.evaluation.private)
+    out = ~shots.pm_inlier[mine]
+    weight = np.where(out, np.minimum(pm_limits(problem)[mine] / np.maximum(parts.cost[mine], 1e-12), 1.0), 1.0)
+    gradient, hessian = weight[:, None] * parts.gradient[mine], weight[:, None, None] * parts.hessian[mine]
+    pose, covariance = slice(6 * place, 6 * place + 6), registration.covariance
+    step = np.zeros(len(covariance))  # from the registration, that of the inliers, to that of all
+    if out.any():
+        total = optimum.evaluation.hessian[0] + hessian[out].sum(axis=0)
+        scale = 1.0 / np.sqrt(np.diag(total))
+        covariance = np.asarray(np.linalg.inv(total * scale * scale[:, None]) * scale * scale[:, None])
+        step = -covariance @ gradient[out].sum(axis=0)
+    moved = moved_registrations(gradient + hessian @ step, hessian, covariance, pose)
+    return tuple(problem.pms[pm] for pm in mine), replace(moved, mean=moved.mean + step[pose])
 
 
 def _probability_beyond(moved: MovedRegistrations, jacobian: FloatArray, limit_mm: float) -> float:

@@ -335,13 +335,15 @@ def _epoch_verdicts(
             estimate = EpochEstimate(k, start.t, None, None, count, Verdict.REFUSED, None)
         else:
             place = registration.epochs.index(k)
-            found = [*steady[k], *_epoch_conditions(measurements, registration, pairs, k, model, config)]
+            found = [*steady[k], *_epoch_conditions(registration, pairs, k, model, config)]
             tre = with_effects(budget.predicted[place], common)
             causes = causes_of_error(registration, place, model.targets_mm)
             both = two_sided(pair for pair in measurements.pairs if pair.epoch == k)
             named_mm = sum(condition.effect_mm for condition in common)
             largest = largest_causes(budget.constants)
             found.extend(accuracy(tre, config, causes, largest, both_sides=both, named_mm=named_mm))
+            doubted = verdict_of([*common, *found]) is not Verdict.OK
+            found.extend(_side_of_a_move(registration, place, measurements, config, doubted=doubted))
             block = slice(6 * place, 6 * place + 6)
             estimate = EpochEstimate(
                 index=k,
@@ -357,7 +359,6 @@ def _epoch_verdicts(
 
 
 def _epoch_conditions(
-    measurements: Measurements,
     registration: Registration,
     pairs: Sequence[PairEstimate],
     epoch: int,
@@ -378,7 +379,7 @@ def _epoch_conditions(
         config=config,
     )
     found.extend(hypotheses(search, config))
-    found.extend(_outlier_conditions(registration, place, measurements, config))
+    found.extend(_outlier_conditions(registration, place))
     if mine:
         directions = _directions_in_trus(np.stack([p.marker.camera_T_marker for p in mine]), state, place)
         points = np.stack([e.trus_p_pm_mm for e in pairs if e.epoch == epoch and e.used and e.trus_p_pm_mm is not None])
@@ -395,9 +396,7 @@ def _steadiness(registration: Registration, place: int, limit_mm: float) -> list
     return [*([] if doubt is None else possible_camera_move(doubt, limit_mm)), *groups]
 
 
-def _outlier_conditions(
-    registration: Registration, place: int, measurements: Measurements, config: SolveConfig
-) -> list[Condition]:
+def _outlier_conditions(registration: Registration, place: int) -> list[Condition]:
     """Conditions on the outliers of one epoch, and on PMs that do not fit but were not left out."""
     shots = registration.shots
     mine = np.zeros(len(shots.problem.pms), dtype=bool)
@@ -406,16 +405,34 @@ def _outlier_conditions(
         return []
     kept, nis = shots.pm_inlier[mine], shots.innovations.pm[mine]
     pms = [pm for pm, here in zip(shots.problem.pms, mine, strict=True) if here]
-    out = left_out(kept, nis, "pairs", SURE_OF_PAIRS)
-    row = outliers_in_a_row(kept)
-    if row is not None and (out or row.stop == len(pms)):
-        looks = [pair for pair in measurements.pairs if pair.epoch in registration.epochs]
-        of_row = set(np.flatnonzero(mine)[row].tolist())
-        pairs = [pair for pair, pm in zip(looks, shots.problem.look_pm.tolist(), strict=True) if pm in of_row]
-        if may_share_a_registration(measurements, pairs, registration.model, config):
-            out = side_of_a_move(pms[row.start], pms[row.stop - 1], int(np.sum(~kept[row])))
     names = [f"PM {pm}" for pm in pms]
-    return [*out, *too_few_to_tell(shots.pm_beyond_limit[mine], kept, nis, names)]
+    return [
+        *left_out(kept, nis, "pairs", SURE_OF_PAIRS),
+        *too_few_to_tell(shots.pm_beyond_limit[mine], kept, nis, names),
+    ]
+
+
+def _side_of_a_move(
+    registration: Registration, place: int, measurements: Measurements, config: SolveConfig, *, doubted: bool
+) -> list[Condition]:
+    """Outliers in a row that may share a registration.
+
+    Where they are the last PMs the registration may be that of the camera before it moved. Where they are not, the PMs
+    on both sides of them fit one registration, so they count only where that is ``doubted`` for another reason.
+    """
+    shots = registration.shots
+    mine = np.unique(shots.problem.beam_pm[shots.problem.beam_epoch == place])
+    kept = shots.pm_inlier[mine]
+    row = outliers_in_a_row(kept)
+    if row is None or (row.stop < len(mine) and not doubted):
+        return []
+    looks = [pair for pair in measurements.pairs if pair.epoch in registration.epochs]
+    of_row = set(mine[row].tolist())
+    pairs = [pair for pair, pm in zip(looks, shots.problem.look_pm.tolist(), strict=True) if pm in of_row]
+    if not may_share_a_registration(measurements, pairs, registration.model, config):
+        return []
+    first, last = (shots.problem.pms[pm] for pm in (mine[row.start], mine[row.stop - 1]))
+    return side_of_a_move(first, last, int(np.sum(~kept[row])))
 
 
 def _directions_in_trus(camera_T_marker: FloatArray, state: SharedState, epoch: int) -> FloatArray:
