@@ -14,11 +14,12 @@ import pytest
 from fgreg.camera_moves.found import DetectedMove
 from fgreg.camera_moves.recorded_session import find_epochs, find_moves, placed, renumbered, split_epochs
 from fgreg.cli.main import main
+from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, make_transform
 from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
 from fgreg.model.measurements import EpochStart, Measurements, Pair
-from fgreg.model.session_model import SessionModel
+from fgreg.model.session_model import NoiseModel, SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.live_session import LiveSession
@@ -29,7 +30,7 @@ from fgreg.registration.register import register
 from fgreg.registration.verdict import MOST_WRONG
 from fgreg.session.result_file import read_result
 from fgreg.session.session_reader import read_ground_truth, read_session
-from fgreg.simulation.presets import PRESETS
+from fgreg.simulation.presets import FIRST_HIT, PRESETS
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
 from tests.forward import make_measurements
@@ -213,3 +214,20 @@ def test_steady_sessions_are_neither_split_nor_refused_for_a_move() -> None:
         doubt = move_doubt(found.registration, 0, CONFIG.limit_mm)
         assert doubt is not None
         assert doubt.wrong < MOST_WRONG
+
+
+def test_a_move_with_inliers_on_both_of_its_sides_is_found(tmp_path: Path) -> None:
+    # Among few precise pairs the largest consensus is of some pairs before the move and some after it.
+    noise = NoiseModel((0.001, 0.001, 0.002), (5e-5, 5e-5, 5e-5), 0.0, (0.3, 0.3, 0.1), 0.24, 0.16)
+    near = replace(FIRST_HIT, camera_distance_mm=(105.0, 135.0), marker_distance_mm=(45.0, 160.0), noise=noise)
+    config = replace(near, pairs=15, tracks_heard=0, tracks_silent=0, epochs=2)
+    write_session(simulate(replace(config, camera_moves_reported=False), 20079), tmp_path / "session")
+    session = read_session(tmp_path / "session")
+    measurements = extract_measurements(session.events, session.model, redetect=False).measurements
+    together = register(measurements, session.model, CONFIG).shots.pm_inlier
+    assert together[:8].any()
+    assert together[8:].any()
+    found = find_epochs(measurements, session.model, CONFIG)
+    assert [move.since for move in found.moves] == [8]
+    assert found.registration is not None
+    assert found.registration.shots.pm_inlier.all()

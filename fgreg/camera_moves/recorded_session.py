@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fgreg.camera_moves.bayes_filter import MoveSettings
 from fgreg.camera_moves.boundary import likeliest_boundary
 from fgreg.camera_moves.detector import CameraMove, LoopClosure, MoveCase, find_camera_move
 from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
@@ -15,13 +17,21 @@ from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import IntArray
 from fgreg.graph.reduced_graph import pm_contributions
 from fgreg.graph.shared_state import Quadratic, one_epoch
+from fgreg.graph.split_points import ALARM, logsumexp
 from fgreg.model.measurements import EpochStart, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.move_doubt import moves_in_epoch
 from fgreg.registration.register import Registration, labels_and_inliers, pack_session, register
 
 MOST_MOVES = 10
 """Largest number of moves that are looked for."""
+ALARM_ONCE, ALARM_EACH = 3.6, 1.5
+"""Where all pairs are tested once a move is certain from a lower score than online, where each pair brings a test: from
+this score, and from this Bayes factor on average over all split points, as the sum grows with their number. One in 250
+steady sessions of 25 PMs reaches it."""
+LEAST_OUTLIERS, MOST_LEFT = 2, 0.5
+"""Outliers that may hide a move, and the largest share of them that is left after it."""
 LEAST_SURE = 12
 """PMs of an epoch from which two minima may be the two sides of a move."""
 
@@ -99,10 +109,45 @@ def _next_move(
     config: SolveConfig,
 ) -> CameraMove | None:
     for place in range(len(registration.epochs)):
-        found = find_camera_move(_case(split, registration, place), model, config)
+        case = _case(split, registration, place)
+        threshold = min(max(ALARM_ONCE, math.log(ALARM_EACH * len(case.pms))), ALARM)
+        found = find_camera_move(case, model, config, MoveSettings(threshold=threshold))
         if isinstance(found, CameraMove):
             return found
+        hidden = _move_among_inliers(split, registration, place, model, config)
+        if hidden is not None:
+            return hidden
     return None
+
+
+def _move_among_inliers(
+    split: Measurements, registration: Registration, place: int, model: SessionModel, config: SolveConfig
+) -> CameraMove | None:
+    """A move with inliers and outliers on both of its sides; None where there is none.
+
+    The test starts from the inliers of one side, and such inliers have no registration. So the epoch is registered with
+    the move at its likeliest place. Most outliers have to be inliers then: of false PMs hardly one becomes an inlier.
+    """
+    epoch = registration.epochs[place]
+    pms, moves = moves_in_epoch(registration, place, outliers=True)
+    labels, inlier = labels_and_inliers(registration, split)
+    mine = [index for index, pair in enumerate(split.pairs) if pair.epoch == epoch]
+    outliers = len({labels[index] for index in mine if not inlier[index]})
+    by_split = logsumexp(moves.log, axis=1)
+    if outliers < LEAST_OUTLIERS or logsumexp(by_split) < ALARM:
+        return None
+    best = int(np.argmax(by_split))
+    first = next(index for index in mine if labels[index] == pms[best + 1])
+    move = DetectedMove(epoch, first, split.pairs[first].t, split.pairs[first].t, split.pairs[first].t, None)
+    divided = split_epochs(split, [move])
+    found = _registered(divided, model, config)
+    if found is None or not {epoch, epoch + 1} <= set(found.epochs):
+        return None
+    labels, inlier = labels_and_inliers(found, divided)
+    left = len({(divided.pairs[index].epoch, labels[index]) for index in mine if not inlier[index]})
+    if left > MOST_LEFT * outliers:
+        return None
+    return CameraMove(epoch, first, float(by_split[best]), float(logsumexp(by_split)))
 
 
 def _case(
