@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from fgreg.camera_moves.found import DetectedMove
-from fgreg.camera_moves.recorded_session import find_epochs, find_moves, placed, renumbered, split_epochs
+from fgreg.camera_moves.recorded_session import EpochsFound, find_epochs, find_moves, placed, renumbered, split_epochs
 from fgreg.cli.main import main
 from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, make_transform
+from fgreg.model.estimate import Verdict
 from fgreg.model.events import AimEvent, CameraMovedEvent, PairEvent
 from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import NoiseModel, SessionModel
@@ -24,7 +25,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.live_session import LiveSession
 from fgreg.pipeline.replay import ReplayRequest, replay_session
-from fgreg.pipeline.solve import SolveRequest, solve_session
+from fgreg.pipeline.solve import SolveRequest, move_conditions, solve_session
 from fgreg.registration.move_doubt import move_doubt
 from fgreg.registration.register import register
 from fgreg.registration.verdict import MOST_WRONG
@@ -231,3 +232,11 @@ def test_a_move_with_inliers_on_both_of_its_sides_is_found(tmp_path: Path) -> No
     assert [move.since for move in found.moves] == [8]
     assert found.registration is not None
     assert found.registration.shots.pm_inlier.all()
+
+
+def test_as_few_pairs_after_a_move_as_determine_a_registration_are_refused() -> None:
+    whole = Measurements((), _pairs((0,) * 12, tuple(range(12))), (EpochStart(0.0),))
+    for since, verdicts in ((5, [Verdict.WARNING]), (6, [Verdict.WARNING, Verdict.REFUSED])):
+        move = DetectedMove(0, since, float(since), since - 1.0, 11.0, 9.0)
+        conditions = move_conditions(EpochsFound((move,)), split_epochs(whole, [move]))
+        assert [condition.verdict for condition in conditions] == verdicts

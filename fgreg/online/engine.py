@@ -501,8 +501,14 @@ class OnlineRegistration:
 
     def _solve_all(self) -> None:
         """Run the full solve of everything in this process."""
-        case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements())
-        self._take_over(full_solve(case, self._model, self._config, verdicts=self._verdicts))
+        for left in range(MOST_ROUNDS)[::-1]:
+            detected = left > 0 and self._start_detected()
+            case = FullSolveCase(self._serial, self._state.epoch, self._state.measurements(), detected=detected)
+            found = full_solve(case, self._model, self._config, verdicts=self._verdicts)
+            if found.begins is None:
+                self._take_over(found)
+                break
+            self._begin_again(found.begins)
 
     # --- estimate ---------------------------------------------------------------------------------------------------
 
@@ -559,11 +565,11 @@ class OnlineRegistration:
         for left in range(MOST_ROUNDS)[::-1]:
             measurements = self.measurements()
             solution = solve(measurements, [], self._model, self._config)
-            detected = self._start_detected()
+            detected = left > 0 and self._start_detected()
             case = FullSolveCase(self._serial, self._state.epoch, measurements, detected=detected)
             found = solution.registration
             begins = None if found is None else other_start(case, measurements, found, self._config)
-            if begins is None or not left:
+            if begins is None:
                 break
             self._begin_again(begins)
         self._solver.failure = ""

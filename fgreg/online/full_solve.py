@@ -181,7 +181,7 @@ def other_start(
     case: FullSolveCase, measurements: Measurements, found: Registration, config: SolveConfig
 ) -> int | None:
     """The pair with which the current epoch begins, if the registrations on both sides of its start have another."""
-    if not case.detected or case.finished is not None:
+    if not case.detected or case.finished is not None or case.epoch in found.ambiguous:
         return None
     now = min((index for index, pair in enumerate(measurements.pairs) if pair.epoch == case.epoch), default=None)
     first = likeliest_first(measurements, case.epoch, found, config)

@@ -31,10 +31,11 @@ from fgreg.model.estimate import (
     Verdict,
 )
 from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, TrackEvent, looks_of
-from fgreg.model.measurements import Check, Look
+from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
+from fgreg.registration.move_doubt import TELLING
 from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import Condition
 from fgreg.session.ground_truth import GroundTruth
@@ -169,7 +170,7 @@ def solve_extracted(
         extracted.tracks,
         session.model,
         config,
-        [*move_conditions(found), *detection_conditions(extracted)],
+        [*move_conditions(found, extracted.measurements), *detection_conditions(extracted)],
         registration=found.registration,
     )
     return extracted, found, solution, session_estimate(session, extracted, solution, config)
@@ -201,9 +202,19 @@ def with_moves(extracted: ExtractedMeasurements, found: EpochsFound) -> Extracte
     )
 
 
-def move_conditions(found: EpochsFound) -> list[Condition]:
-    """Conditions of the verdict from detected camera moves."""
-    return [Condition(Verdict.WARNING, text) for text in found.texts]
+def move_conditions(found: EpochsFound, split: Measurements) -> list[Condition]:
+    """Conditions of the verdict from detected camera moves; ``split``: the measurements with their epochs.
+
+    So few PMs as determine a registration do not show whether they are all of one, and a move may be placed one PM off.
+    """
+    conditions = [Condition(Verdict.WARNING, text) for text in found.texts]
+    pms = len({pair.pm for pair in split.pairs if pair.epoch == len(split.epochs) - 1})
+    if found.moves and found.moves[-1].since_t == split.epochs[-1].t and pms < TELLING:
+        text = (
+            f"{pms} pairs since the camera moved do not show that all of them are: take at least {TELLING - pms} more"
+        )
+        conditions.append(Condition(Verdict.REFUSED, text))
+    return conditions
 
 
 def detection_conditions(extracted: ExtractedMeasurements) -> list[Condition]:

@@ -11,6 +11,7 @@ from fgreg.errors import EstimationError
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.graph.reduced_graph import pm_contributions
+from fgreg.graph.scaled_inverse import scaled_inverse
 from fgreg.graph.split_points import ALARM, MovedRegistrations, logsumexp, moved_registrations
 from fgreg.model.measurements import EpochStart, Measurements, Pair
 from fgreg.model.session_model import SessionModel
@@ -90,8 +91,7 @@ def moves_in_epoch(
     step = np.zeros(len(covariance))  # from the registration, that of the inliers, to that of all
     if out.any():
         total = optimum.evaluation.hessian[0] + hessian[out].sum(axis=0)
-        scale = 1.0 / np.sqrt(np.diag(total))
-        covariance = np.asarray(np.linalg.inv(total * scale * scale[:, None]) * scale * scale[:, None])
+        covariance = scaled_inverse(total)
         step = -covariance @ gradient[out].sum(axis=0)
     moved = moved_registrations(gradient + hessian @ step, hessian, covariance, pose)
     return tuple(problem.pms[pm] for pm in mine), replace(moved, mean=moved.mean + step[pose])
