@@ -155,7 +155,7 @@ def test_a_camera_move_test_that_fails_is_reported_and_the_estimate_goes_on(
     if where == "in the test":
         monkeypatch.setattr(full_solve_module, "find_camera_move", fails)
     else:
-        monkeypatch.setattr(OnlineRegistration, "_move_case", fails)
+        monkeypatch.setattr("fgreg.online.engine.move_case", fails)
     for pair in measurements.pairs[BEFORE:]:
         estimate = engine.add(pair)
         assert any("camera moves are not looked for: ZeroDivisionError" in reason for reason in estimate.reasons)

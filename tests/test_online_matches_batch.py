@@ -14,7 +14,8 @@ from fgreg.geometry.transforms import as_float_array
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import NoiseModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.online.engine import OnlineRegistration, is_due
+from fgreg.online.cases import is_due
+from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import gaussian_tre
 from fgreg.online.events import CameraMoved
 from fgreg.online.full_solve import FullSolveCase, result_of

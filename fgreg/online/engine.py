@@ -17,20 +17,19 @@ from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
 
-import numpy as np
-
-from fgreg.camera_moves.detector import MIN_KNOWN, CameraMove, LoopClosure, MoveCase
+from fgreg.camera_moves.detector import CameraMove, LoopClosure
 from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
-from fgreg.camera_moves.loop_closure import MIN_EARLIER, MOST_LOOKS, back_to
+from fgreg.camera_moves.loop_closure import back_to
 from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
 from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, make_transform, rotation_to_direction
-from fgreg.graph.shared_state import Quadratic, gaussian_prior
+from fgreg.graph.shared_state import Quadratic
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
+from fgreg.online.cases import FIRST_PMS, LEAST_PMS, is_due, known_minima, move_case
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.event_checks import check
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
@@ -39,12 +38,11 @@ from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
-from fgreg.registration.multistart import EpochSearch, Minimum
 from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
 from fgreg.smoother.marginal_prior import has_moved
-from fgreg.smoother.state import Epoch, State, finished_prior, looks_by_pm, make_setting
+from fgreg.smoother.state import Epoch, State, finished_prior, make_setting
 from fgreg.smoother.updates import (
     FIRST_PAIRS,
     finished_prior_at_start,
@@ -57,23 +55,10 @@ from fgreg.smoother.updates import (
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
-LEAST_PMS = 3
-"""Smallest number of PMs with which an epoch is registered."""
-FIRST_PMS = 8
-"""Up to this number of PMs of an epoch the full solve runs at each pair."""
-LATER_PAIRS = (12, 15, 20, 25, 30, 40, 60, 80)
-"""Numbers of pairs at which the full solve runs later; after the last one it runs whenever the pairs have doubled."""
 MOST_LOSSES = 3
 """Times that a case is submitted again after its worker process has ended, until the next event."""
 MOST_ROUNDS = 4
 """Largest number of full solves at one event: after each camera move that one finds another follows."""
-
-
-def is_due(pairs: int) -> bool:
-    """Whether the full solve runs because the epoch now has ``pairs`` pairs."""
-    if pairs <= LATER_PAIRS[-1]:
-        return pairs <= FIRST_PAIRS or pairs in LATER_PAIRS
-    return bool(pairs % LATER_PAIRS[-1] == 0 and (pairs // LATER_PAIRS[-1]).bit_count() == 1)
 
 
 class OnlineRegistration:
@@ -314,7 +299,7 @@ class OnlineRegistration:
         move = None
         if self._move_wanted:
             try:
-                move = self._move_case()
+                move = move_case(state, self._setting.columns)
             except Exception as error:  # the pair is taken in without the test
                 self._move_failure = f"{type(error).__name__}: {error}"
         if not self._solve_wanted:
@@ -322,7 +307,7 @@ class OnlineRegistration:
         finished = self._finished()
         measurements = self._state.measurements()
         if finished is None:
-            known, detected = self._known(), self._start_detected()
+            known, detected = known_minima(self._state), self._start_detected()
             return FullSolveCase(self._serial, state.epoch, measurements, known, move=move, detected=detected)
         return FullSolveCase(
             self._serial,
@@ -350,42 +335,6 @@ class OnlineRegistration:
             self._state = replace(state, finished=prior)
         old = state.epochs[state.now.start.old(state.epoch)]
         return FinishedEpochs(prior, is_open=old.is_open and has_registration(prior))
-
-    def _known(self) -> dict[int, EpochSearch]:
-        """Minima of earlier epochs that are not ambiguous, which are not searched again."""
-        out = {}
-        for k, epoch in enumerate(self._state.epochs[:-1]):
-            mine = [shot for shot in self._state.shots if shot.pair.epoch == k]
-            if epoch.state is not None and not epoch.is_open and len({shot.label for shot in mine}) >= LEAST_PMS:
-                clean = all(shot.inlier for shot in mine)
-                out[k] = EpochSearch((Minimum(0.0, epoch.state),), None, clean=clean)
-        return out
-
-    def _move_case(self) -> MoveCase | None:
-        state, active = self._state, self._state.active_window
-        looks = looks_by_pm(state.current, state.now.first)
-        # Among many PMs a camera move leaves two minima: the pairs of either side are outliers of the other.
-        sound = state.carried is not None and (not state.is_open or state.epoch_pms >= 2 * MIN_KNOWN)
-        return MoveCase(
-            epoch=state.epoch,
-            pms=tuple(tuple(state.shots[place].pair for place in places) for places in looks.values()),
-            places=tuple(places[0] for places in looks.values()),
-            inlier=np.array([state.shots[places[0]].inlier for places in looks.values()], dtype=bool),
-            known=state.carried.at(active.state, self._setting.columns) if active and state.carried and sound else None,
-            earlier=self._earlier(state.epoch) if state.epoch_pairs <= MOST_LOOKS else {},
-        )
-
-    def _earlier(self, to: int) -> dict[int, Quadratic]:
-        """Registrations of the epochs before ``to`` that a loop may be closed to; none where the motion is known."""
-        state = self._state
-        if state.epochs[to].start.motion_known:
-            return {}
-        out = {}
-        for k, epoch in enumerate(state.epochs[:to]):
-            pms = {shot.label for shot in state.shots if shot.pair.epoch == k}
-            if epoch.state is not None and epoch.covariance is not None and len(pms) >= MIN_EARLIER:
-                out[k] = gaussian_prior(epoch.state, epoch.covariance)
-        return out
 
     def _take_over(self, found: FullSolveResult) -> None:
         """Take over optimum, inliers and report of a full solve; where that fails the incremental estimate stays."""
@@ -556,7 +505,7 @@ class OnlineRegistration:
 
     def settle(self) -> OnlineEstimate:
         """Run the full solve of everything now, unless it is up to date; the estimate is then that of the solve."""
-        if not self._estimate.settled or self._known():
+        if not self._estimate.settled or known_minima(self._state):
             self.solution()
         return self._estimate
 
