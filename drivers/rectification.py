@@ -12,11 +12,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from fgreg.detection.frame_files import Picture, as_picture
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, log_so3, make_transform
 from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.lens import in_view, normalized_from_pixels, project
+
+Float32Array = npt.NDArray[np.float32]
+FAR_MM = 1000.0
+"""Of points along a ray: any distance will do."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,8 +38,8 @@ class Rectification:
     rig: StereoRig
     rectified_R_left: FloatArray
     rectified_R_right: FloatArray
-    left_maps: tuple[FloatArray, FloatArray]
-    right_maps: tuple[FloatArray, FloatArray]
+    left_maps: tuple[Float32Array, Float32Array]
+    right_maps: tuple[Float32Array, Float32Array]
 
     def left(self, picture: Picture) -> Picture:
         """The left picture, rectified."""
@@ -52,7 +58,7 @@ def rectification(rig: StereoRig) -> Rectification:
     ``stereoRectify`` makes pixels square). One centre for both, so that infinitely far points have no disparity.
 
     Raises:
-        InputError: one camera only, or cameras that do not stand side by side.
+        InputError: one camera only, cameras that do not stand side by side, or a lens model that cannot be inverted.
     """
     if rig.right is None or rig.right_T_left is None:
         raise InputError("camera.right", "nothing", "two cameras, to rectify their pictures")
@@ -88,22 +94,32 @@ def _common_matrix(cameras: tuple[tuple[CameraModel, FloatArray], ...]) -> Float
     width, height = cameras[0][0].image_size
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
     middles = []
-    for camera, turn in cameras:
-        undistort = cv2.fisheye.undistortPoints if camera.fisheye else cv2.undistortPoints
-        normal = undistort(corners[:, None, :], camera.matrix, camera.distortion, R=turn)
-        middles.append(np.asarray(normal).reshape(-1, 2).mean(axis=0))
+    for (camera, turn), side in zip(cameras, ("left", "right"), strict=True):
+        normalized = normalized_from_pixels(camera, corners)
+        if not np.isfinite(normalized).all():
+            found = "a lens model that cannot be inverted in the image's corners"
+            raise InputError(f"camera.{side}.distortion", found, "one that holds over the image, to rectify it")
+        rays = np.column_stack([normalized, np.ones(4)]) @ turn.T
+        if rays[:, 2].min() <= 0.0:
+            raise InputError(f"camera.{side}", "a corner 90 degrees off the rectified axis", "a narrower lens")
+        middles.append((rays[:, :2] / rays[:, 2:]).mean(axis=0))
     middle = np.mean(middles, axis=0)
     cx, cy = (width - 1) / 2.0 - fx * middle[0], (height - 1) / 2.0 - fy * middle[1]
     return as_float_array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _maps(camera: CameraModel, turn: FloatArray, matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    make = cv2.fisheye.initUndistortRectifyMap if camera.fisheye else cv2.initUndistortRectifyMap
-    x, y = make(camera.matrix, camera.distortion, turn, matrix, camera.image_size, cv2.CV_32FC1)
-    return np.asarray(x), np.asarray(y)
+def _maps(camera: CameraModel, turn: FloatArray, matrix: FloatArray) -> tuple[Float32Array, Float32Array]:
+    """Column and row (h, w), px, in the camera's picture of each rectified pixel; -1 where it sees nothing of it."""
+    width, height = camera.image_size
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    x, y = (columns - matrix[0, 2]) / matrix[0, 0], (rows - matrix[1, 2]) / matrix[1, 1]
+    camera_p = FAR_MM * np.stack([x, y, np.ones_like(x)], axis=-1) @ turn
+    seen = in_view(camera, camera_p, -1.0)
+    pixels = np.where(seen[..., None], project(camera, np.where(seen[..., None], camera_p, [0.0, 0.0, FAR_MM])), -1.0)
+    return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
 
 
-def _remapped(picture: Picture, maps: tuple[FloatArray, FloatArray], size: tuple[int, int]) -> Picture:
+def _remapped(picture: Picture, maps: tuple[Float32Array, Float32Array], size: tuple[int, int]) -> Picture:
     if picture.shape[1::-1] != size:
         found = f"a picture of {picture.shape[1]} x {picture.shape[0]} px"
         raise InputError("endoscope", found, f"{size[0]} x {size[1]} px, as its calibration")

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from fgreg.detection.body_pose import choose_pose
-from fgreg.detection.camera import focal_px, ideal_by_lens, ideal_from_pixels, pixels_from_normalized
 from fgreg.detection.pose_least_squares import CornerSet
 from fgreg.detection.results import RigidFit
 from fgreg.geometry.rig import CAMERA, Constant
@@ -22,11 +22,13 @@ from fgreg.model.camera_dependence import (
     nominal_spot_gain,
     plausible_share,
 )
-from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.camera_model import StereoRig
+from fgreg.model.lens import focal_px, ideal_by_lens, ideal_from_pixels, pixel_by_ideal_jacobian, pixels_from_normalized
 from fgreg.model.session_model import BoardModel, SessionModel
 from fgreg.model.systematic import CAREFUL_LAB, Systematic
 from tests.forward import make_session
-from tests.marker_scene import LEFT, ONE_TAG, RIG, RIGHT, RIGHT_T_LEFT, facing_pose
+from tests.lens_models import LENSES
+from tests.marker_scene import ONE_TAG, RIG, RIGHT_T_LEFT, facing_pose
 
 POSE = facing_pose((12.0, -8.0, 110.0), 25.0)
 BOARD_P = np.column_stack([np.tile(np.arange(9.0), 6), np.repeat(np.arange(6.0), 9), np.zeros(54)]) * 9.0
@@ -57,7 +59,11 @@ def seen(body_p: FloatArray, camera_T_body: FloatArray, c: FloatArray, size: Con
     right_T_left = right_T_left @ make_transform(
         exp_so3(get(Constant.STEREO_ROTATION_X, 3)), get(Constant.STEREO_TRANSLATION_X, 3)
     )
-    ideal, lens, focal, n = [], [], [], len(body_p)
+    n = len(body_p)
+    ideal: list[FloatArray] = []
+    lens: list[FloatArray] = []
+    focal: list[FloatArray] = []
+    noise: list[FloatArray] = []
     for camera, view_T_camera, first, centre in (
         (rig.left, np.eye(4), Constant.FOCAL_LEFT, Constant.CENTRE_LEFT_X),
         (rig.right, right_T_left, Constant.FOCAL_RIGHT, Constant.CENTRE_RIGHT_X),
@@ -66,8 +72,10 @@ def seen(body_p: FloatArray, camera_T_body: FloatArray, c: FloatArray, size: Con
         matrix = camera.matrix.copy()
         matrix[:2, :2] *= 1.0 + get(first)
         matrix[:2, 2] += get(centre, 2)
-        pixels = pixels_from_normalized(CameraModel(camera.image_size, matrix, camera.distortion), q[:, :2] / q[:, 2:])
+        pixels = pixels_from_normalized(replace(camera, matrix=matrix), q[:, :2] / q[:, 2:])
         ideal.append(ideal_from_pixels(camera, pixels))
+        inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal[-1]))
+        noise.append(np.asarray(0.02**2 * inverse @ np.swapaxes(inverse, 1, 2)))  # the same in pixels
         lens.append(ideal_by_lens(camera, ideal[-1]))
         focal.append(np.tile(focal_px(camera), (n, 1)))
     view = np.repeat([0, 1], n)
@@ -76,7 +84,7 @@ def seen(body_p: FloatArray, camera_T_body: FloatArray, c: FloatArray, size: Con
         ideal_px=np.concatenate(ideal),
         view=view,
         group=view,
-        covariance=0.02**2 * np.eye(4 * n),
+        covariance=block_diag(*np.concatenate(noise)),
         common_px=np.zeros(2 * n),
         outward_px=np.zeros((2 * n, 2)),
         focal_px=np.concatenate(focal),
@@ -85,11 +93,18 @@ def seen(body_p: FloatArray, camera_T_body: FloatArray, c: FloatArray, size: Con
     )
 
 
-def detected(c: FloatArray, size: Constant, noise_px: float = 0.0, seed: int = 0) -> RigidFit:
+def detected(
+    c: FloatArray,
+    size: Constant,
+    noise_px: float = 0.0,
+    seed: int = 0,
+    rig: StereoRig = RIG,
+    tag_pose: FloatArray = POSE,
+) -> RigidFit:
     """The pose that the declared rig gives for corners that a rig off by c sees."""
     tag = size is Constant.TAG_SIZE
-    body, pose = (ONE_TAG.tags[0].marker_p_corners_mm, POSE) if tag else (BOARD_P, BOARD_POSE)
-    corners = seen(body, pose, c, size, RIG)
+    body, pose = (ONE_TAG.tags[0].marker_p_corners_mm, tag_pose) if tag else (BOARD_P, BOARD_POSE)
+    corners = seen(body, pose, c, size, rig)
     noise = noise_px * np.random.default_rng(seed).normal(size=corners.ideal_px.shape)
     fit = choose_pose(replace(corners, ideal_px=corners.ideal_px + noise), "body", [], size)
     assert isinstance(fit, RigidFit)
@@ -111,6 +126,23 @@ def test_the_gain_brings_a_pose_back_to_the_true_one(constant: Constant) -> None
     found = fit.dependence.gain @ c
     scale = np.array([0.01] * 3 + [1.0] * 3)
     assert np.linalg.norm((shift - found) / scale) < 0.03 * np.linalg.norm(shift / scale) + 2e-5
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_gains_hold_with_every_lens_model_far_from_the_axis(name: str) -> None:
+    rig = StereoRig(LENSES[name], LENSES[name], RIGHT_T_LEFT)
+    pose = facing_pose((40.0, -22.0, 60.0), 25.0)  # 37 deg from the axis
+    nominal = nominal_pose_gain(replace(session(), camera=rig), pose)
+    scale = np.array([0.01] * 3 + [1.0] * 3)
+    for constant in MEASURED:
+        if constant is Constant.BOARD_SIZE:
+            continue
+        c = off_by(constant, 0.05)
+        fit = detected(c, Constant.TAG_SIZE, rig=rig, tag_pose=pose)
+        shift = twist(pose, fit.camera_T_body)
+        for gain in (fit.dependence.gain, nominal):  # with frames, and without
+            miss = np.linalg.norm((shift - gain @ c) / scale)
+            assert miss < 0.003 * np.linalg.norm(shift / scale) + 2e-5, constant.name
 
 
 def test_a_tag_that_is_smaller_is_nearer() -> None:
@@ -179,12 +211,7 @@ def session(*, camera: bool = True, marker: bool = True, board: bool = True) -> 
 
 
 def test_a_pose_without_frames_depends_as_a_nominal_detection_does() -> None:
-    rig = StereoRig(
-        CameraModel(LEFT.image_size, LEFT.matrix, np.zeros(5)),
-        CameraModel(RIGHT.image_size, RIGHT.matrix, np.zeros(5)),
-        RIGHT_T_LEFT,
-    )
-    corners = seen(ONE_TAG.tags[0].marker_p_corners_mm, POSE, np.zeros(CONSTANTS), Constant.TAG_SIZE, rig)
+    corners = seen(ONE_TAG.tags[0].marker_p_corners_mm, POSE, np.zeros(CONSTANTS), Constant.TAG_SIZE, RIG)
     fit = choose_pose(corners, "body", [], Constant.TAG_SIZE)
     assert isinstance(fit, RigidFit)
     nominal = nominal_pose_dependence(session(), POSE)

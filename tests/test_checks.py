@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from fgreg.detection.camera import project
 from fgreg.detection.check_points import PIXEL_SIGMA, check_measurement, in_plane, triangulate
 from fgreg.geometry.target_error import offset_quantile_mm
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform, transform_points
 from fgreg.model.estimate import EpochEstimate, SessionEstimate, Verdict
 from fgreg.model.events import AimEvent, CheckEvent, PairEvent, PlaneRecord, TrackEvent
+from fgreg.model.lens import project
 from fgreg.model.measurements import Check
 from fgreg.model.session_model import default_targets_mm
 from fgreg.model.solve_config import SolveConfig

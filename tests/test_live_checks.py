@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgreg.detection.camera import project
 from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.geometry.transforms import FloatArray, inverse, transform_points
 from fgreg.model.estimate import Verdict
 from fgreg.model.events import CheckEvent
+from fgreg.model.lens import project
 from fgreg.session.session_reader import read_session
 from tests.test_live_camera_moves import Stand, standing
 

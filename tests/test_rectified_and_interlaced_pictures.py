@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,7 @@ from fgreg.drivers.rectification import rectification
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
 from fgreg.model.camera_model import CameraModel, StereoRig
+from tests.lens_models import LENSES, opencv_pixels
 
 SIZE = (640, 480)
 LEFT_P = np.array([[-20.0, -12.0, 100.0], [5.0, 3.0, 80.0], [22.0, 15.0, 110.0], [10.0, -14.0, 90.0]])
@@ -69,6 +72,30 @@ def test_points_in_rectified_pictures_are_where_the_rectified_model_says_on_the_
     np.testing.assert_allclose(shift[1:], 0.0)
     assert -shift[0] == pytest.approx(np.linalg.norm(endoscope.right_T_left[:3, 3]))
     np.testing.assert_array_equal(found.rig.left.distortion, np.zeros(5))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_rectified_pixels_are_taken_from_where_each_lens_model_sees_them(name: str) -> None:
+    wide = LENSES[name]
+    camera = replace(wide, image_size=(320, 180), matrix=as_float_array(np.diag([0.25, 0.25, 1.0]) @ wide.matrix))
+    endoscope = StereoRig(camera, camera, rig().right_T_left)
+    found = rectification(endoscope)
+    k = found.rig.left.matrix
+    pixels = np.array([[5.0, 7.0], [160.0, 90.0], [300.0, 10.0], [225.0, 175.0]])
+    rays = np.column_stack([(pixels - k[:2, 2]) / k[[0, 1], [0, 1]], np.ones(4)])
+    for maps, turn in ((found.left_maps, found.rectified_R_left), (found.right_maps, found.rectified_R_right)):
+        column, row = pixels.astype(int).T
+        taken = np.column_stack([maps[0][row, column], maps[1][row, column]])
+        expected = opencv_pixels(camera, rays @ turn)
+        inside = ((expected >= 0.0) & (expected <= [319.0, 179.0])).all(axis=1)
+        assert inside.sum() >= 2
+        np.testing.assert_allclose(taken[inside], expected[inside], atol=1e-3)
+
+
+def test_a_lens_that_folds_within_the_picture_is_not_rectified() -> None:
+    folded = replace(LENSES["five"], distortion=as_float_array([-0.5, 0, 0, 0, 0]))
+    with pytest.raises(InputError, match=r"camera\.left\.distortion: found a lens model that cannot be inverted"):
+        rectification(StereoRig(folded, folded, rig().right_T_left))
 
 
 def test_rectified_turns_fit_together_and_agree_with_opencv() -> None:

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, robust_pose
-from fgreg.detection.camera import focal_px, ideal_by_lens, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.corners import eight_bit, grey, refine_subpixel
 from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
@@ -26,6 +25,7 @@ from fgreg.detection.tags import BORDER_PX, detector_parameters, dictionary_name
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.lens import focal_px, ideal_by_lens, ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.model.session_model import BoardModel
 
 CORNER_SIGMA_PX = 0.03
@@ -158,22 +158,23 @@ def find_board_corners(image: GreyImage, board: BoardModel) -> tuple[FloatArray,
 
 def _view_corners(
     image: npt.NDArray[np.generic], camera: CameraModel, view: int, view_T_camera: FloatArray, board: BoardModel
-) -> CornerSet | None:
+) -> tuple[CornerSet | None, int]:
+    """The board's corners in one view, and how many more were seen where its lens cannot be inverted."""
     found = find_board_corners(grey(image), board)
     if found is None:
-        return None
+        return None, 0
     pixels, ids = found
     ideal = ideal_from_pixels(camera, pixels)
     good = np.isfinite(ideal).all(axis=1)
     ideal, ids = ideal[good], ids[good]
-    n = len(ids)
+    n, blind = len(ids), int((~good).sum())
     if n == 0:
-        return None
+        return None, blind
     inverse = np.linalg.inv(pixel_by_ideal_jacobian(camera, ideal))
     covariance = np.zeros((n, 2, n, 2))
     covariance[np.arange(n), :, np.arange(n), :] = CORNER_SIGMA_PX**2 * inverse @ np.swapaxes(inverse, 1, 2)
     board_p = np.column_stack([ids % board.columns, ids // board.columns, np.zeros(n)]) * board.square_mm
-    return CornerSet(
+    corners = CornerSet(
         body_p_mm=board_p,
         ideal_px=ideal,
         view=np.full(n, view, dtype=np.int64),
@@ -185,6 +186,7 @@ def _view_corners(
         view_T_camera=np.tile(view_T_camera, (n, 1, 1)),
         by_lens=ideal_by_lens(camera, ideal),
     )
+    return corners, blind
 
 
 def _strays(corners: CornerSet) -> BoolArray:
@@ -230,23 +232,28 @@ def detect_board(
     """
     if left is None and right is None:
         raise ValueError("no frame to detect in")
+    if right is not None and (rig.right is None or rig.right_T_left is None):
+        raise ValueError("a right frame, but the rig has no right camera")
     parts: list[CornerSet] = []
-    if left is not None:
-        corners = _view_corners(left, rig.left, 0, np.eye(4), board)
+    left_out: list[str] = []
+    for view, (image, camera, view_T_camera) in enumerate(
+        ((left, rig.left, np.eye(4)), (right, rig.right, rig.right_T_left))
+    ):
+        if image is None or camera is None or view_T_camera is None:
+            continue
+        corners, blind = _view_corners(image, camera, view, view_T_camera, board)
         parts += [] if corners is None else [corners]
-    if right is not None:
-        if rig.right is None or rig.right_T_left is None:
-            raise ValueError("a right frame, but the rig has no right camera")
-        corners = _view_corners(right, rig.right, 1, rig.right_T_left, board)
-        parts += [] if corners is None else [corners]
+        if blind:
+            left_out.append(f"{blind} corners where the {VIEW_NAMES[view]} lens model cannot be inverted")
     where = " or ".join(name for name, image in zip(VIEW_NAMES, (left, right), strict=True) if image is not None)
     if not parts:
-        return NotFound(f"board: not found in the {where} view{_pattern_hint([left, right], board)}")
+        why = f" ({', '.join(left_out)})" if left_out else _pattern_hint([left, right], board)
+        return NotFound(f"board: not found in the {where} view{why}")
     everything = join(parts)
     if len(everything.view) < MIN_CORNERS:
         return NotFound(f"board: only {len(everything.view)} corners seen in the {where} view")
     stray = _strays(everything)
-    left_out = [f"{int(stray.sum())} corners off the board"] if stray.any() else []
+    left_out += [f"{int(stray.sum())} corners off the board"] if stray.any() else []
     if 3 * int(stray.sum()) > len(stray):
         return NotFound(f"board: {int(stray.sum())} of {len(stray)} corners do not fit the board")
     pose = choose_pose(everything.subset(~stray), "board", left_out, Constant.BOARD_SIZE)

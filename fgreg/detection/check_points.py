@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.detection.camera import focal_px, normalized_from_pixels
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import StereoRig
 from fgreg.model.events import CheckEvent, PlaneRecord
+from fgreg.model.lens import focal_px, normalized_from_pixels
 from fgreg.model.measurement_checks import problem_of
 from fgreg.model.measurements import FLOOR_MM, Check, usable_covariance
 from fgreg.model.session_model import SessionModel

@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.camera import ideal_from_pixels, pixel_by_ideal_jacobian
 from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image, fit_edges, segment_frames
 from fgreg.detection.frame_files import white_level
 from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.camera_model import CameraModel
+from fgreg.model.lens import ideal_from_pixels, pixel_by_ideal_jacobian
 
 CORNER_FLOOR_PX = 0.003
 """Added to the sigma of corners from edges: independent errors that remain after averaging along an edge."""

@@ -25,13 +25,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from fgreg.detection.camera import (
+from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
+from fgreg.model.camera_model import CameraModel
+from fgreg.model.lens import (
     distort_jacobian,
     focal_px,
     pixels_from_ideal,
 )
-from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
-from fgreg.model.camera_model import CameraModel
 
 Image = npt.NDArray[np.uint8]
 GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.float32]

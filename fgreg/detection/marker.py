@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, without_strays
-from fgreg.detection.camera import focal_px, ideal_by_lens
 from fgreg.detection.corners import eight_bit, grey, square_corners
 from fgreg.detection.edges import GreyImage, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
@@ -23,6 +22,7 @@ from fgreg.detection.tags import FoundTag, find_tags, tag_cells
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.lens import focal_px, ideal_by_lens, ideal_from_pixels
 from fgreg.model.session_model import MarkerModel
 
 LARGE_WIDTH_PX = 1000
@@ -104,6 +104,12 @@ def _moved(tags: list[FoundTag], window: Window) -> list[FoundTag]:
     return [FoundTag(tag.id, tag.corners_px + corner) for tag in tags]
 
 
+def _why_unused(tag: FoundTag, camera: CameraModel, view: str) -> str:
+    if not np.isfinite(ideal_from_pixels(camera, tag.corners_px)).all():
+        return f"where the {view} lens model cannot be inverted"
+    return f"cut by the border of the {view} view"
+
+
 def view_corners(
     image: npt.NDArray[np.generic],
     camera: CameraModel,
@@ -131,7 +137,7 @@ def view_corners(
             tags, sets = spoilt, shown
     used = [(tag.id, corners) for tag, corners in zip(tags, sets, strict=True) if len(corners.view)]
     left_out += [
-        f"tag {tag.id} cut by the border of the {VIEW_NAMES[view]} view"
+        f"tag {tag.id} {_why_unused(tag, camera, VIEW_NAMES[view])}"
         for tag, corners in zip(tags, sets, strict=True)
         if not len(corners.view)
     ]

@@ -12,7 +12,7 @@ the constants c, W a weight (inverse covariance) and r observed less predicted c
 
     twist(c) = -(J' W J)^-1 J' W C c,   L = C - J (J' W J)^-1 J' W C,   information = L' W L,   pull = L' W r
 
-Corners are in ideal pixels: without distortion, counted from the principal point (fgreg.detection.camera).
+Corners are in ideal pixels: without distortion, counted from the principal point (fgreg.model.lens).
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ import numpy as np
 
 from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, hat, rotation_to_direction, transform_points
-from fgreg.model.camera_model import StereoRig
+from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.model.lens import focal_px, seen_by_lens
 from fgreg.model.measurements import CameraDependence
 from fgreg.model.session_model import SessionModel
 
@@ -56,10 +57,10 @@ def corner_derivatives(
     camera_T_body: FloatArray,
     body_p_mm: FloatArray,
     view: IntArray,
-    focal_px: FloatArray,
+    focal: FloatArray,
     view_T_camera: FloatArray,
     size: Constant,
-    by_lens: FloatArray | None = None,
+    by_lens: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Derivatives of n corners (ideal px) by the pose's twist, (..., n, 2, 6), and by the constants, (..., n, 2, 19).
 
@@ -67,25 +68,21 @@ def corner_derivatives(
         camera_T_body: (..., 4, 4).
         body_p_mm: (n, 3).
         view: (n,) 0 left, 1 right.
-        focal_px: (n, 2) of the corner's camera.
+        focal: (n, 2) px of the corner's camera.
         view_T_camera: (n, 4, 4) of the corner's camera from the left one.
         size: TAG_SIZE or BOARD_SIZE.
-        by_lens: (n, 2, 3) derivative by the camera's focal length (relative) and centre; None: without distortion.
+        by_lens: (..., n, 2, 3) derivative by the camera's focal length (relative) and centre.
     """
     arm = body_p_mm @ np.swapaxes(camera_T_body[..., :3, :3], -1, -2)
     p = arm + camera_T_body[..., None, :3, 3]
     rotation = view_T_camera[:, :3, :3]
-    q = np.einsum("nij,...nj->...ni", rotation, p) + view_T_camera[:, :3, 3]
-    z = np.maximum(q[..., 2], _NEAREST_MM)
-    ideal = focal_px * q[..., :2] / z[..., None]
+    ideal, z = _ideal_px(camera_T_body, body_p_mm, focal, view_T_camera)
     projection = np.zeros((*z.shape, 2, 3))
-    projection[..., 0, 0] = focal_px[:, 0] / z
-    projection[..., 1, 1] = focal_px[:, 1] / z
+    projection[..., 0, 0] = focal[:, 0] / z
+    projection[..., 1, 1] = focal[:, 1] / z
     projection[..., 2] = -ideal / z[..., None]
     by_camera_p = projection @ rotation
     out = np.zeros((*z.shape, 2, CONSTANTS))
-    if by_lens is None:
-        by_lens = np.concatenate([ideal[..., None], np.broadcast_to(np.eye(2), (*z.shape, 2, 2))], axis=-1)
     for side in range(2):
         own = (view == side)[:, None]
         out[..., _FOCAL[side]] = own * by_lens[..., 0]
@@ -96,6 +93,45 @@ def corner_derivatives(
     out[..., _SHIFT] = right[..., None] * by_camera_p
     out[..., column(size)] = np.einsum("...nij,...nj->...ni", by_camera_p, arm)
     return np.concatenate([-by_camera_p @ hat(arm), by_camera_p], axis=-1), out
+
+
+def _ideal_px(
+    camera_T_body: FloatArray, body_p_mm: FloatArray, focal: FloatArray, view_T_camera: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Ideal pixels (..., n, 2) of corners and their depths (..., n), mm; arguments as of :func:`corner_derivatives`."""
+    p = transform_points(camera_T_body[..., None, :, :], body_p_mm)
+    q = np.einsum("nij,...nj->...ni", view_T_camera[:, :3, :3], p) + view_T_camera[:, :3, 3]
+    z = np.maximum(q[..., 2], _NEAREST_MM)
+    return focal * q[..., :2] / z[..., None], z
+
+
+def _pixel_derivatives(
+    rig: StereoRig, camera_T_body: FloatArray, corners_mm: FloatArray, size: Constant
+) -> tuple[FloatArray, FloatArray]:
+    """:func:`corner_derivatives` of corners (n, 3) in all v views of a rig, left first, in pixels as they are seen.
+
+    Returns:
+        (..., v n, 2, 6) and (..., v n, 2, 19).
+    """
+    views = _views(rig)
+    n = len(corners_mm)
+    view = np.repeat(np.arange(len(views)), n)
+    view_T_camera = np.repeat(np.stack([transform for _, transform in views]), n, axis=0)
+    focal = np.repeat(np.stack([focal_px(camera) for camera, _ in views]), n, axis=0)
+    body_p = np.tile(corners_mm, (len(views), 1))
+    ideal, _ = _ideal_px(camera_T_body, body_p, focal, view_T_camera)
+    seen = [seen_by_lens(camera, ideal[..., k * n : (k + 1) * n, :]) for k, (camera, _) in enumerate(views)]
+    by_lens, by_ideal = (np.concatenate(parts, axis=-3) for parts in zip(*seen, strict=True))
+    J, C = corner_derivatives(camera_T_body, body_p, view, focal, view_T_camera, size, by_lens)
+    return by_ideal @ J, by_ideal @ C
+
+
+def _views(rig: StereoRig) -> list[tuple[CameraModel, FloatArray]]:
+    """Each camera with ``view_T_camera`` (4, 4)."""
+    views = [(rig.left, np.eye(4))]
+    if rig.right is not None and rig.right_T_left is not None:
+        views.append((rig.right, rig.right_T_left))
+    return views
 
 
 def fitted_dependence(
@@ -150,8 +186,9 @@ def corner_dependence(camera_T_board: FloatArray, board_p_mm: FloatArray, board:
 def nominal_pose_gain(model: SessionModel, camera_T_marker: FloatArray) -> FloatArray:
     """(..., 6, 19) gain of marker poses (..., 4, 4) that came without frames.
 
-    That of a detection of all tags that face the camera, all corners equally well. Where the session does not say what
-    the cameras or the tags are: distances scale with CAMERA_SCALE and TAG_SIZE, depths with both focal lengths' mean.
+    That of a detection of all tags that face the camera, all corners equally well in pixels. Where the session does not
+    say what the cameras or the tags are: distances scale with CAMERA_SCALE and TAG_SIZE, depths with both focal
+    lengths' mean.
     """
     t = camera_T_marker[..., :3, 3]
     plain = np.zeros((*t.shape[:-1], 6, CONSTANTS))
@@ -205,11 +242,7 @@ def nominal_point_gain(model: SessionModel, camera_p_mm: FloatArray) -> FloatArr
         return _plain_gain(camera_p_mm)
     camera_T_point = np.tile(np.eye(4), (len(camera_p_mm), 1, 1))
     camera_T_point[:, :3, 3] = camera_p_mm
-    view_T_camera = np.stack([np.eye(4), rig.right_T_left])
-    focal_px = np.stack([np.diag(camera.matrix)[:2] for camera in (rig.left, rig.right)])
-    J, C = corner_derivatives(
-        camera_T_point, np.zeros((2, 3)), np.arange(2), focal_px, view_T_camera, Constant.TAG_SIZE
-    )
+    J, C = _pixel_derivatives(rig, camera_T_point, np.zeros((1, 3)), Constant.TAG_SIZE)
     J, C = J[..., 3:].reshape(-1, 4, 3), C.reshape(-1, 4, CONSTANTS)
     turned = np.swapaxes(J, -1, -2)
     return -np.asarray(np.linalg.solve(turned @ J, turned @ C))
@@ -249,20 +282,13 @@ def _nominal_gain(
 
     Where a corner is behind a camera: ``plain``.
     """
-    cameras = [(rig.left, np.eye(4))]
-    if rig.right is not None and rig.right_T_left is not None:
-        cameras.append((rig.right, rig.right_T_left))
-    n = len(corners_mm)
-    view = np.repeat(np.arange(len(cameras)), n)
-    view_T_camera = np.repeat(np.stack([transform for _, transform in cameras]), n, axis=0)
-    focal_px = np.repeat(np.stack([np.diag(camera.matrix)[:2] for camera, _ in cameras]), n, axis=0)
-    body_p = np.tile(corners_mm, (len(cameras), 1))
     in_front = np.ones(camera_T_body.shape[:-2], dtype=bool)
-    for _, transform in cameras:
+    views = _views(rig)
+    for _, transform in views:
         depth = transform_points((transform @ camera_T_body)[..., None, :, :], corners_mm)[..., 2]
         in_front &= ((depth > _NEAREST_MM) | ~used).all(axis=-1)
-    J, C = corner_derivatives(camera_T_body, body_p, view, focal_px, view_T_camera, size)
-    weight = np.tile(used, len(cameras))[..., None, None]
+    J, C = _pixel_derivatives(rig, camera_T_body, corners_mm, size)
+    weight = np.tile(used, len(views))[..., None, None]
     lead = camera_T_body.shape[:-2]
     J, C = (J * weight).reshape(*lead, -1, 6), (C * weight).reshape(*lead, -1, CONSTANTS)
     turned = np.swapaxes(J, -1, -2)

@@ -22,7 +22,15 @@ from fgreg.schema.record import Key, record
 
 _PIXELS = 1e5
 DISTORTION_SIZES = (4, 5, 8, 12)
-"""Numbers of coefficients of OpenCV's lens models."""
+"""Numbers of coefficients of OpenCV's polynomial lens models: the plain one (4 or 5), rational (8), thin prism (12)."""
+FISHEYE_SIZE = 4
+"""Of Kannala and Brandt's model."""
+POLYNOMIAL_NAMES = ("plumb_bob", "radtan", "rational_polynomial", "pinhole", "none", "")
+"""What calibration files call the polynomial models, whose number of coefficients tells which one it is."""
+FISHEYE_NAMES = ("fisheye", "equidistant")
+_TILTED_SIZE = 14
+_TILTED = "OpenCV's model with a tilted sensor"
+_SIZES = "4, 5, 8 or 12"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,11 +50,42 @@ class CameraModel:
     fisheye: bool = False
 
 
+def lens_coefficients(values: FloatArray, name: str) -> tuple[FloatArray, bool]:
+    """A calibration file's coefficients in OpenCV's order and whether the lens is a fisheye one.
+
+    Args:
+        values: (n,); trailing coefficients of a larger polynomial model that are zero are left out, none is five zeros.
+        name: of the model, as files call it.
+
+    Raises:
+        FieldError: another model, or a number of coefficients that it does not have.
+    """
+    values = np.asarray(values, dtype=np.float64).ravel()
+    if name in FISHEYE_NAMES:
+        if values.size != FISHEYE_SIZE:
+            raise FieldError.of(f"{values.size} coefficients", f"{FISHEYE_SIZE}, of a fisheye lens")
+        return values, True
+    if name not in POLYNOMIAL_NAMES:
+        expected = "plumb_bob, radtan, rational_polynomial, or equidistant (fisheye); calibrate with one of these"
+        raise FieldError.of(f"the distortion model {shown(name)}", expected)
+    expected = f"{_SIZES}, in OpenCV's order"
+    if values.size not in (0, *DISTORTION_SIZES, _TILTED_SIZE):
+        raise FieldError.of(f"{values.size} coefficients", expected)
+    if values[DISTORTION_SIZES[-1] :].any():
+        raise FieldError.of(f"{values.size} coefficients, of {_TILTED}", expected)
+    needed = next(size for size in DISTORTION_SIZES[1:] if not values[size:].any())
+    out = np.zeros(needed)
+    out[: values.size] = values[:needed]
+    return out, False
+
+
 @dataclass(frozen=True, slots=True)
 class _Distortion(Numbers):
     """The coefficients of a lens, of one of the numbers that OpenCV knows."""
 
     def read(self, value: object, _folder: Path | None = None, /) -> FloatArray:
+        if isinstance(value, list) and len(value) == _TILTED_SIZE:
+            raise FieldError.of(f"{_TILTED_SIZE} numbers, {_TILTED}", self.expected)
         if not isinstance(value, list) or len(value) not in DISTORTION_SIZES:
             raise FieldError.of(shown(value), self.expected)
         out: FloatArray = Numbers.read(self, value)
@@ -54,7 +93,7 @@ class _Distortion(Numbers):
 
     @property
     def expected(self) -> str:
-        return f"a list of 4, 5, 8 or 12 numbers, each {self.each.expected}"
+        return f"a list of {_SIZES} numbers, each {self.each.expected}"
 
     def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
         each = self.each.json_schema(definitions)
@@ -71,11 +110,14 @@ class _LensSection:
     ]
     model: Annotated[str | None, Key("Kannala-Brandt, with 4 coefficients", Text(allowed=("fisheye",)))] = None
 
-    JSON_RULES: ClassVar = ({"if": {"required": ["model"]}, "then": {"properties": {"distortion": {"maxItems": 4}}}},)
+    JSON_RULES: ClassVar = (
+        {"if": {"required": ["model"]}, "then": {"properties": {"distortion": {"maxItems": FISHEYE_SIZE}}}},
+    )
 
     def __post_init__(self) -> None:
-        if self.model is not None and len(self.distortion) != 4:
-            raise FieldError.of(f"{len(self.distortion)} numbers", "4 numbers, for model: fisheye", "distortion")
+        if self.model is not None and len(self.distortion) != FISHEYE_SIZE:
+            expected = f"{FISHEYE_SIZE} numbers, for model: fisheye"
+            raise FieldError.of(f"{len(self.distortion)} numbers", expected, "distortion")
         matrix = self.matrix
         zeros = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1.0)
         positive = matrix[0, 0] > 0 and matrix[1, 1] > 0

@@ -15,6 +15,7 @@ import numpy as np
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import StereoRig
 from fgreg.model.commissioned_rig import CommissionedRig
+from fgreg.model.lens import blind_px
 from fgreg.model.measurements import Aim, Measurements, Pair
 from fgreg.model.session_model import BoardModel, MarkerModel, NoiseModel, ProbeModel, SessionModel, StageModel
 from fgreg.model.systematic import Systematic
@@ -120,6 +121,12 @@ def implausible_camera(rig: StereoRig) -> Iterator[str]:
         yield from FOCAL.doubt(f"camera.{side}.matrix", float(camera.matrix[0, 0]) / width)
         if not (0 <= cx <= width and 0 <= cy <= height):
             yield f"camera.{side}.matrix has its centre ({cx:g}, {cy:g}) outside {width} x {height} px"
+        blind = blind_px(camera)
+        if blind is not None:
+            yield (
+                f"camera.{side}.distortion cannot be inverted {blind:.0f} px from the image's centre and beyond: "
+                "nothing is found there; its coefficients are hardly this lens', or of another model"
+            )
     if rig.right_T_left is not None:
         yield from BASELINE.doubt("camera.right_T_left", float(np.linalg.norm(rig.right_T_left[:3, 3])))
 

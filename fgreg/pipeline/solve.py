@@ -16,7 +16,6 @@ import numpy as np
 
 from fgreg.camera_moves.found import DetectedMove
 from fgreg.camera_moves.recorded_session import EpochsFound, find_epochs, renumbered, split_epochs
-from fgreg.detection.camera import project
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.detection.results import MarkerFit, NoSignal, PaFind
 from fgreg.errors import InputError
@@ -31,6 +30,7 @@ from fgreg.model.estimate import (
     Verdict,
 )
 from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, TrackEvent, looks_of
+from fgreg.model.lens import project
 from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig

@@ -22,7 +22,6 @@ from fgreg.errors import EstimationError
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import expected_tre_mm, target_jacobians
 from fgreg.geometry.transforms import (
-    BoolArray,
     FloatArray,
     IntArray,
     as_float_array,
@@ -36,7 +35,7 @@ from fgreg.graph.packing import PackedProblem, pack, pack_more
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate, pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
-from fgreg.model.camera_model import CameraModel
+from fgreg.model.lens import in_view
 from fgreg.model.measurements import EpochStart, Look, MarkerObservation, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.tissue_surface import REACH_MM, TissueSurface, fit_surface
@@ -282,7 +281,9 @@ def propose(registration: Registration, place: int, sweeps: tuple[int, ...]) -> 
     keep = ((scan >= low) & (scan <= high)).all(axis=1)
     keep &= (trus_p_spot[:, 0] > aperture.min()) & (trus_p_spot[:, 0] < aperture.max())
     if model.camera is not None:
-        keep &= _in_view(model.camera.left, camera_p) & _in_view(model.camera.left, camera_T_marker[:, :3, 3])
+        margin_px = IMAGE_MARGIN * model.camera.left.image_size[0]
+        keep &= in_view(model.camera.left, camera_p, margin_px)
+        keep &= in_view(model.camera.left, camera_T_marker[:, :3, 3], margin_px)
     index = np.flatnonzero(keep)
     if index.size == 0:
         within = ", from both sides," if len(sweeps) > 1 else ""
@@ -398,15 +399,6 @@ def _exact_look(
         sweep=sweep,
         window_sigma_rad=model.noise_per_pm.window_rad,
     )
-
-
-def _in_view(camera: CameraModel, camera_p: FloatArray) -> BoolArray:
-    """Whether points (n, 3) fall into the image; lens distortion is left out, the margin covers it."""
-    depth = np.maximum(camera_p[:, 2], 1e-6)
-    pixel = camera_p[:, :2] / depth[:, None] * camera.matrix[[0, 1], [0, 1]] + camera.matrix[:2, 2]
-    size = np.array(camera.image_size, dtype=np.float64)
-    margin = IMAGE_MARGIN * size[0]
-    return np.asarray((camera_p[:, 2] > 1.0) & (pixel > margin).all(axis=1) & (pixel < size - margin).all(axis=1))
 
 
 # ---- information of the candidates ----

@@ -1,4 +1,8 @@
-"""The camera's lens: projection with OpenCV's distortion models, and its inverse."""
+"""The camera's lens: projection with OpenCV's distortion models, and its inverse.
+
+The estimator's formulas (fgreg.model.lens) are not used here, so that an error in them shows in simulated sessions.
+Both are tested against OpenCV's own functions, which are too slow for all pixels of an image.
+"""
 
 from __future__ import annotations
 
