@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.detection.frame_files import Picture, decode_picture
-from fgreg.drivers.calibration_files import CameraInfo
+from fgreg.drivers.calibration_parts import CameraInfo
 from fgreg.errors import InputError
 from fgreg.geometry.quaternions import rotation_from_quaternion, turn_about_x
 from fgreg.geometry.transforms import FloatArray, as_float_array, make_transform, right_from_parent_covariance

@@ -180,6 +180,7 @@ def test_kalibr_camchain_in_metres(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"camera_model": "ds"}, "camera_model.*found 'ds', expected pinhole"),
         ({"camera_model": "omni"}, "camera_model.*found 'omni', expected pinhole"),
         ({"distortion_model": "fov"}, "distortion model 'fov', expected plumb_bob, radtan"),
         ({"intrinsics": [1.0, 2.0]}, "cam1.intrinsics.*expected a list of 4 numbers"),
@@ -229,7 +230,7 @@ def test_lens_models_are_opencvs_and_others_are_refused_by_name(tmp_path: Path) 
     np.testing.assert_allclose(read_calibration([path]).rig.left.distortion, eight[0])
     tilted = np.array([[-0.3, 0.1, 0.0, 0.0, 0.05, 0, 0, 0, 0, 0, 0, 0, 0.01, 0.0]])
     storage(path, camera_matrix=M1, distortion_coefficients=tilted, image_size=(640, 240))
-    with pytest.raises(InputError, match="14 parameters, with a tilted sensor"):
+    with pytest.raises(InputError, match="14 coefficients, of OpenCV's model with a tilted sensor"):
         read_calibration([path])
 
 
@@ -248,8 +249,22 @@ def test_four_parameters_of_an_opencv_file_are_fisheye_only_where_it_says_so(tmp
     five = np.array([[0.1, 0.05, 0.01, 0.02, 0.0]])
     storage(path, K1=M1, D1=five, K2=M2, D2=five, R=R, T=T, image_size=(640, 240))
     path.write_text(path.read_text() + "fisheye_model: 1\n")
-    with pytest.raises(InputError, match=r"D1: found 5 parameters, expected 4, of a fisheye lens"):
+    with pytest.raises(InputError, match=r"D1: found 5 coefficients, expected 4, of a fisheye lens"):
         read_calibration([path])
+
+
+def test_ros_models_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "left.yaml"
+    for model, numbers, fisheye in (
+        ("equidistant", [0.1, 0.05, 0.01, 0.02], True),
+        ("rational_polynomial", [0.5, -2.7, 0.0007, -0.0002, 1.6, 0.38, -2.5, 1.5], False),
+        ("rational_polynomial", [0.1] * 12, False),
+    ):
+        text = CAMERA_INFO.format(name="left", r=LEVEL, p3=0.0, model=model, k3="K3")
+        path.write_text(text.replace("[-0.25, 0.125, 0.001, -0.002, K3]", str(numbers)), encoding="utf-8")
+        left = read_calibration([path]).rig.left
+        assert left.fisheye is fisheye
+        assert left.distortion.tolist() == numbers
 
 
 def test_kalibrs_equidistant_model_is_fisheye(tmp_path: Path) -> None:

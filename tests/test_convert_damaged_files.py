@@ -15,7 +15,14 @@ from fgreg.convert.plus import read_plus
 from fgreg.convert.table import read_table
 from fgreg.drivers.calibration_files import read_calibration
 from fgreg.errors import FgregError
-from tests import bags, test_camera_calibrations, test_convert_bags, test_convert_plus_sequences, test_convert_tables
+from tests import (
+    bags,
+    test_camera_calibration_texts,
+    test_camera_calibrations,
+    test_convert_bags,
+    test_convert_plus_sequences,
+    test_convert_tables,
+)
 
 MAPPING = RecordingMapping()
 
@@ -55,6 +62,14 @@ def kalibr(folder: Path) -> Path:
     return path
 
 
+def ost(folder: Path) -> Path:
+    return test_camera_calibration_texts.text(folder / "ost.txt", test_camera_calibration_texts.LEFT)
+
+
+def matlab(folder: Path) -> Path:
+    return test_camera_calibration_texts.written(folder, test_camera_calibration_texts.matlab())
+
+
 def recording(folder: Path) -> Path:
     return next(bags.write_bag(folder / "bag", test_convert_bags.room(), mcap=True).glob("*.mcap"))
 
@@ -66,9 +81,11 @@ def recording(folder: Path) -> Path:
         (table, lambda path: read_table(path, MAPPING), 150),
         (opencv, lambda path: read_calibration([path]), 100),
         (kalibr, lambda path: read_calibration([path]), 100),
+        (ost, lambda path: read_calibration([path]), 100),
+        (matlab, lambda path: read_calibration([path]), 100),
         (recording, lambda path: read_bag(path, MAPPING), 40),
     ],
-    ids=["plus", "csv", "opencv", "kalibr", "mcap"],
+    ids=["plus", "csv", "opencv", "kalibr", "ost", "matlab", "mcap"],
 )
 def test_a_damaged_file_is_read_or_refused_in_one_line(
     tmp_path: Path, make: Callable[[Path], Path], read: Callable[[Path], object], count: int

@@ -246,3 +246,9 @@ def test_a_calibration_becomes_the_camera_of_a_setup_that_has_none(tmp_path: Pat
     message = refused(shots, tmp_path / "o", "--setup", setup(tmp_path), "--calibration", path)
     assert "it, and a camera in setup.yaml" in message
     assert "--rectified: found it alone" in refused(shots, tmp_path / "o", "--setup", without, "--rectified")
+    options = ["--setup", without, "--calibration", path, "--calibration-size"]
+    assert "expected 1280 x 720 px" in refused(shots, tmp_path / "o", *options, "1280x720")
+    assert "such as 1280x720" in refused(shots, tmp_path / "o", *options, "1280 by 720")
+    assert "--calibration-size: found it alone" in refused(
+        shots, tmp_path / "o", "--setup", without, "--calibration-size", "1x1"
+    )

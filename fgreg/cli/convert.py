@@ -27,9 +27,10 @@ A result (a session's folder, or its result.yaml), by the ending of OUT:
   fgreg convert SESSION registration.tfm    3D Slicer: linear transform CameraToTrus
   fgreg convert SESSION registration.json   all of it: covariance, verdict, reasons
 \b
-Where session.yaml has no camera, --calibration FILE provides it: ROS camera_info (left
-and right: give the option twice), OpenCV FileStorage, Kalibr camchain. A ROS 2
-recording with camera_info topics needs none.
+Where session.yaml has no camera, --calibration FILE provides it: ROS camera_info or
+ost.txt (left and right: give the option twice), OpenCV FileStorage, Kalibr camchain,
+scikit-surgery's .l2r.txt, MATLAB's struct as JSON. Files that do not state the size of
+the images need --calibration-size. A ROS 2 recording with camera_info topics needs none.
 \b
 Columns, topics and fields have usual names: a CSV has t, type (pair where absent),
 pm, scan_deg, x_mm, range_mm or frame, sweep, camera_T_marker (16 numbers) or
@@ -66,6 +67,9 @@ def add_convert(app: typer.Typer) -> None:
         unit: Annotated[
             str | None, typer.Option("--calibration-unit", metavar="m|mm", help="Of the calibration's lengths.")
         ] = None,
+        size: Annotated[
+            str | None, typer.Option("--calibration-size", metavar="WxH", help="Of the images, px, where no file says.")
+        ] = None,
         rectified: Annotated[
             bool, typer.Option("--rectified", help="The images were rectified with this calibration.")
         ] = False,
@@ -87,7 +91,7 @@ def add_convert(app: typer.Typer) -> None:
         _refuse({"--epoch": epoch, "--force": force or None}, "a recording", "a result")
         if setup is None:
             raise InputError("--setup", "nothing", "the session.yaml of the set-up")
-        _import(source, out, setup, mapping, calibration or [], unit, rectified, overwrite, quiet)
+        _import(source, out, setup, mapping, calibration or [], unit, size, rectified, overwrite, quiet)
 
 
 def _refuse(options: Mapping[str, object], given: str, of: str) -> None:
@@ -139,6 +143,7 @@ def _import(
     mapping: Path | None,
     calibration: list[Path],
     unit: str | None,
+    size: str | None,
     rectified: bool,
     overwrite: bool,
     quiet: bool,
@@ -153,12 +158,15 @@ def _import(
         file = setup / "session.yaml" if setup.is_dir() else setup
         if "camera" in load_yaml(file, str(file)):
             raise InputError("--calibration", f"it, and a camera in {file.name}", "one of the two")
-        found = read_calibration(calibration, unit=unit, rectified=rectified)
+        found = read_calibration(calibration, unit=unit, rectified=rectified, image_size=_size(size))
         rig = found.rig
         for warning in found.warnings:
             sys.stderr.write(f"fgreg: warning: {warning}\n")
-    elif rectified or unit is not None:
-        raise InputError("--rectified" if rectified else "--calibration-unit", "it alone", "it with --calibration")
+    else:
+        alone = {"--rectified": rectified or None, "--calibration-unit": unit, "--calibration-size": size}
+        for option, value in alone.items():
+            if value is not None:
+                raise InputError(option, "it alone", "it with --calibration")
     imported = _read(source, RecordingMapping() if mapping is None else read_mapping(mapping))
     written = write_session(imported, setup, out, rig=rig, overwrite=overwrite)
     for warning in [*written.left_out[:MOST_SAID], *written.warnings]:
@@ -168,6 +176,16 @@ def _import(
     if not quiet:
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(written.events.items()))
         typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {out}")
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Width and height of ``1280x720``."""
+    if text is None:
+        return None
+    width, _, height = text.lower().partition("x")
+    if not (width.isascii() and width.isdigit() and height.isascii() and height.isdigit()) or len(text) > 11:
+        raise InputError("--calibration-size", f"'{text[:40]}'", "width x height of the images in px, such as 1280x720")
+    return int(width), int(height)
 
 
 def _read(source: Path, mapping: "RecordingMapping") -> "Imported":

@@ -30,7 +30,7 @@ from fgreg.convert.bag_claims import TopicClaims, check_metres, told_of_angles, 
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.detection.frame_files import png_bytes
-from fgreg.drivers.calibration_files import rig_of_infos
+from fgreg.drivers.calibration_parts import rig_of_infos
 from fgreg.drivers.ros_messages import (
     ARRAY_TYPES,
     IMAGE_TYPES,

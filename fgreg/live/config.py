@@ -292,7 +292,9 @@ class _Reader:
         from fgreg.drivers.rectification import rectification
 
         files = [file for file in (options.left, options.right) if file is not None]
-        read = read_calibration(files, unit=options.unit, rectified=options.pictures == "rectified")
+        read = read_calibration(
+            files, unit=options.unit, rectified=options.pictures == "rectified", image_size=options.image_size
+        )
         rig = read.rig
         self.warnings += read.warnings
         if not options.of_fields:

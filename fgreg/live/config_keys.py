@@ -11,7 +11,7 @@ from fgreg.live.workflow import WorkflowSettings
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.time_sync import Latencies
 from fgreg.schema.files import ExistingPath
-from fgreg.schema.kinds import Integer, JsonSchema, Kind, ListOf, Number, Text
+from fgreg.schema.kinds import Integer, IntegerPair, JsonSchema, Kind, ListOf, Number, Text
 from fgreg.schema.record import Field, Inline, Key, record
 from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.simulation.room import BUMP_EVERY_S
@@ -37,7 +37,7 @@ class CalibrationOptions:
     """Files with the endoscope's calibration."""
 
     left: Annotated[
-        Path, Key("ROS camera_info, OpenCV FileStorage or Kalibr camchain", ExistingPath(), example="calibration.yaml")
+        Path, Key("of ROS, OpenCV, Kalibr, scikit-surgery or MATLAB (JSON)", ExistingPath(), example="calibration.yaml")
     ]
     right: Annotated[
         Path | None,
@@ -46,10 +46,19 @@ class CalibrationOptions:
     unit: Annotated[
         str | None,
         Key(
-            "of the files' lengths; m for ROS and Kalibr, mm for OpenCV",
+            "of the files' lengths; m for ROS and Kalibr, mm for the others",
             Text(allowed=("m", "mm")),
             null=True,
             example="m",
+        ),
+    ] = None
+    image_size: Annotated[
+        tuple[int, int] | None,
+        Key(
+            "width and height, px, where the files do not say",
+            IntegerPair(1, 32768, "[width, height], two integers from 1 to 32768"),
+            null=True,
+            example="[1280, 720]",
         ),
     ] = None
     pictures: Annotated[

@@ -20,7 +20,10 @@ from fgreg.schema.matrices import Matrix, Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key, record
 
-_PIXELS = 1e5
+MOST_PX = 1e5
+"""Of an entry of a camera's matrix."""
+MOST_COEFFICIENT = 1e4
+"""Of a lens' coefficient."""
 DISTORTION_SIZES = (4, 5, 8, 12)
 """Numbers of coefficients of OpenCV's polynomial lens models: the plain one (4 or 5), rational (8), thin prism (12)."""
 FISHEYE_SIZE = 4
@@ -28,6 +31,7 @@ FISHEYE_SIZE = 4
 POLYNOMIAL_NAMES = ("plumb_bob", "radtan", "rational_polynomial", "pinhole", "none", "")
 """What calibration files call the polynomial models, whose number of coefficients tells which one it is."""
 FISHEYE_NAMES = ("fisheye", "equidistant")
+_COEFFICIENT = Number(-MOST_COEFFICIENT, MOST_COEFFICIENT)
 _TILTED_SIZE = 14
 _TILTED = "OpenCV's model with a tilted sensor"
 _SIZES = "4, 5, 8 or 12"
@@ -106,7 +110,7 @@ class _LensSection:
 
     matrix: Annotated[FloatArray, Key("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], px", Matrix(3))]
     distortion: Annotated[
-        FloatArray, Key("[k1, k2, p1, p2, k3, ...], OpenCV's: 4, 5, 8 or 12", _Distortion(None, Number(-1e4, 1e4)))
+        FloatArray, Key("[k1, k2, p1, p2, k3, ...], OpenCV's: 4, 5, 8 or 12", _Distortion(None, _COEFFICIENT))
     ]
     model: Annotated[str | None, Key("Kannala-Brandt, with 4 coefficients", Text(allowed=("fisheye",)))] = None
 
@@ -121,7 +125,7 @@ class _LensSection:
         matrix = self.matrix
         zeros = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1.0)
         positive = matrix[0, 0] > 0 and matrix[1, 1] > 0
-        if not (positive and max(map(abs, zeros)) <= 1e-9 and np.abs(matrix).max() <= _PIXELS):
+        if not (positive and max(map(abs, zeros)) <= 1e-9 and np.abs(matrix).max() <= MOST_PX):
             found = "[" + ", ".join("[" + ", ".join(f"{v:g}" for v in row) + "]" for row in matrix) + "]"
             raise FieldError.of(found, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0", "matrix")
 
