@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fgreg.detection.frame_files import to_display
 from fgreg.drivers.base import DeviceLost, MotionSample, StereoFrame, host_now
 from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES, picture_of, pose_of, stamp_ns
 from fgreg.drivers.ros_recordings import ECM_POSE, Recorded, Recording
@@ -120,7 +121,7 @@ class RecordedMotion(_RecordedDevice):
     """A MotionSource: the endoscope's pose by its holder (CRTK ``measured_cp`` of the ECM; metres become mm).
 
     Args:
-        path: rosbag2 folder, .mcap or .db3.
+        path: rosbag2 folder, .mcap, .db3 or .bag (ROS 1).
         topic: PoseStamped, TransformStamped or PoseWithCovarianceStamped. Default: ``/ECM/measured_cp``.
         tip_T_camera: (4, 4), mm, camera pose in the frame that the topic's poses are of. Default: identity.
         pace: shared with other devices that play the recording. Default: from now, at recorded speed.
@@ -165,10 +166,10 @@ class RecordedMotion(_RecordedDevice):
 
 
 class RecordedCamera(_RecordedDevice):
-    """A StereoCamera: recorded images, raw or compressed, matched by the times in their headers.
+    """A StereoCamera: recorded images, raw or compressed, in 8 bits, matched by the times in their headers.
 
     Args:
-        path: rosbag2 folder, .mcap or .db3.
+        path: rosbag2 folder, .mcap, .db3 or .bag (ROS 1).
         left, right: topics. Default: found by name; one camera if there is no right topic.
         pace: as in RecordedMotion.
         max_gap_s: longest time between left and right.
@@ -211,7 +212,7 @@ class RecordedCamera(_RecordedDevice):
         for recorded, index in self._player.due():
             message = self._player.recording.decode(recorded)
             try:
-                picture = picture_of(message)
+                picture = to_display(picture_of(message))
             except ValueError:
                 self._player.dropped += 1
                 continue

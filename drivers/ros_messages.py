@@ -1,4 +1,4 @@
-"""ROS 2 messages as this package's types: metres become millimetres, quaternions rotations, images arrays.
+"""ROS messages (1 and 2) as this package's types: metres become millimetres, quaternions rotations, images arrays.
 
 Functions take any object with the message's fields, so that neither ROS nor a reader of recordings is needed here.
 Each raises ValueError with a short text if a message's content is invalid.
@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.frame_files import Picture, decode_picture
+from fgreg.detection.frame_files import Picture, as_picture, decode_picture
 from fgreg.drivers.calibration_parts import CameraInfo
 from fgreg.errors import InputError
 from fgreg.geometry.quaternions import rotation_from_quaternion, turn_about_x
@@ -31,15 +32,41 @@ ARRAY_TYPES = frozenset(
     {"sensor_msgs/msg/Image", "std_msgs/msg/Float32MultiArray", "std_msgs/msg/Int16MultiArray"},
 )
 TEXT_TYPES = frozenset({"std_msgs/msg/String"})
+TF_TYPES = frozenset({"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"})
 
 MM_PER_M = 1000.0
 
-_CHANNELS = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3, "bgra8": 4, "8UC4": 4, "rgba8": 4}
-_TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "bgra8": cv2.COLOR_BGRA2BGR, "8UC4": cv2.COLOR_BGRA2BGR}
-_TO_BGR |= {"rgba8": cv2.COLOR_RGBA2BGR}
-# ROS names a Bayer pattern by its first line, OpenCV by its second and third pixel of the second line.
-_BAYER = {"bayer_rggb8": cv2.COLOR_BayerBG2BGR, "bayer_bggr8": cv2.COLOR_BayerRG2BGR}
-_BAYER |= {"bayer_gbrg8": cv2.COLOR_BayerGR2BGR, "bayer_grbg8": cv2.COLOR_BayerGB2BGR}
+
+@dataclass(frozen=True, slots=True)
+class _Encoding:
+    """Pixels of an image: their type, values for each, OpenCV's conversion to grey or BGR, rows per row of pixels."""
+
+    kind: str
+    channels: int
+    to_bgr: int | None = None
+    rows: float = 1.0
+
+
+def _encodings() -> dict[str, _Encoding]:
+    """ROS's names of encodings; OpenCV's type names and names without an alpha channel are synonyms."""
+    found: dict[str, _Encoding] = {}
+    for bits, kind in ((8, "u1"), (16, "u2")):
+        grey, bgr, bgra = _Encoding(kind, 1), _Encoding(kind, 3), _Encoding(kind, 4, cv2.COLOR_BGRA2BGR)
+        found |= {f"mono{bits}": grey, f"{bits}UC1": grey, f"bgr{bits}": bgr, f"{bits}UC3": bgr}
+        found |= {f"rgb{bits}": _Encoding(kind, 3, cv2.COLOR_RGB2BGR), f"bgra{bits}": bgra, f"{bits}UC4": bgra}
+        found |= {f"rgba{bits}": _Encoding(kind, 4, cv2.COLOR_RGBA2BGR)}
+        # ROS names a Bayer pattern by its first line, OpenCV by its second and third pixel of the second line.
+        for pattern, code in (("rggb", "BG"), ("bggr", "RG"), ("gbrg", "GR"), ("grbg", "GB")):
+            found[f"bayer_{pattern}{bits}"] = _Encoding(kind, 1, getattr(cv2, f"COLOR_Bayer{code}2BGR"))
+    # yuv422 is ROS's older name of uyvy, yuv422_yuy2 of yuyv.
+    uyvy, yuyv = _Encoding("u1", 2, cv2.COLOR_YUV2BGR_UYVY), _Encoding("u1", 2, cv2.COLOR_YUV2BGR_YUY2)
+    found |= {"uyvy": uyvy, "yuv422": uyvy, "yuyv": yuyv, "yuv422_yuy2": yuyv}
+    # A plane of Y, then one of half its height with U and V.
+    found |= {"nv21": _Encoding("u1", 1, cv2.COLOR_YUV2BGR_NV21, 1.5)}
+    return found | {"nv12": _Encoding("u1", 1, cv2.COLOR_YUV2BGR_NV12, 1.5)}
+
+
+_ENCODINGS = _encodings()
 _ARRAYS: dict[str, str] = {"32FC1": "f4", "16SC1": "i2", "16UC1": "u2", "mono16": "u2", "8UC1": "u1", "mono8": "u1"}
 
 
@@ -109,7 +136,7 @@ def scan_deg_of(message: Any, joint: str | None, unit: str) -> float:
 
 
 def picture_of(message: Any) -> Picture:
-    """An endoscope image, (h, w) grey or (h, w, 3) BGR, of an Image or CompressedImage."""
+    """An endoscope image, (h, w) grey or (h, w, 3) BGR, of an Image or CompressedImage, 8 or 16 bits as sent."""
     if not hasattr(message, "encoding"):
         if "compresseddepth" in str(message.format).lower().replace(" ", ""):
             raise ValueError("a depth image")
@@ -121,15 +148,14 @@ def picture_of(message: Any) -> Picture:
         if decoded is None:
             raise ValueError(f"a compressed image that cannot be decoded ({message.format})")
         return decoded
-    encoding = str(message.encoding)
-    if encoding in _BAYER:
-        return np.asarray(cv2.cvtColor(_pixels(message, 1, "u1"), _BAYER[encoding]), dtype=np.uint8)
-    if encoding not in _CHANNELS:
-        raise ValueError(f"an image encoded as {encoding}, which is none of {', '.join([*_CHANNELS, *_BAYER])}")
-    picture = _pixels(message, _CHANNELS[encoding], "u1")
-    if encoding in _TO_BGR:
-        picture = cv2.cvtColor(picture, _TO_BGR[encoding])
-    return np.array(picture, dtype=np.uint8)
+    name = str(message.encoding)
+    encoding = _ENCODINGS.get(name)
+    if encoding is None:
+        raise ValueError(f"an image encoded as {name}, which is none of {', '.join(_ENCODINGS)}")
+    pixels = _pixels(message, encoding.channels, encoding.kind, encoding.rows)
+    if (encoding.channels == 2 or encoding.rows != 1.0) and (pixels.shape[1] % 2 or int(message.height) % 2):
+        raise ValueError(f"an image encoded as {name} with {message.width} x {message.height} px, which are not even")
+    return as_picture(np.array(pixels if encoding.to_bgr is None else cv2.cvtColor(pixels, encoding.to_bgr)))
 
 
 def array_of(message: Any) -> npt.NDArray[Any]:
@@ -152,9 +178,9 @@ def array_of(message: Any) -> npt.NDArray[Any]:
     return np.ascontiguousarray(array, dtype=kind)
 
 
-def _pixels(message: Any, channels: int, kind: str) -> npt.NDArray[Any]:
+def _pixels(message: Any, channels: int, kind: str, rows_per_row: float = 1.0) -> npt.NDArray[Any]:
     """Pixels without the padding at the end of each row, in this machine's byte order."""
-    width, height, step = int(message.width), int(message.height), int(message.step)
+    width, height, step = int(message.width), int(int(message.height) * rows_per_row), int(message.step)
     item = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     row = width * channels * item.itemsize
     data = np.frombuffer(np.ascontiguousarray(message.data), dtype=np.uint8)

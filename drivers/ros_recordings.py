@@ -1,4 +1,4 @@
-"""ROS 2 recordings (rosbag2 folders, MCAP and SQLite files) read without ROS, by ``rosbags`` (extra ``[ros]``)."""
+"""ROS recordings read without ROS, by ``rosbags`` (extra ``[ros]``): rosbag2 folders, MCAP, SQLite and ROS 1 files."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from typing import Any, Self
 from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES
 from fgreg.errors import InputError, MissingExtraError
 
-STORAGE_SUFFIXES = (".mcap", ".db3")
+STORAGE_SUFFIXES = (".mcap", ".db3", ".bag")
 ECM_POSE = "ECM/measured_cp"
 """CRTK's topic of the endoscope holder's pose, in any namespace but the setup joints' and ``local``."""
 _OLD_ECM_POSE = "ECM/position_cartesian_current"
 """The same in versions of the dVRK before CRTK."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
 
-_EXPECTED = "a ROS 2 recording: a rosbag2 folder, .mcap or .db3"
+_EXPECTED = "a ROS recording: a rosbag2 folder, .mcap, .db3, or .bag of ROS 1"
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path looks like a ROS 2 recording."""
+    """Whether a path looks like a ROS recording."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     return path.suffix.lower() in STORAGE_SUFFIXES
@@ -199,7 +199,8 @@ class Recording:
         return None, f"camera moves are not known: there is no {ECM_POSE}, and of the ECM only {', '.join(other)}"
 
     def _damaged(self, error: Exception) -> InputError:
-        hint = "; of a recorder that was cut off, mcap recover makes one" if self.path.suffix == ".mcap" else ""
+        mend = {".mcap": "mcap recover", ".bag": "rosbag reindex"}.get(self.path.suffix.lower())
+        hint = f"; of a recorder that was cut off, {mend} makes one" if mend else ""
         return InputError(str(self.path), f"a recording that cannot be read ({_words(error)})", f"a whole one{hint}")
 
 

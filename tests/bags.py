@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rosbags", reason="rosbags is not installed (pip install 'fgreg[ros]')")
 
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE: Any = get_typestore(Stores.ROS2_HUMBLE)
 TYPES: Any = STORE.types
@@ -188,3 +188,49 @@ def write_mcap(path: Path, topic: str, poses: Sequence[tuple[float, Sequence[flo
             writer.add_message(channel, log_time=ns, data=packed_pose(t_s, numbers), publish_time=ns, sequence=i)
         writer.finish()
     return path
+
+
+def tf(transforms: Sequence[tuple[float, str, str, Sequence[float], Sequence[float]]]) -> Any:
+    """A TFMessage: (seconds, parent, child, x y z in m, quaternion xyzw)."""
+    made = []
+    for t_s, parent, child, xyz_m, xyzw in transforms:
+        one = transform_stamped(t_s, xyz_m, xyzw)
+        one.header.frame_id, one.child_frame_id = parent, child
+        made.append(one)
+    return TYPES["tf2_msgs/msg/TFMessage"](transforms=made)
+
+
+def write_ros1_bag(path: Path, messages: Sequence[Message], compression: str = "") -> Path:
+    """A ROS 1 bag (``.bag``) by the writer of rosbags, with the same messages as :func:`write_bag`."""
+    from rosbags.rosbag1 import Writer as Writer1
+
+    old: Any = get_typestore(Stores.ROS1_NOETIC)
+    old.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    writer: Any = Writer1(path)
+    if compression:
+        writer.set_compression(Writer1.CompressionFormat[compression])
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, t_s, message in sorted(messages, key=lambda m: m[1]):
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=old)
+            when = START_NS + round((t_s + 0.005) * 1e9)
+            data = old.serialize_ros1(_of_ros1(old, message), kind)
+            writer.write(connections[topic], when, data)
+    return path
+
+
+def _of_ros1(store: Any, value: Any) -> Any:
+    """A message with the fields of ROS 1: headers count, and camera_info has capital letters."""
+    if isinstance(value, list):
+        return [_of_ros1(store, entry) for entry in value]
+    kind = getattr(value, "__msgtype__", None)
+    if kind is None:
+        return value
+    fields = {key: _of_ros1(store, getattr(value, key)) for key in value.__dataclass_fields__ if key != "__msgtype__"}
+    if kind == "std_msgs/msg/Header":
+        fields["seq"] = 7
+    if kind == "sensor_msgs/msg/CameraInfo":
+        fields = {key.upper() if key in "dkrp" else key: entry for key, entry in fields.items()}
+    return store.types[kind](**fields)

@@ -180,6 +180,32 @@ def test_image_encodings(encoding: str, channels: int) -> None:
 
 
 @pytest.mark.parametrize("big", [False, True])
+def test_pictures_of_16_bits_keep_all_of_them(big: bool) -> None:
+    ramp = np.arange(0, 48 * 80, 80, dtype=np.uint16).reshape(6, 8)
+    np.testing.assert_array_equal(picture_of(bags.image(0.0, "mono16", ramp, padding=2, big=big)), ramp)
+    colour = np.stack([ramp, ramp + 1, ramp + 2], axis=2)
+    np.testing.assert_array_equal(picture_of(bags.image(0.0, "rgb16", colour, big=big)), colour[..., ::-1])
+    png = cv2.imencode(".png", ramp)[1].tobytes()
+    np.testing.assert_array_equal(picture_of(bags.compressed(0.0, png)), ramp)
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuyv", "yuv422_yuy2", "nv21", "nv12"])
+def test_pictures_of_luma_and_chroma(encoding: str) -> None:
+    # One colour by BT.601 in studio range: pure red is Y 82, U 90, V 240 (8 bits).
+    y, u, v = 82, 90, 240
+    if encoding.startswith("nv"):
+        chroma = [v, u] if encoding == "nv21" else [u, v]
+        message = bags.image(0.0, encoding, np.full((4, 8), y, np.uint8))
+        message.data = np.concatenate([message.data, np.tile(np.array(chroma, np.uint8), 8)])
+    else:
+        words = [u, y, v, y] if encoding in ("yuv422", "uyvy") else [y, u, y, v]
+        message = bags.image(0.0, encoding, np.tile(np.array(words, np.uint8).reshape(2, 2), (4, 4, 1)), padding=4)
+    picture = picture_of(message)
+    assert picture.shape == (4, 8, 3)
+    assert np.abs(picture.astype(int) - [0, 0, 255]).max() <= 2
+
+
+@pytest.mark.parametrize("big", [False, True])
 def test_probe_frames_keep_their_numbers_in_either_byte_order(big: bool) -> None:
     data = np.arange(12, dtype=np.int16).reshape(3, 4) - 6
     found = array_of(bags.image(0.0, "16SC1", data, padding=2, big=big))
@@ -195,8 +221,12 @@ def test_messages_that_do_not_hold_what_they_say_are_reported() -> None:
     short.data = short.data[:7]
     with pytest.raises(ValueError, match="7 bytes of 4 x 4 px"):
         picture_of(short)
-    with pytest.raises(ValueError, match="encoded as yuv422"):
-        picture_of(bags.image(0.0, "yuv422", np.zeros((4, 4), np.uint8)))
+    with pytest.raises(ValueError, match="encoded as nv24, which is none of mono8"):
+        picture_of(bags.image(0.0, "nv24", np.zeros((4, 4), np.uint8)))
+    with pytest.raises(ValueError, match="16 bytes of 4 x 6 px"):
+        picture_of(bags.image(0.0, "nv21", np.zeros((4, 4), np.uint8)))
+    with pytest.raises(ValueError, match="5 x 4 px, which are not even"):
+        picture_of(bags.image(0.0, "yuyv", np.zeros((4, 5, 2), np.uint8)))
     with pytest.raises(ValueError, match="cannot be decoded"):
         picture_of(bags.compressed(0.0, b"nothing", "jpeg"))
     with pytest.raises(ValueError, match="two that fit"):

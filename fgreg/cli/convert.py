@@ -18,7 +18,7 @@ _HELP = """Convert recordings to sessions, and results to files for other progra
 \b
 A recording, with the session.yaml of its set-up:
   fgreg convert shots.csv   OUT --setup session.yaml   CSV: one row, one event
-  fgreg convert bag/        OUT --setup session.yaml   ROS 2: rosbag2 folder, .mcap, .db3
+  fgreg convert bag/        OUT --setup session.yaml   ROS: rosbag2 folder, .mcap, .db3, .bag (ROS 1)
   fgreg convert scan.mha    OUT --setup session.yaml   PLUS sequence (.mha, .mhd)
 \b
 A result (a session's folder, or its result.yaml), by the ending of OUT:
@@ -118,7 +118,9 @@ def _result_file(source: Path) -> Path | None:
             raise InputError(str(source), "a session without result.yaml", "a solved one: fgreg solve first")
         raise InputError(str(source), "a folder of another kind", "a rosbag2 folder, or a session with its result")
     if not source.exists():
-        raise InputError(str(source), "nothing", "a recording (.csv, .mcap, .db3, .mha, rosbag2 folder) or a result")
+        raise InputError(
+            str(source), "nothing", "a recording (.csv, .mcap, .bag, .mha, rosbag2 folder, ...) or a result"
+        )
     return source if source.suffix.lower() in (".yaml", ".yml") else None
 
 
@@ -201,4 +203,4 @@ def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
         return read_table(source, mapping)
     if suffix in (".mha", ".mhd"):
         return read_plus(source, mapping)
-    raise InputError(str(source), f"a file that ends in {suffix or 'nothing'}", ".csv, .mcap, .db3, .mha or .mhd")
+    raise InputError(str(source), f"a file that ends in {suffix or 'nothing'}", ".csv, .mcap, .db3, .bag, .mha or .mhd")

@@ -1,4 +1,4 @@
-"""ROS 2 recordings: looks, marker, stage angle and endoscope images, joined by time to a session's events.
+"""ROS recordings (1 and 2): looks, marker, stage angle and endoscope images, joined by time to a session's events.
 
 The events:
 
@@ -29,6 +29,7 @@ import numpy.typing as npt
 from fgreg.convert.bag_claims import TopicClaims, check_metres, told_of_angles, told_of_frames, told_of_stamps
 from fgreg.convert.drafts import Document, Draft, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
+from fgreg.convert.transform_tree import TransformTree
 from fgreg.detection.frame_files import png_bytes
 from fgreg.drivers.calibration_parts import rig_of_infos
 from fgreg.drivers.ros_messages import (
@@ -40,6 +41,7 @@ from fgreg.drivers.ros_messages import (
     POSE_TYPES,
     SCAN_TYPES,
     TEXT_TYPES,
+    TF_TYPES,
     array_of,
     info_of,
     picture_of,
@@ -143,11 +145,15 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> tuple[dict[str, 
             raise InputError("topics", "look and frame, both", "one of them: each would be a look at the same PM")
         # The probe's data have more information than a position computed from them.
         del found["frame" if mapped == {"look"} else "look"]
-    if "ecm" not in found:
+    for role in mapping.tf:
+        if role in mapping.topics:
+            raise InputError(f"tf.{role}", f"it, and topics.{role}", "one of the two")
+        found.pop(role, None)
+    if "ecm" not in found.keys() | mapping.tf.keys():
         name, remark = recording.endoscope_pose_topic()
         told += [remark] if remark else []
         found |= {"ecm": name} if name is not None else {}
-    elif "SUJ" in found["ecm"].split("/"):
+    elif "SUJ" in found.get("ecm", "").split("/"):
         told.append(
             f"camera moves are taken from {found['ecm']}: a setup joint's pose does not have the arm's own motion"
         )
@@ -156,9 +162,10 @@ def _topics(recording: Recording, mapping: RecordingMapping) -> tuple[dict[str, 
     if not found.keys() & {"look", "frame", "mark"}:
         expected = "a topic of looks, frames or marks, named in the mapping (topics.look, topics.frame, topics.mark)"
         raise InputError(f"{where}: topics", there[:300] or "none", expected)
-    if not found.keys() & {"marker", "left"}:
+    roles = found.keys() | mapping.tf.keys()
+    if not roles & {"marker", "left"}:
         raise InputError(f"{where}: topics", there[:300], "the marker's pose (topics.marker) or images (topics.left)")
-    if found.keys() & {"look", "frame"} and "scan" not in found:
+    if found.keys() & {"look", "frame"} and "scan" not in roles:
         raise InputError(f"{where}: topics", there[:300], "the stage's angle (topics.scan)")
     return found, told
 
@@ -170,9 +177,15 @@ def _read_streams(recording: Recording, topics: dict[str, str], mapping: Recordi
     for role, name in topics.items():
         roles.setdefault(name, []).append(role)
     claims = {name: TopicClaims(name) for name in roles}
-    for recorded in recording.messages(roles):
-        index = claims[recorded.topic].count
+    trees = [name for name, topic in recording.topics.items() if mapping.tf and topic.kind in TF_TYPES]
+    tree = TransformTree(recording.path.name)
+    for recorded in recording.messages([*roles, *trees]):
         message = recording.decode(recorded)
+        if recorded.topic in trees:
+            if problems := tree.add_message(message, recorded, recording.start_ns, mapping.by_header):
+                streams.bad.setdefault(recorded.topic, []).extend(problems)
+            continue
+        index = claims[recorded.topic].count
         strange = claims[recorded.topic].add(message, recorded.bag_ns)
         if strange and {"marker", "ecm"} & set(roles[recorded.topic]):
             streams.bad.setdefault(recorded.topic, []).append(strange)
@@ -186,6 +199,14 @@ def _read_streams(recording: Recording, topics: dict[str, str], mapping: Recordi
             except InputError as error:
                 where = f"{recording.path.name}: {recorded.topic}: message {index}"
                 raise InputError(where, error.found, error.expected) from None
+    for role, (target, source) in mapping.tf.items():
+        if role == "scan":
+            streams.scan = tree.angles_deg(target, source, mapping.max_gap_s)
+        else:
+            poses = tree.poses(target, source, mapping.max_gap_s)
+            distances = [float(np.linalg.norm(pose[:3, 3])) for _, pose in poses]
+            check_metres(role, f"{recording.path.name}: tf.{role}", distances)
+            (streams.marker if role == "marker" else streams.ecm).extend((t, (pose, None)) for t, pose in poses)
     timed: tuple[list[Any], ...] = (streams.marker, streams.scan, streams.looks, streams.marks)
     for stream in (*timed, streams.left, streams.right, streams.ecm):
         stream.sort(key=lambda entry: entry[0])

@@ -4,8 +4,9 @@ format: fgreg-mapping/1
 # CSV
 delimiter: ";"
 columns: {t: time_s, scan_deg: {column: angle_rad, scale: 57.29577951}, type: {value: pair}}
-# ROS 2
+# ROS
 topics: {left: /rig/left/image_raw, marker: /marker/pose, scan: /stage/joint_states, frame: /probe/channels}
+tf: {marker: [endoscope_left_optical, marker], scan: [probe_holder, probe], ecm: [base, endoscope_tip]}
 scan: {joint: stage, unit: deg}
 clock: recorder
 max_gap_s: 0.1
@@ -47,7 +48,10 @@ COLUMNS = (
 """Roles of CSV columns; a column has the name of its role unless the mapping names another."""
 
 TOPICS = ("left", "right", "left_info", "right_info", "marker", "scan", "look", "frame", "mark", "ecm")
-"""Roles of ROS 2 topics; images, their camera_info and the ECM are also found by name."""
+"""Roles of ROS topics; images, their camera_info and the ECM are also found by name."""
+
+TF_ROLES = ("marker", "scan", "ecm")
+"""Roles that a pose of ``/tf`` and ``/tf_static`` can have, in place of a topic."""
 
 FIELDS = ("marker", "scan", "type", "pm", "sweep", "amplitude", "x_mm", "range_mm", "text")
 """Roles of the fields of a PLUS frame, besides its image and time."""
@@ -133,6 +137,15 @@ def _check_delimiter(text: str) -> None:
 
 
 _GAP = Number(0.0, 3600.0, above=True, unit="s")
+
+
+def _two(names: tuple[str, ...]) -> tuple[str, str]:
+    if len(names) != 2:
+        raise FieldError.of(f"{len(names)} names", "two: the frame to express the pose in, and the frame of the body")
+    return names[0], names[1]
+
+
+_TWO_FRAMES = Converted(ListOf(Text("the name of a frame"), "a list of two names of frames"), _two, list)
 _FRAMES = ListOf(Integer(0, 2**31 - 1), "a list of frame numbers from 0")
 
 
@@ -147,7 +160,11 @@ class RecordingMapping:
         str | None, Key("of CSV tables; absent: comma, semicolon or tab", Text("one character", check=_check_delimiter))
     ] = None
     topics: Annotated[
-        Mapping[str, str], Key("of ROS 2 recordings, by their roles", _by_name("Topics", TOPICS, Text("a name")))
+        Mapping[str, str], Key("of ROS recordings, by their roles", _by_name("Topics", TOPICS, Text("a name")))
+    ] = field(default_factory=dict)
+    tf: Annotated[
+        Mapping[str, tuple[str, str]],
+        Key("of ROS recordings: poses from /tf and /tf_static, by their roles", _by_name("Tf", TF_ROLES, _TWO_FRAMES)),
     ] = field(default_factory=dict)
     joint: Annotated[str | None, Key("joint that is the stage", Text("the name of a joint"), name="scan.joint")] = None
     angle_unit: Annotated[str | None, Key("unit of plain numbers", Text(allowed=("rad", "deg")), name="scan.unit")] = (
