@@ -21,10 +21,12 @@ from tests import (
     test_camera_calibrations,
     test_convert_bags,
     test_convert_plus_sequences,
+    test_convert_ros1_and_tf,
     test_convert_tables,
 )
 
 MAPPING = RecordingMapping()
+THROUGH_TF = RecordingMapping(tf={"marker": ("optical", "marker"), "scan": ("holder", "probe")})
 
 
 def damaged(data: bytes, chance: random.Random) -> bytes:
@@ -70,6 +72,16 @@ def matlab(folder: Path) -> Path:
     return test_camera_calibration_texts.written(folder, test_camera_calibration_texts.matlab())
 
 
+def nrrd_sequence(folder: Path) -> Path:
+    module = pytest.importorskip("tests.test_convert_nrrd_sequences")
+    made: Path = module.as_plus(folder / "a.nrrd", test_convert_plus_sequences.three(), encoding="gzip")
+    return made
+
+
+def ros1(folder: Path) -> Path:
+    return bags.write_ros1_bag(folder / "a.bag", test_convert_ros1_and_tf.tree())
+
+
 def recording(folder: Path) -> Path:
     return next(bags.write_bag(folder / "bag", test_convert_bags.room(), mcap=True).glob("*.mcap"))
 
@@ -84,8 +96,10 @@ def recording(folder: Path) -> Path:
         (ost, lambda path: read_calibration([path]), 100),
         (matlab, lambda path: read_calibration([path]), 100),
         (recording, lambda path: read_bag(path, MAPPING), 40),
+        (ros1, lambda path: read_bag(path, THROUGH_TF), 20),
+        (nrrd_sequence, lambda path: read_plus(path, MAPPING), 50),
     ],
-    ids=["plus", "csv", "opencv", "kalibr", "ost", "matlab", "mcap"],
+    ids=["plus", "csv", "opencv", "kalibr", "ost", "matlab", "mcap", "ros1", "nrrd"],
 )
 def test_a_damaged_file_is_read_or_refused_in_one_line(
     tmp_path: Path, make: Callable[[Path], Path], read: Callable[[Path], object], count: int

@@ -19,7 +19,7 @@ _HELP = """Convert recordings to sessions, and results to files for other progra
 A recording, with the session.yaml of its set-up:
   fgreg convert shots.csv   OUT --setup session.yaml   CSV: one row, one event
   fgreg convert bag/        OUT --setup session.yaml   ROS: rosbag2 folder, .mcap, .db3, .bag (ROS 1)
-  fgreg convert scan.mha    OUT --setup session.yaml   PLUS sequence (.mha, .mhd)
+  fgreg convert scan.mha    OUT --setup session.yaml   PLUS sequence (.mha, .mhd, .nrrd)
 \b
 A result (a session's folder, or its result.yaml), by the ending of OUT:
   fgreg convert SESSION registration.xml    PLUS: <Transform From="Camera" To="Trus">, mm
@@ -201,6 +201,8 @@ def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
         return read_bag(source, mapping)
     if suffix in (".csv", ".tsv", ".txt"):
         return read_table(source, mapping)
-    if suffix in (".mha", ".mhd"):
+    if suffix in (".mha", ".mhd", ".nrrd", ".nhdr"):
         return read_plus(source, mapping)
-    raise InputError(str(source), f"a file that ends in {suffix or 'nothing'}", ".csv, .mcap, .db3, .bag, .mha or .mhd")
+    raise InputError(
+        str(source), f"a file that ends in {suffix or 'nothing'}", ".csv, .mcap, .db3, .bag, .mha, .mhd or .nrrd"
+    )

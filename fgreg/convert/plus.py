@@ -23,6 +23,8 @@ import numpy.typing as npt
 
 from fgreg.convert.drafts import Document, Draft, ImageClaim, ImageKind, Imported, rows
 from fgreg.convert.mapping import RecordingMapping
+from fgreg.convert.nrrd_sequence import SUFFIXES as NRRD_SUFFIXES
+from fgreg.convert.nrrd_sequence import read_nrrd_sequence
 from fgreg.convert.plus_transforms import Chain, Step, chain, mapped_chain
 from fgreg.convert.sequence_file import SequenceFile, read_sequence
 from fgreg.errors import InputError, one_line
@@ -57,7 +59,7 @@ def read_plus(path: Path, mapping: RecordingMapping) -> Imported:
     Raises:
         InputError: the file or a field of a frame is invalid.
     """
-    sequence = read_sequence(path)
+    sequence = read_nrrd_sequence(path) if path.suffix.lower() in NRRD_SUFFIXES else read_sequence(path)
     frames = _Frames(sequence, mapping)
     drafts: list[Draft] = []
     left_out: dict[str, list[int]] = {}

@@ -18,11 +18,10 @@ def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> FloatArr
     Raises:
         ValueError: its length is not 1.
     """
-    q = np.array([x, y, z, w], dtype=np.float64)
-    length = float(np.linalg.norm(q))
+    length = math.hypot(x, y, z, w)
     if not abs(length - 1.0) <= UNIT_TOLERANCE:
         raise ValueError(f"a quaternion of length {length:.4g}, not 1")
-    x, y, z, w = (float(value) for value in q / length)
+    x, y, z, w = x / length, y / length, z / length, w / length
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
