@@ -20,6 +20,7 @@ A recording, with the session.yaml of its set-up:
   fgreg convert shots.csv   OUT --setup session.yaml   CSV: one row, one event
   fgreg convert bag/        OUT --setup session.yaml   ROS: rosbag2 folder, .mcap, .db3, .bag (ROS 1)
   fgreg convert scan.mha    OUT --setup session.yaml   PLUS sequence (.mha, .mhd, .nrrd)
+  fgreg convert shots.mat   OUT --setup session.yaml   MATLAB, HDF5, IPASC, UFF: variables
 \b
 A result (a session's folder, or its result.yaml), by the ending of OUT:
   fgreg convert SESSION registration.xml    PLUS: <Transform From="Camera" To="Trus">, mm
@@ -191,7 +192,9 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
+    from fgreg.convert.array_table import read_arrays
     from fgreg.convert.bag import read_bag
+    from fgreg.convert.frame_sources import ARRAY_SUFFIXES
     from fgreg.convert.plus import read_plus
     from fgreg.convert.table import read_table
     from fgreg.drivers.ros_recordings import is_recording
@@ -203,6 +206,8 @@ def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
         return read_table(source, mapping)
     if suffix in (".mha", ".mhd", ".nrrd", ".nhdr"):
         return read_plus(source, mapping)
+    if suffix in ARRAY_SUFFIXES:
+        return read_arrays(source, mapping)
     raise InputError(
         str(source), f"a file that ends in {suffix or 'nothing'}", ".csv, .mcap, .db3, .bag, .mha, .mhd or .nrrd"
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from fgreg.convert.probe_frames import DeclaredProbe
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import StereoRig
@@ -106,6 +107,7 @@ class Imported:
         source: description of the recording.
         told: sentences about what was taken for granted.
         images: what the recording says of the probe's frames, where it says something.
+        declared: what the recording says of the probe.
     """
 
     drafts: list[Draft]
@@ -115,6 +117,7 @@ class Imported:
     rig: StereoRig | None = None
     told: list[str] = field(default_factory=list)
     images: ImageClaim | None = None
+    declared: list[DeclaredProbe] = field(default_factory=list)
 
 
 def rows(matrix: FloatArray) -> list[list[float]]:

@@ -12,6 +12,8 @@ clock: recorder
 max_gap_s: 0.1
 same_pm_s: 0.5
 camera_moved: {mm: 1.0, deg: 0.5, sigma_mm: 1.0, sigma_deg: 0.5, tip_T_camera: [[...]]}
+# MATLAB, HDF5, UFF
+array: {variable: rf, axes: [samples, elements, frames], wavelength_nm: 800}
 # PLUS
 fields: {marker: MarkerToCameraTransform, scan: StageAngle, pm: Pm}
 images: envelope
@@ -43,7 +45,7 @@ COLUMNS = (
     *("t", "type", "pm", *(key.name for key in LOOK), "left", "right", "text"),
     *("camera_T_marker", "marker_x_mm", "marker_y_mm", "marker_z_mm", "marker_qx", "marker_qy", "marker_qz"),
     *("marker_qw", "marker_rx_rad", "marker_ry_rad", "marker_rz_rad", "spot_x_mm", "spot_y_mm", "spot_z_mm"),
-    *("corner_column", "corner_row", "camera_new_T_camera_old"),
+    *("corner_column", "corner_row", "camera_new_T_camera_old", "frame_index"),
 )
 """Roles of CSV columns; a column has the name of its role unless the mapping names another."""
 
@@ -146,6 +148,20 @@ def _two(names: tuple[str, ...]) -> tuple[str, str]:
 
 
 _TWO_FRAMES = Converted(ListOf(Text("the name of a frame"), "a list of two names of frames"), _two, list)
+AXES = ("elements", "samples", "depth", "lateral", "frames")
+"""Names of the axes of an array of frames: channel data have elements and samples, images depth and lateral."""
+
+
+def _axes(names: tuple[str, ...]) -> tuple[str, ...]:
+    of_frame = set(names) - {"frames"}
+    if len(set(names)) != len(names) or of_frame not in ({"elements", "samples"}, {"depth", "lateral"}):
+        raise FieldError.of(
+            shown(list(names)), "elements and samples, or depth and lateral, and frames, in their order"
+        )
+    return names
+
+
+_AXES = Converted(ListOf(Text(allowed=AXES), "a list of names of axes"), _axes, list)
 _FRAMES = ListOf(Integer(0, 2**31 - 1), "a list of frame numbers from 0")
 
 
@@ -180,6 +196,17 @@ class RecordingMapping:
     moves: Annotated[CameraMoves, Key("when the camera moved", name="camera_moved")] = field(
         default_factory=CameraMoves
     )
+    array_variable: Annotated[
+        str | None, Key("of MATLAB, HDF5, UFF: array of frames; absent: frame", Text("a name"), name="array.variable")
+    ] = None
+    array_axes: Annotated[
+        tuple[str, ...] | None,
+        Key("of that array: its axes, in the order of its own program", _AXES, name="array.axes"),
+    ] = None
+    wavelength_nm: Annotated[
+        float | None,
+        Key("of IPASC data: the wavelength to take", Number(1.0, 1e5, unit="nm"), name="array.wavelength_nm"),
+    ] = None
     fields: Annotated[
         Mapping[str, str], Key("of PLUS sequences, by their roles", _by_name("Fields", FIELDS, Text("a name")))
     ] = field(default_factory=dict)

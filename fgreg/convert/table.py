@@ -6,14 +6,14 @@ import csv
 import io
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from fgreg.convert.drafts import Document, Draft, Imported, rows
+from fgreg.convert.frame_sources import FrameSources
 from fgreg.convert.mapping import COLUMNS, LOOK, Column, RecordingMapping
-from fgreg.detection.frame_files import png_bytes, read_picture
 from fgreg.errors import InputError
 from fgreg.geometry.quaternions import rotation_from_quaternion
 from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transform
@@ -32,7 +32,7 @@ _WITH_MARKER = ("aim", "pair", "track")
 
 
 def read_table(path: Path, mapping: RecordingMapping) -> Imported:
-    """Read a table; the frames it names are files relative to its folder.
+    """Read a table; the frames it names are in files relative to its folder.
 
     Raises:
         InputError: the first invalid cell, with its line.
@@ -47,24 +47,44 @@ def read_table(path: Path, mapping: RecordingMapping) -> Imported:
         raise InputError(path.name, "nothing", "a table with a line of column names")
     delimiter = mapping.delimiter or max(_DELIMITERS, key=lines[start].count)
     reader = csv.reader(io.StringIO("".join(lines[start:])), delimiter=delimiter, strict=True)
-    table = _Table(path, mapping)
-    frames: dict[Path, str] = {}
-    drafts: list[Draft] = []
-    try:
-        table.take_header([name.strip() for name in next(reader)])
+
+    def rows_of_cells() -> Iterator[tuple[str, list[str]]]:
         for cells in reader:
-            line = start + reader.line_num
-            if not any(cell.strip() for cell in cells) or cells[0].startswith("#"):
-                continue
-            drafts.append(_Row(table, cells, line, frames).draft())
+            if any(cell.strip() for cell in cells) and not cells[0].startswith("#"):
+                yield f"line {start + reader.line_num}", cells
+
+    try:
+        names = [name.strip() for name in next(reader)]
+        return events_of_rows(path, mapping, names, rows_of_cells(), f"CSV table {path.name}")
     except csv.Error as error:
         raise InputError(f"{path.name}: line {start + reader.line_num}", str(error), "a row of a CSV table") from None
+
+
+def events_of_rows(
+    path: Path, mapping: RecordingMapping, names: list[str], rows: Iterable[tuple[str, list[str]]], source: str
+) -> Imported:
+    """The events of a table.
+
+    Args:
+        path: of the table, for messages; the files that it names are relative to its folder.
+        mapping: names of the columns.
+        names: of the columns, in order.
+        rows: the place of each row in the file, and its cells.
+        source: description of the table.
+
+    Raises:
+        InputError: a role without its column, an invalid cell, times that go back.
+    """
+    table = _Table(path, mapping)
+    table.take_header(names)
+    frames = FrameSources(mapping)
+    drafts = [_Row(table, cells, place, frames).draft() for place, cells in rows]
     for before, after in itertools.pairwise(drafts):
         if after.t < before.t:
             where = before.where.removeprefix(f"{path.name}: ")
             raise InputError(f"{after.where}: t", f"{after.t:.17g}", f"at least {before.t:.17g}, the time on {where}")
     notes = [f"columns that are not used: {', '.join(table.unused)}"] if table.unused else []
-    return Imported(drafts, lambda folder: _copy_frames(frames, folder), f"CSV table {path.name}", notes)
+    return Imported(drafts, frames.write, source, notes, declared=frames.declared)
 
 
 class _Table:
@@ -104,9 +124,9 @@ class _Table:
 class _Row:
     """One row: its cells by role."""
 
-    def __init__(self, table: _Table, cells: list[str], line: int, frames: dict[Path, str]) -> None:
+    def __init__(self, table: _Table, cells: list[str], place: str, frames: FrameSources) -> None:
         self._table, self._cells, self._frames = table, cells, frames
-        self.where = f"{table.path.name}: line {line}"
+        self.where = f"{table.path.name}: {place}"
         if len(cells) != table.width:
             raise InputError(self.where, f"{len(cells)} cells", f"{table.width}, as the header has")
 
@@ -237,29 +257,6 @@ class _Row:
         return trus
 
     def _frame(self, role: str, name: str, suffix: str) -> str:
-        """The name of a file in the session; the same file always has the same name."""
-        path = self._table.path.parent / name
-        if not path.is_file():
-            raise InputError(f"{self.where}: {role}", f"{shown(name)}: no such file", "a file relative to the table")
-        if suffix == ".npy" and path.suffix.lower() != ".npy":
-            raise InputError(f"{self.where}: {role}", shown(name), "an NPY array")
-        if path in self._frames:
-            return self._frames[path]
-        stem = "".join(c if c.isascii() and (c.isalnum() or c in "-_.") else "_" for c in path.stem)[:60]
-        new = f"frames/{len(self._frames):04d}-{stem}{suffix}"
-        self._frames[path] = new
-        return new
-
-
-def _copy_frames(frames: Mapping[Path, str], folder: Path) -> None:
-    """Copy files; images of other formats are converted to PNG."""
-    for path, name in frames.items():
-        data = read_bounded(path, str(path), _MAX_BYTES)
-        if path.suffix.lower() not in (".npy", ".png"):
-            picture = read_picture(path)
-            if picture is None:
-                raise InputError(str(path), "a file that is not an image", "a picture (PNG, JPEG, BMP, TIFF)")
-            data = png_bytes(picture)
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(data)
+        """The name of a frame in the session."""
+        index = self.whole("frame_index") if role == "frame" and self.text("frame_index") else None
+        return self._frames.name(self._table.path.parent / name, name, index, f"{self.where}: {role}", suffix)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fgreg.convert.drafts import Draft, Imported
 from fgreg.convert.files import whole_folder
+from fgreg.convert.probe_frames import check_declared
 from fgreg.errors import InputError, one_line
 from fgreg.model.camera_model import STEREO_RIG, StereoRig
 from fgreg.schema.yaml_writer import one_line_yaml
@@ -62,8 +63,11 @@ def write_session(
         read = _read_setup(folder / SETUP_FILE, str(file), out.resolve().name, file.parent.resolve())
         if read.model is not None and read.model.rig_file is not None:
             copy_rig(read.model.rig_file, folder / read.model.rig_file.relative_to(file.parent.resolve()))
-        if imported.images is not None and read.probe is not None:
-            imported.images.check(read.probe)
+        if read.probe is not None:
+            if imported.images is not None:
+                imported.images.check(read.probe)
+            for declared in imported.declared:
+                imported.told += check_declared(declared, read.probe)
         imported.write_frames(folder)
         lines, frames = _lines(imported.drafts, folder, read)
         note = {"type": "note", "t": imported.drafts[0].t, "text": _summary(imported)}
