@@ -31,12 +31,19 @@ class InputError(FgregError):
         self.expected = one_line(expected)
         super().__init__(f"{self.where}: found {self.found}, expected {self.expected}")
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return InputError, (self.where, self.found, self.expected)
+
 
 class MissingExtraError(FgregError):
     """An optional dependency is not installed; names the extra that brings it."""
 
     def __init__(self, package: str, extra: str) -> None:
+        self.package, self.extra = package, extra
         super().__init__(f"{package} is not installed; install it with: pip install 'fgreg[{extra}]'")
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
+        return MissingExtraError, (self.package, self.extra)
 
 
 class EstimationError(FgregError):

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 import scipy.io
 
-from fgreg.errors import MissingExtraError
+from fgreg.convert import array_files, child_reader
+from fgreg.convert.mapping import MAPPING, RecordingMapping
+from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import exp_so3, make_transform
 from tests.test_convert_tables import convert, events, mapping, refused, setup
 
 h5py: Any = pytest.importorskip("h5py", reason="h5py is not installed (pip install 'fgreg[hdf5]')")
 
+IN_A_CHILD = child_reader.open_array_file
 COUNT, ELEMENTS, SAMPLES = 5, 128, 20
 TIMES = 10.0 + 0.1 * np.arange(COUNT)
 POSES = np.stack([make_transform(exp_so3(np.array([0.1 * i, 0.2, 0])), np.array([i, 2.0, 150])) for i in range(COUNT)])
@@ -29,6 +32,12 @@ MAP: dict[str, dict[str, Any]] = {
     },
     "array": {"variable": "rf", "axes": ["samples", "elements", "frames"]},
 }
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Starting a child for each file takes long; the last tests do it."""
+    monkeypatch.setattr(child_reader, "open_array_file", array_files.open_array_file)
 
 
 def matlab_variables() -> dict[str, Any]:
@@ -226,26 +235,33 @@ def test_what_does_not_fit_is_named(
     assert not (tmp_path / "s").exists()
 
 
-def test_a_damaged_file_that_ends_its_reader_is_refused_in_one_line(tmp_path: Path) -> None:
-    # The type of the numbers of t becomes a code that does not exist, which scipy takes for the place of one.
-    path = tmp_path / "a.mat"
-    scipy.io.savemat(path, {"t": np.array([[0.5]])})
-    data = path.read_bytes()
-    number = data.index(np.float64(0.5).tobytes()) - 8
-    path.write_bytes(data[:number] + (200).to_bytes(4, "little") + data[number + 4 :])
-    message = refused(path, tmp_path / "s", "--setup", setup(tmp_path))
-    assert message.startswith("a.mat: found a MATLAB file that cannot be read (")
-
-
 def test_files_that_are_none_are_refused_and_a_missing_library_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "a.h5").write_bytes(b"nothing")
-    assert "found another file, expected an HDF5 file" in refused(
-        tmp_path / "a.h5", tmp_path / "s", "--setup", setup(tmp_path)
-    )
+    for name, expected in (("a.mat", "a MATLAB file that cannot be read"), ("a.h5", "another file, expected an HDF5")):
+        (tmp_path / name).write_bytes(b"nothing")
+        assert expected in refused(tmp_path / name, tmp_path / "s", "--setup", setup(tmp_path))
     path = by_h5py(tmp_path / "b.h5")
     monkeypatch.setitem(sys.modules, "h5py", None)
     done = convert(path, tmp_path / "s", "--setup", setup(tmp_path))
     assert isinstance(done.exception, MissingExtraError)
     assert "pip install 'fgreg[hdf5]'" in str(done.exception)
+
+
+def test_files_are_read_in_a_child_which_may_end(tmp_path: Path) -> None:
+    mapped: RecordingMapping = MAPPING.read({"format": "fgreg-mapping/1"} | MAP)
+    opened = IN_A_CHILD(by_hdf5storage(tmp_path / "shots.mat"), mapped)
+    assert opened.frames is not None
+    np.testing.assert_array_equal(opened.frames.frame(3), RF[3])
+    np.testing.assert_array_equal(opened.variables["t"].numbers(), TIMES)
+    # The type of the numbers of t becomes a code that does not exist, which scipy takes for the place of one.
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"t": np.array([[0.5]])})
+    data = path.read_bytes()
+    kind = data.index(np.float64(0.5).tobytes()) - 8
+    path.write_bytes(data[:kind] + (200).to_bytes(4, "little") + data[kind + 4 :])
+    with pytest.raises(InputError, match=r"^a\.mat: found a file that cannot be read \(its reader has ended\)"):
+        IN_A_CHILD(path, mapped)
+    (tmp_path / "b.mat").write_bytes(b"nothing")
+    with pytest.raises(InputError, match=r"^b\.mat: found a MATLAB file that cannot be read"):
+        IN_A_CHILD(tmp_path / "b.mat", mapped)

@@ -9,9 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fgreg.convert.array_table import read_arrays
 from fgreg.convert.bag import read_bag
-from fgreg.convert.frame_sources import open_probe_frames
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.plus import read_plus
 from fgreg.convert.table import read_table
@@ -84,18 +82,6 @@ def ros1(folder: Path) -> Path:
     return bags.write_ros1_bag(folder / "a.bag", test_convert_ros1_and_tf.tree())
 
 
-def hdf5(folder: Path) -> Path:
-    module = pytest.importorskip("tests.test_convert_photoacoustic_files")
-    made: Path = module.by_hand(folder / "a.h5", module.DATA, None, module.ipasc_device(module.X_M[:2]))
-    return made
-
-
-def read_frames(path: Path) -> object:
-    """The frames in a file, and its variables as events."""
-    frames = open_probe_frames(path, RecordingMapping(array_axes=("elements", "samples", "frames")))
-    return frames and frames.frame(0), read_arrays(path, MAPPING)
-
-
 def recording(folder: Path) -> Path:
     return next(bags.write_bag(folder / "bag", test_convert_bags.room(), mcap=True).glob("*.mcap"))
 
@@ -112,9 +98,8 @@ def recording(folder: Path) -> Path:
         (recording, lambda path: read_bag(path, MAPPING), 40),
         (ros1, lambda path: read_bag(path, THROUGH_TF), 20),
         (nrrd_sequence, lambda path: read_plus(path, MAPPING), 50),
-        (hdf5, read_frames, 30),
     ],
-    ids=["plus", "csv", "opencv", "kalibr", "ost", "matlab", "mcap", "ros1", "nrrd", "hdf5"],
+    ids=["plus", "csv", "opencv", "kalibr", "ost", "matlab", "mcap", "ros1", "nrrd"],
 )
 def test_a_damaged_file_is_read_or_refused_in_one_line(
     tmp_path: Path, make: Callable[[Path], Path], read: Callable[[Path], object], count: int

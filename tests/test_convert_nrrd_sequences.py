@@ -44,8 +44,7 @@ def as_slicer(path: Path, images: Any, first: bool) -> Path:
     return path
 
 
-@pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2"])
-@pytest.mark.parametrize("suffix", [".seq.nrrd", ".nhdr"])
+@pytest.mark.parametrize(("encoding", "suffix"), [("raw", ".seq.nrrd"), ("gzip", ".nhdr"), ("bzip2", ".nrrd")])
 def test_an_nrrd_sequence_becomes_the_same_session_as_its_metaimage(tmp_path: Path, encoding: str, suffix: str) -> None:
     fields = three(MarkerToCameraTransformStatus="MISSING")
     done = [

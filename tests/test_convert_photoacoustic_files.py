@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgreg.convert.frame_sources import open_probe_frames
+from fgreg.convert import array_files, child_reader
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.probe_frames import ProbeFrames, pitch_of
 from fgreg.errors import InputError, MissingExtraError
@@ -22,6 +22,12 @@ COUNT, ELEMENTS, SAMPLES = 3, 128, 20
 DATA = np.random.default_rng(8).normal(size=(ELEMENTS, SAMPLES, 1, COUNT)).astype(np.float32)
 X_M = (np.arange(ELEMENTS) - (ELEMENTS - 1) / 2) * 0.43e-3
 TIMES = np.array([100.0, 100.1, 100.2])
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Starting a child for each file takes long; tests/test_convert_arrays.py has one."""
+    monkeypatch.setattr(child_reader, "open_array_file", array_files.open_array_file)
 
 
 def ipasc_acquisition(**changes: Any) -> dict[str, Any]:
@@ -60,7 +66,7 @@ def by_pacfish(path: Path) -> Path:
 
 
 def opened(path: Path, **options: Any) -> ProbeFrames:
-    found = open_probe_frames(path, RecordingMapping(**options))
+    found = array_files.open_array_file(path, RecordingMapping(**options)).frames
     assert found is not None
     return found
 

@@ -18,11 +18,10 @@ from tests.test_convert_bags import convert, events, mapping, refused, room, set
 NONE, HALF = (0.0, 0.0, 0.0, 1.0), math.sqrt(0.5)
 
 
-@pytest.mark.parametrize("compression", ["", "BZ2"])
-def test_a_ros_1_bag_becomes_the_same_session_as_its_ros_2_twin(tmp_path: Path, compression: str) -> None:
+def test_a_ros_1_bag_becomes_the_same_session_as_its_ros_2_twin(tmp_path: Path) -> None:
     messages = room()
     new = bags.write_bag(tmp_path / "bag", messages)
-    old = bags.write_ros1_bag(tmp_path / "bag.bag", messages, compression)
+    old = bags.write_ros1_bag(tmp_path / "bag.bag", messages, "BZ2")
     for name, path in (("new", new), ("old", old)):
         done = convert(path, tmp_path / name, "--setup", setup(tmp_path, camera=False))
         assert done.exit_code == 0, done.output

@@ -192,9 +192,9 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 
 def _read(source: Path, mapping: "RecordingMapping") -> "Imported":
+    from fgreg.convert.array_files import ARRAY_SUFFIXES
     from fgreg.convert.array_table import read_arrays
     from fgreg.convert.bag import read_bag
-    from fgreg.convert.frame_sources import ARRAY_SUFFIXES
     from fgreg.convert.plus import read_plus
     from fgreg.convert.table import read_table
     from fgreg.drivers.ros_recordings import is_recording

@@ -7,12 +7,12 @@ row has a position (x, range). IPASC's ``measurement_timestamps`` are the times 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fgreg.convert import child_reader
 from fgreg.convert.drafts import Imported
-from fgreg.convert.frame_sources import open_probe_frames, read_variables
 from fgreg.convert.mapping import COLUMNS, RecordingMapping
 from fgreg.convert.probe_frames import ProbeFrames
 from fgreg.convert.table import events_of_rows
@@ -31,8 +31,8 @@ def read_arrays(path: Path, mapping: RecordingMapping) -> Imported:
         InputError: damaged, no times, a variable with another number of values than ``t``, an invalid value.
         MissingExtraError: what reads it is not installed.
     """
-    variables = read_variables(path)
-    frames = open_probe_frames(path, mapping, variables)
+    opened = child_reader.open_array_file(path, mapping)
+    variables, frames = opened.variables, opened.frames
     columns: dict[str, Sequence[Any]] = {}
     count = _times(path, variables, frames, mapping, columns)
     for role in COLUMNS:
@@ -58,7 +58,7 @@ def _name(role: str, mapping: RecordingMapping) -> str:
 
 def _times(
     path: Path,
-    variables: dict[str, Variable],
+    variables: Mapping[str, Variable],
     frames: ProbeFrames | None,
     mapping: RecordingMapping,
     columns: dict[str, Sequence[Any]],
@@ -97,7 +97,7 @@ def _add_frames(
 
 
 def _check_pose_and_scan(
-    path: Path, mapping: RecordingMapping, columns: dict[str, Sequence[Any]], variables: dict[str, Variable]
+    path: Path, mapping: RecordingMapping, columns: dict[str, Sequence[Any]], variables: Mapping[str, Variable]
 ) -> None:
     """Raises InputError where the file has frames and times alone: poses and angles are in another one then."""
     for role, others in (("scan_deg", ()), ("camera_T_marker", ("marker_x_mm", "left"))):

@@ -14,6 +14,7 @@ from fgreg.model.session_model import ProbeModel
 
 MAX_BYTES = 4_000_000_000
 """Largest array that is read from a file."""
+_FAR_MM = 1e6
 _UNEVEN = 0.05
 """Largest relative difference between the distances of neighbouring elements of a linear array."""
 
@@ -116,6 +117,8 @@ def pitch_of(positions_mm: FloatArray, where: str) -> float | None:
     """
     if len(positions_mm) < 2 or not np.ptp(positions_mm, axis=0).any():
         return None
+    if not np.abs(positions_mm).max() < _FAR_MM:
+        raise InputError(where, "elements more than a kilometre away", "their positions in metres")
     steps = np.diff(positions_mm, axis=0)
     pitch = float(np.linalg.norm(positions_mm[-1] - positions_mm[0])) / len(steps)
     if not np.isfinite(steps).all() or (np.linalg.norm(steps - steps.mean(axis=0), axis=1) > _UNEVEN * pitch).any():
