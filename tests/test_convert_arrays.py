@@ -167,6 +167,20 @@ def test_struct_and_cell_arrays_of_both_kinds_of_file_have_one_entry_for_each_ev
         assert_same(loaded(tmp_path / kind), right)
 
 
+def test_images_are_turned_to_depth_and_lateral_and_keep_their_bits(tmp_path: Path) -> None:
+    images = np.random.default_rng(2).integers(0, 255, (3, 30, 40)).astype(np.uint8)
+    scipy.io.savemat(tmp_path / "a.mat", {"frame": np.transpose(images, (2, 1, 0))})
+    mapped = RecordingMapping(array_axes=("lateral", "depth", "frames"))
+    frames = array_files.open_array_file(tmp_path / "a.mat", mapped).frames
+    assert frames is not None
+    np.testing.assert_array_equal(frames.frame(2), images[2])
+    assert frames.frame(2).dtype == np.uint8
+    with pytest.raises(
+        InputError, match=r"a\.mat: frame: found frames of 40 x 30 x 3 numbers and nothing about their axes"
+    ):
+        array_files.open_array_file(tmp_path / "a.mat", RecordingMapping())
+
+
 def test_a_table_names_frames_inside_other_files(tmp_path: Path) -> None:
     by_hdf5storage(tmp_path / "data.mat")
     pose = " ".join(map(repr, POSES[0].ravel().tolist()))

@@ -161,6 +161,16 @@ def test_what_a_file_says_of_the_probe_is_compared_with_the_setup(
     assert not (tmp_path / "s").exists()
 
 
+def test_channel_data_are_never_taken_for_pictures(tmp_path: Path) -> None:
+    by_hand(tmp_path / "scan.hdf5")
+    probe = session_files.setup()["probe"]
+    del probe["channels"]
+    message = refused(table(tmp_path, "scan.hdf5"), tmp_path / "s", "--setup", setup(tmp_path, probe=probe))
+    assert (
+        "scan.hdf5: frames: found channel data, expected images: there is no probe.channels, as session.yaml" in message
+    )
+
+
 def test_another_speed_of_sound_is_told_and_the_setups_is_used(tmp_path: Path) -> None:
     by_hand(tmp_path / "scan.hdf5", DATA, ipasc_acquisition(speed_of_sound=1480.0))
     done = convert(table(tmp_path, "scan.hdf5"), tmp_path / "s", "--setup", setup(tmp_path))

@@ -108,5 +108,5 @@ def _frames_of(file: str, name: str, variable: Variable, axes: tuple[str, ...] |
         return stored if flat == [first, second] else stored.T
 
     elements = shape[flat.index("elements")] if "elements" in flat else None
-    declared = DeclaredProbe(variable.where, elements=elements)
+    declared = DeclaredProbe(variable.where, elements=elements, channels=elements is not None)
     return ProbeFrames(file, count, read, declared, taken=(name,))

@@ -50,6 +50,7 @@ def read_ipasc(path: Path, mapping: RecordingMapping) -> ProbeFrames:
             pitch_mm=None if positions is None else pitch_of(positions, f"{path.name}: detector positions"),
             sampling_mhz=None if rate is None else rate * _MHZ_PER_HZ,
             sound_speed_m_s=speed,
+            channels=True,
         )
         times = _numbers(file, "meta_data/measurement_timestamps")
 

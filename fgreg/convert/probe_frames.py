@@ -26,6 +26,7 @@ class DeclaredProbe:
     Attributes:
         source: of the statement, for messages.
         t0_us: time of sample 0 after the laser pulse.
+        channels: whether the frames are channel data, not images.
     """
 
     source: str
@@ -34,6 +35,38 @@ class DeclaredProbe:
     sampling_mhz: float | None = None
     t0_us: float | None = None
     sound_speed_m_s: float | None = None
+    channels: bool = False
+
+    def check(self, probe: ProbeModel) -> list[str]:
+        """Compare with session.yaml; returns warnings.
+
+        Raises:
+            InputError: the two contradict each other where one of them must be wrong.
+        """
+
+        def refuse(key: str, found: str, expected: str) -> InputError:
+            return InputError(f"{self.source}: {key}", found, f"{expected}, as session.yaml says")
+
+        if self.channels and probe.channels is None:
+            raise refuse("frames", "channel data", "images: there is no probe.channels")
+        if self.elements is not None and self.elements != probe.elements:
+            raise refuse("elements", str(self.elements), f"{probe.elements} (probe.elements)")
+        if self.pitch_mm is not None and abs(self.pitch_mm / probe.pitch_mm - 1.0) > 0.01:
+            raise refuse("pitch", f"{self.pitch_mm:.4g} mm", f"{probe.pitch_mm:g} mm (probe.pitch_mm)")
+        if probe.channels is not None:
+            rate, start = probe.channels.sampling_mhz, probe.channels.t0_us
+            if self.sampling_mhz is not None and abs(self.sampling_mhz / rate - 1.0) > 1e-3:
+                raise refuse("sampling rate", f"{self.sampling_mhz:.6g} MHz", f"{rate:g} MHz (probe.channels)")
+            if self.t0_us is not None and abs(self.t0_us - start) > 0.5 / rate:
+                expected = f"{start:g} us (probe.channels.t0_us)"
+                raise refuse("time of the first sample", f"{self.t0_us:.6g} us", expected)
+        speed, ours = self.sound_speed_m_s, probe.sound_speed_m_s
+        if speed is not None and abs(speed / ours - 1.0) > 0.002:
+            # Files hold what the scanner beamforms with; what the lab measured goes into session.yaml.
+            return [
+                f"{self.source} says {speed:g} m/s, session.yaml {ours:g} m/s (probe.sound_speed_m_s): that is used"
+            ]
+        return []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +94,7 @@ class ProbeFrames:
         return variable in self.taken or any(name.endswith("/") and variable.startswith(name) for name in self.taken)
 
     def frame(self, index: int) -> npt.NDArray[np.generic]:
-        """A frame as a session holds it: int16 as it is, all other numbers as float32.
+        """A frame as a session holds it: int16, and unsigned pixels of 8 and 16 bits, as they are, else float32.
 
         Raises:
             InputError: no such frame, or one that holds no real numbers.
@@ -73,40 +106,11 @@ class ProbeFrames:
             is_complex = stored.dtype.kind == "c" or stored.dtype.names == ("real", "imag")  # the latter by MATLAB
             found = "complex numbers (IQ data)" if is_complex else f"an array of {stored.dtype}"
             raise InputError(f"{self.name}: frame {index}", found, "real numbers")
-        kind = np.int16 if stored.dtype == np.int16 else np.float32
+        pixels = (np.uint8, np.uint16) if not self.declared.channels else ()
+        kind = stored.dtype.newbyteorder("=") if stored.dtype in (np.int16, *pixels) else np.dtype(np.float32)
         if stored.dtype.kind == "f" and (np.abs(stored) > np.finfo(np.float32).max).any():
             raise InputError(f"{self.name}: frame {index}", "numbers beyond 3e38", "channel data")
         return np.ascontiguousarray(stored, dtype=kind)
-
-
-def check_declared(declared: DeclaredProbe, probe: ProbeModel) -> list[str]:
-    """Compare what a file says of the probe with session.yaml; returns warnings.
-
-    Raises:
-        InputError: the two contradict each other where one of them must be wrong.
-    """
-
-    def refuse(key: str, found: str, expected: str) -> InputError:
-        return InputError(f"{declared.source}: {key}", found, f"{expected}, as session.yaml says")
-
-    if declared.elements is not None and declared.elements != probe.elements:
-        raise refuse("elements", str(declared.elements), f"{probe.elements} (probe.elements)")
-    if declared.pitch_mm is not None and abs(declared.pitch_mm / probe.pitch_mm - 1.0) > 0.01:
-        raise refuse("pitch", f"{declared.pitch_mm:.4g} mm", f"{probe.pitch_mm:g} mm (probe.pitch_mm)")
-    if probe.channels is not None:
-        rate, start = probe.channels.sampling_mhz, probe.channels.t0_us
-        if declared.sampling_mhz is not None and abs(declared.sampling_mhz / rate - 1.0) > 1e-3:
-            raise refuse("sampling rate", f"{declared.sampling_mhz:.6g} MHz", f"{rate:g} MHz (probe.channels)")
-        if declared.t0_us is not None and abs(declared.t0_us - start) > 0.5 / rate:
-            expected = f"{start:g} us (probe.channels.t0_us)"
-            raise refuse("time of the first sample", f"{declared.t0_us:.6g} us", expected)
-    speed, ours = declared.sound_speed_m_s, probe.sound_speed_m_s
-    if speed is not None and abs(speed / ours - 1.0) > 0.002:
-        # Files hold what the scanner beamforms with; what the lab measured goes into session.yaml.
-        return [
-            f"{declared.source} says {speed:g} m/s, session.yaml {ours:g} m/s (probe.sound_speed_m_s): that is used"
-        ]
-    return []
 
 
 def pitch_of(positions_mm: FloatArray, where: str) -> float | None:

@@ -94,4 +94,5 @@ def _channel_data(stored: Any, where: str) -> tuple[npt.NDArray[Any], DeclaredPr
         sampling_mhz=None if rate is None else rate * _MHZ_PER_HZ,
         t0_us=None if start is None else float(np.asarray(start).flat[0]) * _US_PER_S,
         sound_speed_m_s=positive(stored.sound_speed),
+        channels=True,
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from fgreg.convert.drafts import Draft, Imported
 from fgreg.convert.files import whole_folder
-from fgreg.convert.probe_frames import check_declared
 from fgreg.errors import InputError, one_line
 from fgreg.model.camera_model import STEREO_RIG, StereoRig
 from fgreg.schema.yaml_writer import one_line_yaml
@@ -67,7 +66,7 @@ def write_session(
             if imported.images is not None:
                 imported.images.check(read.probe)
             for declared in imported.declared:
-                imported.told += check_declared(declared, read.probe)
+                imported.told += declared.check(read.probe)
         imported.write_frames(folder)
         lines, frames = _lines(imported.drafts, folder, read)
         note = {"type": "note", "t": imported.drafts[0].t, "text": _summary(imported)}
