@@ -1,15 +1,16 @@
 """The command line: ``fgreg solve``, ``check``, ``simulate``; the other commands have modules of their own.
 
 Exit status: 0 done; 1 done, but the verdict is ``refused``; 2 bad input or usage, with one line on standard error that
-starts with ``fgreg: error:``; anything else is a crash with its traceback. Heavy modules are imported by the command
-that needs them. The annotations of the command modules are objects, not strings (no ``from __future__``): Typer would
-evaluate each string twice, a tenth of ``fgreg --help``.
+starts with ``fgreg: error:``; 70 a crash, with its traceback; 130 interrupted. A closed pipe changes none of them.
+
+Heavy modules are imported by the command that needs them. The annotations of the command modules are objects, not
+strings (no ``from __future__``): Typer would evaluate each string twice, a tenth of ``fgreg --help``.
 """
 
+import errno
 import gc
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +27,7 @@ from fgreg.cli.live import add_live
 from fgreg.cli.options import EstimateOption, LimitOption, solve_config
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
+from fgreg.cli.streams import print_crash, take_streams
 from fgreg.cli.verify import add_verify
 from fgreg.errors import FgregError, InputError
 from fgreg.version import __version__
@@ -34,9 +36,12 @@ from fgreg.workers.threads import one_thread_each
 if TYPE_CHECKING:
     from fgreg.pipeline.solve import SolveReport
 
-EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_CRASH, EXIT_INTERRUPTED = 1, 2, 70, 130
 GARBAGE_THRESHOLD = 50_000
 """New objects between garbage collections: imports leave no garbage, and the default 700 costs 5 % of a command."""
+
+OUT_OF = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EROFS, errno.EIO}
+"""What a machine can run out of or fail at; an error of these is no defect of fgreg's."""
 
 app = typer.Typer(
     name="fgreg",
@@ -60,28 +65,48 @@ QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, a
 def main() -> None:
     """Entry point: known errors become one line and exit status 2."""
     gc.set_threshold(GARBAGE_THRESHOLD)
+    take_streams()
+    sys.exit(_exit_status(sys.argv[1:]))
+
+
+def _exit_status(arguments: list[str]) -> int:
     try:
         with one_thread_each():  # parallel work is over frames, solves or devices, not in matrices
-            status = app(standalone_mode=False)
+            status = _run(arguments)
+        sys.stdout.flush()
+        return status
     except FgregError as error:
-        _fail(str(error))
-    except typer.Abort:
-        sys.exit(EXIT_INTERRUPTED)
+        return _fail(str(error))
     except UsageError as error:
-        _fail(str(getattr(error, "format_message", error.__str__)()))
-    except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
-    except BrokenPipeError:
-        # The reader of our output has closed it: print nothing more, not even at interpreter exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(EXIT_REFUSED)
-    sys.exit(status if isinstance(status, int) else 0)
+        return _fail(str(getattr(error, "format_message", error.__str__)()))
+    except (KeyboardInterrupt, typer.Abort):
+        return EXIT_INTERRUPTED
+    except MemoryError as error:
+        return _fail(f"not enough memory ({error})" if str(error) else "not enough memory")
+    except BaseException as error:  # also what is no Exception: a panic of a library in Rust
+        if isinstance(error, OSError) and (error.filename is not None or error.errno in OUT_OF):
+            return _fail(f"{error.filename or 'this machine'}: {error.strerror}")
+        if isinstance(error, SystemExit):
+            raise
+        print_crash(error)
+        return EXIT_CRASH
 
 
-def _fail(message: str) -> None:
+def _run(arguments: list[str]) -> int:
+    """Run a command. Not by Typer's own call, which makes status 1 of a broken pipe, be it of a device."""
+    command = typer.main.get_command(app)
+    try:
+        with command.make_context("fgreg", arguments) as context:
+            command.invoke(context)
+    except typer.Exit as done:
+        return done.exit_code
+    return 0
+
+
+def _fail(message: str) -> int:
     line = " ".join(message.split())
     sys.stderr.write(f"fgreg: error: {line}\n")
-    sys.exit(EXIT_BAD_INPUT)
+    return EXIT_BAD_INPUT
 
 
 def _version(wanted: bool) -> None:
