@@ -26,6 +26,7 @@ from fgreg.drivers.base import BmodeFrame
 from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
 from fgreg.errors import InputError, one_line
+from fgreg.limits import BK_MESSAGE_BYTES, BK_SIDE
 from fgreg.model.time_sync import Stamp
 
 if TYPE_CHECKING:
@@ -35,10 +36,7 @@ if TYPE_CHECKING:
 START, END, ESCAPE = b"\x01", b"\x04", b"\x1b"
 ESCAPED = {bytes([byte]): ESCAPE + bytes([byte ^ 0xFF]) for byte in (0x01, 0x04, 0x1B)}
 INVERTED = np.array([pair[1] for pair in ESCAPED.values()], dtype=np.uint8)
-MAX_MESSAGE_BYTES = 16 << 20
-"""As sent, escapes included: a colour picture of 1920 x 1080 has 6.2 million bytes."""
 STAMP_BYTES = 4
-MAX_SIDE = 8192
 SUBSCRIBED = ("US_WIN_SIZE", "B_GEOMETRY_PIXEL", "B_GEOMETRY_TISSUE", "B_GEOMETRY_US_FRAME_GRAB")
 ASKED = ("US_WIN_SIZE", "B_GEOMETRY_PIXEL:A", "B_GEOMETRY_TISSUE:A", "B_GEOMETRY_US_FRAME_GRAB:A")
 RECTANGLES = {"B_GEOMETRY_PIXEL": "screen", "B_GEOMETRY_TISSUE": "tissue_m", "B_GEOMETRY_US_FRAME_GRAB": "grabbed"}
@@ -121,8 +119,8 @@ class OemDecoder:
         if self._buffer and START not in self._buffer:
             self._rejections.add("bytes outside of a message")
             self._buffer.clear()
-        if len(self._buffer) > MAX_MESSAGE_BYTES:
-            raise StreamBroken(f"no end of a message within {MAX_MESSAGE_BYTES} bytes")
+        if len(self._buffer) > BK_MESSAGE_BYTES:
+            raise StreamBroken(f"no end of a message within {BK_MESSAGE_BYTES} bytes")
         return messages
 
 
@@ -264,7 +262,7 @@ class BkOemScanner(LinkedDevice[OemMessage]):
         name, values = told.group(1), told.group(2)
         if name == "US_WIN_SIZE":
             columns, rows = (int(value) for value in _numbers(values, 2))
-            if not (1 <= columns <= MAX_SIDE and 1 <= rows <= MAX_SIDE):
+            if not (1 <= columns <= BK_SIDE and 1 <= rows <= BK_SIDE):
                 raise ValueError(f"a window of {columns} x {rows}")
             self._geometry = replace(self._geometry, window=(columns, rows))
         elif name in RECTANGLES:

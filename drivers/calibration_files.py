@@ -27,7 +27,6 @@ import numpy as np
 
 from fgreg.drivers.calibration_matlab import HINT, is_binary, rig_of_struct, struct_of
 from fgreg.drivers.calibration_parts import (
-    MAX_BYTES,
     MM_PER,
     PARAMETERS,
     ROTATION_TOLERANCE,
@@ -45,6 +44,7 @@ from fgreg.drivers.calibration_texts import is_ost, is_scikit_surgery, read_ost,
 from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, is_rigid
+from fgreg.limits import SETUP_BYTES
 from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.schema.kinds import Integer, Kind, Numbers, Text
 from fgreg.schema.matrices import Matrix
@@ -104,7 +104,7 @@ def read_calibration(
     elif kind is _Kind.OST:
         rig = _rig_of(read_ost(files), MM_PER[used], rectified)
     else:
-        documents = [load_yaml(path, path.name, max_bytes=MAX_BYTES) for path in files]
+        documents = [load_yaml(path, path.name) for path in files]
         if kind is _Kind.KALIBR:
             rig = _from_kalibr(documents[0], name, MM_PER[used])
         elif kind is _Kind.MATLAB:
@@ -132,7 +132,7 @@ _WITH_PROJECTION = (_Kind.ROS, _Kind.OST, _Kind.OPENCV)
 
 
 def _kind(path: Path) -> _Kind:
-    data = read_bounded(path, path.name, MAX_BYTES)
+    data = read_bounded(path, path.name, SETUP_BYTES)
     if is_binary(data):
         raise InputError(path.name, "a .mat file", HINT)
     if is_scikit_surgery(path):
@@ -141,7 +141,7 @@ def _kind(path: Path) -> _Kind:
         return _Kind.OPENCV
     if is_ost(data):
         return _Kind.OST
-    document = load_yaml(path, path.name, max_bytes=MAX_BYTES)
+    document = load_yaml(path, path.name)
     if "cam0" in document:
         return _Kind.KALIBR
     return _Kind.ROS if struct_of(document) is None else _Kind.MATLAB

@@ -18,7 +18,6 @@ from fgreg.schema.problems import FieldError, Problem, input_error, shown
 MM_PER = {"m": 1000.0, "mm": 1.0}
 """Units that a calibration's lengths can have."""
 ROTATION_TOLERANCE = 1e-3
-MAX_BYTES = 4_000_000
 _MOST = 1e9
 """Of a number in a calibration: far above any, and far below where products overflow."""
 _LEAST_PX = 1e-3

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from fgreg.drivers.calibration_parts import (
-    MAX_BYTES,
     CameraInfo,
     bounded,
     camera_of,
@@ -28,6 +27,7 @@ from fgreg.drivers.calibration_parts import (
 )
 from fgreg.errors import InputError, one_line
 from fgreg.geometry.transforms import FloatArray
+from fgreg.limits import SETUP_BYTES
 from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.session.yaml_loader import read_bounded
 
@@ -152,7 +152,7 @@ def _table(path: Path, count: int | None) -> FloatArray:
 
 def _text(path: Path) -> str:
     try:
-        return read_bounded(path, path.name, MAX_BYTES).decode("utf-8-sig")
+        return read_bounded(path, path.name, SETUP_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(path.name, "bytes that are not text (UTF-8)", "a text file") from None
 

@@ -25,10 +25,9 @@ import numpy.typing as npt
 from fgreg.drivers.tcp_link import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import FloatArray
+from fgreg.limits import IGTL_BODY_BYTES
 
 NAME_BYTES = 20
-MAX_BODY_BYTES = 32 << 20
-"""Largest message taken: 128 elements of 60,000 samples in floats, a volume of 256 x 256 x 256 bytes."""
 HEADER = struct.Struct(">H12s20sIIQQ")
 STATUS = struct.Struct(">Hq20s")
 
@@ -127,8 +126,8 @@ def parse_header(data: bytes) -> Header:
         raise StreamBroken("names that are not text: not OpenIGTLink") from error
     if not (kind_text.isprintable() and device_text.isprintable() and kind_text):
         raise StreamBroken("names that are not text: not OpenIGTLink")
-    if body_bytes > MAX_BODY_BYTES:
-        raise StreamBroken(f"a message of {body_bytes} bytes announced, at most {MAX_BODY_BYTES} taken")
+    if body_bytes > IGTL_BODY_BYTES:
+        raise StreamBroken(f"a message of {body_bytes} bytes announced, at most {IGTL_BODY_BYTES} taken")
     sent_s = seconds + fraction / 2**32 if seconds or fraction else None
     return Header(version, kind_text, device_text, sent_s, body_bytes, checksum)
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 
 from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand
 from fgreg.drivers.operator_words import asked, understand
+from fgreg.limits import TYPED_LINE_BYTES
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext, Operator
     from fgreg.drivers.options import NoOptions
 
 MOST_WAITING = 64
-MAX_LINE_BYTES = 1000
 BACKGROUND_S = 0.5
 """Time between checks for the foreground. A background program that reads from its terminal would be suspended."""
 
@@ -99,9 +99,9 @@ class KeyboardOperator:
                 self._open = False
                 lines, held = [held] if held else [], b""  # a last line without a newline; empty input is no line
             for line in lines:
-                self._take(line, too_long or len(line) > MAX_LINE_BYTES)
+                self._take(line, too_long or len(line) > TYPED_LINE_BYTES)
                 too_long = False
-            if len(held) > MAX_LINE_BYTES:
+            if len(held) > TYPED_LINE_BYTES:
                 held, too_long = b"", True
 
     def _read(self) -> bytes | None:
@@ -120,7 +120,7 @@ class KeyboardOperator:
 
     def _take(self, line: bytes, too_long: bool) -> None:
         if too_long:
-            self._say(f"a line of more than {MAX_LINE_BYTES} characters is not understood")
+            self._say(f"a line of more than {TYPED_LINE_BYTES} characters is not understood")
             return
         command = understand(line.decode("utf-8", errors="replace"), self._corners)
         if isinstance(command, str):

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from fgreg.drivers.ros_limits import bound_chunks, check_tables
 from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES
 from fgreg.errors import InputError, MissingExtraError
 
@@ -68,6 +69,8 @@ class Recording:
             raise InputError(
                 str(path), "a folder without metadata.yaml" if path.is_dir() else "another file", _EXPECTED
             )
+        bound_chunks()
+        check_tables(path)
         self._reader: Any = None
         try:
             reader: Any = AnyReader([path], default_typestore=_common_types())

@@ -45,7 +45,7 @@ def receive(connection: socket.socket) -> tuple[dict[str, Any], bytearray]:
         raise WireClosed("a message of impossible size")
     try:
         header = json.loads(_read(connection, header_length))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise WireClosed("a header that is not JSON") from None
     if not isinstance(header, dict):
         raise WireClosed("a header that is no mapping")

@@ -17,6 +17,7 @@ from fgreg.drivers.base import BmodeFrame, BmodeSource, DeviceLost
 from fgreg.drivers.bk_oem import BkOemScanner, OemDecoder, encode, unescape
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken
 from fgreg.errors import InputError
+from fgreg.limits import BK_MESSAGE_BYTES
 from tests.bk_emulator import Scanner, Unframer, frame, grabbed
 from tests.network_peers import collect, wait_for
 
@@ -137,7 +138,7 @@ def test_what_is_not_a_picture_is_left_out_and_the_next_one_is_shown(scanner: Sc
 def test_a_message_without_end_ends_the_connection_not_the_driver(
     scanner: Scanner, source: BkOemScanner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bk_oem, "MAX_MESSAGE_BYTES", 100_000)
+    monkeypatch.setattr(bk_oem, "BK_MESSAGE_BYTES", 100_000)
     wait_for(lambda: scanner.grabbing)
     scanner.grabbing = b""
     scanner.send_raw(b"\x01" + b"x" * 150_000)
@@ -196,7 +197,7 @@ def test_an_endless_message_is_bounded() -> None:
     decoder = OemDecoder(Rejections(), count())
     piece = b"x" * (1 << 18)
     decoder.feed(b"\x01" + piece, 0.0)
-    for _ in range(bk_oem.MAX_MESSAGE_BYTES // len(piece) - 2):
+    for _ in range(BK_MESSAGE_BYTES // len(piece) - 2):
         assert decoder.feed(piece, 0.0) == []
     decoder.feed(piece[:-1], 0.0)
     with pytest.raises(StreamBroken, match="no end of a message"):

@@ -91,7 +91,7 @@ def recording(folder: Path) -> Path:
     [
         (sequence, lambda path: read_plus(path, MAPPING), 150),
         (table, lambda path: read_table(path, MAPPING), 150),
-        (opencv, lambda path: read_calibration([path]), 100),
+        (opencv, lambda path: read_calibration([path]), 6),
         (kalibr, lambda path: read_calibration([path]), 100),
         (ost, lambda path: read_calibration([path]), 100),
         (matlab, lambda path: read_calibration([path]), 100),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from fgreg.drivers.tcp_link import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
+from fgreg.limits import IGTL_BODY_BYTES
 from tests.igtl_bytes import crc64, image_body, message, read_message, transform_body
 
 pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
@@ -143,7 +144,7 @@ def test_messages_not_wanted_are_skipped_unread() -> None:
     ("header", "reason"),
     [
         (struct.pack(">H12s20sIIQQ", 1, b"IMAGE", b"US", 0, 0, 1 << 60, 0), "1152921504606846976 bytes announced"),
-        (struct.pack(">H12s20sIIQQ", 1, b"IMAGE", b"US", 0, 0, igtl.MAX_BODY_BYTES + 1, 0), "bytes announced"),
+        (struct.pack(">H12s20sIIQQ", 1, b"IMAGE", b"US", 0, 0, IGTL_BODY_BYTES + 1, 0), "bytes announced"),
         (struct.pack(">H12s20sIIQQ", 3, b"IMAGE", b"US", 0, 0, 10, 0), "header version 3"),
         (struct.pack(">H12s20sIIQQ", 1, b"\xff\xff", b"US", 0, 0, 10, 0), "not text"),
         (struct.pack(">H12s20sIIQQ", 1, b"IMAGE", b"\x01\x02", 0, 0, 10, 0), "not text"),

@@ -17,10 +17,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand
-from fgreg.drivers.keyboard import MAX_LINE_BYTES, MOST_WAITING, KeyboardOperator
+from fgreg.drivers.keyboard import MOST_WAITING, KeyboardOperator
 from fgreg.drivers.operator_words import EXPECTED, LETTERS, asked, understand
 from fgreg.drivers.operators import IgtlOperator, Operators
 from fgreg.drivers.tcp_link import Endpoint
+from fgreg.limits import TYPED_LINE_BYTES
 from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
 
@@ -154,10 +155,10 @@ def test_the_end_of_the_input_is_no_loss_and_its_last_line_counts(typed: Typed) 
 
 def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -> None:
     for _ in range(20):
-        typed.type(b"a" * MAX_LINE_BYTES)
+        typed.type(b"a" * TYPED_LINE_BYTES)
     typed.type(b"\nfollow\n")
     assert collect(typed.operator.poll, 1) == [OperatorCommand(CommandKind.FOLLOW)]
-    assert typed.messages == [f"a line of more than {MAX_LINE_BYTES} characters is not understood"]
+    assert typed.messages == [f"a line of more than {TYPED_LINE_BYTES} characters is not understood"]
 
 
 def test_commands_not_fetched_are_dropped_oldest_first_but_never_a_stop(typed: Typed) -> None:

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fgreg.limits import STAGE_TEXT
 from fgreg.model.session_model import StageModel
 from fgreg.stage.limits import MotionKind, MotionLimits
 from fgreg.stage.messages import (
-    MAX_TEXT,
     Beat,
     Command,
     Message,
@@ -41,7 +41,7 @@ def test_messages_come_back_as_they_went() -> None:
         line = encode(message)
         assert line.count(b"\n") == 1
         assert decode(line) == message
-    assert len(encode(Stop(0.0, True, "x" * 9999))) < MAX_TEXT + 200
+    assert len(encode(Stop(0.0, True, "x" * 9999))) < STAGE_TEXT + 200
     with pytest.raises(ValueError, match="not JSON compliant"):
         encode(Command(2.0, 3, MotionKind.TRACK, math.nan, 0.2, 0.01, ""))
 

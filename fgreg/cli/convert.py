@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgreg.errors import InputError
+from fgreg.limits import RECORDING_MEMORY, memory_at_most
 
 if TYPE_CHECKING:
     from fgreg.convert.drafts import Imported
@@ -170,8 +171,9 @@ def _import(
         for option, value in alone.items():
             if value is not None:
                 raise InputError(option, "it alone", "it with --calibration")
-    imported = _read(source, RecordingMapping() if mapping is None else read_mapping(mapping))
-    written = write_session(imported, setup, out, rig=rig, overwrite=overwrite)
+    names = RecordingMapping() if mapping is None else read_mapping(mapping)
+    with memory_at_most(RECORDING_MEMORY):
+        written = write_session(_read(source, names), setup, out, rig=rig, overwrite=overwrite)
     for warning in [*written.left_out[:MOST_SAID], *written.warnings]:
         sys.stderr.write(f"fgreg: warning: {warning}\n")
     if (more := len(written.left_out) - MOST_SAID) > 0:

@@ -30,6 +30,7 @@ from fgreg.cli.schema import add_schema
 from fgreg.cli.streams import print_crash, take_streams
 from fgreg.cli.verify import add_verify
 from fgreg.errors import FgregError, InputError
+from fgreg.limits import tell_libraries
 from fgreg.version import __version__
 from fgreg.workers.threads import one_thread_each
 
@@ -66,6 +67,7 @@ def main() -> None:
     """Entry point: known errors become one line and exit status 2."""
     gc.set_threshold(GARBAGE_THRESHOLD)
     take_streams()
+    tell_libraries()
     sys.exit(_exit_status(sys.argv[1:]))
 
 

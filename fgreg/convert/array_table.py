@@ -18,10 +18,10 @@ from fgreg.convert.probe_frames import ProbeFrames
 from fgreg.convert.table import events_of_rows
 from fgreg.convert.variables import Variable, cell_text
 from fgreg.errors import InputError
+from fgreg.limits import EVENT_LINES
 
 _MATRICES = ("camera_T_marker", "camera_new_T_camera_old")
 _OF_FRAMES = ("frame", "frame_index")
-_MAX_ROWS = 1_000_000
 
 
 def read_arrays(path: Path, mapping: RecordingMapping) -> Imported:
@@ -74,8 +74,8 @@ def _times(
         expected = f"{name}, the time of each event in s; or a CSV table whose column frame names this file"
         raise InputError(path.name, there[:200], expected)
     count = len(columns[name])
-    if not 0 < count <= _MAX_ROWS:
-        raise InputError(f"{path.name}: {name}", f"{count} values", f"1 to {_MAX_ROWS}")
+    if not 0 < count <= EVENT_LINES:
+        raise InputError(f"{path.name}: {name}", f"{count} values", f"1 to {EVENT_LINES}")
     return count
 
 

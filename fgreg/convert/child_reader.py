@@ -17,12 +17,9 @@ from typing import Any
 from fgreg.convert import array_files
 from fgreg.convert.array_files import ArrayFile
 from fgreg.convert.mapping import RecordingMapping
-from fgreg.convert.probe_frames import MAX_BYTES
 from fgreg.errors import FgregError, InputError, MissingExtraError
+from fgreg.limits import ARRAY_MEMORY, ARRAY_SECONDS
 from fgreg.workers.worker_process import START_S, WorkerProcess
-
-_ANSWER_S = 120.0
-_MEMORY = 3 * MAX_BYTES
 
 _Question = tuple[str, tuple[Any, ...]]
 
@@ -60,7 +57,7 @@ class _Child:
             name="fgreg reader",
             what="its reader",
             niceness=0,
-            answer_s=_ANSWER_S,
+            answer_s=ARRAY_SECONDS,
             restart=False,
         )
         weakref.finalize(self, self._worker.close)
@@ -68,7 +65,7 @@ class _Child:
     def ask(self, what: str, *arguments: Any) -> Any:
         """The answer to a question. Raises what reading raised."""
         self._worker.send((what, arguments))
-        reply = self._worker.fetch(START_S + _ANSWER_S)
+        reply = self._worker.fetch(START_S + ARRAY_SECONDS)
         if reply is None or reply[0] is None:
             words = (self._worker.failure or "no answer")[:160]
             raise InputError(self._name, f"a file that cannot be read ({words})", "a whole one")
@@ -83,7 +80,7 @@ def _reader(path: Path, mapping: RecordingMapping) -> Callable[[_Question], tupl
     import resource
     import warnings
 
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (ARRAY_MEMORY, ARRAY_MEMORY))
     warnings.simplefilter("ignore")
     with Path(os.devnull).open("wb") as nowhere:
         os.dup2(nowhere.fileno(), 2)

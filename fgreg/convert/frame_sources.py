@@ -12,10 +12,10 @@ from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.probe_frames import DeclaredProbe, ProbeFrames
 from fgreg.detection.frame_files import png_bytes, read_picture
 from fgreg.errors import InputError
+from fgreg.limits import PICTURE_BYTES
+from fgreg.schema.files import exists
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
-
-_MAX_BYTES = 256_000_000
 
 
 class FrameSources:
@@ -48,7 +48,7 @@ class FrameSources:
         Raises:
             InputError: no such file or frame, or one of another kind.
         """
-        if not path.is_file():
+        if not exists(path) or not path.is_file():
             raise InputError(where, f"{shown(text)}: no such file", "a file relative to the table")
         if suffix == ".npy" and path.suffix.lower() in ARRAY_SUFFIXES:
             index = self._index(path, index, where)
@@ -89,7 +89,7 @@ class FrameSources:
             if index is not None:
                 np.save(target, self._opened[path].frame(index), allow_pickle=False)
                 continue
-            data = read_bounded(path, str(path), _MAX_BYTES)
+            data = read_bounded(path, str(path), PICTURE_BYTES)
             if path.suffix.lower() not in (".npy", ".png"):
                 picture = read_picture(path)
                 if picture is None:

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.convert.probe_frames import MAX_BYTES
 from fgreg.convert.variables import Variable
 from fgreg.errors import InputError, MissingExtraError
+from fgreg.limits import ARRAY_BYTES, ARRAY_VARIABLES
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_MAX_DATASETS = 10_000
 _NOT_VARIABLES = ("#refs#", "#subsystem#")
 
 
@@ -70,8 +69,8 @@ def check_dataset(dataset: Any, where: str) -> None:
     """Raises InputError where a dataset is too large to read, or kept in another file."""
     if dataset.external or dataset.is_virtual:
         raise InputError(where, "a dataset kept in another file", "one in this file")
-    if dataset.shape is None or math.prod(dataset.shape) * dataset.dtype.itemsize > MAX_BYTES:
-        raise InputError(where, f"an array of shape {dataset.shape}", f"at most {MAX_BYTES} bytes")
+    if dataset.shape is None or math.prod(dataset.shape) * dataset.dtype.itemsize > ARRAY_BYTES:
+        raise InputError(where, f"an array of shape {dataset.shape}", f"at most {ARRAY_BYTES} bytes")
 
 
 def read_hdf5(path: Path) -> dict[str, Variable]:
@@ -88,8 +87,8 @@ def read_hdf5(path: Path) -> dict[str, Variable]:
         def collect(key: str, item: Any) -> None:
             if key.split("/", 1)[0] in _NOT_VARIABLES or not hasattr(item, "shape"):
                 return
-            if len(found) >= _MAX_DATASETS:
-                raise InputError(path.name, f"more than {_MAX_DATASETS} datasets", "fewer")
+            if len(found) >= ARRAY_VARIABLES:
+                raise InputError(path.name, f"more than {ARRAY_VARIABLES} datasets", "fewer")
             name = key.replace("/", ".") if matlab else key
             if item.shape and math.prod(item.shape) == 1 and item.dtype.hasobject:
                 item = _alone(file, item)  # a cell around an array, as in Verasonics' RcvData

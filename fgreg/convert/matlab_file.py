@@ -10,12 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from fgreg.convert.probe_frames import MAX_BYTES
 from fgreg.convert.variables import Variable
 from fgreg.errors import InputError
-
-_MAX_DEPTH = 20
-_MAX_VARIABLES = 10_000
+from fgreg.limits import ARRAY_BYTES, ARRAY_VARIABLES, NESTING
 
 
 def read_matlab(path: Path) -> dict[str, Variable]:
@@ -32,8 +29,8 @@ def read_matlab(path: Path) -> dict[str, Variable]:
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", matlab.MatReadWarning)  # a variable that cannot be read, or is there twice
             size = sum(8 * math.prod(int(n) for n in shape) for _, shape, _ in whosmat(str(path), appendmat=False))
-            if size > 2 * MAX_BYTES:
-                raise InputError(name, f"arrays of {size} bytes", f"at most {2 * MAX_BYTES}")
+            if size > 2 * ARRAY_BYTES:
+                raise InputError(name, f"arrays of {size} bytes", f"at most {2 * ARRAY_BYTES}")
             stored = loadmat(str(path), appendmat=False, chars_as_strings=True, struct_as_record=True)
     except InputError:
         raise
@@ -57,8 +54,8 @@ class _Variables:
     def collect(self, key: str, value: Any, depth: int) -> None:
         """Add a variable, or the fields of a struct."""
         where = f"{self._file}: {key}"
-        if depth > _MAX_DEPTH or len(self.found) > _MAX_VARIABLES:
-            expected = f"at most {_MAX_DEPTH} levels and {_MAX_VARIABLES} fields"
+        if depth > NESTING or len(self.found) > ARRAY_VARIABLES:
+            expected = f"at most {NESTING} levels and {ARRAY_VARIABLES} fields"
             raise InputError(where, "more structs inside each other, or more fields", expected)
         if isinstance(value, self._opaque) or not isinstance(value, np.ndarray):
             unreadable = "an object (string, table, datetime, sparse)"

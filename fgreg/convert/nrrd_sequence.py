@@ -21,11 +21,11 @@ import numpy.typing as npt
 
 from fgreg.convert.sequence_file import SequenceFile
 from fgreg.errors import InputError, MissingExtraError
+from fgreg.limits import SEQUENCE_BYTES
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 
 SUFFIXES = (".nrrd", ".nhdr")
-_MAX_BYTES = 4_000_000_000
 _FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{1,9})_(\w{1,200})")
 _ITEM_FIELD = re.compile(r"axis ([0-9]{1,2}) item ([0-9]{1,9}) (\w{1,200})")
 _NAMES = {
@@ -46,7 +46,7 @@ def read_nrrd_sequence(path: Path) -> SequenceFile:
     except ImportError:
         raise MissingExtraError("pynrrd", "nrrd") from None
     name = path.name
-    data = read_bounded(path, name, _MAX_BYTES)
+    data = read_bounded(path, name, SEQUENCE_BYTES)
     lines, start = _header_lines(data, name)
     try:
         header: dict[str, Any] = dict(nrrd.read_header(lines))
@@ -117,10 +117,10 @@ def _pixel_bytes(header: Mapping[str, Any], data: bytes, path: Path, points: int
     if stored is not None:
         if Path(str(stored)).name != stored or str(stored).startswith("LIST") or "%" in str(stored):
             raise InputError(f"{name}: data file", shown(str(stored)), "one file beside it")
-        data = read_bounded(path.with_name(str(stored)), str(stored), _MAX_BYTES)
-    if points > _MAX_BYTES:
-        raise InputError(f"{name}: sizes", f"{points} pixels", f"at most {_MAX_BYTES}")
-    most = min(8 * points, _MAX_BYTES) + 1
+        data = read_bounded(path.with_name(str(stored)), str(stored), SEQUENCE_BYTES)
+    if points > SEQUENCE_BYTES:
+        raise InputError(f"{name}: sizes", f"{points} pixels", f"at most {SEQUENCE_BYTES}")
+    most = min(8 * points, SEQUENCE_BYTES) + 1
     encoding = str(header.get("encoding", ""))
     try:
         match encoding:

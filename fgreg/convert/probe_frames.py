@@ -12,8 +12,6 @@ from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import ProbeModel
 
-MAX_BYTES = 4_000_000_000
-"""Largest array that is read from a file."""
 _FAR_MM = 1e6
 _UNEVEN = 0.05
 """Largest relative difference between the distances of neighbouring elements of a linear array."""

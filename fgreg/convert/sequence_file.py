@@ -18,14 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
+from fgreg.limits import SEQUENCE_BYTES, SEQUENCE_FIELDS, SEQUENCE_FRAMES, SEQUENCE_HEADER_BYTES
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 
 _TYPES = {"UCHAR": "u1", "CHAR": "i1", "USHORT": "u2", "SHORT": "i2", "UINT": "u4", "INT": "i4", "FLOAT": "f4"}
 _TYPES |= {"DOUBLE": "f8"}
 _FRAME_FIELD = re.compile(r"Seq_Frame([0-9]{1,9})_(\w{1,200})")
-_MAX_BYTES = 4_000_000_000
-_MAX_HEADER = 256_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +51,8 @@ def read_sequence(path: Path) -> SequenceFile:
         InputError: not a MetaImage of three dimensions, or truncated.
     """
     name = path.name
-    data = read_bounded(path, name, _MAX_BYTES)
-    fields, start = _header(data, name)
+    data = memoryview(read_bounded(path, name, SEQUENCE_HEADER_BYTES + SEQUENCE_BYTES))
+    fields, start = _header(data[:SEQUENCE_HEADER_BYTES].tobytes(), name)
     if fields.get("ObjectType") != "Image":
         raise InputError(name, "another file", "a PLUS sequence (MetaImage, .mha)")
     frames: dict[int, dict[str, str]] = {}
@@ -73,8 +72,8 @@ def read_sequence(path: Path) -> SequenceFile:
         raise InputError(f"{name}: NDims", shown(fields["NDims"]), f"{len(stated)}, as many as in DimSize")
     images = _images(fields, data[start:], path, (count, height, width)) if width and height and count else None
     known = max(count if images is not None else 0, 1 + max(frames, default=-1))
-    if known > 10_000_000:
-        raise InputError(name, f"frame {known - 1}", "a frame number that can be")
+    if known > SEQUENCE_FRAMES:
+        raise InputError(name, f"frame {known - 1}", f"numbers below {SEQUENCE_FRAMES}")
     return SequenceFile(name, fields, tuple(frames.get(i, {}) for i in range(known)), images)
 
 
@@ -82,7 +81,7 @@ def _header(data: bytes, name: str) -> tuple[dict[str, str], int]:
     """Fields in order, and where the pixels start."""
     fields: dict[str, str] = {}
     at = 0
-    while at < min(len(data), _MAX_HEADER):
+    while at < len(data):
         end = data.find(b"\n", at)
         if end < 0:
             break
@@ -93,12 +92,15 @@ def _header(data: bytes, name: str) -> tuple[dict[str, str], int]:
             continue
         if not equals or len(key) > 300 or b"\0" in key:
             raise InputError(name, "no header of key = value lines", "a PLUS sequence (MetaImage, .mha)")
+        if len(fields) >= SEQUENCE_FIELDS:
+            raise InputError(name, f"more than {SEQUENCE_FIELDS} fields", "fewer: a part of the sequence")
         field, text = key.strip().decode("latin-1"), value.strip().decode("latin-1")
         if fields.setdefault(field, text) != text and field != "Comment":
             raise InputError(f"{name}: {field[:100]}", f"{shown(fields[field])} and {shown(text)}", "one value")
         if field == "ElementDataFile":
             return fields, at
-    raise InputError(name, "a header without ElementDataFile", "a whole PLUS sequence (MetaImage, .mha)")
+    expected = f"a whole PLUS sequence (MetaImage, .mha) with at most {SEQUENCE_HEADER_BYTES} bytes of it"
+    raise InputError(name, "a header without ElementDataFile", expected)
 
 
 def _numbers(fields: Mapping[str, str], key: str, name: str) -> list[int]:
@@ -109,7 +111,9 @@ def _numbers(fields: Mapping[str, str], key: str, name: str) -> list[int]:
     return [int(word) for word in words]
 
 
-def _images(fields: Mapping[str, str], data: bytes, path: Path, shape: tuple[int, int, int]) -> npt.NDArray[Any]:
+def _images(
+    fields: Mapping[str, str], data: bytes | memoryview, path: Path, shape: tuple[int, int, int]
+) -> npt.NDArray[Any]:
     name = path.name
     kind = _TYPES.get(fields.get("ElementType", "").removeprefix("MET_"))
     if kind is None:
@@ -127,11 +131,11 @@ def _images(fields: Mapping[str, str], data: bytes, path: Path, shape: tuple[int
     if stored.upper() != "LOCAL":
         if Path(stored).name != stored:
             raise InputError(f"{name}: ElementDataFile", shown(stored), "LOCAL, or a file beside it")
-        data = read_bounded(path.with_name(stored), stored, _MAX_BYTES)
+        data = read_bounded(path.with_name(stored), stored, SEQUENCE_BYTES)
     item = np.dtype(kind).newbyteorder(">" if _big(fields) else "<")
     needed = item.itemsize * math.prod(shape)
-    if needed > _MAX_BYTES:
-        raise InputError(f"{name}: DimSize", f"{needed} bytes", f"at most {_MAX_BYTES}")
+    if needed > SEQUENCE_BYTES:
+        raise InputError(f"{name}: DimSize", f"{needed} bytes", f"at most {SEQUENCE_BYTES}: a part of the sequence")
     if fields.get("CompressedData", "False").lower() == "true":
         try:
             data = zlib.decompressobj().decompress(data, needed + 1)

@@ -17,12 +17,12 @@ from fgreg.convert.mapping import COLUMNS, LOOK, Column, RecordingMapping
 from fgreg.errors import InputError
 from fgreg.geometry.quaternions import rotation_from_quaternion
 from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transform
+from fgreg.limits import EVENT_LINES, TABLE_BYTES, TABLE_COLUMNS
 from fgreg.schema.files import FrameName
 from fgreg.schema.kinds import Number
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 
-_MAX_BYTES = 256_000_000
 _DELIMITERS = (",", ";", "\t")
 _POSITION = ("marker_x_mm", "marker_y_mm", "marker_z_mm")
 _QUATERNION = ("marker_qx", "marker_qy", "marker_qz", "marker_qw")
@@ -38,10 +38,12 @@ def read_table(path: Path, mapping: RecordingMapping) -> Imported:
         InputError: the first invalid cell, with its line.
     """
     try:
-        text = read_bounded(path, path.name, _MAX_BYTES).decode("utf-8-sig")
+        text = read_bounded(path, path.name, TABLE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(path.name, "bytes that are not UTF-8", "a CSV table in UTF-8") from None
     lines = text.splitlines(keepends=True)
+    if len(lines) > EVENT_LINES:
+        raise InputError(path.name, f"{len(lines)} lines", f"at most {EVENT_LINES}: a part of the table")
     start = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
     if start is None:
         raise InputError(path.name, "nothing", "a table with a line of column names")
@@ -98,6 +100,8 @@ class _Table:
         self.unused: list[str] = []
 
     def take_header(self, names: list[str]) -> None:
+        if len(names) > TABLE_COLUMNS:
+            raise InputError(f"{self.path.name}: header", f"{len(names)} columns", f"at most {TABLE_COLUMNS}")
         twice = sorted({name for name in names if name and names.count(name) > 1})
         if twice:
             raise InputError(f"{self.path.name}: header", f"the column {shown(twice[0])} twice", "each name once")

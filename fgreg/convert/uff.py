@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from fgreg.convert.hdf5_file import open_hdf5
 from fgreg.convert.mapping import RecordingMapping
-from fgreg.convert.probe_frames import MAX_BYTES, DeclaredProbe, ProbeFrames, pitch_of, positive
+from fgreg.convert.probe_frames import DeclaredProbe, ProbeFrames, pitch_of, positive
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import as_float_array
+from fgreg.limits import ARRAY_BYTES
 
 _CLASS = "uff.channel_data"
 _MM_PER_M, _MHZ_PER_HZ, _US_PER_S = 1e3, 1e-6, 1e6
@@ -53,10 +54,10 @@ def read_uff(path: Path, mapping: RecordingMapping) -> ProbeFrames:
         if (
             stored is None
             or not 2 <= len(stored.shape) <= 4
-            or math.prod(stored.shape) * stored.dtype.itemsize > MAX_BYTES
+            or math.prod(stored.shape) * stored.dtype.itemsize > ARRAY_BYTES
         ):
             raise InputError(
-                f"{where}.data", "no array of samples, channels, waves, frames", f"one of at most {MAX_BYTES} bytes"
+                f"{where}.data", "no array of samples, channels, waves, frames", f"one of at most {ARRAY_BYTES} bytes"
             )
         data, declared = _channel_data(pyuff_ustb.Uff(str(path)).read(name), where)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from fgreg.convert.drafts import Draft, Imported
 from fgreg.convert.files import whole_folder
 from fgreg.errors import InputError, one_line
+from fgreg.limits import EVENT_LINES, SETUP_BYTES
 from fgreg.model.camera_model import STEREO_RIG, StereoRig
 from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.event_reader import frames_of, read_line
@@ -21,7 +22,6 @@ from fgreg.session.yaml_loader import load_yaml, read_bounded
 
 MOST_SAID = 20
 """Sentences about what was left out, in the terminal and in the session's first note."""
-_MAX_SETUP = 4_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +52,10 @@ def write_session(
     if not imported.drafts:
         why = f"; {imported.left_out[0]}" if imported.left_out else ""
         raise InputError(imported.source, f"no events{why}", "at least one")
+    if len(imported.drafts) >= EVENT_LINES:
+        raise InputError(imported.source, f"{len(imported.drafts)} events", f"fewer than {EVENT_LINES}: a part of it")
     file = setup / SETUP_FILE if setup.is_dir() else setup
-    text = read_bounded(file, str(file), _MAX_SETUP).decode("utf-8", errors="replace")
+    text = read_bounded(file, str(file), SETUP_BYTES).decode("utf-8", errors="replace")
     rig = rig or imported.rig
     if rig is not None and "camera" not in load_yaml(file, str(file)):
         text = text.rstrip("\n") + "\n" + camera_yaml(rig)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
+from fgreg.limits import PICTURE_BYTES
 from fgreg.session.exif import UPRIGHT, orientation
+from fgreg.workers.library_messages import printed_by_libraries
 
+_DAMAGED = (b"Corrupt JPEG data", b"Premature end of JPEG file", b"TIFF_Error")
 Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 HOT_SHARE = 0.8
@@ -20,7 +24,7 @@ HOT_SHARE = 0.8
 
 def read_picture(path: Path) -> Picture | None:
     """An endoscope image of a file; as :func:`decode_picture`."""
-    return decode_picture(path.read_bytes(), path.name)
+    return None if path.stat().st_size > PICTURE_BYTES else decode_picture(path.read_bytes(), path.name)
 
 
 def decode_picture(data: bytes, name: str) -> Picture | None:
@@ -31,7 +35,7 @@ def decode_picture(data: bytes, name: str) -> Picture | None:
     Raises:
         InputError: parts of it are transparent, or it is to be turned before it is shown (EXIF).
     """
-    picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    picture = _decode(data)
     if picture is None or picture.dtype not in (np.uint8, np.uint16):
         return None
     if (turned := orientation(data)) != UPRIGHT:
@@ -68,6 +72,22 @@ def white_level(picture: Picture) -> int:
     top = int(picture.max())
     calm = int(cv2.erode(picture, np.ones((2, 2), dtype=np.uint8)).max())
     return max(top if calm >= HOT_SHARE * top else calm, 1)
+
+
+def _decode(data: bytes) -> npt.NDArray[Any] | None:
+    """``cv2.imdecode``, and None where it fails or the decoder says that the data are damaged.
+
+    The decoders of JPEG and TIFF say so on standard error only, and give a picture that is wrong from some line on.
+    """
+    if not data:
+        return None
+    is_png = data.startswith(b"\x89PNG")  # has checksums: its decoder gives no picture at all
+    try:
+        with nullcontext([b""]) if is_png else printed_by_libraries() as said:
+            picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # too many pixels
+        return None
+    return None if picture is None or any(word in said[0] for word in _DAMAGED) else np.asarray(picture)
 
 
 def to_display(picture: Picture) -> npt.NDArray[np.uint8]:

@@ -35,8 +35,6 @@ from fgreg.session.setup_reader import read_setup
 from fgreg.session.yaml_loader import load_yaml, parse_yaml, read_bounded
 from fgreg.stage.limits import MotionLimits
 
-_MAX_BYTES = 1_000_000
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
@@ -158,7 +156,7 @@ def read_config(path: Path) -> LiveConfig:
         InputError: the first problem, with file, key and line.
         MissingExtraError: a driver's library is not installed.
     """
-    data = load_yaml(path, path.name, max_bytes=_MAX_BYTES)
+    data = load_yaml(path, path.name)
     try:
         return _Reader(path, data).read()
     except FieldError as error:

@@ -7,10 +7,10 @@ from enum import Enum
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from fgreg.errors import one_line
+from fgreg.limits import NAME_BYTES
 from fgreg.schema.kinds import JsonSchema, Kind
 from fgreg.schema.problems import FieldError, shown
 
-_MAX_NAME = 1024
 _FILE_NAME = "a relative name of a file inside the session's folder"
 
 
@@ -34,7 +34,7 @@ class FileName(Kind):
             raise FieldError.of(shown(value), self.expected)
         windows = PureWindowsPath(value)
         outside = PurePosixPath(value).is_absolute() or windows.drive or windows.root or ".." in windows.parts
-        if outside or not value.isprintable() or len(value) > _MAX_NAME:
+        if outside or not value.isprintable() or len(value) > NAME_BYTES:
             raise FieldError.of(shown(value), _FILE_NAME)
         if folder is None:
             raise AssertionError("names are relative to a folder")
@@ -59,7 +59,7 @@ class FileName(Kind):
         return "the name of a file"
 
     def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
-        return {"type": "string", "minLength": 1, "maxLength": _MAX_NAME}
+        return {"type": "string", "minLength": 1, "maxLength": NAME_BYTES}
 
 
 @dataclass(frozen=True, slots=True)

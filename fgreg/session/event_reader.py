@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import IO
 
 from fgreg.errors import InputError, one_line
+from fgreg.limits import DIGITS, EVENT_LINES, LINE_BYTES, PROBLEMS
 from fgreg.model.events import (
     EVENTS,
     AimEvent,
@@ -26,9 +27,6 @@ from fgreg.schema.problems import FieldError, Problem, input_error, path_text, s
 from fgreg.session.frame_files import FrameUse
 from fgreg.session.setup_reader import Setup
 from fgreg.session.yaml_loader import open_file
-
-MAX_LINE_BYTES = 1_000_000
-_MAX_INTEGER_DIGITS = 30
 
 
 @dataclass(slots=True)
@@ -194,27 +192,33 @@ def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator
     number = 0
     while True:
         try:
-            line = stream.readline(MAX_LINE_BYTES + 1)
+            line = stream.readline(LINE_BYTES + 1)
         except OSError as error:
             problems.append(InputError(file, f"no access ({error.strerror})", "a file that can be read"))
             return
         if not line:
             return
         number += 1
+        if number > EVENT_LINES:
+            problems.append(InputError(file, f"more than {EVENT_LINES} lines", "fewer: several sessions"))
+            return
+        if len(problems) >= PROBLEMS:
+            problems.append(InputError(file, f"more than {PROBLEMS} problems", "fewer"))
+            return
         if number == 1:
             line = line.removeprefix(b"\xef\xbb\xbf")
-        if len(line) > MAX_LINE_BYTES:
+        if len(line) > LINE_BYTES:
             # The rest cannot be split into lines.
             where = f"{file}: line {number}"
-            problems.append(InputError(where, "a longer line", f"at most {MAX_LINE_BYTES} bytes"))
+            problems.append(InputError(where, "a longer line", f"at most {LINE_BYTES} bytes"))
             return
         yield number, line
 
 
 def _parse(line: bytes) -> Mapping[str, object]:
     """The object on a line. Raises FieldError where it is invalid, _CutShortError where a last line is truncated."""
-    if len(line) > MAX_LINE_BYTES:
-        raise FieldError.of(f"{len(line)} bytes", f"at most {MAX_LINE_BYTES}")
+    if len(line) > LINE_BYTES:
+        raise FieldError.of(f"{len(line)} bytes", f"at most {LINE_BYTES}")
     expected = "one JSON object"
     try:
         value = json.loads(
@@ -258,4 +262,4 @@ def _refuse_constant(name: str) -> float:
 
 def _integer(digits: str) -> int | float:
     # Python refuses to convert thousands of digits; no field needs more precision than a double.
-    return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)
+    return int(digits) if len(digits) <= DIGITS else float(digits)

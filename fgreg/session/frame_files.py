@@ -15,6 +15,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from fgreg.errors import InputError
+from fgreg.limits import FRAME_BYTES, NPY_HEADER_BYTES, PICTURE_PIXELS
 from fgreg.model.session_model import ProbeModel
 from fgreg.schema.files import FrameKind
 from fgreg.schema.problems import shown
@@ -22,7 +23,6 @@ from fgreg.session.exif import UPRIGHT, orientation_in
 from fgreg.session.yaml_loader import open_file
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_MAX_BYTES = 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,9 @@ def check_camera_frame(path: Path, name: str, where: str, image_size: tuple[int,
         if found is None:
             raise InputError(where, f"{shown(name)}, which is not a complete PNG", "a PNG image")
         size, turned = found
+        if size[0] * size[1] > PICTURE_PIXELS:
+            text = f"{shown(name)} with {size[0]} x {size[1]} px"
+            raise InputError(where, text, f"at most {PICTURE_PIXELS} px")
         if turned != UPRIGHT:
             text = f"{shown(name)} with EXIF orientation {turned}"
             raise InputError(where, text, "pixels as the sensor has them: orientation 1")
@@ -129,8 +132,10 @@ def check_trus_frame(path: Path, name: str, where: str, probe: ProbeModel | None
             raise InputError(where, f"{shown(name)} with Python objects", "an NPY array of numbers")
         needed = file.tell() + dtype.itemsize * math.prod(shape)
         size = os.fstat(file.fileno()).st_size
-        if not needed <= size <= _MAX_BYTES:
+        if needed > size:
             raise InputError(where, f"{shown(name)} with {size} bytes", f"{needed} bytes, as its header says")
+        if size > FRAME_BYTES:
+            raise InputError(where, f"{shown(name)} with {size} bytes", f"at most {FRAME_BYTES}")
         problem = None if probe is None else trus_frame_problem(shape, dtype, probe)
         if problem is not None:
             raise InputError(where, f"{shown(name)} with {problem[0]}", problem[1])
@@ -144,6 +149,11 @@ def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[np.generic]]
         version = npy_format.read_magic(file)
         if version not in ((1, 0), (2, 0), (3, 0)):
             return None
+        at = file.tell()
+        length = int.from_bytes(file.read(2 if version == (1, 0) else 4), "little")
+        if length > NPY_HEADER_BYTES:
+            return None
+        file.seek(at)
         read = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fgreg.errors import InputError
+from fgreg.limits import RESULT_BYTES, RESULT_NODES
 from fgreg.model.estimate import RESULT, SessionEstimate
 from fgreg.model.session_model import SessionModel
 from fgreg.schema.problems import FieldError, input_error
@@ -17,8 +18,6 @@ from fgreg.session.yaml_loader import load_yaml
 RESULT_FILE = "result.yaml"
 
 _SESSION_FILES = frozenset({"session.yaml", "events.jsonl", "ground_truth.yaml"})
-_MAX_BYTES = 256_000_000
-_MAX_NODES = 20_000_000
 _ONE_LINE = frozenset({"predicted_tre_mm", "checks", "pairs", "tracks", "add", "track"})
 
 _FORMAT_LINE = b"format: fgreg-result/"
@@ -86,7 +85,7 @@ def read_result(path: Path) -> SessionEstimate:
     Raises:
         InputError: the first problem of the file.
     """
-    data = load_yaml(path, path.name, max_bytes=_MAX_BYTES, max_nodes=_MAX_NODES)
+    data = load_yaml(path, path.name, max_bytes=RESULT_BYTES, max_nodes=RESULT_NODES)
     try:
         estimate: SessionEstimate = RESULT.read(data)
         _check_indices(estimate)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgreg.errors import InputError
+from fgreg.limits import TRUTH_BYTES, TRUTH_NODES
 from fgreg.model.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.model.plausible import implausible_distances
 from fgreg.model.session_model import SessionModel
@@ -26,9 +27,6 @@ from fgreg.session.yaml_loader import load_yaml
 SETUP_FILE = "session.yaml"
 EVENTS_FILE = "events.jsonl"
 TRUTH_FILE = "ground_truth.yaml"
-
-_TRUTH_BYTES = 64_000_000
-_TRUTH_NODES = 2_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +170,7 @@ def _read_truth(folder: Path, problems: list[InputError]) -> GroundTruth | None:
     path = folder / TRUTH_FILE
     if not os.path.lexists(path):
         return None
-    data = load_yaml(path, TRUTH_FILE, max_bytes=_TRUTH_BYTES, max_nodes=_TRUTH_NODES)
+    data = load_yaml(path, TRUTH_FILE, max_bytes=TRUTH_BYTES, max_nodes=TRUTH_NODES)
     try:
         truth: GroundTruth = GROUND_TRUTH.read(data)
     except FieldError as error:

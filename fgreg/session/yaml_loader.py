@@ -11,6 +11,7 @@ It uses the parser's events, so no constructor of PyYAML runs. Differences from 
 
 from __future__ import annotations
 
+import os
 import re
 import stat
 from dataclasses import dataclass
@@ -20,9 +21,7 @@ from typing import IO
 import yaml
 
 from fgreg.errors import InputError, one_line
-
-MAX_DEPTH = 32
-"""Largest nesting of a file; the formats here need seven levels."""
+from fgreg.limits import DIGITS, NESTING, SETUP_BYTES, SETUP_NODES
 
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
@@ -31,7 +30,6 @@ _OLD_NUMBER = re.compile(r"([-+]?[0-9]+\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
 _SPECIAL = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _TRUTH = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _NULLS = frozenset({"", "~", "null", "Null", "NULL"})
-_MAX_INTEGER_DIGITS = 30
 
 # libyaml's parser where the wheel includes it (ten times faster); the pure one raises the same errors.
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -89,15 +87,18 @@ def read_bounded(path: Path, label: str, max_bytes: int) -> bytes:
     """
     with open_file(path, label) as file:
         try:
-            data = file.read(max_bytes + 1)
+            size = os.fstat(file.fileno()).st_size
+            data = b"" if size > max_bytes else file.read(size + 1)  # reserves a buffer of this size at once
+            if len(data) > size:  # it grows
+                data += file.read(max_bytes + 1 - len(data))
         except OSError as error:
             raise InputError(label, f"no access ({error.strerror})", "a file that can be read") from None
-    if len(data) > max_bytes:
+    if max(size, len(data)) > max_bytes:
         raise InputError(label, f"more than {max_bytes} bytes", f"a file of at most {max_bytes} bytes")
     return data
 
 
-def load_yaml(path: Path, label: str, *, max_bytes: int = 4_000_000, max_nodes: int = 200_000) -> YamlMapping:
+def load_yaml(path: Path, label: str, *, max_bytes: int = SETUP_BYTES, max_nodes: int = SETUP_NODES) -> YamlMapping:
     """Read the top mapping of a YAML file.
 
     Args:
@@ -117,7 +118,7 @@ def load_yaml(path: Path, label: str, *, max_bytes: int = 4_000_000, max_nodes: 
     return parse_yaml(text, label, max_nodes=max_nodes)
 
 
-def parse_yaml(text: str, label: str, *, max_nodes: int = 200_000) -> YamlMapping:
+def parse_yaml(text: str, label: str, *, max_nodes: int = SETUP_NODES) -> YamlMapping:
     """As :func:`load_yaml`, from a text."""
     builder = _Builder(label, max_nodes)
     try:
@@ -126,7 +127,7 @@ def parse_yaml(text: str, label: str, *, max_nodes: int = 200_000) -> YamlMappin
     except yaml.MarkedYAMLError as error:
         where = f"{label}: line {error.problem_mark.line + 1}" if error.problem_mark else label
         if "nesting" in (error.problem or ""):  # libyaml may reach its own nesting limit first
-            raise InputError(where, "nesting too deep", f"at most {MAX_DEPTH} levels") from None
+            raise InputError(where, "nesting too deep", f"at most {NESTING} levels") from None
         raise InputError(where, f"bad YAML ({_problem(error.problem)})", "YAML") from None
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(label, f"bad YAML ({_problem(getattr(error, 'reason', None))})", "YAML") from None
@@ -223,8 +224,8 @@ class _Builder:
         if known is None:
             raise self._error(line, f"the alias *{one_line(anchor, 60)} inside its own anchor", "data without loops")
         value, size, height = known
-        if len(self._stack) + height > MAX_DEPTH:
-            raise self._error(line, "nesting too deep", f"at most {MAX_DEPTH} levels")
+        if len(self._stack) + height > NESTING:
+            raise self._error(line, "nesting too deep", f"at most {NESTING} levels")
         self._count(size, line)
         top = self._stack[-1] if self._stack else None
         if top is not None and isinstance(top.node, YamlMapping) and top.key is None:
@@ -236,8 +237,8 @@ class _Builder:
         top = self._stack[-1] if self._stack else None
         if top is not None and isinstance(top.node, YamlMapping) and top.key is None:
             raise self._error(line, "a list or mapping as a key", "a text as a key")
-        if len(self._stack) >= MAX_DEPTH:
-            raise self._error(line, "nesting too deep", f"at most {MAX_DEPTH} levels")
+        if len(self._stack) >= NESTING:
+            raise self._error(line, "nesting too deep", f"at most {NESTING} levels")
         if anchor is not None:
             self._anchors[anchor] = None
         self._stack.append(_Open(YamlMapping() if mapping else YamlSequence(), anchor, line))
@@ -265,7 +266,7 @@ class _Builder:
 
 
 def _height(node: object) -> int:
-    """Levels of nesting of a built value: at most ``MAX_DEPTH``, so recursion is safe."""
+    """Levels of nesting of a built value: at most ``NESTING``, so recursion is safe."""
     children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
     return 1 + max((_height(child) for child in children if isinstance(child, dict | list)), default=0)
 
@@ -278,7 +279,7 @@ def _plain_value(text: str) -> object:
         return _TRUTH[text]
     if _INTEGER.fullmatch(text):
         # Python refuses to convert thousands of digits; no field here needs more than a double holds.
-        return int(text) if len(text) <= _MAX_INTEGER_DIGITS else float(text)
+        return int(text) if len(text) <= DIGITS else float(text)
     if _LEADING_ZERO.fullmatch(text):
         return text
     if _NUMBER.fullmatch(text):

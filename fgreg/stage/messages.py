@@ -12,12 +12,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from fgreg.errors import FgregError
+from fgreg.limits import STAGE_TEXT
 from fgreg.stage.limits import MotionKind
-
-MAX_LINE = 4096
-"""Largest number of bytes of a line."""
-MAX_TEXT = 300
-"""Largest number of characters of a reason; the sender cuts longer ones."""
 
 
 class MessageError(FgregError):
@@ -127,7 +123,7 @@ def encode(message: Message) -> bytes:
     document = {"message": _NAMES[type(message)], **asdict(message)}
     for key in ("reason", "by"):
         if key in document:
-            document[key] = document[key][:MAX_TEXT]
+            document[key] = document[key][:STAGE_TEXT]
     return json.dumps(document, allow_nan=False).encode() + b"\n"
 
 
@@ -145,14 +141,14 @@ def decode(line: bytes) -> Message:
             raise ValueError(f"fields {sorted(document)}, expected {sorted(names)}")
         return kind(**{name: _checked(name, value) for name, value in document.items()})
     except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
-        raise MessageError(f"a message that cannot be read: {type(error).__name__}: {error}"[:MAX_TEXT]) from error
+        raise MessageError(f"a message that cannot be read: {type(error).__name__}: {error}"[:STAGE_TEXT]) from error
 
 
 def _checked(name: str, value: Any) -> Any:
     if value is None and name in _OPTIONAL:
         return None
     if name in ("reason", "by", "registration"):
-        if not isinstance(value, str) or len(value) > MAX_TEXT:
+        if not isinstance(value, str) or len(value) > STAGE_TEXT:
             raise ValueError(f"{name} is no text")
         return value
     if name == "kind":

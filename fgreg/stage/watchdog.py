@@ -26,9 +26,10 @@ from types import FrameType
 from typing import Any, TextIO, cast
 
 from fgreg.errors import FgregError, one_line
+from fgreg.limits import STAGE_LINE_BYTES
 from fgreg.stage.interface import RotationStage, StageError, StageLost, StageStatus
 from fgreg.stage.limits import MotionLimits
-from fgreg.stage.messages import MAX_LINE, Action, Arrived, Drive, Halt, MessageError, Refusal, decode
+from fgreg.stage.messages import Action, Arrived, Drive, Halt, MessageError, Refusal, decode
 from fgreg.stage.safety_gate import Gate
 
 TICK_S = 0.02
@@ -162,12 +163,12 @@ class Watchdog:
             self._end("the main program is gone")
             return
         *lines, self._in = (self._in + data).split(b"\n")
-        if len(self._in) > MAX_LINE:
+        if len(self._in) > STAGE_LINE_BYTES:
             lines, self._in = [*lines, self._in], b""
         for line in lines:
             try:
-                if len(line) > MAX_LINE:
-                    raise MessageError(f"a message of {len(line)} bytes, at most {MAX_LINE} allowed")
+                if len(line) > STAGE_LINE_BYTES:
+                    raise MessageError(f"a message of {len(line)} bytes, at most {STAGE_LINE_BYTES} allowed")
                 actions = self._gate.handle(decode(line), self._clock())
             except MessageError as error:
                 actions = self._gate.fault(str(error), self._clock())
