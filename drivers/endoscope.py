@@ -13,12 +13,11 @@ from __future__ import annotations
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -31,6 +30,7 @@ from fgreg.drivers.rectification import Rectification
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Origin, Timing, VideoInput
 from fgreg.errors import InputError
+from fgreg.limits import PICTURE_PIXELS
 from fgreg.model.time_sync import Stamp
 
 if TYPE_CHECKING:
@@ -272,20 +272,33 @@ class _Source:
             return cls(text, folder.again, played, "file")
         if not path.is_file():
             raise InputError(text, "nothing", "a video device, a stream, a video file, or a folder of pictures")
-        capture = _quietly(lambda: cv2.VideoCapture(text, cv2.CAP_FFMPEG))
+        try:
+            capture = _capture(text, cv2.CAP_FFMPEG)
+        except OSError as error:
+            raise InputError(text, str(error), "a video") from None
         try:
             if not capture.isOpened():
                 raise InputError(text, "a file that FFMPEG cannot read", "a video")
         finally:
             capture.release()
-        return cls(text, lambda: _quietly(lambda: cv2.VideoCapture(text, cv2.CAP_FFMPEG)), played, "file")
+        return cls(text, lambda: _capture(text, cv2.CAP_FFMPEG), played, "file")
+
+
+def _capture(*arguments: Any) -> cv2.VideoCapture:
+    """A capture whose frames, where their size is known, are not too large. Raises OSError."""
+    capture = cv2.VideoCapture(*arguments)
+    width, height = (round(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height > PICTURE_PIXELS:
+        capture.release()
+        raise OSError(f"frames of {width} x {height} px, more than {PICTURE_PIXELS}")
+    return capture
 
 
 def _open_device(path: str, config: InputConfig) -> Capture | None:
     if not os.path.exists(path):  # noqa: PTH110  (OpenCV would complain on standard error at each attempt)
         return None
     backend = cv2.CAP_V4L2 if sys.platform == "linux" else cv2.CAP_ANY
-    capture = _quietly(lambda: cv2.VideoCapture(int(path.removeprefix("/dev/video")), backend))
+    capture = _capture(int(path.removeprefix("/dev/video")), backend)
     # The pixel format first: available sizes and rates depend on it.
     if config.fourcc is not None:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
@@ -304,39 +317,9 @@ def _open_device(path: str, config: InputConfig) -> Capture | None:
 
 
 def _open_stream(url: str, silence_s: float) -> Capture | None:
-    # FFMPEG's own log would fill standard error during repeated attempts.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     patience_ms = max(1, round(1000.0 * silence_s))
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, patience_ms]
-    return _quietly(lambda: cv2.VideoCapture(url, cv2.CAP_FFMPEG, limits))
-
-
-class _Quiet:
-    """Suppresses OpenCV's own warnings while a source is opened, since absent devices are tried repeatedly."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._inside = self._before = 0
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if self._inside == 0:
-                self._before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-            self._inside += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
-                cv2.utils.logging.setLogLevel(self._before)
-
-
-_QUIET = _Quiet()
-
-
-def _quietly(make: Callable[[], cv2.VideoCapture]) -> cv2.VideoCapture:
-    with _QUIET:
-        return make()
+    return _capture(url, cv2.CAP_FFMPEG, limits)
 
 
 def video_devices(known: Path = Path("/sys/class/video4linux")) -> list[tuple[str, str]]:

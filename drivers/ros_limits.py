@@ -11,6 +11,9 @@ from typing import Any
 from fgreg.errors import InputError
 from fgreg.limits import CHUNK_BYTES
 
+_COMPUTED = """SELECT 1 FROM sqlite_master WHERE type NOT IN ('table', 'index')
+UNION ALL SELECT 1 FROM sqlite_master JOIN pragma_table_xinfo(sqlite_master.name) AS columns WHERE columns.hidden > 0"""
+
 
 def bound_chunks() -> None:
     """Let ``rosbags`` unpack a chunk of an MCAP file to the size that the chunk states, and to CHUNK_BYTES at most."""
@@ -30,7 +33,7 @@ def _unpacked(decompressor: Any, data: bytes, size: int) -> bytes:
 
 
 def check_tables(path: Path) -> None:
-    """Check that the tables of an SQLite recording are tables: a view may compute for ever.
+    """Check that the tables of an SQLite recording hold what they give: a view or a generated column computes it.
 
     Raises:
         InputError: they are not.
@@ -38,8 +41,8 @@ def check_tables(path: Path) -> None:
     for file in path.glob("*.db3") if path.is_dir() else [path] if path.suffix.lower() == ".db3" else []:
         try:
             with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
-                views = base.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchmany(1)
+                computed = base.execute(_COMPUTED).fetchmany(1)
         except sqlite3.Error:
             continue  # the reader of recordings says what is wrong
-        if views:
-            raise InputError(str(file), "views or triggers", "a recording with plain tables")
+        if computed:
+            raise InputError(str(file), "tables that are computed", "a recording with plain tables")

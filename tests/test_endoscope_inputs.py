@@ -194,6 +194,13 @@ def test_an_invalid_source_is_reported_at_once(tmp_path: Path, source: str, mess
         Endoscope(EndoscopeConfig(InputConfig(str(tmp_path / source))))
 
 
+def test_a_video_of_frames_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = video(tmp_path / "a.avi", [shade(1)])
+    monkeypatch.setattr("fgreg.drivers.endoscope.PICTURE_PIXELS", 64 * 48 - 1)
+    with pytest.raises(InputError, match="frames of 64 x 48 px, more than 3071"):
+        Endoscope(EndoscopeConfig(InputConfig(source)))
+
+
 def test_a_device_that_was_never_there_is_lost_within_a_second_and_closing_does_not_wait() -> None:
     endoscope = Endoscope(EndoscopeConfig(InputConfig("/dev/video4711", silence_s=0.4)))
     began = time.monotonic()
