@@ -15,7 +15,7 @@ from pathlib import Path
 # Texts
 
 NESTING = 32
-"""Levels of a YAML or JSON text; the formats here need seven."""
+"""Levels of a YAML text; the formats here need seven. JSON has Python's own limit, about 1,000."""
 DIGITS = 30
 """Digits of a whole number; longer ones are read as doubles, which is all that any field holds."""
 NAME_BYTES = 1024

@@ -27,9 +27,10 @@ from fgreg.drivers.calibration_files import read_calibration
 from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.drivers.ros_recordings import Recording
 from fgreg.errors import InputError
+from fgreg.live.config import read_config
 from fgreg.session.frame_files import check_camera_frame, check_trus_frame
 from fgreg.session.session_reader import check_session
-from tests import bags, session_files
+from tests import bags, live_configs, session_files
 
 POSE = "1 0 0 0 0 1 0 0 0 0 1 100 0 0 0 1"
 OPENCV = {
@@ -53,6 +54,15 @@ def test_deep_but_readable_opencv_files_are_judged_by_their_content(tmp_path: Pa
     path.write_text('{"M1": {"type_id": "opencv-matrix"}, "a": ' + "[" * 1000 + "]" * 1000 + "}", encoding="utf-8")
     with pytest.raises(InputError, match="no size of the images"):
         read_calibration([path])
+
+
+def test_a_live_session_refuses_them_before_it_starts(tmp_path: Path) -> None:
+    session, data = session_files.setup(), live_configs.config()
+    del session["camera"]
+    (tmp_path / "deep.yaml").write_text(OPENCV["yaml"], encoding="utf-8")
+    data["calibration"] = {"left": "deep.yaml"}
+    with pytest.raises(InputError, match=r"deep.yaml: found something that OpenCV cannot read \(its parser ended by"):
+        read_config(live_configs.write(tmp_path, data, session))
 
 
 def sequence(path: Path, head: str, pixels: bytes = b"") -> Path:
