@@ -26,8 +26,8 @@ from fgreg.drivers.base import BmodeFrame
 from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
 from fgreg.errors import InputError, one_line
-from fgreg.limits import BK_MESSAGE_BYTES, BK_SIDE
 from fgreg.model.time_sync import Stamp
+from fgreg.schema.limits import BK_MESSAGE_BYTES, BK_SIDE
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import BmodeSource, DriverContext

@@ -44,9 +44,9 @@ from fgreg.drivers.calibration_texts import is_ost, is_scikit_surgery, read_ost,
 from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, is_rigid
-from fgreg.limits import SETUP_BYTES
 from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.schema.kinds import Integer, Kind, Numbers, Text
+from fgreg.schema.limits import SETUP_BYTES
 from fgreg.schema.matrices import Matrix
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import load_yaml, read_bounded

@@ -27,8 +27,8 @@ from fgreg.drivers.calibration_parts import (
 )
 from fgreg.errors import InputError, one_line
 from fgreg.geometry.transforms import FloatArray
-from fgreg.limits import SETUP_BYTES
 from fgreg.model.camera_model import CameraModel, StereoRig
+from fgreg.schema.limits import SETUP_BYTES
 from fgreg.session.yaml_loader import read_bounded
 
 _L2R, _INTRINSICS, _DISTORTION = ".l2r.txt", ".intrinsics.txt", ".distortion.txt"

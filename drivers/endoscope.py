@@ -30,8 +30,8 @@ from fgreg.drivers.rectification import Rectification
 from fgreg.drivers.stereo_matching import StereoMatcher
 from fgreg.drivers.video_input import SILENCE_S, Capture, Grabbed, Origin, Timing, VideoInput
 from fgreg.errors import InputError
-from fgreg.limits import PICTURE_PIXELS
 from fgreg.model.time_sync import Stamp
+from fgreg.schema.limits import PICTURE_PIXELS
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext, StereoCamera

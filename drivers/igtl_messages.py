@@ -25,7 +25,7 @@ import numpy.typing as npt
 from fgreg.drivers.tcp_link import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import FloatArray
-from fgreg.limits import IGTL_BODY_BYTES
+from fgreg.schema.limits import IGTL_BODY_BYTES
 
 NAME_BYTES = 20
 HEADER = struct.Struct(">H12s20sIIQQ")

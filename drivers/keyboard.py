@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand
 from fgreg.drivers.operator_words import asked, understand
-from fgreg.limits import TYPED_LINE_BYTES
+from fgreg.schema.limits import TYPED_LINE_BYTES
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext, Operator

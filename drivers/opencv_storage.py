@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from fgreg.errors import InputError
-from fgreg.limits import CONFINED_SECONDS, SETUP_BYTES, confine
+from fgreg.schema.limits import CONFINED_SECONDS, SETUP_BYTES, confine
 from fgreg.session.yaml_loader import read_bounded
 from fgreg.workers.threads import NAMES
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fgreg.errors import InputError
-from fgreg.limits import CHUNK_BYTES
+from fgreg.schema.limits import CHUNK_BYTES
 
 _COMPUTED = """SELECT 1 FROM sqlite_master WHERE type NOT IN ('table', 'index')
 UNION ALL SELECT 1 FROM sqlite_master JOIN pragma_table_xinfo(sqlite_master.name) AS columns WHERE columns.hidden > 0"""

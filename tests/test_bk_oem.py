@@ -17,7 +17,7 @@ from fgreg.drivers.base import BmodeFrame, BmodeSource, DeviceLost
 from fgreg.drivers.bk_oem import BkOemScanner, OemDecoder, encode, unescape
 from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken
 from fgreg.errors import InputError
-from fgreg.limits import BK_MESSAGE_BYTES
+from fgreg.schema.limits import BK_MESSAGE_BYTES
 from tests.bk_emulator import Scanner, Unframer, frame, grabbed
 from tests.network_peers import collect, wait_for
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fgreg.drivers.tcp_link import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
-from fgreg.limits import IGTL_BODY_BYTES
+from fgreg.schema.limits import IGTL_BODY_BYTES
 from tests.igtl_bytes import crc64, image_body, message, read_message, transform_body
 
 pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")

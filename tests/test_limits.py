@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import pytest
 
-from fgreg import limits
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.plus import read_plus
 from fgreg.convert.sequence_file import read_sequence
@@ -28,6 +27,7 @@ from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.drivers.ros_recordings import Recording
 from fgreg.errors import InputError
 from fgreg.live.config import read_config
+from fgreg.schema import limits
 from fgreg.session.frame_files import check_camera_frame, check_trus_frame
 from fgreg.session.session_reader import check_session
 from tests import bags, live_configs, session_files

@@ -21,7 +21,7 @@ from fgreg.drivers.keyboard import MOST_WAITING, KeyboardOperator
 from fgreg.drivers.operator_words import EXPECTED, LETTERS, asked, understand
 from fgreg.drivers.operators import IgtlOperator, Operators
 from fgreg.drivers.tcp_link import Endpoint
-from fgreg.limits import TYPED_LINE_BYTES
+from fgreg.schema.limits import TYPED_LINE_BYTES
 from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
 

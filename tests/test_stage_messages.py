@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgreg.limits import STAGE_TEXT
 from fgreg.model.session_model import StageModel
+from fgreg.schema.limits import STAGE_TEXT
 from fgreg.stage.limits import MotionKind, MotionLimits
 from fgreg.stage.messages import (
     Beat,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgreg.errors import InputError
-from fgreg.limits import RECORDING_MEMORY, memory_at_most
+from fgreg.schema.limits import RECORDING_MEMORY, memory_at_most
 
 if TYPE_CHECKING:
     from fgreg.convert.drafts import Imported

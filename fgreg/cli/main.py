@@ -30,7 +30,7 @@ from fgreg.cli.schema import add_schema
 from fgreg.cli.streams import print_crash, take_streams
 from fgreg.cli.verify import add_verify
 from fgreg.errors import FgregError, InputError
-from fgreg.limits import tell_libraries
+from fgreg.schema.limits import tell_libraries
 from fgreg.version import __version__
 from fgreg.workers.threads import one_thread_each
 

@@ -18,7 +18,7 @@ from fgreg.convert.probe_frames import ProbeFrames
 from fgreg.convert.table import events_of_rows
 from fgreg.convert.variables import Variable, cell_text
 from fgreg.errors import InputError
-from fgreg.limits import EVENT_LINES
+from fgreg.schema.limits import EVENT_LINES
 
 _MATRICES = ("camera_T_marker", "camera_new_T_camera_old")
 _OF_FRAMES = ("frame", "frame_index")

@@ -18,7 +18,7 @@ from fgreg.convert import array_files
 from fgreg.convert.array_files import ArrayFile
 from fgreg.convert.mapping import RecordingMapping
 from fgreg.errors import FgregError, InputError, MissingExtraError
-from fgreg.limits import ARRAY_MEMORY, ARRAY_SECONDS
+from fgreg.schema.limits import ARRAY_MEMORY, ARRAY_SECONDS
 from fgreg.workers.worker_process import START_S, WorkerProcess
 
 _Question = tuple[str, tuple[Any, ...]]

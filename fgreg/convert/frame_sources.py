@@ -12,8 +12,8 @@ from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.probe_frames import DeclaredProbe, ProbeFrames
 from fgreg.detection.frame_files import png_bytes, read_picture
 from fgreg.errors import InputError
-from fgreg.limits import PICTURE_BYTES
 from fgreg.schema.files import exists
+from fgreg.schema.limits import PICTURE_BYTES
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 

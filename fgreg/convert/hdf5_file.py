@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fgreg.convert.variables import Variable
 from fgreg.errors import InputError, MissingExtraError
-from fgreg.limits import ARRAY_BYTES, ARRAY_VARIABLES
+from fgreg.schema.limits import ARRAY_BYTES, ARRAY_VARIABLES
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _NOT_VARIABLES = ("#refs#", "#subsystem#")

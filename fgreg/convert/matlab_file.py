@@ -12,7 +12,7 @@ import numpy as np
 
 from fgreg.convert.variables import Variable
 from fgreg.errors import InputError
-from fgreg.limits import ARRAY_BYTES, ARRAY_VARIABLES, NESTING
+from fgreg.schema.limits import ARRAY_BYTES, ARRAY_VARIABLES, NESTING
 
 
 def read_matlab(path: Path) -> dict[str, Variable]:

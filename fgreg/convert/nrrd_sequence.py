@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from fgreg.convert.sequence_file import SequenceFile
 from fgreg.errors import InputError, MissingExtraError
-from fgreg.limits import SEQUENCE_BYTES
+from fgreg.schema.limits import SEQUENCE_BYTES
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 

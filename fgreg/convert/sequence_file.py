@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
-from fgreg.limits import SEQUENCE_BYTES, SEQUENCE_FIELDS, SEQUENCE_FRAMES, SEQUENCE_HEADER_BYTES
+from fgreg.schema.limits import SEQUENCE_BYTES, SEQUENCE_FIELDS, SEQUENCE_FRAMES, SEQUENCE_HEADER_BYTES
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 

@@ -17,9 +17,9 @@ from fgreg.convert.mapping import COLUMNS, LOOK, Column, RecordingMapping
 from fgreg.errors import InputError
 from fgreg.geometry.quaternions import rotation_from_quaternion
 from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transform
-from fgreg.limits import EVENT_LINES, TABLE_BYTES, TABLE_COLUMNS
 from fgreg.schema.files import FrameName
 from fgreg.schema.kinds import Number
+from fgreg.schema.limits import EVENT_LINES, TABLE_BYTES, TABLE_COLUMNS
 from fgreg.schema.problems import shown
 from fgreg.session.yaml_loader import read_bounded
 

@@ -14,7 +14,7 @@ from fgreg.convert.mapping import RecordingMapping
 from fgreg.convert.probe_frames import DeclaredProbe, ProbeFrames, pitch_of, positive
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import as_float_array
-from fgreg.limits import ARRAY_BYTES
+from fgreg.schema.limits import ARRAY_BYTES
 
 _CLASS = "uff.channel_data"
 _MM_PER_M, _MHZ_PER_HZ, _US_PER_S = 1e3, 1e-6, 1e6

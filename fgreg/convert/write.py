@@ -9,8 +9,8 @@ from pathlib import Path
 from fgreg.convert.drafts import Draft, Imported
 from fgreg.convert.files import whole_folder
 from fgreg.errors import InputError, one_line
-from fgreg.limits import EVENT_LINES, SETUP_BYTES
 from fgreg.model.camera_model import STEREO_RIG, StereoRig
+from fgreg.schema.limits import EVENT_LINES, SETUP_BYTES
 from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.event_reader import frames_of, read_line
 from fgreg.session.event_writer import event_line

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.errors import InputError
-from fgreg.limits import PICTURE_BYTES
+from fgreg.schema.limits import PICTURE_BYTES
 from fgreg.session.exif import UPRIGHT, orientation
 from fgreg.workers.library_messages import printed_by_libraries
 

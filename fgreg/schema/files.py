@@ -7,8 +7,8 @@ from enum import Enum
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from fgreg.errors import one_line
-from fgreg.limits import NAME_BYTES
 from fgreg.schema.kinds import JsonSchema, Kind
+from fgreg.schema.limits import NAME_BYTES
 from fgreg.schema.problems import FieldError, shown
 
 _FILE_NAME = "a relative name of a file inside the session's folder"

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import IO
 
 from fgreg.errors import InputError, one_line
-from fgreg.limits import DIGITS, EVENT_LINES, LINE_BYTES, PROBLEMS
 from fgreg.model.events import (
     EVENTS,
     AimEvent,
@@ -23,6 +22,7 @@ from fgreg.model.events import (
 )
 from fgreg.schema.files import FrameKind
 from fgreg.schema.kinds import SECONDS
+from fgreg.schema.limits import DIGITS, EVENT_LINES, LINE_BYTES, PROBLEMS
 from fgreg.schema.problems import FieldError, Problem, input_error, path_text, shown
 from fgreg.session.frame_files import FrameUse
 from fgreg.session.setup_reader import Setup

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from fgreg.errors import InputError
-from fgreg.limits import FRAME_BYTES, NPY_HEADER_BYTES, PICTURE_PIXELS
 from fgreg.model.session_model import ProbeModel
 from fgreg.schema.files import FrameKind
+from fgreg.schema.limits import FRAME_BYTES, NPY_HEADER_BYTES, PICTURE_PIXELS
 from fgreg.schema.problems import shown
 from fgreg.session.exif import UPRIGHT, orientation_in
 from fgreg.session.yaml_loader import open_file

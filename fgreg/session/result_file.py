@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from fgreg.errors import InputError
-from fgreg.limits import RESULT_BYTES, RESULT_NODES
 from fgreg.model.estimate import RESULT, SessionEstimate
 from fgreg.model.session_model import SessionModel
+from fgreg.schema.limits import RESULT_BYTES, RESULT_NODES
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.schema.yaml_writer import yaml_text
 from fgreg.session.atomic_file import why_refused, write_atomically

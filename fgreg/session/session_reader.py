@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgreg.errors import InputError
-from fgreg.limits import TRUTH_BYTES, TRUTH_NODES
 from fgreg.model.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.model.plausible import implausible_distances
 from fgreg.model.session_model import SessionModel
+from fgreg.schema.limits import TRUTH_BYTES, TRUTH_NODES
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.session.event_reader import EventLog, frames_of, read_events
 from fgreg.session.frame_files import check_frames

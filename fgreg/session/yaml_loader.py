@@ -21,7 +21,7 @@ from typing import IO
 import yaml
 
 from fgreg.errors import InputError, one_line
-from fgreg.limits import DIGITS, NESTING, SETUP_BYTES, SETUP_NODES
+from fgreg.schema.limits import DIGITS, NESTING, SETUP_BYTES, SETUP_NODES
 
 _NUMBER = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")

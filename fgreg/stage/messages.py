@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from fgreg.errors import FgregError
-from fgreg.limits import STAGE_TEXT
+from fgreg.schema.limits import STAGE_TEXT
 from fgreg.stage.limits import MotionKind
 
 

@@ -26,7 +26,7 @@ from types import FrameType
 from typing import Any, TextIO, cast
 
 from fgreg.errors import FgregError, one_line
-from fgreg.limits import STAGE_LINE_BYTES
+from fgreg.schema.limits import STAGE_LINE_BYTES
 from fgreg.stage.interface import RotationStage, StageError, StageLost, StageStatus
 from fgreg.stage.limits import MotionLimits
 from fgreg.stage.messages import Action, Arrived, Drive, Halt, MessageError, Refusal, decode
