@@ -15,6 +15,7 @@ import yaml
 from typer.testing import CliRunner
 
 from fgreg.cli.main import app
+from fgreg.convert.export import WRITERS
 from fgreg.errors import FgregError, InputError
 from fgreg.geometry.transforms import exp_so3
 from tests import session_files
@@ -160,11 +161,18 @@ def test_an_epoch_without_a_transform_is_not_exported_even_by_force(tmp_path: Pa
 
 
 def test_what_is_there_stays_there_unless_overwriting_is_asked_for(tmp_path: Path) -> None:
-    folder, out = result(tmp_path / "s"), tmp_path / "r.json"
+    folder, out = result(tmp_path / "s", verdict="warning"), tmp_path / "r.json"
     out.write_text("mine", encoding="utf-8")
     assert "found a file of this name" in refused(folder, out)
     assert out.read_text(encoding="utf-8") == "mine"
-    assert convert(folder, out, "--overwrite").exit_code == 0
+    assert "a file that is not a JSON file of fgreg" in refused(folder, out, "--overwrite")
+    assert out.read_text(encoding="utf-8") == "mine"
+    out.unlink()
+    for suffix in WRITERS:
+        for _ in range(2):  # its own older file is told by its content, whatever the verdict says at its head
+            assert convert(folder, tmp_path / f"r{suffix}", "--overwrite").exit_code == 0
+        (tmp_path / f"r{suffix}").unlink()
+    assert convert(folder, out).exit_code == 0
     assert "own file" in refused(folder, folder / "session.yaml", "--overwrite")
     assert "own file" in refused(folder, folder / "result.yaml", "--overwrite")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r.json", "s"]

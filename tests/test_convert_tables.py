@@ -204,7 +204,7 @@ def test_a_session_that_is_there_is_replaced_only_when_the_new_one_is_whole(tmp_
     where = setup(tmp_path)
     assert convert(good, tmp_path / "s", "--setup", where).exit_code == 0
     before = (tmp_path / "s" / "events.jsonl").read_bytes()
-    assert "no empty folder" in refused(good, tmp_path / "s", "--setup", where)
+    assert "not empty" in refused(good, tmp_path / "s", "--setup", where)
     bad = table(tmp_path, ROW + f"1,{POSE},2,3,900,0\n")
     refused(bad, tmp_path / "s", "--setup", where, "--overwrite")
     assert (tmp_path / "s" / "events.jsonl").read_bytes() == before

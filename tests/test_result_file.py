@@ -30,7 +30,8 @@ from fgreg.model.estimate import (
     Verdict,
 )
 from fgreg.model.session_model import SessionModel
-from fgreg.session.result_file import read_result, remove_result, write_result
+from fgreg.output.atomic_file import check_output
+from fgreg.session.result_file import RESULT_KIND, read_result, write_result
 from fgreg.session.session_reader import read_session
 from tests import session_files
 
@@ -265,7 +266,8 @@ def test_a_failure_on_the_way_leaves_the_older_file_and_no_other(
     tmp_path: Path, model: SessionModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "result.yaml"
-    path.write_text("older")
+    write_result(an_estimate(2), model, path, "0.2.0")
+    older = path.read_bytes()
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
@@ -274,7 +276,7 @@ def test_a_failure_on_the_way_leaves_the_older_file_and_no_other(
         patch.setattr(os, "fsync", full)
         with pytest.raises(InputError, match="No space left on device"):
             write_result(an_estimate(), model, path, "0.3.0")
-    assert path.read_text() == "older"
+    assert path.read_bytes() == older
     assert sorted(p.name for p in tmp_path.iterdir()) == ["result.yaml", "session"]
     write_result(an_estimate(), model, path, "0.3.0")
     assert read_result(path).session == "phantom-01"
@@ -287,43 +289,42 @@ def test_a_new_result_has_the_permissions_of_any_new_file(tmp_path: Path, model:
     assert (tmp_path / "result.yaml").stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
-def test_an_older_result_is_removed_and_nothing_else(tmp_path: Path) -> None:
-    path = tmp_path / "result.yaml"
-    remove_result(path)
-    path.write_text("older")
-    remove_result(path)
-    assert not path.exists()
+def test_only_an_older_result_is_replaced_told_by_its_content(tmp_path: Path, model: SessionModel) -> None:
     target = tmp_path / "target"
-    target.write_text("kept")
-    path.symlink_to(target)
-    other = tmp_path / "thesis.tex"
-    other.write_text("kept")
-    for not_ours in (path, other):
+    write_result(an_estimate(), model, target, "0.3.0")
+    link, named, other = tmp_path / "link.yaml", tmp_path / "result.yaml", tmp_path / "thesis.tex"
+    link.symlink_to(target)
+    named.write_text("name: mine")
+    other.write_text("")
+    for not_ours in (link, named, other):
+        before = not_ours.read_bytes()
         with pytest.raises(InputError, match="a file that is not a result"):
-            remove_result(not_ours)
-        assert not_ours.read_text() == "kept"
-    named = tmp_path / "mine.yaml"
-    named.write_text("format: fgreg-result/1\n")
-    remove_result(named)
-    assert not named.exists()
+            write_result(an_estimate(), model, not_ours, "0.3.0")
+        assert not_ours.read_bytes() == before
+    write_result(an_estimate(), model, target, "0.4.0")
+    assert read_result(target).version == "0.4.0"
+    assert link.is_symlink()
 
 
 def test_places_where_no_result_can_be(tmp_path: Path) -> None:
     session = session_files.write(tmp_path / "session")
+    (session / "ground_truth.yaml").unlink(missing_ok=True)
     for path, found in (
         (session / "session.yaml", "the name of a session's own file"),
-        (session / "events.jsonl", "the name of a session's own file"),
+        (session / "ground_truth.yaml", "the name of a session's own file"),
         (tmp_path / "none" / "result.yaml", "no such folder"),
         (session / "session.yaml" / "result.yaml", "no such folder"),
         (session, "a folder"),
+        (session / ("x" * 300), "no access (File name too long)"),
     ):
         with pytest.raises(InputError) as caught:
-            remove_result(path)
+            check_output(path, RESULT_KIND)
         assert caught.value.found == found
     assert len(read_session(session).events) == 16
 
 
 def written(tmp_path: Path, model: SessionModel) -> dict[str, Any]:
+    (tmp_path / "result.yaml").unlink(missing_ok=True)
     write_result(an_estimate(), model, tmp_path / "result.yaml", "0.3.0")
     data: dict[str, Any] = yaml.safe_load((tmp_path / "result.yaml").read_text(encoding="utf-8"))
     return data

@@ -386,7 +386,7 @@ def test_a_session_without_shots_makes_a_recording(tmp_path: Path) -> None:
 
 def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None:
     path = tmp_path / "phantom.rrd"
-    path.write_bytes(b"RRF2 an older one")
+    path.write_bytes(b"RRF2 an older one of fgreg")
 
     def crash() -> None:
         with open_viewer(path, "phantom") as viewer:
@@ -395,33 +395,38 @@ def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None
 
     with pytest.raises(ZeroDivisionError):
         crash()
-    assert path.read_bytes() == b"RRF2 an older one"
+    assert path.read_bytes() == b"RRF2 an older one of fgreg"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_recording_takes_the_place_of_an_older_one_and_leaves_no_other_file(tmp_path: Path) -> None:
     path = tmp_path / "phantom.rrd"
-    path.write_bytes(b"RRF2 an older one")
-    with open_viewer(path, "phantom") as viewer:
-        viewer.session(make_session())
+    for _ in range(2):
+        with open_viewer(path, "phantom") as viewer:
+            viewer.session(make_session())
     assert "/world/probe" in read_recording(path)
     assert "world" in views(path)
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_folder_that_does_not_exist_is_bad_input(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="no such folder"):
         open_viewer(tmp_path / "nowhere" / "a.rrd", "a")
     with pytest.raises(InputError, match="found a folder"):
         open_viewer(tmp_path, "a")
 
 
 def test_nothing_but_a_recording_is_written_over(tmp_path: Path) -> None:
-    path = tmp_path / "events.jsonl"
-    path.write_text("{}")
-    with pytest.raises(InputError, match="a file that is not a recording"):
-        open_viewer(path, "a")
-    assert path.read_text() == "{}"
+    for name, content, found in (
+        ("events.jsonl", b"{}", "the name of a session's own file"),
+        ("notes.txt", b"{}", "a file that is not a recording"),
+        ("other.rrd", b"RRF2 of another program", "a file that is not a recording"),
+    ):
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=found):
+            open_viewer(path, "a")
+        assert path.read_bytes() == content
 
 
 def test_the_null_viewer_takes_every_call_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fgreg.cli.options import warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
             found = "nothing" if out is None else "both"
             raise InputError("--out, --check", found, "one of the two")
         if out is not None:
+            warn_of_leftovers(out)
             with progress_bar(quiet or as_json) as progress:
                 report = commission_sessions(sessions, out, use_checks=checks, progress=progress)
             _warn(report.sessions, implausible_rig(report.rig, str(out)))

@@ -1,5 +1,6 @@
 """The command ``fgreg convert``."""
 
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgreg.cli.options import warn_of_leftovers
 from fgreg.errors import InputError
 from fgreg.schema.limits import RECORDING_MEMORY, memory_at_most
 
@@ -82,6 +84,7 @@ def add_convert(app: typer.Typer) -> None:
         overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing OUT.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
     ) -> None:
+        warn_of_leftovers(out)
         result = _result_file(source)
         if result is not None:
             unused = {"--setup": setup, "--map": mapping, "--calibration": calibration or None}
@@ -128,14 +131,17 @@ def _result_file(source: Path) -> Path | None:
 
 def _export(result: Path, out: Path, epoch: int | None, force: bool, overwrite: bool) -> str:
     from fgreg.convert.export import WRITERS, registration_of
-    from fgreg.convert.files import write_whole
+    from fgreg.output.atomic_file import check_output, write_file
     from fgreg.session.result_file import read_result
 
-    writer = WRITERS.get(out.suffix.lower())
-    if writer is None:
+    if out.suffix.lower() not in WRITERS:
         raise InputError(str(out), f"a name that ends in {out.suffix or 'nothing'}", "one in " + ", ".join(WRITERS))
+    if os.path.lexists(out) and not out.is_dir() and not overwrite:
+        raise InputError(str(out), "a file of this name", "a new name, or --overwrite")
+    writer, kind = WRITERS[out.suffix.lower()]
+    check_output(out, kind)
     registration = registration_of(read_result(result), result, epoch=epoch, force=force)
-    write_whole(out, writer(registration), overwrite=overwrite)
+    write_file(out, writer(registration), kind)
     marked = ", REFUSED and marked as such" if registration.refused else ""
     return f"{out}: epoch {registration.epoch} of {registration.session}, verdict {registration.verdict}{marked}"
 
@@ -155,8 +161,12 @@ def _import(
     from fgreg.convert.mapping import RecordingMapping, read_mapping
     from fgreg.convert.write import MOST_SAID, write_session
     from fgreg.drivers.calibration_files import read_calibration
+    from fgreg.output.session_folder import check_folder
     from fgreg.session.yaml_loader import load_yaml
 
+    place = check_folder(out, overwrite=overwrite)
+    if overwrite and source.resolve().is_relative_to(place):
+        raise InputError(str(source), f"a recording inside of {out}, which is to be replaced", "another OUT")
     rig = None
     if calibration:
         file = setup / "session.yaml" if setup.is_dir() else setup

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgreg.cli.options import warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,11 +58,12 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         TRE. Exit status 1 where a verdict is refused.
         """
         from fgreg.evaluation.case import EvaluationConfig
-        from fgreg.evaluation.export import as_csv, as_dict
-        from fgreg.evaluation.plots import FORMATS, new_figure, save_plots
+        from fgreg.evaluation.export import CSV_FILE, as_csv, as_dict
+        from fgreg.evaluation.plots import FORMATS, check_plots, plot_files, save_plots
         from fgreg.evaluation.run import evaluate as run
         from fgreg.evaluation.tables import print_evaluation
         from fgreg.model.estimate import Verdict
+        from fgreg.output.atomic_file import check_outputs, write_file
 
         for option, value, least in (("--folds", folds, 0), ("--subsets", subsets, 0), ("--seed", seed, 0)):
             if value < least:
@@ -73,7 +75,11 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         if plot_format not in FORMATS:
             raise InputError("--plot-format", plot_format, "one of " + ", ".join(FORMATS))
         if plots is not None:
-            new_figure()  # reports a missing library before the work starts
+            check_plots(plots, plot_format)
+        pictures = [] if plots is None else plot_files(plots, plot_format)
+        outputs = [("--plots", path, FORMATS[plot_format]) for path in pictures if path.parent.is_dir()]
+        check_outputs([("--csv", csv, CSV_FILE), *outputs])
+        warn_of_leftovers(*sessions, csv, plots)
         config = EvaluationConfig(
             folds=folds,
             leave_one_out=one_by_one,
@@ -87,7 +93,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
             cases, conditions = named_apart([case for case, _ in read], sessions), [found for _, found in read]
             found = run(cases, config, jobs=jobs or _cores(), progress=progress, conditions=conditions)
         if csv is not None:
-            write_text(csv, as_csv(found), "--csv")
+            write_file(csv, as_csv(found), CSV_FILE)
         written = save_plots(found, plots, plot_format) if plots is not None else []
         if as_json:
             typer.echo(json.dumps(as_dict(found), indent=2))
@@ -164,18 +170,6 @@ def named_apart(cases: "list[Case]", folders: list[Path]) -> "list[Case]":
         replace(case, name=str(folder)) if names.count(case.name) > 1 else case
         for case, folder in zip(cases, folders, strict=True)
     ]
-
-
-def write_text(path: Path, text: str, option: str) -> None:
-    """Write a file that the user asked for.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(option, f"{path}: {error.strerror}", "a file that can be written") from error
 
 
 def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]":

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import LimitOption, solve_config
+from fgreg.cli.options import LimitOption, solve_config, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -118,7 +118,10 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         from fgreg.cli.report_document import summary_dict
         from fgreg.live.launch import default_folder
         from fgreg.model.estimate import Verdict
+        from fgreg.output.atomic_file import check_outputs
         from fgreg.pipeline.solve import SolveRequest, solve_session
+        from fgreg.session.result_file import RESULT_FILE, RESULT_KIND
+        from fgreg.viewer.recording_file import RECORDING
 
         if duration is not None and not 0 < duration < math.inf:
             raise InputError("--duration", str(duration), "seconds > 0")
@@ -127,6 +130,9 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
         settings = solve_config(limit_mm, "")
         folder = default_folder() if out is None else out
         silent = as_json or quiet
+        result = folder / RESULT_FILE if folder.is_dir() else None
+        check_outputs([("the result", result, RESULT_KIND), ("--rrd", rrd, RECORDING)])
+        warn_of_leftovers(folder, rrd)
         with ExitStack() as stack:
             viewer = not (no_viewer or silent)
             seen = viewer or rrd is not None

@@ -24,7 +24,7 @@ from fgreg.cli.convert import add_convert
 from fgreg.cli.devices import add_devices
 from fgreg.cli.evaluate import add_commands
 from fgreg.cli.live import add_live
-from fgreg.cli.options import EstimateOption, LimitOption, solve_config
+from fgreg.cli.options import EstimateOption, LimitOption, solve_config, warn_of_leftovers
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
 from fgreg.cli.streams import print_crash, take_streams
@@ -182,6 +182,7 @@ def solve(
     from fgreg.pipeline.solve import SolveRequest, solve_session
 
     config = solve_config(limit_mm, estimate)
+    warn_of_leftovers(session, out, rrd)
     with _progress(quiet or as_json) as progress:
         report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves), config, progress)
     if as_json or not quiet:
@@ -327,6 +328,7 @@ def simulate(
     """
     from dataclasses import replace
 
+    from fgreg.output.session_folder import check_folder
     from fgreg.simulation.config import Sweep
     from fgreg.simulation.deviations import with_deviations
     from fgreg.simulation.presets import PRESETS
@@ -361,6 +363,8 @@ def simulate(
         raise InputError("--off", str(error), "a name among these") from error
     declared = {key: _number("--declare", value) for key, value in _named_values("--declare", declare)}
     config = replace(config, declared=declared, camera_declared=camera)
+    warn_of_leftovers(out)
+    check_folder(out, overwrite=overwrite)
     with _progress(quiet) as progress:
         try:
             simulated = run(config, seed)

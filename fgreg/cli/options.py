@@ -1,5 +1,7 @@
 """Options that several commands share, and their settings."""
 
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -49,3 +51,11 @@ def solve_config(
         )
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
+
+
+def warn_of_leftovers(*paths: Path | None) -> None:
+    """Name on standard error what interrupted runs left beside these outputs, and how to take it back."""
+    from fgreg.output.leftovers import leftovers
+
+    for text in dict.fromkeys(text for path in paths if path is not None for text in leftovers(path)):
+        sys.stderr.write(f"fgreg: warning: {text}\n")

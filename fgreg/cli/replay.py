@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import LimitOption, OnlineEstimateOption, solve_config
+from fgreg.cli.options import LimitOption, OnlineEstimateOption, solve_config, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         pace = _speed(speed)
         config = solve_config(limit_mm, estimate, ("sound_speed",))
+        warn_of_leftovers(session, out, rrd)
         with _display(quiet or as_json) as (progress, on_step):
             request = ReplayRequest(session, out, rrd, live, pace, redetect)
             report = replay_session(request, config, progress, on_step)

@@ -27,9 +27,11 @@ from fgreg.errors import InputError, one_line
 from fgreg.geometry.quaternions import quaternion_from_rotation
 from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.model.estimate import SessionEstimate, Verdict
+from fgreg.output.atomic_file import FileKind
 from fgreg.version import __version__
 
 JSON_FORMAT = "fgreg-transform/1"
+_PLUS_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n<PlusConfiguration version="2.9">\n'
 _LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
@@ -120,8 +122,7 @@ def plus_xml(found: Exported) -> str:
     notes = [f"Registration of session {found.session}, epoch {found.epoch}, by fgreg {__version__}; mm"]
     comments = "".join(f"  <!-- {_comment(line)} -->\n" for line in [*notes, *found.warning_lines])
     return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n<PlusConfiguration version="2.9">\n'
-        f"{comments}  <CoordinateDefinitions>\n"
+        f"{_PLUS_HEAD}{comments}  <CoordinateDefinitions>\n"
         f'    <Transform From="Camera" To="Trus" Matrix={quoteattr(matrix)}{error}'
         f' Date="{found.solved:%Y.%m.%d %H:%M:%S}" />\n'
         "  </CoordinateDefinitions>\n</PlusConfiguration>\n"
@@ -186,15 +187,20 @@ def as_json(found: Exported) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
-WRITERS: dict[str, Callable[[Exported], str]] = {
-    ".xml": plus_xml,
-    ".yaml": ros_yaml,
-    ".yml": ros_yaml,
-    ".tfm": slicer_tfm,
-    ".txt": slicer_tfm,
-    ".json": as_json,
+_PLUS = FileKind("a PLUS file of fgreg", (_PLUS_HEAD.encode() + b"  <!-- Registration of session ",))
+_ROS = FileKind("a ROS file of fgreg", (b"# ",), (b", fgreg ", b"\n# ros2 run tf2_ros static_transform_publisher "))
+_SLICER = FileKind("a transform file of fgreg", (b"#Insight Transform File V1.0\n# fgreg ",))
+_JSON = FileKind("a JSON file of fgreg", (f'{{\n  "format": "{JSON_FORMAT}",\n  "fgreg": '.encode(),))
+
+WRITERS: dict[str, tuple[Callable[[Exported], str], FileKind]] = {
+    ".xml": (plus_xml, _PLUS),
+    ".yaml": (ros_yaml, _ROS),
+    ".yml": (ros_yaml, _ROS),
+    ".tfm": (slicer_tfm, _SLICER),
+    ".txt": (slicer_tfm, _SLICER),
+    ".json": (as_json, _JSON),
 }
-"""The writer of each file suffix."""
+"""The writer of each file suffix, and how its older files are told."""
 
 
 def _iso(moment: datetime) -> str:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgreg.convert.drafts import Draft, Imported
-from fgreg.convert.files import whole_folder
 from fgreg.errors import InputError, one_line
 from fgreg.model.camera_model import STEREO_RIG, StereoRig
+from fgreg.output.session_folder import new_session
 from fgreg.schema.limits import EVENT_LINES, SETUP_BYTES
 from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.event_reader import frames_of, read_line
@@ -59,7 +59,7 @@ def write_session(
     rig = rig or imported.rig
     if rig is not None and "camera" not in load_yaml(file, str(file)):
         text = text.rstrip("\n") + "\n" + camera_yaml(rig)
-    with whole_folder(out, overwrite=overwrite) as folder:
+    with new_session(out, overwrite=overwrite) as folder:
         (folder / SETUP_FILE).write_text(text, encoding="utf-8")
         read = _read_setup(folder / SETUP_FILE, str(file), out.resolve().name, file.parent.resolve())
         if read.model is not None and read.model.rig_file is not None:

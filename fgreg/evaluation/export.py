@@ -23,9 +23,11 @@ from fgreg.evaluation.summary import (
     prediction_of,
     spread_of,
 )
+from fgreg.output.atomic_file import FileKind
 
 COLUMNS = ("session", "table", "epoch", "pm", "pairs", "quantity", "value")
 """Columns of the CSV file: one figure per line; ``quantity`` ends in its unit."""
+CSV_FILE = FileKind("a table of fgreg evaluate", (",".join(COLUMNS).encode() + b"\n",))
 
 
 def plain(value: Any) -> Any:

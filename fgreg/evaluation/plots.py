@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +15,17 @@ from fgreg.errors import InputError, MissingExtraError
 from fgreg.evaluation.run import SessionEvaluation
 from fgreg.evaluation.summary import all_tre_mm, pooled_curve
 from fgreg.geometry.transforms import FloatArray
+from fgreg.output.atomic_file import FileKind, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FORMATS = ("png", "svg")
+FORMATS = {
+    "png": FileKind("a plot of fgreg", (b"\x89PNG\r\n",), (b"tEXtSoftware\0fgreg",)),
+    "svg": FileKind("a plot of fgreg", (b"<?xml",), (b"<dc:title>fgreg</dc:title>",)),
+}
+PLOTS = ("error-against-pairs", "held-out-pairs", "influence", "tre")
 BLUE, ORANGE, GREY, RED = "#2a6f97", "#d97706", "#6b7280", "#b91c1c"
 MOST_BARS = 60
 
@@ -43,26 +50,43 @@ def save_plots(evaluations: Sequence[SessionEvaluation], folder: Path, file_form
         MissingExtraError: matplotlib is not installed.
         InputError: the folder cannot be written to, or another format than ``FORMATS``.
     """
-    if file_format not in FORMATS:
-        raise InputError("--plot-format", file_format, "one of " + ", ".join(FORMATS))
-    figures = {
-        "error-against-pairs": curve_figure(evaluations),
-        "held-out-pairs": held_out_figure(evaluations),
-        "influence": influence_figure(evaluations),
-        "tre": tre_figure(evaluations),
-    }
-    written = []
+    check_plots(folder, file_format)
+    makers = (curve_figure, held_out_figure, influence_figure, tre_figure)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, figure in figures.items():
-            if figure is not None:
-                path = folder / f"{name}.{file_format}"
-                # No date in the file, so that the same figures give the same bytes.
-                figure.savefig(path, metadata={"Date": None} if file_format == "svg" else None)
-                written.append(path)
     except OSError as error:
         raise InputError(str(folder), f"no access ({error.strerror})", "a folder that can be written to") from error
+    written = []
+    for path, make in zip(plot_files(folder, file_format), makers, strict=True):
+        figure = make(evaluations)
+        if figure is not None:
+            data = io.BytesIO()
+            # No date in the file, so that the same figures give the same bytes.
+            about = {"Software": "fgreg"} if file_format == "png" else {"Date": None, "Creator": "fgreg"}
+            figure.savefig(data, format=file_format, metadata=about)
+            write_file(path, data.getvalue(), FORMATS[file_format])
+            written.append(path)
     return written
+
+
+def plot_files(folder: Path, file_format: str) -> list[Path]:
+    """The files that :func:`save_plots` may write."""
+    return [folder / f"{name}.{file_format}" for name in PLOTS]
+
+
+def check_plots(folder: Path, file_format: str) -> None:
+    """Whether plots can be made and written, to be asked before the work begins.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        InputError: another format than ``FORMATS``, or the folder cannot be made or written to.
+    """
+    if file_format not in FORMATS:
+        raise InputError("--plot-format", file_format, "one of " + ", ".join(FORMATS))
+    new_figure()
+    above = next((place for place in (folder, *folder.absolute().parents) if os.path.lexists(place)), folder)
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(str(folder), f"{above}, where no file can be made", "a folder that can be written to")
 
 
 def _dress(axes: Axes) -> None:

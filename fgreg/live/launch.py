@@ -24,6 +24,7 @@ from fgreg.model.time_sync import Latencies
 from fgreg.online.engine_process import EngineProcess
 from fgreg.online.live_session import Engine, LiveSession
 from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
+from fgreg.output.session_folder import STAGE_LOG, new_session
 from fgreg.session.rig_file import copy_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE
 from fgreg.session.yaml_loader import parse_yaml
@@ -32,9 +33,6 @@ from fgreg.stage.limits import MotionLimits
 from fgreg.stage.reconnect import ReconnectingStage
 from fgreg.stage.stop_on_exit import emergency_stop_all
 from fgreg.workers.threads import undisturbed
-
-WATCHDOG_LOG = "stage-orders.log"
-
 
 OpenDevices = Callable[[ExitStack, SessionModel], Devices]
 """Opens all devices except the stage; they are closed with the stack."""
@@ -146,15 +144,12 @@ def make_folder(folder: Path, setup: str, rig_file: Path | None = None) -> None:
             if path.read_text(encoding="utf-8") != setup:
                 raise InputError(str(path), "another set-up", f"the same as now, or a new folder for {EVENTS_FILE}")
             return
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            found = "a folder that is not empty" if folder.is_dir() else "a file"
-            raise InputError(str(folder), found, "a new or empty folder, or a session")
-        folder.mkdir(parents=True, exist_ok=True)
-        if rig_file is not None:
-            copy_rig(rig_file, folder / str(parse_yaml(setup, SETUP_FILE)["rig"]))
-        path.write_text(setup, encoding="utf-8")
     except OSError as error:
         raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from None
+    with new_session(folder) as part:
+        if rig_file is not None:
+            copy_rig(rig_file, part / str(parse_yaml(setup, SETUP_FILE)["rig"]))
+        (part / SETUP_FILE).write_text(setup, encoding="utf-8")
 
 
 def setup_text(document: Mapping[str, Any]) -> str:
@@ -241,7 +236,7 @@ def _open_stage(
         session.journal.append(record.event(t, model.stage), durable=False, late=True)
 
     limits = MotionLimits.of_session(model.stage, **stage.limits)
-    return ReconnectingStage(lambda: StageLink.open(stage.driver, stage.options, limits, log, folder / WATCHDOG_LOG))
+    return ReconnectingStage(lambda: StageLink.open(stage.driver, stage.options, limits, log, folder / STAGE_LOG))
 
 
 def default_folder() -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,17 @@ from typing import Any
 import numpy as np
 
 from fgreg.detection.events_to_measurements import extract_measurements
-from fgreg.errors import FgregError, InputError
+from fgreg.errors import FgregError
 from fgreg.model.measurements import Measurements
+from fgreg.output.atomic_file import FileKind, write_file
 from fgreg.schema.yaml_writer import yaml_text
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.session_reader import TRUTH_FILE, read_ground_truth, read_session
 from fgreg.simulation.documents import rows
+
+ROOM_TRUTH = FileKind(
+    "the ground truth of a simulated room", (b"trus_T_camera:",), (b"\nx_moved_s:",), file_name=TRUTH_FILE
+)
 
 TruthAt = Callable[[Sequence[float], Sequence[float]], dict[str, Any]]
 """As :meth:`fgreg.simulation.room.Room.truth_at`."""
@@ -37,7 +41,8 @@ def write_room_truth(truth_at: TruthAt, folder: Path, start_s: float, begin_t: f
             their entries in the file stay.
 
     Raises:
-        FgregError: the room does not answer, or the truth of the earlier epochs is unknown.
+        FgregError: the room does not answer, the truth of the earlier epochs is unknown, or the folder has a ground
+            truth that is not a room's.
     """
     session = read_session(folder)
     measured = extract_measurements(session.events, session.model).measurements
@@ -49,15 +54,7 @@ def write_room_truth(truth_at: TruthAt, folder: Path, start_s: float, begin_t: f
     fresh = {pm: t for pm, t in sorted(first.items()) if t > begin_t}
     truth = truth_at([start_s + t for t in at_t[old:]], [start_s + t for t in fresh.values()])
     text = yaml_text(_document(truth, earlier, old, list(fresh), start_s))
-    path = folder / TRUTH_FILE
-    part = path.with_name(f".{TRUTH_FILE}.tmp")
-    try:
-        part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise InputError(str(path), f"a place that refuses files ({error.strerror})", "a writable one") from None
+    write_file(folder / TRUTH_FILE, text, ROOM_TRUTH)
 
 
 def _epoch_ends(measured: Measurements, last_t: float) -> list[float]:

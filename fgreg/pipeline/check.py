@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import InputError
+from fgreg.output.leftovers import leftovers
 from fgreg.session.event_writer import type_of
 from fgreg.session.session_reader import EVENTS_FILE, check_session, read_session
 
@@ -51,6 +52,7 @@ def check(
     A session with problems is not looked at further.
     """
     problems, warnings = check_session(folder)
+    warnings = [*leftovers(folder), *warnings]
     if problems or not frames:
         return SessionCheck(tuple(problems), tuple(warnings))
     session = read_session(folder)

@@ -21,6 +21,7 @@ from fgreg.model.measurements import Check
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import TEXTS
+from fgreg.output.atomic_file import check_output
 from fgreg.pipeline.solve import detection_conditions
 from fgreg.registration.checks import with_checks
 from fgreg.registration.commissioning import (
@@ -36,7 +37,7 @@ from fgreg.registration.error_budget import conflicts
 from fgreg.registration.register import Registration
 from fgreg.registration.solve import solve
 from fgreg.session.input_hashes import input_hashes
-from fgreg.session.rig_file import not_made_from, read_rig, same_rig, section_hashes, write_rig
+from fgreg.session.rig_file import RIG_FILE, not_made_from, same_rig, section_hashes, write_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session
 
 TOGETHER = 0.5
@@ -123,13 +124,7 @@ def commission_sessions(
         InputError: a session is not valid, given twice, has another probe, camera, marker or other priors than the
             first; or none is left.
     """
-    if not out.parent.is_dir():
-        raise InputError(str(out.parent), "no such folder", f"a folder to write {out.name} to")
-    if out.exists():
-        try:
-            read_rig(out)
-        except InputError:
-            raise InputError(str(out), "a file that is no commissioned rig", "a new file, or a rig.yaml") from None
+    check_output(out, RIG_FILE)
     sessions = [read_session(folder) for folder in folders]
     hashes = [input_hashes(session) for session in sessions]
     _check_alike(sessions, hashes)

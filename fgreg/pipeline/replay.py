@@ -25,11 +25,10 @@ from fgreg.online.checks import CheckPoints
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import Engine, EpochFeed, MakeEngine, online_engine
 from fgreg.pipeline.solve import (
-    RESULT_FILE,
     Progress,
     SolveReport,
     errors_where_known,
-    remove_older_result,
+    result_place,
     show_frames,
     solve_extracted,
 )
@@ -115,17 +114,14 @@ def replay_session(
         make_engine: makes the online engine; None: the package's.
 
     Raises:
-        InputError: bad input; no result is left behind, not even an older one.
+        InputError: bad input; an older result stays.
         ViewerError: the viewer cannot be started.
     """
     start = time.perf_counter()
     config = config or SolveConfig()
-    result_path = request.folder / RESULT_FILE if request.out is None else request.out
-    if request.rrd is not None and request.rrd.resolve() == result_path.resolve():
-        raise InputError("--rrd", f"{request.rrd}, where the result goes", "a file of its own")
     if request.speed is not None and not 0 < request.speed < float("inf"):
         raise InputError("--speed", str(request.speed), "1, 10 or another number > 0, or max")
-    remove_older_result(request.folder, result_path)
+    result_path = result_place(request.folder, request.out, request.rrd)
     session = read_session(request.folder)
     truth = read_ground_truth(request.folder)
     url = spawn_viewer() if request.live else None

@@ -18,7 +18,6 @@ from fgreg.camera_moves.found import DetectedMove
 from fgreg.camera_moves.recorded_session import EpochsFound, find_epochs, renumbered, split_epochs
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.detection.results import MarkerFit, NoSignal, PaFind
-from fgreg.errors import InputError
 from fgreg.geometry.target_error import beam_error, tre_mm
 from fgreg.geometry.transforms import FloatArray, transform_points
 from fgreg.model.estimate import (
@@ -34,21 +33,22 @@ from fgreg.model.lens import project
 from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.output.atomic_file import check_outputs
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
 from fgreg.registration.move_doubt import TELLING
 from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import Condition
 from fgreg.session.ground_truth import GroundTruth
-from fgreg.session.result_file import remove_result, write_result
-from fgreg.session.session_reader import Session, read_ground_truth, read_session
+from fgreg.session.result_file import RESULT_FILE, RESULT_KIND, write_result
+from fgreg.session.session_reader import Session, read_ground_truth, read_session, session_place
 from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
+from fgreg.viewer.recording_file import RECORDING
 
 if TYPE_CHECKING:
     from fgreg.viewer.recording import Viewer
     from fgreg.viewer.scene import ShotKind
 
-RESULT_FILE = "result.yaml"
 TOO_FEW_AIMS = 0.5
 """Share of unusable aims from which there is a warning."""
 
@@ -128,14 +128,11 @@ def solve_session(
     """Solve a recorded session.
 
     Raises:
-        InputError: bad input; no result is left behind, not even an older one.
+        InputError: bad input; an older result stays.
     """
     start = time.perf_counter()
     config = config or SolveConfig()
-    result_path = request.folder / RESULT_FILE if request.out is None else request.out
-    if request.rrd is not None and request.rrd.resolve() == result_path.resolve():
-        raise InputError("--rrd", f"{request.rrd}, where the result goes", "a file of its own")
-    remove_older_result(request.folder, result_path)
+    result_path = result_place(request.folder, request.out, request.rrd)
     session = read_session(request.folder)
     truth = read_ground_truth(request.folder)
     with open_viewer(request.rrd, session.model.name) as viewer:
@@ -176,15 +173,16 @@ def solve_extracted(
     return extracted, found, solution, session_estimate(session, extracted, solution, config)
 
 
-def remove_older_result(folder: Path, result_path: Path) -> None:
-    """Remove an older result before work starts, so that it does not remain after a failure.
+def result_place(folder: Path, out: Path | None, rrd: Path | None) -> Path:
+    """The result's file, checked together with the recording's before the work begins.
 
     Raises:
-        InputError: the session's folder does not exist, or the result cannot be written there.
+        InputError: the session's folder does not exist, or one of them cannot be written.
     """
-    if not folder.is_dir():
-        raise InputError(str(folder), "a file" if folder.exists() else "nothing", "a session's folder")
-    remove_result(result_path)
+    session_place(folder)
+    place = folder / RESULT_FILE if out is None else out
+    check_outputs([("the result", place, RESULT_KIND), ("--rrd", rrd, RECORDING)])
+    return place
 
 
 def with_moves(extracted: ExtractedMeasurements, found: EpochsFound) -> ExtractedMeasurements:

@@ -23,9 +23,9 @@ from fgreg.model.events import CameraMovedEvent, Event, PairEvent, refused_lines
 from fgreg.model.measurements import Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
-from fgreg.pipeline.solve import RESULT_FILE, Progress, detection_conditions, with_moves
+from fgreg.pipeline.solve import Progress, detection_conditions, with_moves
 from fgreg.registration.solve import solve
-from fgreg.session.result_file import read_result
+from fgreg.session.result_file import RESULT_FILE, read_result
 from fgreg.session.rig_file import sections
 from fgreg.session.session_reader import Session, read_more_events, read_session
 from fgreg.tracking.snapshot import Snapshot

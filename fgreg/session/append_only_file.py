@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Self
 
 from fgreg.errors import JournalError
+from fgreg.output.atomic_file import lock
 
 _MODE = 0o644
 
@@ -75,12 +76,12 @@ class AppendFile:
                 if not stat.S_ISREG(there.st_mode):
                     raise JournalError(name, "it is no regular file", "put a file in its place")
                 try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    found = "another program is recording to this session"
-                    raise JournalError(name, found, "end that program first") from None
+                    alone = lock(handle)
                 except OSError as error:
                     raise JournalError(name, f"it cannot be locked ({error.strerror})", "use a local disk") from None
+                if not alone:
+                    found = "another program is recording to this session"
+                    raise JournalError(name, found, "end that program first")
                 if not _same_file(handle, path):  # replaced between opening and locking
                     os.close(handle)
                     continue

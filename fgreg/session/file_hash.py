@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 from fgreg.errors import InputError
-from fgreg.session.atomic_file import why_refused
+from fgreg.output.atomic_file import why_refused
 
 
 def file_hash(path: Path) -> str:

@@ -21,7 +21,7 @@ from fgreg.session.append_only_file import AppendFile, sync_path
 from fgreg.session.event_reader import frames_of, read_line
 from fgreg.session.event_writer import event_document, event_line, type_of
 from fgreg.session.frame_files import check_frames
-from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session
+from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session, session_place
 from fgreg.session.setup_reader import Setup, read_setup
 from fgreg.session.yaml_loader import load_yaml
 
@@ -62,7 +62,7 @@ class Journal:
             InputError: the session's files are invalid.
             JournalError: another program records to it, or the disk fails.
         """
-        resolved = _resolved(folder)
+        resolved = session_place(folder)
         setup = _setup(resolved)
         file = AppendFile.open(resolved / EVENTS_FILE, EVENTS_FILE)
         try:
@@ -148,16 +148,6 @@ class Journal:
     def close(self) -> None:
         """Unlock the session; may be called twice."""
         self._file.close()
-
-
-def _resolved(folder: Path) -> Path:
-    try:
-        resolved = folder.resolve(strict=True)
-    except (OSError, RuntimeError, ValueError):
-        raise InputError(str(folder), "nothing", "a session's folder") from None
-    if not resolved.is_dir():
-        raise InputError(str(folder), "a file", "a session's folder")
-    return resolved
 
 
 def _setup(folder: Path) -> Setup:

@@ -12,12 +12,13 @@ from pathlib import Path
 from fgreg.errors import InputError
 from fgreg.model.commissioned_rig import RIG, SHARED_SECTIONS, CommissionedRig
 from fgreg.model.session_model import SESSION, SessionModel
+from fgreg.output.atomic_file import FileKind, why_refused, write_file
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.schema.yaml_writer import yaml_text
-from fgreg.session.atomic_file import why_refused, write_atomically
 from fgreg.session.file_hash import file_hash
 from fgreg.session.yaml_loader import load_yaml
 
+RIG_FILE = FileKind("a commissioned rig", (b"format: fgreg-rig/",))
 _ABSENT = ""
 
 
@@ -40,10 +41,10 @@ def write_rig(rig: CommissionedRig, path: Path) -> None:
     """Write a rig, replacing an older one when it is complete.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: the file cannot be written, or there is another file.
     """
     document = RIG.write(rig)
-    write_atomically(path, f"format: {document.pop('format')}\n" + yaml_text(document, {"sessions"}))
+    write_file(path, f"format: {document.pop('format')}\n" + yaml_text(document, {"sessions"}), RIG_FILE)
 
 
 def copy_rig(rig_file: Path, target: Path) -> None:

@@ -15,6 +15,8 @@ from fgreg.errors import InputError
 from fgreg.model.events import AimEvent, Event, PairEvent, TrackEvent
 from fgreg.model.plausible import implausible_distances
 from fgreg.model.session_model import SessionModel
+from fgreg.output.atomic_file import SESSION_FILES
+from fgreg.output.leftovers import leftovers
 from fgreg.schema.limits import TRUTH_BYTES, TRUTH_NODES
 from fgreg.schema.problems import FieldError, input_error
 from fgreg.session.event_reader import EventLog, frames_of, read_events
@@ -24,9 +26,7 @@ from fgreg.session.rig_file import not_made_from
 from fgreg.session.setup_reader import Setup, read_setup
 from fgreg.session.yaml_loader import load_yaml
 
-SETUP_FILE = "session.yaml"
-EVENTS_FILE = "events.jsonl"
-TRUTH_FILE = "ground_truth.yaml"
+SETUP_FILE, EVENTS_FILE, TRUTH_FILE, _ = SESSION_FILES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +44,24 @@ class Session:
     model: SessionModel
     events: tuple[Event, ...]
     warnings: tuple[str, ...]
+
+
+def session_place(folder: Path) -> Path:
+    """A session's folder, without links.
+
+    Raises:
+        InputError: there is none; where an interrupted run has left it under another name, how to restore it.
+    """
+    try:
+        resolved = folder.resolve(strict=True)
+    except (OSError, RuntimeError, ValueError) as error:
+        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
+        found = "nothing" if absent else f"no access ({getattr(error, 'strerror', None) or error})"
+        left = leftovers(folder) if absent else []
+        raise InputError(str(folder), found, "; ".join(["a session's folder", *left])) from None
+    if not resolved.is_dir():
+        raise InputError(str(folder), "a file", "a session's folder")
+    return resolved
 
 
 def read_session(folder: str | Path) -> Session:
@@ -113,14 +131,9 @@ def read_ground_truth(folder: Path) -> GroundTruth | None:
 def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, EventLog]:
     """Read both files of a session; appends problems to ``problems`` and reads the rest."""
     try:
-        resolved = folder.resolve(strict=True)
-        if not resolved.is_dir():
-            problems.append(InputError(str(folder), "a file", "a session's folder"))
-            return None, EventLog()
-    except (OSError, RuntimeError, ValueError) as error:
-        absent = isinstance(error, FileNotFoundError | NotADirectoryError)
-        found = "nothing" if absent else f"no access ({getattr(error, 'strerror', None) or error})"
-        problems.append(InputError(str(folder), found, "a session's folder"))
+        resolved = session_place(folder)
+    except InputError as error:
+        problems.append(error)
         return None, EventLog()
     setup: Setup | None = None
     try:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from fgreg.errors import InputError
+from fgreg.output.session_folder import new_session
 from fgreg.schema.yaml_writer import yaml_text
 from fgreg.simulation.simulate import Frame, SimulatedSession
 
@@ -33,45 +32,19 @@ def write_session(
         progress: called after each frame.
 
     Raises:
-        InputError: the folder is not empty and ``overwrite`` is not set, or it holds no session.
+        InputError: as :func:`fgreg.output.session_folder.new_session`.
     """
-    folder = Path(folder).resolve()
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not overwrite:
-            raise InputError(str(folder), "a folder that is not empty", "a new or empty folder, or --overwrite")
-        if not (folder / "session.yaml").is_file():
-            raise InputError(str(folder), "no session to overwrite", "a folder with a session.yaml")
-    partial, older = folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".older")
-    try:
-        if partial.exists() or older.exists():
-            raise InputError(str(folder), f"{partial.name} or {older.name} beside it", "neither: remove them first")
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(str(folder), f"a place that refuses folders ({error.strerror})", "a writable one") from error
-    try:
-        (partial / "session.yaml").write_text(yaml_text(simulated.session), encoding="utf-8")
+    with new_session(folder, overwrite=overwrite) as part:
+        (part / "session.yaml").write_text(yaml_text(simulated.session), encoding="utf-8")
         lines = [json.dumps(event, separators=(", ", ": ")) + "\n" for event in simulated.events]
-        (partial / "events.jsonl").write_text("".join(lines), encoding="utf-8")
-        (partial / "ground_truth.yaml").write_text(yaml_text(simulated.truth), encoding="utf-8")
+        (part / "events.jsonl").write_text("".join(lines), encoding="utf-8")
+        (part / "ground_truth.yaml").write_text(yaml_text(simulated.truth), encoding="utf-8")
         for done, (name, frame) in enumerate(simulated.frames.items(), start=1):
-            path = partial / name
+            path = part / name
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(encoded(name, frame()))
             if progress is not None:
                 progress(done, len(simulated.frames))
-        if folder.exists():
-            folder.rename(older)
-        try:
-            partial.rename(folder)
-        except OSError:
-            if older.exists():
-                older.rename(folder)
-            raise
-        shutil.rmtree(older, ignore_errors=True)
-    except OSError as error:
-        raise InputError(str(folder), f"a place that refuses files ({error.strerror})", "a writable one") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def encoded(name: str, frame: Frame) -> bytes:

@@ -36,7 +36,7 @@ def open_viewer(rrd: Path | None, session_name: str, url: str | None = None) -> 
     """A viewer that records to ``rrd`` and shows in the running viewer at ``url``; the null viewer where both are None.
 
     Raises:
-        InputError: the folder of ``rrd`` does not exist or cannot be written to, or ``rrd`` is a folder.
+        InputError: ``rrd`` cannot be written, or is another file.
     """
     if rrd is None and url is None:
         return NullViewer()

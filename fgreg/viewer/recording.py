@@ -17,7 +17,6 @@ Timelines: ``shot`` (number among all aims, pairs and tracks, from 0) and ``time
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -27,16 +26,17 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.model.estimate import SessionEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import ProbeModel, SessionModel
+from fgreg.output.atomic_file import NewFile
 from fgreg.viewer import scene as scene
 from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LiveDrawing, ViewerUpdate
 from fgreg.viewer.pa_frame import pa_picture, texture
+from fgreg.viewer.recording_file import RECORDING
 from fgreg.viewer.result import ResultDrawing, Truth
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.shapes import Image8
@@ -44,33 +44,6 @@ from fgreg.viewer.status_line import BmodePicture
 
 LARGEST_TEXTURE = 160
 """Larger side of a B-mode image on the image plane, px."""
-
-
-def _is_recording(path: Path) -> bool:
-    """Whether a file is a Rerun recording: no other file is overwritten."""
-    if path.is_symlink() or not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(3) == b"RRF"
-
-
-def _part_of(rrd: Path) -> Path:
-    """Create the temporary file that becomes ``rrd``.
-
-    Raises:
-        InputError: ``rrd`` cannot be written.
-    """
-    if not rrd.parent.is_dir():
-        raise InputError(str(rrd), "a folder that does not exist", "an existing folder for the recording")
-    if os.path.lexists(rrd) and not _is_recording(rrd):
-        found = "a folder" if rrd.is_dir() else "a file that is not a recording"
-        raise InputError(str(rrd), found, "a new name, or that of an older recording")
-    part = rrd.with_name(f".{rrd.name}.{os.getpid()}.part")
-    try:
-        part.touch()
-    except OSError as error:
-        raise InputError(str(rrd), f"no access ({error.strerror})", "a writable one") from error
-    return part
 
 
 class Viewer:
@@ -85,14 +58,13 @@ class Viewer:
         url: of a running viewer that shows it too.
 
     Raises:
-        InputError: the folder does not exist or cannot be written to, or ``rrd`` is a folder.
+        InputError: ``rrd`` cannot be written, or is another file.
     """
 
     def __init__(self, rrd: Path | None, session_name: str, url: str | None = None) -> None:
-        self._rrd = rrd
-        self._part = None if rrd is None else _part_of(rrd)
+        self._file = None if rrd is None else NewFile(rrd, RECORDING)
         try:
-            self._rec = shapes.Recorder(self._part, session_name, url)
+            self._rec = shapes.Recorder(None if self._file is None else self._file.part, session_name, url)
         except BaseException:
             self._drop_part()
             raise
@@ -116,14 +88,14 @@ class Viewer:
             if not self._finished and self._live is None:
                 self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
             self._rec.close()
-            if kind is None and self._part is not None and self._rrd is not None:
-                self._part.replace(self._rrd)
+            if kind is None and self._file is not None:
+                self._file.keep()
         finally:
             self._drop_part()
 
     def _drop_part(self) -> None:
-        if self._part is not None:
-            self._part.unlink(missing_ok=True)
+        if self._file is not None:
+            self._file.drop()
 
     def session(self, model: SessionModel) -> None:
         """Draw the static parts: probe, array, axes, cameras, the marker's outline, the plots' styles."""
