@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,8 @@ def test_solve_writes_a_result_and_reports_it(
     assert len(result.pairs) == 20
     assert len(result.tracks) == 4
     assert result.epochs[0].trus_T_camera is not None
+    files = {name: (pose_session / name).read_bytes() for name in ("session.yaml", "events.jsonl")}
+    assert result.inputs == {name: sha256(content).hexdigest() for name, content in files.items()}
 
 
 def test_json_is_one_document_with_the_results_names(
@@ -79,6 +82,42 @@ def test_bad_input_is_one_line_and_leaves_the_older_result(
     assert error.startswith("fgreg: error: session.yaml: probe")
     assert error.count("\n") == 1
     assert (pose_session / "result.yaml").read_bytes() == older
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (("--rrd", "nowhere/a.rrd"), "--rrd: nowhere: found no such folder"),
+        (("--rrd", "S/events.jsonl"), "--rrd: S/events.jsonl: found the name of a session's own file"),
+        (("--rrd", "S/result.yaml"), "--rrd: found S/result.yaml, where the result goes"),
+        (("--out", "S/frames"), "S/frames: found a folder"),
+        ((), ""),
+    ],
+)
+def test_an_older_result_stays_until_there_is_a_new_one(
+    words: tuple[str, ...],
+    found: str,
+    pose_session: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    older = "format: fgreg-result/1\n"
+    (pose_session / "result.yaml").write_text(older)
+    (pose_session / "frames").mkdir()
+    (tmp_path / "S").symlink_to(pose_session)
+    monkeypatch.chdir(tmp_path)
+    for command in ("solve", "replay"):
+        monkeypatch.setattr(f"fgreg.pipeline.{command}.extract_measurements", interrupt)
+        assert _run(monkeypatch, command, "S", *words, "-q") == (2 if words else 130)
+        assert found in capsys.readouterr().err
+        assert (pose_session / "result.yaml").read_text() == older
+    assert sorted(path.name for path in pose_session.iterdir()) == [
+        *("events.jsonl", "frames", "ground_truth.yaml", "result.yaml", "session.yaml"),
+    ]
 
 
 def test_check_reports_all_problems_at_once(

@@ -47,7 +47,8 @@ Others are named in a mapping (--map):
   images: envelope      (of PLUS; or log, or channels: data of the single elements)
 \b
 What lacks its marker or stage angle is left out with a warning. A result with the verdict
-refused is exported with --force only, and the file says so.
+refused, or made from other files than those that are there now, is exported with --force
+only, and the file says so.
 """
 
 
@@ -79,7 +80,7 @@ def add_convert(app: typer.Typer) -> None:
         ] = False,
         epoch: Annotated[int | None, typer.Option("--epoch", help="Of a result; default: the last one.")] = None,
         force: Annotated[
-            bool, typer.Option("--force", help="Export a result that is refused, marked as such.")
+            bool, typer.Option("--force", help="Export a result that is refused or stale, marked as such.")
         ] = False,
         overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing OUT.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
@@ -132,6 +133,7 @@ def _result_file(source: Path) -> Path | None:
 def _export(result: Path, out: Path, epoch: int | None, force: bool, overwrite: bool) -> str:
     from fgreg.convert.export import WRITERS, registration_of
     from fgreg.output.atomic_file import check_output, write_file
+    from fgreg.session.input_hashes import stale
     from fgreg.session.result_file import read_result
 
     if out.suffix.lower() not in WRITERS:
@@ -140,9 +142,15 @@ def _export(result: Path, out: Path, epoch: int | None, force: bool, overwrite: 
         raise InputError(str(out), "a file of this name", "a new name, or --overwrite")
     writer, kind = WRITERS[out.suffix.lower()]
     check_output(out, kind)
-    registration = registration_of(read_result(result), result, epoch=epoch, force=force)
+    estimate, changed = read_result(result), ""
+    try:
+        changed = stale(result, estimate)
+    except InputError as error:
+        sys.stderr.write(f"fgreg: warning: whether the result is stale cannot be told: {error}\n")
+    registration = registration_of(estimate, result, epoch=epoch, force=force, stale=changed)
     write_file(out, writer(registration), kind)
     marked = ", REFUSED and marked as such" if registration.refused else ""
+    marked += ", STALE and marked as such" if changed else ""
     return f"{out}: epoch {registration.epoch} of {registration.session}, verdict {registration.verdict}{marked}"
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgreg.cli.options import warn_of_leftovers
+from fgreg.cli.options import refuse_stale, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         plots: Annotated[
             Path | None, typer.Option("--plots", metavar="DIR", help="Also write plots into this folder.")
         ] = None,
+        force: Annotated[
+            bool, typer.Option("--force", help="Evaluate also where a session's result.yaml is of other events.")
+        ] = False,
         plot_format: Annotated[str, typer.Option("--plot-format", help="png or svg.")] = "png",
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and no tables.")] = False,
@@ -55,7 +58,8 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
 
         Solves each SESSION repeatedly from subsets of its pairs. With a ground_truth.yaml: TRE, tracking and beam
         errors. Without: how well the pairs predict each other; the pair residual (the publication's Eq. 12) is not a
-        TRE. Exit status 1 where a verdict is refused.
+        TRE. A session whose result.yaml was made from other files is refused: solve it again. Exit status 1 where a
+        verdict is refused.
         """
         from fgreg.evaluation.case import EvaluationConfig
         from fgreg.evaluation.export import CSV_FILE, as_csv, as_dict
@@ -80,6 +84,8 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         outputs = [("--plots", path, FORMATS[plot_format]) for path in pictures if path.parent.is_dir()]
         check_outputs([("--csv", csv, CSV_FILE), *outputs])
         warn_of_leftovers(*sessions, csv, plots)
+        for folder in () if force else sessions:
+            refuse_stale(folder)
         config = EvaluationConfig(
             folds=folds,
             leave_one_out=one_by_one,

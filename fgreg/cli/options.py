@@ -1,6 +1,7 @@
 """Options that several commands share, and their settings."""
 
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,6 +52,22 @@ def solve_config(
         )
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
+
+
+def refuse_stale(session: Path) -> None:
+    """Refuse a session whose ``result.yaml`` was made from other files; one that cannot be told is none.
+
+    Raises:
+        InputError: the result is stale.
+    """
+    from fgreg.session.input_hashes import stale
+    from fgreg.session.result_file import RESULT_FILE, read_result
+
+    result, found = session / RESULT_FILE, ""
+    with suppress(InputError):
+        found = stale(result, read_result(result))
+    if found:
+        raise InputError(str(result), found, "that of the session as it is (fgreg solve), or --force")
 
 
 def warn_of_leftovers(*paths: Path | None) -> None:

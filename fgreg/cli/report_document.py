@@ -28,6 +28,7 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
     laser = estimate.laser
     out: dict[str, Any] = {
         "session": estimate.session,
+        "inputs": dict(estimate.inputs),
         "verdict": estimate.verdict.value,
         "reasons": list(estimate.reasons),
         "laser": None

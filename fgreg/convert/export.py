@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ class Exported:
         covariance: (6, 6) right tangent, or None.
         tre_mm: predicted error at the targets, mean and 95 % at the worst one; None where there is none.
         solved: when the result was written.
+        stale: that the session has changed since; empty where it has not.
     """
 
     session: str
@@ -58,6 +59,7 @@ class Exported:
     covariance: FloatArray | None
     tre_mm: tuple[float, float] | None
     solved: datetime
+    stale: str = ""
 
     @property
     def refused(self) -> bool:
@@ -66,7 +68,9 @@ class Exported:
 
     @property
     def warning_lines(self) -> list[str]:
-        """Warning at the top of the file: verdict and reasons; empty where the verdict is ``ok``."""
+        """Warning at the top of the file: stale, verdict and reasons; empty where the verdict is ``ok``."""
+        if self.stale:
+            return [f"STALE, exported with --force: {self.stale}", *replace(self, stale="").warning_lines]
         if self.verdict is Verdict.OK:
             return []
         forced = "REFUSED by fgreg, exported with --force: DO NOT USE for navigation"
@@ -75,7 +79,7 @@ class Exported:
 
 
 def registration_of(
-    estimate: SessionEstimate, path: Path, *, epoch: int | None = None, force: bool = False
+    estimate: SessionEstimate, path: Path, *, epoch: int | None = None, force: bool = False, stale: str = ""
 ) -> Exported:
     """The epoch of a result for export.
 
@@ -83,11 +87,14 @@ def registration_of(
         estimate: the result in ``path``.
         path: the result's file; its time of change becomes ``solved``.
         epoch: index; None: the last one.
-        force: export also where the verdict is ``refused``.
+        force: export also where the verdict is ``refused``, or the result is stale.
+        stale: why it is; empty where it is not.
 
     Raises:
-        InputError: no such epoch, no transform in it, or refused without ``force``.
+        InputError: no such epoch, no transform in it, or refused or stale without ``force``.
     """
+    if stale and not force:
+        raise InputError(path.name, stale, "one of the session as it is (fgreg solve), or --force to export it")
     known = {entry.index: entry for entry in estimate.epochs}
     if not known:
         raise InputError(f"{path.name}: epochs", "none", "a result with at least one")
@@ -112,6 +119,7 @@ def registration_of(
         covariance=chosen.covariance,
         tre_mm=None if tre is None else (tre.mean_mm, tre.worst_mm),
         solved=datetime.fromtimestamp(path.stat().st_mtime, UTC).replace(microsecond=0),
+        stale=stale,
     )
 
 
@@ -176,8 +184,8 @@ def as_json(found: Exported) -> str:
         "epoch": found.epoch,
         "solved": _iso(found.solved),
         "verdict": found.verdict.value,
-        "reasons": list(found.reasons),
-        "forced": found.refused,
+        "reasons": [*([found.stale] if found.stale else []), *found.reasons],
+        "forced": found.refused or bool(found.stale),
         "from": "camera",
         "to": "trus",
         "trus_T_camera": found.trus_T_camera.tolist(),

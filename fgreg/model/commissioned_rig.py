@@ -1,18 +1,16 @@
 """``rig.yaml``: the rig's constants as a commissioning found them, with their full covariance."""
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
 
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.systematic import TEXTS
-from fgreg.schema.kinds import ANY_SIZE, JsonSchema, Kind, ListOf, Number, Numbers, Text
-from fgreg.schema.problems import FieldError, shown
+from fgreg.schema.hashes import Hashes
+from fgreg.schema.kinds import ANY_SIZE, ListOf, Number, Numbers, Text
+from fgreg.schema.problems import FieldError
 from fgreg.schema.record import Key, record
 
 RIG_FORMAT = "fgreg-rig/1"
@@ -21,33 +19,6 @@ SHARED_SECTIONS = ("probe", "camera", "marker", "board")
 MOST_CONDITION = 1e14
 """Largest condition number of the correlation of constants."""
 _NAMES = tuple(text.name for text in TEXTS)
-_SHA256 = "[0-9a-f]{64}"
-
-
-@dataclass(frozen=True, slots=True)
-class Hashes(Kind):
-    """A mapping of names to SHA-256 hashes; one hash alone is that of ``events.jsonl``."""
-
-    def read(self, value: object, _folder: Path | None = None, /) -> dict[str, str]:
-        if isinstance(value, str):
-            value = {"events.jsonl": value}
-        if not isinstance(value, Mapping) or not value:
-            raise FieldError.of(shown(value), self.expected)
-        for name, entry in value.items():
-            if not isinstance(entry, str) or not re.fullmatch(_SHA256, entry):
-                raise FieldError.of(shown(entry), "a SHA-256, 64 hexadecimal digits", str(name))
-        return {str(name): entry for name, entry in value.items()}
-
-    def write(self, value: Any, _folder: Path | None = None, /) -> dict[str, str]:
-        return dict(value)
-
-    @property
-    def expected(self) -> str:
-        return "SHA-256 hashes by name"
-
-    def json_schema(self, _definitions: dict[str, JsonSchema], /) -> JsonSchema:
-        one = {"type": "string", "pattern": f"^{_SHA256}$"}
-        return {"anyOf": [one, {"type": "object", "minProperties": 1, "additionalProperties": one}]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,11 +5,13 @@ that rotations stay rigid to 1e-8; angles and lengths to 1e-6; covariances to te
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
 from fgreg.geometry.transforms import FloatArray
+from fgreg.schema.hashes import Hashes
 from fgreg.schema.kinds import ANY_SIZE, SECONDS, Figure, Integer, ListOf, Number, Numbers, Text
 from fgreg.schema.matrices import Covariance, Transform
 from fgreg.schema.record import Key, NotStored, record
@@ -258,6 +260,15 @@ class SessionEstimate:
         default="", kw_only=True
     )
     session: Annotated[str, Key("its name")]
+    inputs: Annotated[
+        Mapping[str, str],
+        Key(
+            "SHA-256 of the files that it was made from: session.yaml, events.jsonl, the rig's, and `frames`, over the "
+            "hashes of all frames in the order in which events name them",
+            Hashes(),
+            brief=True,
+        ),
+    ] = field(default_factory=dict, kw_only=True)
     verdict: Annotated[Verdict, Key("ok: usable; warning: a condition is missed; refused: use no transform", VERDICT)]
     reasons: Annotated[
         tuple[str, ...],

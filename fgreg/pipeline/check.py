@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import InputError
 from fgreg.output.leftovers import leftovers
 from fgreg.session.event_writer import type_of
+from fgreg.session.input_hashes import stale
+from fgreg.session.result_file import RESULT_FILE, read_result
 from fgreg.session.session_reader import EVENTS_FILE, check_session, read_session
 
 
@@ -52,7 +55,7 @@ def check(
     A session with problems is not looked at further.
     """
     problems, warnings = check_session(folder)
-    warnings = [*leftovers(folder), *warnings]
+    warnings = [*leftovers(folder), *warnings, *_about_result(folder)]
     if problems or not frames:
         return SessionCheck(tuple(problems), tuple(warnings))
     session = read_session(folder)
@@ -69,3 +72,15 @@ def check(
         for index, reason in sorted(extracted.unused.items())
     )
     return SessionCheck((), tuple(warnings), unused)
+
+
+def _about_result(folder: Path) -> list[str]:
+    """What is wrong with a session's result: stale, not readable, or not known what it was made from."""
+    result = folder / RESULT_FILE
+    if not os.path.lexists(result):
+        return []
+    try:
+        found = stale(result, read_result(result))
+    except InputError as error:
+        return [str(error)]
+    return [f"{result}: {found}; solve the session again"] if found else []

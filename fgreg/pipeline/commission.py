@@ -36,7 +36,7 @@ from fgreg.registration.commissioning import (
 from fgreg.registration.error_budget import conflicts
 from fgreg.registration.register import Registration
 from fgreg.registration.solve import solve
-from fgreg.session.input_hashes import input_hashes
+from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.rig_file import RIG_FILE, not_made_from, same_rig, section_hashes, write_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session
 
@@ -125,8 +125,8 @@ def commission_sessions(
             first; or none is left.
     """
     check_output(out, RIG_FILE)
-    sessions = [read_session(folder) for folder in folders]
-    hashes = [input_hashes(session) for session in sessions]
+    read = [read_with_hashes(folder) for folder in folders]
+    sessions, hashes = [session for session, _ in read], [found for _, found in read]
     _check_alike(sessions, hashes)
     solved = [
         _solved(session, replace(session.model, rig=None), use_checks, _step(progress, i, len(sessions)))

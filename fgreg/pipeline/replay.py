@@ -33,8 +33,9 @@ from fgreg.pipeline.solve import (
     solve_extracted,
 )
 from fgreg.registration.checks import CHECKS_REFUSE
+from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import write_result
-from fgreg.session.session_reader import Session, read_ground_truth, read_session
+from fgreg.session.session_reader import Session, read_ground_truth
 from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.spawn import spawn_viewer
@@ -122,7 +123,7 @@ def replay_session(
     if request.speed is not None and not 0 < request.speed < float("inf"):
         raise InputError("--speed", str(request.speed), "1, 10 or another number > 0, or max")
     result_path = result_place(request.folder, request.out, request.rrd)
-    session = read_session(request.folder)
+    session, inputs = read_with_hashes(request.folder)
     truth = read_ground_truth(request.folder)
     url = spawn_viewer() if request.live else None
     with open_viewer(request.rrd, session.model.name, url) as viewer:
@@ -140,7 +141,7 @@ def replay_session(
         player.play(on_step)
         taken, found, solution, estimate = solve_extracted(session, player.taken(), config)
         settled = engine.settle() if player.estimate is not None else None
-        estimate = replace(estimate, timing=player.timing(), tracks=player.answers(estimate.tracks))
+        estimate = replace(estimate, inputs=inputs, timing=player.timing(), tracks=player.answers(estimate.tracks))
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         viewer.result(session.model, taken.measurements, estimate, truth, extracted.tracks)
         write_result(estimate, session.model, result_path, __version__)

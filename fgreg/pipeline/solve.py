@@ -39,8 +39,9 @@ from fgreg.registration.move_doubt import TELLING
 from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import Condition
 from fgreg.session.ground_truth import GroundTruth
+from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import RESULT_FILE, RESULT_KIND, write_result
-from fgreg.session.session_reader import Session, read_ground_truth, read_session, session_place
+from fgreg.session.session_reader import Session, read_ground_truth, session_place
 from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording_file import RECORDING
@@ -133,7 +134,7 @@ def solve_session(
     start = time.perf_counter()
     config = config or SolveConfig()
     result_path = result_place(request.folder, request.out, request.rrd)
-    session = read_session(request.folder)
+    session, inputs = read_with_hashes(request.folder)
     truth = read_ground_truth(request.folder)
     with open_viewer(request.rrd, session.model.name) as viewer:
         extracted = extract_measurements(
@@ -143,6 +144,7 @@ def solve_session(
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
         extracted, found, solution, estimate = solve_extracted(session, extracted, config, request.detect_moves)
+        estimate = replace(estimate, inputs=inputs)
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         show(viewer, session, extracted, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)

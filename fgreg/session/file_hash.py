@@ -13,10 +13,12 @@ def file_hash(path: Path) -> str:
     """64 hexadecimal digits.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: there is no such file, or it cannot be read.
     """
+    if not path.is_file():  # a pipe would block
+        raise InputError(str(path), "no regular file", "a session's file")
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise InputError(str(path), f"a file that cannot be read ({why_refused(error)})", "a session's file") from None
