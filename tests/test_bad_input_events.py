@@ -152,7 +152,7 @@ def test_a_bad_line_is_named(tmp_path: Path, line: str, found: str) -> None:
     ("line", "found"),
     [
         (b'{"type": "note", "t": 1, "text": "\xff"}', "found bytes that are not UTF-8, expected UTF-8 text"),
-        ('{"type": "note", "t": 1, "text": "a"}'.encode("utf-16"), "found bytes that are not UTF-8"),
+        ('{"type": "note", "t": 1, "text": "a"}'.encode("utf-16"), "found UTF-16 text"),
         (b" " * 1_000_001, "found a longer line, expected at most 1000000 bytes"),
         (b'{"type": "note", "t": 1, "te', "found bad JSON"),
     ],

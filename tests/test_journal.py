@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import json
 import math
 import os
@@ -369,3 +370,69 @@ def test_what_json_does_not_have_is_a_text_in_the_record_of_a_refusal(folder: Pa
     assert isinstance(event, RefusedEvent)
     assert isinstance(event.event, dict)
     assert event.event["t"] == "nan"
+
+
+WHOLE = '{"type": "note", "t": 1, "text": "a"}\n{"type": "note", "t": 2, "text": "b"}\n'
+REFUSED: list[tuple[str, bytes, str]] = [
+    ("CR", WHOLE.replace("\n", "\r").encode(), "line 1: found line breaks by CR alone"),
+    ("CR, not ended", WHOLE.replace("\n", "\r").encode()[:-20], "line 1: found line breaks by CR alone"),
+    ("gzip", gzip.compress(WHOLE.encode(), mtime=0), "line 1: found gzip data"),
+    ("UTF-16", WHOLE.encode("utf-16"), "line 1: found UTF-16"),
+    ("UTF-16 without mark, one line", WHOLE.split("\n")[0].encode("utf-16-le"), "line 1: found UTF-16"),
+    ("Latin-1", WHOLE.replace("b", "ä").encode("latin-1")[:-1], "line 2: found bytes that are not UTF-8"),
+    ("an array", b'[{"type": "note", "t": 1', "line 1: found bad JSON"),
+    ("other quotes", WHOLE.encode() + b"{'type': 'note'", "line 3: found bad JSON"),
+    ("more after the object", WHOLE.encode() + b'{"type": "note"} {"ty', "line 3: found bad JSON"),
+    ("a text", WHOLE.encode() + b"to be continued", "line 3: found bad JSON"),
+    ("a long line", WHOLE.encode() + b'{"type": "note", "text": "' + b"x" * 1_000_000, "line 3: found a longer line"),
+    ("a bad line before", b'{"type": "note", "t": 1}\n{"type": "no', "line 1: "),
+]
+
+
+@pytest.mark.parametrize(("content", "found"), [case[1:] for case in REFUSED], ids=[case[0] for case in REFUSED])
+def test_what_is_no_beginning_of_a_line_is_refused_by_solve_and_recorder_alike_and_kept(
+    content: bytes, found: str, folder: Path
+) -> None:
+    path = folder / "events.jsonl"
+    path.write_bytes(content)
+    said = []
+    for opened in (Journal.open, read_session):
+        with pytest.raises(InputError) as caught:
+            opened(folder)
+        said.append(str(caught.value))
+        assert path.read_bytes() == content
+    assert said[0] == said[1]
+    assert found in said[0]
+    assert [entry.name for entry in folder.glob("events*")] == ["events.jsonl"]
+
+
+@pytest.mark.parametrize(
+    "tail",
+    ['{"type": "note", "text": "é'.encode()[:-1], b'{"a": [1, {"b": "\\', b'{"t": 1e', b'{"type"\0\0\0', b"\0" * 9],
+)
+def test_what_is_cut_off_is_kept_in_a_file_of_its_own_that_is_named(tail: bytes, folder: Path) -> None:
+    path = folder / "events.jsonl"
+    for name in ("events.jsonl.cut", "events.jsonl.cut-2"):
+        path.write_bytes(WHOLE.encode() + tail)
+        assert len(read_session(folder).events) == 2
+        with Journal.open(folder) as journal:
+            (warning,) = (text for text in journal.warnings if "cut short" in text)
+            assert warning.endswith(f"its {len(tail)} bytes are kept in {name}")
+            journal.append(NoteEvent(3.0, 0, "on"))
+        assert (folder / name).read_bytes() == tail
+        assert path.read_bytes().startswith(WHOLE.encode())
+        assert len(read_session(folder).events) == 3
+
+
+def test_nothing_is_cut_off_that_cannot_be_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder / "events.jsonl"
+    path.write_bytes(before := WHOLE.encode() + b'{"type": "no')
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        Journal.open(folder)
+    assert path.read_bytes() == before
+    assert [entry.name for entry in folder.glob("*events*")] == ["events.jsonl"]

@@ -91,7 +91,7 @@ def test_a_stale_result_is_told_by_check_and_refused_unless_forced(
     assert told in capsys.readouterr().err
     assert command(monkeypatch, "evaluate", solved) == 2
     assert told in capsys.readouterr().err
-    for suffix in WRITERS:
+    for suffix in WRITERS if name == "frames" else [".json"]:
         path = out.with_suffix(suffix)
         assert command(monkeypatch, "convert", solved, path, "--overwrite") == 2
         assert told in capsys.readouterr().err

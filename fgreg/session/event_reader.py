@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,13 +29,17 @@ from fgreg.session.frame_files import FrameUse
 from fgreg.session.setup_reader import Setup
 from fgreg.session.yaml_loader import open_file
 
+_CLOSES = {"{": "}", "[": "]"}
+# A text (perhaps cut short), a bracket, or what else is between them.
+_PIECE = re.compile(r'"(?:[^"\\\x00-\x1f]|\\[^\x00-\x1f])*+(?:"|\\?\Z)|[{}\[\]]|[ \t,:0-9+.eEtrufalsn-]+')
+
 
 @dataclass(slots=True)
 class EventLog:
-    """The valid events of an ``events.jsonl``, and warnings."""
+    """The valid events of an ``events.jsonl``, and a sentence about a last line that is cut short, where it is."""
 
     events: list[Event] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    cut_short: str = ""
 
 
 class _RefusedJsonError(ValueError):
@@ -42,7 +47,7 @@ class _RefusedJsonError(ValueError):
 
 
 class _CutShortError(ValueError):
-    """A last line without line break that is not JSON."""
+    """A last line without line break that is the beginning of an event's line."""
 
 
 def read_events(path: Path, file: str, folder: Path, setup: Setup | None, problems: list[InputError]) -> EventLog:
@@ -66,7 +71,7 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
             try:
                 read = read_line(line, number, file, folder, setup, last)
             except _CutShortError:
-                log.warnings.append(f"{file}: line {number}: cut short, dropped")
+                log.cut_short = f"{file}: line {number}: cut short, dropped ({len(line)} bytes)"
                 continue
             problems += read.problems
             if read.t is not None:
@@ -232,9 +237,11 @@ def _parse(line: bytes) -> Mapping[str, object]:
     except RecursionError:
         found = "nesting too deep"
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        if not line.endswith(b"\n"):
+        if not line.endswith(b"\n") and is_cut_short(line):
             raise _CutShortError from None
-        if isinstance(error, UnicodeDecodeError):
+        if other := _other_content(line):
+            found, expected = other, "UTF-8 text, one JSON object on each line"
+        elif isinstance(error, UnicodeDecodeError):
             found, expected = "bytes that are not UTF-8", "UTF-8 text"
         elif not line.strip():
             found = "an empty line"
@@ -245,6 +252,40 @@ def _parse(line: bytes) -> Mapping[str, object]:
             return value
         found = shown(value)
     raise FieldError.of(found, expected)
+
+
+def is_cut_short(tail: bytes) -> bool:
+    """Whether the bytes after the last line break are the beginning of an event's line, which power loss may leave: an
+    object that is opened and not closed. Zeros at the end are blocks that were never written."""
+    written = tail.rstrip(b"\0")
+    try:
+        text = written.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.reason != "unexpected end of data":
+            return False
+        text = written[: error.start].decode("utf-8")
+    text = text.lstrip(" \t")
+    open_until: list[str] = []
+    at = 0
+    while at < len(text):
+        piece = _PIECE.match(text, at)
+        if piece is None or (at == 0 and piece[0] != "{"):
+            return False
+        if piece[0] in _CLOSES:
+            open_until.append(_CLOSES[piece[0]])
+        elif piece[0] in _CLOSES.values() and (piece[0] != open_until.pop() or not open_until):
+            return False
+        at = piece.end()
+    return True
+
+
+def _other_content(line: bytes) -> str:
+    """What a file is that is no text of lines; empty where that is not known."""
+    if line.startswith(b"\x1f\x8b"):
+        return "gzip data"
+    if line.startswith((b"\xff\xfe", b"\xfe\xff")) or b"\0" in line:
+        return "UTF-16 text or binary data"
+    return "line breaks by CR alone" if b"\r" in line.rstrip(b"\r\n") else ""
 
 
 def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:

@@ -7,8 +7,9 @@ session that is opened again continues from the same numbers.
 
 from __future__ import annotations
 
-import json
+import os
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
@@ -17,6 +18,8 @@ from typing import Self
 from fgreg.errors import InputError, JournalError
 from fgreg.model.events import Event
 from fgreg.model.session_model import SessionModel
+from fgreg.output.atomic_file import FileKind, write_file
+from fgreg.output.session_folder import CUT_SUFFIX
 from fgreg.session.append_only_file import AppendFile, sync_path
 from fgreg.session.event_reader import frames_of, read_line
 from fgreg.session.event_writer import event_document, event_line, type_of
@@ -24,6 +27,9 @@ from fgreg.session.frame_files import check_frames
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session, session_place
 from fgreg.session.setup_reader import Setup, read_setup
 from fgreg.session.yaml_loader import load_yaml
+
+_CUT_OFF = FileKind("what was cut off", ())
+"""Never replaced: each has a name of its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +46,7 @@ class Journal:
     Attributes:
         folder: the session's, resolved.
         model: of the session.
-        warnings: of reading, and about a truncated last line that was dropped.
+        warnings: of reading, and about a truncated last line that was cut off.
     """
 
     def __init__(
@@ -55,20 +61,20 @@ class Journal:
     def open(cls, folder: Path) -> Self:
         """Open a session to record to it; an absent ``events.jsonl`` is created.
 
-        A truncated last line (power was lost during the write) is dropped with a warning: it was never acknowledged.
-        A complete last line without line break gets one.
+        A last line that is only the beginning of one (power was lost during the write) is moved to a file of its own
+        with a warning: it was never acknowledged. A complete last line without line break gets one.
 
         Raises:
-            InputError: the session's files are invalid.
+            InputError: the session's files are invalid, as the reader finds them; they are unchanged.
             JournalError: another program records to it, or the disk fails.
         """
         resolved = session_place(folder)
         setup = _setup(resolved)
         file = AppendFile.open(resolved / EVENTS_FILE, EVENTS_FILE)
         try:
-            warnings = _mend_tail(file, resolved, setup)
             recorded = read_session(resolved)
-            return cls(resolved, recorded.model, setup, file, recorded, [*warnings, *recorded.warnings])
+            warnings = [text for text in recorded.warnings if text != recorded.cut_short]
+            return cls(resolved, recorded.model, setup, file, recorded, [*_mend_tail(file, recorded), *warnings])
         except BaseException:
             file.close()
             raise
@@ -160,25 +166,23 @@ def _setup(folder: Path) -> Setup:
     return setup
 
 
-def _mend_tail(file: AppendFile, folder: Path, setup: Setup) -> list[str]:
-    """Drop a truncated last line, or add a missing line break; returns warnings."""
+def _mend_tail(file: AppendFile, recorded: Session) -> list[str]:
+    """Cut off a last line that is only the beginning of one, or end a whole one; returns warnings.
+
+    The whole file was read: this changes nothing but the last line. What is cut off is kept in a file of its own.
+
+    Raises:
+        InputError, JournalError: the system refuses, and nothing is changed.
+    """
     tail = file.tail()
     if not tail:
         return []
-    # The number and time of the line do not matter here: all is read again afterwards.
-    if read_line(tail + b"\n", 2**31, EVENTS_FILE, folder, setup, None).problems:
-        if not _is_cut_short(tail):
-            return []  # a complete but invalid line: the reader reports it
-        file.cut(file.size - len(tail))
-        return [f"{EVENTS_FILE}: the last line was cut short ({len(tail)} bytes) and is dropped"]
-    file.append(b"\n")
-    return []
-
-
-def _is_cut_short(tail: bytes) -> bool:
-    """Whether a line without line break is not complete JSON, by the reader's rules."""
-    try:
-        json.loads(tail.decode("utf-8"))
-    except (ValueError, RecursionError):
-        return True
-    return False
+    if not recorded.cut_short:
+        file.append(b"\n")
+        return []
+    place = recorded.folder / f"{EVENTS_FILE}{CUT_SUFFIX}"
+    names = (place.with_name(f"{place.name}-{number}") for number in count(2))
+    free = next(path for path in chain([place], names) if not os.path.lexists(path))
+    write_file(free, tail, _CUT_OFF)
+    file.cut(file.size - len(tail))
+    return [f"{EVENTS_FILE}: the last line was cut short; its {len(tail)} bytes are kept in {free.name}"]

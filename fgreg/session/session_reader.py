@@ -38,12 +38,14 @@ class Session:
         model: its set-up.
         events: in order.
         warnings: sentences about values that are allowed but implausible, and about a truncated last line.
+        cut_short: the one about the last line, where that is the beginning of an event's line and was left out.
     """
 
     folder: Path
     model: SessionModel
     events: tuple[Event, ...]
     warnings: tuple[str, ...]
+    cut_short: str = ""
 
 
 def session_place(folder: Path) -> Path:
@@ -77,7 +79,7 @@ def read_session(folder: str | Path) -> Session:
         raise problems[0]
     if setup is None or setup.model is None:
         raise AssertionError("no model and no problem")
-    return Session(folder, setup.model, tuple(log.events), tuple(_warnings(setup, log)))
+    return Session(folder, setup.model, tuple(log.events), tuple(_warnings(setup, log)), log.cut_short)
 
 
 def read_more_events(path: Path, session_folder: Path) -> tuple[Event, ...]:
@@ -148,8 +150,9 @@ def _read(folder: Path, problems: list[InputError]) -> tuple[Setup | None, Event
 
 def _warnings(setup: Setup | None, log: EventLog) -> list[str]:
     """Warnings about implausible values in both files."""
+    cut = [log.cut_short] if log.cut_short else []
     if setup is None:
-        return log.warnings
+        return cut
     beyond = []
     if setup.model is not None:
         lower, upper = (math.degrees(limit) for limit in setup.model.stage.limits_device_rad)
@@ -159,7 +162,7 @@ def _warnings(setup: Setup | None, log: EventLog) -> list[str]:
             )
             if any(not lower - 1e-6 <= look.scan_deg <= upper + 1e-6 for look in looks):
                 beyond.append(event.line)
-    out = [*setup.warnings, *log.warnings]
+    out = [*setup.warnings, *cut]
     out += [f"{EVENTS_FILE}: {text}" for text in _distances(log)]
     if beyond:
         where = f"{EVENTS_FILE}: line {beyond[0]}" + (f" and {len(beyond) - 1} more" if beyond[1:] else "")
