@@ -27,7 +27,10 @@ from fgreg.simulation.write import write_session
 from tests import session_files
 
 NOTE = FileKind("a note", (b"note: ",))
-FOREIGN = {"notes.txt": b"precious", "frames/unnamed.png": b"raw", "deep/er/scan.dcm": b"DICM"}
+FOREIGN = {
+    **{"notes.txt": b"precious", "frames/unnamed.png": b"raw", "deep/er/scan.dcm": b"DICM"},
+    "deep/own.npy": b"by its other name",
+}
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -52,6 +55,12 @@ def older(tmp_path: Path) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
     (folder / "link").symlink_to("deep")
+    (folder / "deep" / "own.npy").write_bytes(b"by its other name")
+    with (folder / "events.jsonl").open("a") as file:
+        file.write(
+            '{"type": "note", "t": 1e6, "text": "n", "x_": {"frame": "link/own.npy", "left": "../outside.png"}}\n'
+        )
+    (tmp_path / "outside.png").write_bytes(b"kept")
     return folder
 
 
@@ -103,7 +112,7 @@ def test_overwriting_replaces_the_sessions_own_files_and_no_others(
     assert set(found) - set(FOREIGN) == {"session.yaml", "events.jsonl", "ground_truth.yaml"}
     assert (older / "link").readlink() == Path("deep")
     assert read_session(older).model.name == "paper"
-    assert [path.name for path in older.parent.iterdir()] == ["s"]
+    assert sorted(path.name for path in older.parent.iterdir()) == ["outside.png", "s"]
 
 
 def test_a_file_that_is_not_the_sessions_is_not_replaced_by_a_new_one(older: Path) -> None:
@@ -187,7 +196,7 @@ def test_a_kill_while_a_session_is_replaced_loses_nothing_and_says_how_to_restor
     assert command(monkeypatch, "solve", older) == 2
     assert str(kept) in (told := capsys.readouterr().err)
     move = next(text for text in leftovers(older) if str(kept) in text).split("restore it")[1].split("mv ")[1]
-    assert str(kept) in told
+    assert "(with deep/er/scan.dcm, which is not the session's, and others: keep that)" in told
     if older.exists():
         older.rename(older.with_name("aside"))
     subprocess.run(["mv", *shlex.split(move.split(";")[0])], check=True)

@@ -118,7 +118,8 @@ class NewFile:
             self._handle = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise _refused(path, error) from None
-        lock(self._handle)
+        with contextlib.suppress(OSError):  # a file system without locks
+            lock(self._handle)
 
     def keep(self) -> None:
         """Flush it to disk and give it its name; an older one is replaced.

@@ -8,6 +8,7 @@ import shlex
 from pathlib import Path
 
 from fgreg.output.atomic_file import OLDER, PART, SWAP, lock, short_name
+from fgreg.output.session_folder import other_files
 
 _TEMPORARY = re.compile(rf"\.(.+)\.[0-9a-f]{{12,16}}\.({PART}|{SWAP}|{OLDER})", re.DOTALL)
 
@@ -46,8 +47,9 @@ def _sentence(entry: Path, path: Path) -> str:
     try:
         if not lock(handle):
             return ""
-    except OSError:
-        pass  # no locks here: nobody can be told from one that has ended
+    except OSError:  # no locks here: what is being written looks the same
+        if entry.name.endswith(f".{PART}"):
+            return ""
     finally:
         os.close(handle)
     quoted, place = shlex.quote(str(entry)), shlex.quote(str(path))
@@ -55,7 +57,10 @@ def _sentence(entry: Path, path: Path) -> str:
         return f"{entry} is left of an interrupted run that did not complete {path.name}; delete it: rm -r {quoted}"
     which = "the older" if entry.name.endswith(f".{OLDER}") else "the new or the older"
     aside = f", after moving {path.name} elsewhere" if os.path.lexists(path) else ""
+    others = other_files(entry) if entry.is_dir() else []
+    more = ", and others" if others[1:] else ""
+    keep = f" (with {others[0]}, which is not the session's{more}: keep that)" if others else ""
     return (
         f"{entry} is {which} {path.name}, left of a run that was interrupted while it replaced it; "
-        f"restore it{aside}: mv {quoted} {place}; or delete it"
+        f"restore it{aside}: mv {quoted} {place}; or delete it{keep}"
     )

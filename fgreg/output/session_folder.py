@@ -47,7 +47,8 @@ def check_folder(folder: Path, *, overwrite: bool = False) -> Path:
                 raise InputError(str(folder), "no session to overwrite", f"a folder with the {SETUP_FILE} of a session")
             with _unrecorded(place):
                 pass
-        above = next((parent for parent in place.parents if os.path.lexists(parent)), place)
+        within = (place, *place.parents) if not _is_session(place) else place.parents
+        above = next((parent for parent in within if os.path.lexists(parent)), place)
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
             raise InputError(str(folder), f"{above}, which cannot be written to", "a writable place")
     except (OSError, ValueError) as error:
@@ -73,17 +74,20 @@ def new_session(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
         if replaced:
             stack.enter_context(_unrecorded(place))
         try:
-            part = beside(place, PART)
+            # An empty folder may be somebody's working directory or a mount: it stays, and the new one is made inside.
+            inside = place.is_dir() and not replaced
+            part = beside(place / place.name if inside else place, PART)
             part.mkdir(parents=True)
             stack.callback(shutil.rmtree, part, ignore_errors=True)
             handle = os.open(part, os.O_RDONLY | os.O_CLOEXEC)
             stack.callback(os.close, handle)
-            lock(handle)
+            with suppress(OSError):  # a file system without locks
+                lock(handle)
             yield part
             if replaced:
                 _sync(part)
                 _replace(part, place)
-            elif place.is_dir():  # it may be somebody's working directory: it stays, and gets session.yaml last
+            elif inside:  # session.yaml comes last: without it there is no session
                 for entry in sorted(part.iterdir(), key=lambda entry: entry.name == SETUP_FILE):
                     entry.rename(place / entry.name)
             else:
@@ -109,7 +113,7 @@ def _unrecorded(folder: Path) -> Iterator[None]:
 
     Raises:
         InputError: another process records to it.
-        OSError: it cannot be locked.
+        OSError: it cannot be read.
     """
     try:
         handle = os.open(folder / EVENTS_FILE, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -117,7 +121,10 @@ def _unrecorded(folder: Path) -> Iterator[None]:
         yield
         return
     try:
-        if not lock(handle):
+        alone = True
+        with suppress(OSError):  # where there are no locks nobody records
+            alone = lock(handle)
+        if not alone:
             raise InputError(str(folder), "a session that another program is recording", "one that nobody records")
         yield
     finally:
@@ -133,8 +140,9 @@ def own_files(folder: Path) -> set[Path]:
         for line in lines:
             with suppress(ValueError, RecursionError):
                 names += _frames(json.loads(line))
-    inside = (Path(os.path.normpath(name)) for name in names if "\0" not in name)
-    return {path for path in inside if not path.is_absolute() and ".." not in path.parts and (folder / path).is_file()}
+    found = {Path(os.path.normpath(name)) for name in names if "\0" not in name}
+    inside = {path for path in found if not path.is_absolute() and ".." not in path.parts}
+    return {path for path in inside if (real := folder / path).is_file() and os.path.realpath(real) == str(real)}
 
 
 def _frames(value: object) -> Iterator[str]:
@@ -156,8 +164,7 @@ def _replace(part: Path, place: Path) -> None:
         InputError: one of these has the name of a new file, or cannot be moved: it is named, and stays where it is.
         OSError: the system refuses.
     """
-    own = own_files(place)
-    others = [path for path in _files(place) if path not in own]
+    own, others = own_files(place), other_files(place)
     for path in others:
         if any(os.path.lexists(part / above) and not (part / above).is_dir() for above in path.parents) or (
             os.path.lexists(part / path)
@@ -188,13 +195,13 @@ def _replace(part: Path, place: Path) -> None:
             Path(folder).rmdir()
 
 
-def _files(folder: Path) -> list[Path]:
-    """Everything below a folder that is not a folder, relative to it; links to folders are files here."""
-    found = []
+def other_files(folder: Path) -> list[Path]:
+    """Everything in a session's folder that is not its own, relative to it; links to folders are files here."""
+    found, own = [], own_files(folder)
     for root, folders, files in os.walk(folder):
         links = [name for name in folders if (Path(root) / name).is_symlink()]
         found += [(Path(root) / name).relative_to(folder) for name in [*files, *links]]
-    return sorted(found)
+    return sorted(path for path in found if path not in own)
 
 
 def _exchange(a: Path, b: Path) -> bool:
