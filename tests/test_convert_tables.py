@@ -211,6 +211,10 @@ def test_a_session_that_is_there_is_replaced_only_when_the_new_one_is_whole(tmp_
     other = table(tmp_path, ROW + f"5,{POSE},2,3,30,0\n")
     assert convert(other, tmp_path / "s", "--setup", where, "--overwrite").exit_code == 0
     assert events(tmp_path / "s")[0]["t"] == 5.0
+    (tmp_path / "s" / "shots.csv").write_bytes(other.read_bytes())
+    inside = tmp_path / "s" / "shots.csv"
+    assert "inside of" in refused(inside, tmp_path / "s", "--setup", where, "--overwrite")
+    assert inside.is_file()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
     assert "no session to overwrite" in refused(good, tmp_path / "mine", "--setup", where, "--overwrite")

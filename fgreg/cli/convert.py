@@ -85,7 +85,7 @@ def add_convert(app: typer.Typer) -> None:
         overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing OUT.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No summary.")] = False,
     ) -> None:
-        warn_of_leftovers(out)
+        warn_of_leftovers(source, out)
         result = _result_file(source)
         if result is not None:
             unused = {"--setup": setup, "--map": mapping, "--calibration": calibration or None}

@@ -176,9 +176,10 @@ def _replace(part: Path, place: Path) -> None:
         older = place.rename(beside(place, OLDER))
         try:
             new.rename(place)
-        except OSError:
-            older.rename(place)
-            new.rename(part)
+        except BaseException:
+            if not os.path.lexists(place):
+                older.rename(place)
+                new.rename(part)
             raise
     sync_folder(place.parent)
     for path in others:
