@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import math
+import os
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.estimate import SessionEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import ChannelModel, MarkerModel, SessionModel, StageModel, TagModel
+from fgreg.viewer import shapes
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
 from tests.answers import REGISTRATION_COVARIANCE, answer_from_truth
@@ -406,6 +408,28 @@ def test_a_recording_takes_the_place_of_an_older_one_and_leaves_no_other_file(tm
             viewer.session(make_session())
     assert "/world/probe" in read_recording(path)
     assert "world" in views(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("failure", ["", "File-writer thread shut down prematurely"])
+def test_a_recording_that_is_not_written_to_its_end_leaves_the_older_one(
+    failure: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "phantom.rrd"
+    path.write_bytes(b"RRF2 an older one of fgreg")
+    real = shapes.Recorder.close
+
+    def close(recorder: shapes.Recorder) -> None:
+        real(recorder)
+        (part,) = tmp_path.glob(".phantom.rrd.*.part")
+        os.truncate(part, part.stat().st_size - 5)
+        if failure:
+            raise RuntimeError(failure)
+
+    monkeypatch.setattr(shapes.Recorder, "close", close)
+    with pytest.raises(InputError, match="a recording that cannot be written"), open_viewer(path, "phantom") as viewer:
+        viewer.session(make_session())
+    assert path.read_bytes() == b"RRF2 an older one of fgreg"
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -102,7 +102,7 @@ def check_outputs(outputs: Iterable[tuple[str, Path | None, FileKind]]) -> None:
 
 
 class NewFile:
-    """A file under construction, at ``part``. As a context manager it is kept at the end of the block.
+    """A file under construction, at ``part``, for ``path``. As a context manager it is kept at the end of the block.
 
     After an exception it is dropped, and an older one is unchanged.
 
@@ -112,7 +112,7 @@ class NewFile:
 
     def __init__(self, path: Path, kind: FileKind) -> None:
         check_output(path, kind)
-        self._path, self._kind = path, kind
+        self.path, self._kind = path, kind
         self.part = beside(path, PART)
         try:
             self._handle = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
@@ -129,11 +129,11 @@ class NewFile:
         """
         try:
             os.fsync(self._handle)
-            check_output(self._path, self._kind)
-            self.part.replace(self._path)
-            sync_folder(self._path.parent)
+            check_output(self.path, self._kind)
+            self.part.replace(self.path)
+            sync_folder(self.path.parent)
         except OSError as error:
-            raise _refused(self._path, error) from None
+            raise _refused(self.path, error) from None
         finally:
             self.drop()
 

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
+from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.model.estimate import SessionEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
@@ -36,7 +37,7 @@ from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LiveDrawing, ViewerUpdate
 from fgreg.viewer.pa_frame import pa_picture, texture
-from fgreg.viewer.recording_file import RECORDING
+from fgreg.viewer.recording_file import RECORDING, is_complete
 from fgreg.viewer.result import ResultDrawing, Truth
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.shapes import Image8
@@ -44,6 +45,10 @@ from fgreg.viewer.status_line import BmodePicture
 
 LARGEST_TEXTURE = 160
 """Larger side of a B-mode image on the image plane, px."""
+
+
+def _not_written(rrd: Path, why: str) -> InputError:
+    return InputError(str(rrd), f"a recording that cannot be written ({why})", "a writable place")
 
 
 class Viewer:
@@ -65,6 +70,11 @@ class Viewer:
         self._file = None if rrd is None else NewFile(rrd, RECORDING)
         try:
             self._rec = shapes.Recorder(None if self._file is None else self._file.part, session_name, url)
+        except RuntimeError as error:
+            self._drop_part()
+            if rrd is None:
+                raise
+            raise _not_written(rrd, str(error)) from None
         except BaseException:
             self._drop_part()
             raise
@@ -87,8 +97,14 @@ class Viewer:
         try:
             if not self._finished and self._live is None:
                 self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
-            self._rec.close()
+            failure = "its end is missing"
+            try:
+                self._rec.close()
+            except RuntimeError as closing:  # also where the user has closed a viewer: the file alone tells
+                failure = str(closing)
             if kind is None and self._file is not None:
+                if not is_complete(self._file.part):
+                    raise _not_written(self._file.path, failure)
                 self._file.keep()
         finally:
             self._drop_part()

@@ -50,6 +50,9 @@ NOWHERE = "not known"
 JPEG_QUALITY = 80
 
 
+FLUSH_S = 600.0
+
+
 class Recorder:
     """A recording stream into a file, a running viewer, or both, with the timelines ``shot`` and ``time``.
 
@@ -95,8 +98,12 @@ class Recorder:
         self._stream.send_blueprint(blueprint)
 
     def close(self) -> None:
-        """Flush and end the recording."""
-        self._stream.flush()
+        """Flush and end the recording.
+
+        Raises:
+            RuntimeError: it is not written, for example on a full disk.
+        """
+        self._stream.flush(timeout_sec=FLUSH_S)  # its default waits forever where the file's thread has ended
         self._stream.disconnect()
 
 
