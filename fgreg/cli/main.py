@@ -250,8 +250,8 @@ def check(
     """Check a session's files and report all problems at once.
 
     Checks session.yaml, events.jsonl, ground_truth.yaml and all frames, and detects in the frames as solve does: each
-    shot that a solve would leave out is named with the reason, and a result.yaml that was made from other files. Exit status 2 where there
-    are problems; warnings alone are 0.
+    shot that a solve would leave out is named with the reason, and so is a result.yaml that was made from other files.
+    Exit status 2 where there are problems; warnings alone are 0.
     """
     from fgreg.pipeline.check import check as check_all
 
