@@ -108,21 +108,16 @@ def test_a_negative_variance_of_a_detector_is_a_reason_everywhere(
     raw_session: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Whatever a detector gives passes the check that files and programs pass."""
-    calls = 0
 
-    def spoilt(*args: Any) -> Any:
-        nonlocal calls
-        found = locate_in_frame(*args)
-        calls += 1
-        if isinstance(found, PaFind) and calls % 3 == 1:
+    def spoilt(frame: Any, *args: Any) -> Any:
+        found = locate_in_frame(frame, *args)
+        if isinstance(found, PaFind) and int(np.abs(frame).sum(dtype=np.float64)) % 3 == 1:  # frames come in any order
             return replace(found, covariance=np.diag([-1.0, 0.01]))
         return found
 
     monkeypatch.setattr("fgreg.detection.event_frames.locate_in_frame", spoilt)
     solved = solve_session(SolveRequest(raw_session, tmp_path / "solved.yaml"), FAST).estimate
-    calls = 0
     replayed = replay_session(ReplayRequest(raw_session, tmp_path / "replayed.yaml"), FAST).solved.estimate
-    calls = 0
     checked = check(raw_session)
     reasons = [p.reason for p in solved.pairs if "the variance -1 on the diagonal" in p.reason]
     assert reasons
@@ -130,9 +125,8 @@ def test_a_negative_variance_of_a_detector_is_a_reason_everywhere(
     assert {shot.reason for shot in checked.unused if shot.kind == "pair"} == set(reasons)
     assert not [r for r in (*solved.reasons, *replayed.reasons) if "chi square -" in r]
     session = read_session(raw_session)
-    calls = 0
-    event = next(event for event in session.events if isinstance(event, PairEvent))
-    assert MeasurementExtractor(session.model).add(event, 0) == reasons[0]
+    live = [MeasurementExtractor(session.model).add(e, 0) for e in session.events if isinstance(e, PairEvent)]
+    assert [found for found in live if isinstance(found, str)] == reasons
 
 
 def test_numbers_of_a_program_are_named_with_their_place(small_session: Path) -> None:

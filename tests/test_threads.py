@@ -25,7 +25,12 @@ def test_commands_run_with_one_thread_for_linear_algebra(monkeypatch: pytest.Mon
     for name in NAMES:
         monkeypatch.delenv(name, raising=False)
     seen: list[str | None] = []
-    monkeypatch.setattr(main, "app", lambda **_: seen.extend(os.environ.get(name) for name in NAMES))
+
+    def run(_: list[str]) -> int:
+        seen.extend(os.environ.get(name) for name in NAMES)
+        return 0
+
+    monkeypatch.setattr(main, "_run", run)
     with pytest.raises(SystemExit) as ended:
         main.main()
     assert ended.value.code == 0
