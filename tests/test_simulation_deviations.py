@@ -274,6 +274,16 @@ def test_points_are_triangulated_by_the_declared_rig(off: dict[str, float], expe
     np.testing.assert_allclose(points_read(config, np.array([[10.0, 0.0, 100.0]])), [expected], atol=1e-6)
 
 
+def test_points_are_triangulated_where_the_views_miss_each_other_by_pixels() -> None:
+    config = quiet({Constant.STEREO_ROTATION_X: 0.003}, camera=simple_rig(), camera_declared=True)
+    grid = np.stack(np.meshgrid([-25.0, 0.0, 25.0], [-25.0, 0.0, 25.0], [110.0, 150.0]), axis=-1).reshape(-1, 3)
+    read = points_read(config, grid)
+    # The right view's rows are 3 px off, and half of that is between the two; the depth hardly changes.
+    rows = 1000.0 * (read[:, 1] / read[:, 2] - grid[:, 1] / grid[:, 2])
+    np.testing.assert_allclose(rows, -1.5, atol=0.1)
+    np.testing.assert_allclose(read[:, 2], grid[:, 2], atol=0.6)
+
+
 def test_turned_right_camera_changes_the_disparity() -> None:
     # (0, 0, 100) is at (100 sin a - 5, 0, 100 cos a) in the right camera.
     config = quiet({Constant.STEREO_ROTATION_Y: ANGLE}, camera=simple_rig(), camera_declared=True)
