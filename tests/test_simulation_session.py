@@ -394,7 +394,15 @@ def test_reversed_elements_reverse_the_channels() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"epochs": 0}, {"pairs": -1}, {"outlier_pairs": 11}, {"frames": True}, {"looks_per_pm": 0}]
+    "changes",
+    [
+        {"epochs": 0},
+        {"pairs": -1},
+        {"outlier_pairs": 11},
+        {"frames": True},
+        {"looks_per_pm": 0},
+        {"camera_move_mm": 3.0},
+    ],
 )
 def test_impossible_configurations_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"have to be|expected|need"):

@@ -208,6 +208,8 @@ class SimulationConfig:
     def __post_init__(self) -> None:
         if self.epochs < 1 or self.looks_per_pm < 1 or self.track_looks < 1:
             raise ValueError("epochs, looks_per_pm and track_looks have to be at least 1")
+        if self.camera_move_mm is not None and self.epochs < 2:
+            raise ValueError("camera_move_mm needs a session in which the camera moves: 2 epochs or more")
         if min(self.aims, self.pairs, self.tracks_heard, self.tracks_silent, self.checks) < 0:
             raise ValueError("aims, pairs, tracks and checks have to be 0 or more")
         if not (self.water_mm >= 0.0 and self.water_index >= 1.0):

@@ -19,7 +19,7 @@ from fgreg.model.session_model import BoardModel, MarkerModel
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.lens import project_points
 
-ITERATIONS = 12
+ITERATIONS = 40
 SETTLED = 1e-7
 """Number of Gauss-Newton steps at most, and the size of a step (rad, mm) that is the last."""
 STEP = 1e-3
