@@ -235,6 +235,8 @@ def test_bad_input_is_named(session: tuple[Path, list[dict[str, Any]]], tmp_path
         verify_session(folder, lines(tmp_path / "note.jsonl", [{"type": "note", "t": 0, "text": "a"}]))
     with pytest.raises(InputError, match=r"wrong\.jsonl: line 1"):
         verify_session(folder, lines(tmp_path / "wrong.jsonl", [{**events[0], "pm": -1}]))
+    with pytest.raises(InputError, match="a shot of the registration itself"):
+        verify_session(folder, folder)
     with pytest.raises(InputError, match=r"nowhere\.jsonl"):
         verify_session(folder, tmp_path / "nowhere.jsonl")
     copy = tmp_path / "copy"

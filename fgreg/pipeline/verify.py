@@ -91,6 +91,13 @@ def verify_session(
     epoch = snapshot.epoch(result.epochs[-1].index)
     if epoch is None:
         raise AssertionError("the registration of the last epoch was compared")
+    known = {_content(event) for event in session.events if isinstance(event, PairEvent)}
+    for event in events:
+        if isinstance(event, PairEvent) and _content(event) in known:
+            where = f"{new}: line {event.line}"
+            raise InputError(
+                where, "a shot of the registration itself", "new ones: of its own shots it is always valid"
+            )
     pairs, unused = _new_pairs(events, model, progress)
     moved = next((event for event in events if isinstance(event, CameraMovedEvent)), None)
     if moved is not None:
@@ -121,6 +128,13 @@ def _new_events(new: Path, session: Session) -> tuple[tuple[Event, ...], Session
     if not any(isinstance(event, PairEvent | CameraMovedEvent) for event in events):
         raise InputError(str(new), "no pair event", "at least one pair: a shot with its look")
     return events, model
+
+
+def _content(shot: PairEvent) -> tuple[object, ...]:
+    """What tells a recorded shot from all others."""
+    marker, look = shot.marker, shot.trus
+    pose = None if marker.camera_T_marker is None else marker.camera_T_marker.tobytes()
+    return shot.t, shot.pm, pose, marker.left, look.scan_deg, look.x_mm, look.range_mm, look.frame
 
 
 def _new_pairs(
