@@ -71,6 +71,7 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("stage.limits_deg", [-181, 60], "stage.limits_deg[0]", "-181", "within +-180 deg"),
     ("stage.direction", 0, "stage.direction", "0", "1 or -1"),
     ("stage.direction", True, "stage.direction", "true", "1 or -1"),
+    ("systematic", "exact", "systematic", "'exact'", "or none"),
     ("stage.zero_deg", 200, "stage.zero_deg", "200", "within +-180 deg"),
     ("camera.image_size", [640], "camera.image_size", "[640]", "[width, height]"),
     ("camera.image_size", [640, 480.0], "camera.image_size", "[640, 480.0]", "two integers from 1 to 32768"),

@@ -15,6 +15,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.kinds import NOISE_MM, Converted, JsonSchema, Number, NumberTuple
+from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key, NotStored, record
 
 _RELATIVE = Number(0.0, 1.0)
@@ -99,7 +100,11 @@ class _SystematicKind(Converted):
     """``systematic`` of ``session.yaml``: a mapping, or the word ``none``."""
 
     def read(self, value: object, folder: Path | None = None, /) -> Any:
-        return NONE if value == _WORD else super().read(value, folder)
+        if value == _WORD:
+            return NONE
+        if not isinstance(value, dict):
+            raise FieldError.of(shown(value), self.expected)
+        return super().read(value, folder)
 
     def write(self, value: Any, folder: Path | None = None, /) -> Any:
         return super().write(value, folder) if value.declared else _WORD
