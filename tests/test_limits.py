@@ -27,7 +27,10 @@ from fgreg.drivers.opencv_storage import is_storage, read_storage
 from fgreg.drivers.ros_recordings import Recording
 from fgreg.errors import InputError
 from fgreg.live.config import read_config
+from fgreg.pipeline import replay
+from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.schema import limits
+from fgreg.session import event_reader
 from fgreg.session.frame_files import check_camera_frame, check_trus_frame
 from fgreg.session.session_reader import check_session
 from tests import bags, live_configs, session_files
@@ -175,6 +178,22 @@ def test_problems_and_lines_of_a_session_are_bounded(tmp_path: Path) -> None:
     (folder / "events.jsonl").write_text("x\n" * 3000, encoding="utf-8")
     problems, _ = check_session(folder)
     assert len(problems) == limits.PROBLEMS + 1
+
+
+def test_pairs_are_bounded_for_solve_and_replay_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = session_files.write(tmp_path / "s")
+    session_files.write_frames(folder)
+    pairs = sum(event["type"] == "pair" for event in session_files.events())
+    monkeypatch.setattr(replay, "REPLAYED_PAIRS", pairs - 1)
+    with pytest.raises(InputError, match=rf"events.jsonl: found {pairs} pairs, expected at most {pairs - 1}"):
+        replay.replay_session(replay.ReplayRequest(folder))
+    monkeypatch.setattr(event_reader, "PAIRS", pairs)
+    assert not check_session(folder)[0]
+    monkeypatch.setattr(event_reader, "PAIRS", pairs - 1)
+    with pytest.raises(InputError, match=rf"events.jsonl: found more than {pairs - 1} pairs"):
+        solve_session(SolveRequest(folder))
 
 
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])

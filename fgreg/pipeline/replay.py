@@ -33,9 +33,10 @@ from fgreg.pipeline.solve import (
     solve_extracted,
 )
 from fgreg.registration.checks import CHECKS_REFUSE
+from fgreg.schema.limits import REPLAYED_PAIRS
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import write_result
-from fgreg.session.session_reader import Session, read_ground_truth
+from fgreg.session.session_reader import EVENTS_FILE, Session, read_ground_truth
 from fgreg.version import __version__
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.spawn import spawn_viewer
@@ -124,6 +125,10 @@ def replay_session(
         raise InputError("--speed", str(request.speed), "1, 10 or another number > 0, or max")
     result_path = result_place(request.folder, request.out, request.rrd)
     session, inputs = read_with_hashes(request.folder)
+    if (pairs := sum(isinstance(event, PairEvent) for event in session.events)) > REPLAYED_PAIRS:
+        raise InputError(
+            EVENTS_FILE, f"{pairs} pairs", f"at most {REPLAYED_PAIRS} for a replay; fgreg solve takes more"
+        )
     truth = read_ground_truth(request.folder)
     url = spawn_viewer() if request.live else None
     with open_viewer(request.rrd, session.model.name, url) as viewer:

@@ -48,6 +48,8 @@ def group_conditions(problem: PackedProblem, optimum: Optimum, covariance: Float
         epoch: of ``problem.columns``.
     """
     mine = np.unique(problem.beam_pm[problem.beam_epoch == epoch])
+    if len(mine) < 2 * LEAST_PMS:
+        return []
     partings = [p for p in _partings(problem, mine) if min(p.second.sum(), (~p.second).sum()) >= LEAST_PMS]
     if not partings:
         return []

@@ -23,7 +23,7 @@ from fgreg.model.events import (
 )
 from fgreg.schema.files import FrameKind
 from fgreg.schema.kinds import SECONDS
-from fgreg.schema.limits import DIGITS, EVENT_LINES, LINE_BYTES, PROBLEMS
+from fgreg.schema.limits import DIGITS, EVENT_LINES, LINE_BYTES, PAIRS, PROBLEMS
 from fgreg.schema.problems import FieldError, Problem, input_error, path_text, shown
 from fgreg.session.frame_files import FrameUse
 from fgreg.session.setup_reader import Setup
@@ -66,6 +66,7 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
         problems.append(error)
         return log
     last: tuple[float, int] | None = None
+    pairs = 0
     with stream:
         for number, line in _lines(stream, file, problems):
             try:
@@ -78,6 +79,10 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
                 last = (read.t, number)
             if read.event is not None:
                 log.events.append(read.event)
+                pairs += isinstance(read.event, PairEvent)
+            if pairs > PAIRS:
+                problems.append(InputError(file, f"more than {PAIRS} pairs", "fewer: several sessions"))
+                break
     return log
 
 
