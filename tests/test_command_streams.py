@@ -79,9 +79,14 @@ import fgreg.cli.main as command_line
 
 @command_line.app.command()
 def act(how: str):
-    if how == "wait":
+    if how in ("wait", "changed"):
         print("ready", flush=True)
-        time.sleep(60)
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            if how == "changed":
+                raise ImportError("initialization failed") from None
+            raise
     if how == "noisy":
         import multiprocessing, threading
         import numpy as np
@@ -124,8 +129,9 @@ def test_libraries_say_nothing_and_threads_are_heard() -> None:
     assert said == b"fgreg: warning: a thread's\n"
 
 
-def test_an_interrupt_ends_without_a_word() -> None:
-    with _start("wait") as process:
+@pytest.mark.parametrize("how", ["wait", "changed"])
+def test_an_interrupt_ends_without_a_word_also_where_a_library_makes_another_error_of_it(how: str) -> None:
+    with _start(how) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"ready\n"
         process.send_signal(signal.SIGINT)
@@ -144,3 +150,28 @@ def test_output_that_cannot_be_written_is_one_line() -> None:
         )
     assert done.returncode == 2
     assert done.stderr == b"fgreg: error: standard output: No space left on device\n"
+
+
+def test_errors_that_cannot_be_told_keep_their_status() -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full")
+    with full.open("wb") as stream:
+        done = subprocess.run([sys.executable, "-m", "fgreg", "solve", "absent"], stderr=stream, check=False)
+    assert done.returncode == 2
+
+
+def test_an_interrupt_while_modules_are_loaded_ends_without_a_word() -> None:
+    program = "import fgreg.cli, os, signal, sys; import fgreg.__main__ as m; os.kill(os.getpid(), signal.SIGINT)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False, timeout=60)
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == b""
+
+
+def test_a_working_folder_that_was_removed_is_one_line(tmp_path: Path) -> None:
+    program = "import os, sys; from fgreg.cli.main import main; os.mkdir('a'); os.chdir('a'); os.rmdir('../a'); main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "solve", "s"], cwd=tmp_path, capture_output=True, check=False, timeout=60
+    )
+    assert done.returncode == 2
+    assert done.stderr == b"fgreg: error: the working folder: found none: it was removed, expected one that exists\n"

@@ -11,10 +11,12 @@ import errno
 import gc
 import json
 import math
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
@@ -46,7 +48,6 @@ OUT_OF = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, e
 
 app = typer.Typer(
     name="fgreg",
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -72,6 +73,7 @@ def main() -> None:
 
 
 def _exit_status(arguments: list[str]) -> int:
+    interrupted = _watch_interrupts()
     try:
         with one_thread_each():  # parallel work is over frames, solves or devices, not in matrices
             status = _run(arguments)
@@ -90,12 +92,31 @@ def _exit_status(arguments: list[str]) -> int:
             return _fail(f"{error.filename or 'this machine'}: {error.strerror}")
         if isinstance(error, SystemExit):
             raise
+        if interrupted:  # a library has made another error of it, as gtsam does while it is loaded
+            return EXIT_INTERRUPTED
         print_crash(error)
         return EXIT_CRASH
 
 
+def _watch_interrupts() -> list[int]:
+    """Handle Ctrl-C as Python does, and note it in the list. Another program's handler, or none, is left alone."""
+    noted: list[int] = []
+
+    def on_interrupt(number: int, _frame: FrameType | None) -> None:
+        noted.append(number)
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, signal.SIG_DFL):
+        signal.signal(signal.SIGINT, on_interrupt)
+    return noted
+
+
 def _run(arguments: list[str]) -> int:
     """Run a command. Not by Typer's own call, which makes status 1 of a broken pipe, be it of a device."""
+    try:
+        Path.cwd()
+    except OSError:
+        raise InputError("the working folder", "none: it was removed", "one that exists") from None
     command = typer.main.get_command(app)
     try:
         with command.make_context("fgreg", arguments) as context:
@@ -117,13 +138,17 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _top(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Options before the command."""
+    """Options before the command; without any, the help."""
+    del version
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
 
 
 def _no_progress(_step: str, _done: int, _total: int) -> None:

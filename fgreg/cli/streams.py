@@ -26,7 +26,8 @@ class _Output(io.FileIO):
     """A file descriptor for writing; once its reader has gone away, what is written is dropped.
 
     Raises:
-        OSError: another failure, once; after it, too, what is written is dropped.
+        OSError: another failure of standard output, once; after it, too, what is written is dropped. One of standard
+            error cannot be told anywhere.
     """
 
     def write(self, data: ReadableBuffer, /) -> int:
@@ -34,7 +35,7 @@ class _Output(io.FileIO):
             return super().write(data)
         except OSError as error:
             _lead_nowhere(self.fileno())
-            if not isinstance(error, BrokenPipeError):
+            if self.fileno() == 1 and not isinstance(error, BrokenPipeError):
                 raise OSError(error.errno, error.strerror, "standard output") from None
             return memoryview(data).nbytes
 
