@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import signal
 import subprocess
@@ -123,6 +124,13 @@ def test_a_file_that_is_not_the_sessions_is_not_replaced_by_a_new_one(older: Pat
     with pytest.raises(InputError, match=r"ground_truth\.yaml/mine: found a file that the older session does not name"):
         overwrite(older)
     assert contents(older) == before
+
+
+def test_a_pipe_in_the_place_of_events_is_refused_and_not_waited_for(older: Path) -> None:
+    (older / "events.jsonl").unlink()
+    os.mkfifo(older / "events.jsonl")
+    with pytest.raises(InputError, match=r"events\.jsonl: found a file that the older session does not name"):
+        overwrite(older)
 
 
 @pytest.mark.parametrize("words", [("simulate",), ("convert", "SHOTS", "--setup")])

@@ -71,7 +71,8 @@ def check_output(path: Path, kind: FileKind) -> None:
         if path.name in SESSION_FILES and path.name != kind.file_name:
             raise InputError(str(path), "the name of a session's own file", f"another name for {kind.name}")
         if os.path.lexists(path) and not kind.holds(path):
-            raise InputError(str(path), f"a file that is not {kind.name}", "a new name, or that of an older one")
+            found = "a link" if path.is_symlink() else f"a file that is not {kind.name}"
+            raise InputError(str(path), found, "a new name, or that of an older one")
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise InputError(str(path.parent), "a folder that cannot be written to", f"one to write {path.name} to")
         path.lstat()  # whether the system takes the name

@@ -136,10 +136,12 @@ def own_files(folder: Path) -> set[Path]:
     names = [*SESSION_FILES, STAGE_LOG, *(path.name for path in folder.glob(f"{EVENTS_FILE}{CUT_SUFFIX}*"))]
     with suppress(OSError):
         names += _RIG.findall((folder / SETUP_FILE).read_text(encoding="utf-8", errors="replace"))
-    with suppress(OSError), (folder / EVENTS_FILE).open("rb") as lines:
-        for line in lines:
-            with suppress(ValueError, RecursionError):
-                names += _frames(json.loads(line))
+    with suppress(OSError):
+        if (folder / EVENTS_FILE).is_file():  # a pipe would be waited for
+            with (folder / EVENTS_FILE).open("rb") as lines:
+                for line in lines:
+                    with suppress(ValueError, RecursionError):
+                        names += _frames(json.loads(line))
     found = {Path(os.path.normpath(name)) for name in names if "\0" not in name}
     inside = {path for path in found if not path.is_absolute() and ".." not in path.parts}
     return {path for path in inside if (real := folder / path).is_file() and os.path.realpath(real) == str(real)}
