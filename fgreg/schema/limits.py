@@ -36,7 +36,7 @@ EVENT_LINES = 200_000
 PAIRS, REPLAYED_PAIRS = 20_000, 1_000
 """Pairs of a session, and of one that is replayed. A solve of 1,000, 5,000, 20,000 takes 2, 9, 24 s and 0.2, 0.5,
 1.7 GB. The online engine weighs all earlier ones at each: 1,000 take 100 s and 0.2 GB, 2,000 already 520 s, and 1,000
-looks at one spot 23 minutes."""
+repeats of one shot 23 minutes."""
 PROBLEMS = 1_000
 """Told of one file; who mends a file does not read more."""
 
