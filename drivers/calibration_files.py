@@ -5,7 +5,8 @@ Content of each kind, and how it is converted (``right_T_left`` maps left coordi
 - ROS: ``K``, ``D``, ``R``, ``P`` of each camera, metres. The rectified cameras are parallel, apart by
   ``b = P_right[:, 3] / f - P_left[:, 3] / f``; so ``right_T_left = [R_right' R_left, R_right' b]``.
 - OpenCV: matrices ``M1 D1 M2 D2`` (or ``K1``, ``cameraMatrix1``, ...) with ``R``, ``T`` of ``stereoCalibrate``, which
-  are ``right_T_left`` itself, in the units of the board; read as millimetres.
+  are ``right_T_left`` itself, in the units of the board; read as millimetres. Of ``cv2.FileStorage``, or plain JSON or
+  YAML with the same names.
 - Kalibr: ``cam0`` is left, ``cam1`` right, ``T_cn_cnm1`` of cam1 is ``right_T_left``, metres.
 - ``ost.txt`` and scikit-surgery: fgreg.drivers.calibration_texts. MATLAB: fgreg.drivers.calibration_matlab.
 
@@ -144,6 +145,8 @@ def _kind(path: Path) -> _Kind:
     document = load_yaml(path, path.name)
     if "cam0" in document:
         return _Kind.KALIBR
+    if _is_plain(document):
+        return _Kind.OPENCV
     return _Kind.ROS if struct_of(document) is None else _Kind.MATLAB
 
 
@@ -206,17 +209,17 @@ def _refuse_cropped(file: Values, size: tuple[int, int]) -> None:
 
 _LEFT_MATRIX = ("M1", "K1", "cameraMatrix1", "camera_matrix_1", "camera_matrix_left", "left_camera_matrix", "M_left")
 _LEFT_DISTORTION = (
-    "D1",
-    "distCoeffs1",
-    "dist_coeffs_1",
-    "distortion_1",
-    "distortion_left",
-    "left_distortion",
-    "D_left",
+    *("D1", "distCoeffs1", "dist_coeffs_1", "distortion_1", "distortion_left", "left_distortion", "D_left"),
+    *("distortion_coefficients_left", "distortion_coeffs_left", "dist_coeffs_left", "left_distortion_coefficients"),
+    *("distCoeffs_left", "dist_left", "distortion_coefficients_1", "distortion1"),
 )
-_ONE_MATRIX = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsic", "camera_intrinsics")
-_ONE_DISTORTION = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "distortion")
-_ROTATION, _TRANSLATION = ("R", "rotation", "R_stereo"), ("T", "translation", "t", "T_stereo")
+_ONE_MATRIX = ("camera_matrix", "cameraMatrix", "K", "M", "intrinsic", "camera_intrinsics", "mtx")
+_ONE_DISTORTION = (
+    *("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "distortion", "dist_coeff", "dist"),
+    *("distortion_coeffs", "dist_coefs", "dist_coefficients"),
+)
+_ROTATION = ("R", "rotation", "R_stereo", "rotation_matrix")
+_TRANSLATION = ("T", "translation", "t", "T_stereo", "translation_vector")
 
 
 def _right_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -227,7 +230,7 @@ def _from_storage(
     files: Sequence[Path], mm_per_unit: float, rectified: bool, image_size: tuple[int, int] | None
 ) -> StereoRig:
     """OpenCV's own files: both cameras by numbered names, or one camera a file and R, T in either."""
-    contents = [read_storage(path, path.name) for path in files]
+    contents = [_storage(path) for path in files]
     merged: dict[str, object] = {}
     for content in contents:
         merged |= content
@@ -254,6 +257,26 @@ def _from_storage(
     return StereoRig(left, right, stereo_transform(rotation, shift * mm_per_unit, f"{name}: R"))
 
 
+def _storage(path: Path) -> Mapping[str, object]:
+    """The values of a file by their names: of ``cv2.FileStorage``, or of plain JSON or YAML with lists of numbers."""
+    if is_storage(read_bounded(path, path.name, SETUP_BYTES)):
+        return read_storage(path, path.name)
+    return {key: _plain(value) for key, value in load_yaml(path, path.name).items()}
+
+
+def _plain(value: object) -> object:
+    try:
+        return np.array(value, dtype=np.float64) if isinstance(value, list) else value
+    except (ValueError, TypeError, OverflowError):
+        return None
+
+
+def _is_plain(document: Mapping[str, object]) -> bool:
+    """Whether a document has OpenCV's matrices as lists of rows, as programs write that dump arrays."""
+    names = (*_LEFT_MATRIX, *_ONE_MATRIX, *_ROTATION)
+    return any(isinstance(rows := document.get(name), list) and len(rows) == 3 for name in names)
+
+
 def _storage_rectified(
     content: Mapping[str, object], name: str, size: tuple[int, int], mm_per_unit: float
 ) -> StereoRig:
@@ -269,6 +292,9 @@ def _storage_camera(
 ) -> CameraModel:
     values = _array(content, matrix, name, 9).reshape(3, 3)
     found = next((key for key in distortion if key in content), None)
+    other = [key for key in content if re.search("dist(?!ance|ortion_model)", key, re.IGNORECASE)]
+    if found is None and other:  # a lens that is left out is a wrong camera
+        raise InputError(f"{name}: {distortion[0]}", f"nothing, beside {shown(other[0])}", ", ".join(distortion)[:300])
     parameters = np.zeros(5) if found is None else _array(content, (found,), name, None)
     coefficients, fisheye = lens(parameters, _storage_model(content), f"{name}: {found}")
     return camera_of(size, values, coefficients, f"{name}: {matrix[0]}", fisheye)
@@ -297,8 +323,8 @@ def _array(content: Mapping[str, object], names: Sequence[str], file: str, count
 def _storage_size(content: Mapping[str, object], name: str) -> tuple[int, int] | None:
     for across, down in (("image_width", "image_height"), ("width", "height"), ("imageWidth", "imageHeight")):
         pair = content.get(across), content.get(down)
-        if isinstance(pair[0], float) and isinstance(pair[1], float):
-            return whole_size(pair[0], pair[1], f"{name}: {across}")
+        if isinstance(pair[0], float | int) and isinstance(pair[1], float | int):
+            return whole_size(float(pair[0]), float(pair[1]), f"{name}: {across}")
     for key in ("image_size", "imageSize", "size", "resolution"):
         value = content.get(key)
         if isinstance(value, np.ndarray) and value.size == 2:

@@ -71,7 +71,7 @@ def _ost_cameras(text: str, name: str) -> list[tuple[str, CameraInfo]]:
 
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
-        if not words or words[0].startswith("#"):
+        if not words or words[0][0] in "#;":
             continue
         stripped = line.strip()
         if stripped.startswith("[") and stripped.endswith("]"):

@@ -76,7 +76,7 @@ def test_ost_txt_of_two_cameras(tmp_path: Path, order: str) -> None:
 
 
 def test_ost_txt_of_one_camera_with_the_rational_model_or_a_doubtful_one(tmp_path: Path) -> None:
-    path = text(tmp_path / "ost.txt", OST.format(side="left", d=EIGHT, r=LEVEL, p3="0.0"))
+    path = text(tmp_path / "ost.txt", "; of ROS 1\n" + OST.format(side="left", d=EIGHT, r=LEVEL, p3="0.0"))
     rig = read_calibration([path]).rig
     assert rig.right is None
     assert rig.left.distortion.tolist() == [float(value) for value in EIGHT.split()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,23 @@ def test_opencv_files_of_every_kind_give_the_stereo_rig(tmp_path: Path, suffix: 
     right_p = left_p @ rig.right_T_left[:3, :3].T + rig.right_T_left[:3, 3]
     again, _ = cv2.projectPoints(right_p, np.zeros(3), np.zeros(3), rig.right.matrix, rig.right.distortion)
     np.testing.assert_allclose(seen, again, atol=1e-9)
+
+
+def test_plain_json_with_opencvs_names_is_the_same_rig_and_a_lens_is_never_left_out(tmp_path: Path) -> None:
+    values = {"camera_matrix_left": M1, "distortion_coefficients_left": D1, "camera_matrix_right": M2}
+    values |= {"distortion_coefficients_right": D2, "rotation_matrix": R, "translation_vector": T}
+    values |= {"image_size": np.array([640, 240])}
+    plain, stored = tmp_path / "s.json", storage(tmp_path / "s.yml", **values)
+    plain.write_text(json.dumps({key: value.tolist() for key, value in values.items()}), encoding="utf-8")
+    for path in (plain, stored):
+        rig = read_calibration([path]).rig
+        assert rig.right is not None
+        np.testing.assert_allclose(rig.left.distortion, D1[0])
+        np.testing.assert_allclose(rig.right.distortion, [*D2[0], 0.0])
+        np.testing.assert_allclose(transform_of(rig)[:3, 3], T.ravel())
+    storage(stored, camera_matrix_left=M1, lens_distortion_left=D1, camera_matrix_right=M2, R=R, T=T)
+    with pytest.raises(InputError, match="found nothing, beside 'lens_distortion_left', expected D1, distCoeffs1"):
+        read_calibration([stored], image_size=(640, 240))
 
 
 def test_opencvs_own_stereo_sample_writes_intrinsics_and_extrinsics_without_a_size(tmp_path: Path) -> None:
