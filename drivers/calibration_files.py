@@ -42,7 +42,7 @@ from fgreg.drivers.calibration_parts import (
     whole_size,
 )
 from fgreg.drivers.calibration_texts import is_ost, is_scikit_surgery, read_ost, read_scikit_surgery
-from fgreg.drivers.opencv_storage import is_storage, read_storage
+from fgreg.drivers.confined_parsers import is_storage, read_mat, read_storage
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, is_rigid
 from fgreg.model.camera_model import CameraModel, StereoRig
@@ -105,7 +105,7 @@ def read_calibration(
     elif kind is _Kind.OST:
         rig = _rig_of(read_ost(files), MM_PER[used], rectified)
     else:
-        documents = [load_yaml(path, path.name) for path in files]
+        documents = [_document(path) for path in files]
         if kind is _Kind.KALIBR:
             rig = _from_kalibr(documents[0], name, MM_PER[used])
         elif kind is _Kind.MATLAB:
@@ -134,20 +134,28 @@ _WITH_PROJECTION = (_Kind.ROS, _Kind.OST, _Kind.OPENCV)
 
 def _kind(path: Path) -> _Kind:
     data = read_bounded(path, path.name, SETUP_BYTES)
-    if is_binary(data):
-        raise InputError(path.name, "a .mat file", HINT)
     if is_scikit_surgery(path):
         return _Kind.SCIKIT_SURGERY
     if is_storage(data):
         return _Kind.OPENCV
     if is_ost(data):
         return _Kind.OST
-    document = load_yaml(path, path.name)
+    document = _document(path)
     if "cam0" in document:
         return _Kind.KALIBR
     if _is_plain(document):
         return _Kind.OPENCV
     return _Kind.ROS if struct_of(document) is None else _Kind.MATLAB
+
+
+def _document(path: Path) -> Mapping[str, object]:
+    """The content of a YAML, JSON or .mat file."""
+    if not is_binary(read_bounded(path, path.name, SETUP_BYTES)):
+        return load_yaml(path, path.name)
+    try:
+        return read_mat(path, path.name)
+    except InputError as error:
+        raise InputError(path.name, error.found, f"{error.expected}, or {HINT}") from None
 
 
 def _rig_of(infos: Sequence[CameraInfo], mm_per_unit: float, rectified: bool) -> StereoRig:
@@ -261,7 +269,7 @@ def _storage(path: Path) -> Mapping[str, object]:
     """The values of a file by their names: of ``cv2.FileStorage``, or of plain JSON or YAML with lists of numbers."""
     if is_storage(read_bounded(path, path.name, SETUP_BYTES)):
         return read_storage(path, path.name)
-    return {key: _plain(value) for key, value in load_yaml(path, path.name).items()}
+    return {key: _plain(value) for key, value in _document(path).items()}
 
 
 def _plain(value: object) -> object:

@@ -1,4 +1,4 @@
-"""Calibrations of MATLAB's Computer Vision Toolbox: the struct of its parameters, as JSON or YAML.
+"""Calibrations of MATLAB's Computer Vision Toolbox: the struct of its parameters, as JSON, YAML or in a ``.mat``.
 
     fprintf(fopen("stereo.json", "w"), "%s", jsonencode(toStruct(stereoParams)));
 

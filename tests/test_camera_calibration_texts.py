@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from fgreg.drivers.calibration_files import read_calibration
 from fgreg.errors import InputError
@@ -185,6 +186,17 @@ def test_matlabs_struct_becomes_opencvs_convention(tmp_path: Path) -> None:
     np.testing.assert_allclose(transform_points(transform_of(rig), row), right_p, atol=1e-9)
 
 
+def test_a_mat_file_of_the_struct_is_the_rig_of_its_json(tmp_path: Path) -> None:
+    expected = read_calibration([written(tmp_path, matlab())]).rig
+    savemat(tmp_path / "s.mat", {"stereoParams": matlab()}, do_compression=True)
+    rig = read_calibration([tmp_path / "s.mat"]).rig
+    assert rig.right is not None
+    assert expected.right is not None
+    np.testing.assert_array_equal(rig.left.matrix, expected.left.matrix)
+    np.testing.assert_array_equal(rig.right.distortion, expected.right.distortion)
+    np.testing.assert_allclose(transform_of(rig), transform_of(expected), atol=1e-15)
+
+
 def test_matlabs_newer_structs_say_the_same(tmp_path: Path) -> None:
     old = read_calibration([written(tmp_path, matlab())]).rig
     new = matlab()
@@ -259,6 +271,7 @@ def test_what_is_given_besides_has_to_agree_and_kinds_are_not_mixed(tmp_path: Pa
         read_calibration([path, path])
     with pytest.raises(InputError, match=r"found an ost\.txt beside a MATLAB struct"):
         read_calibration([path, text(tmp_path / "ost.txt", LEFT)])
-    (tmp_path / "a.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64")
-    with pytest.raises(InputError, match=r"a\.mat: found a \.mat file, expected the struct as JSON"):
-        read_calibration([tmp_path / "a.mat"])
+    for start in (b"MATLAB 5.0 MAT-file, Platform: GLNXA64", b"\x89HDF\r\n\x1a\n"):
+        (tmp_path / "a.mat").write_bytes(start)
+        with pytest.raises(InputError, match=r"a\.mat: found something that scipy cannot .*, or the struct as JSON"):
+            read_calibration([tmp_path / "a.mat"])

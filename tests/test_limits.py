@@ -23,7 +23,7 @@ from fgreg.convert.table import read_table
 from fgreg.convert.write import write_session
 from fgreg.detection.frame_files import decode_picture
 from fgreg.drivers.calibration_files import read_calibration
-from fgreg.drivers.opencv_storage import is_storage, read_storage
+from fgreg.drivers.confined_parsers import is_storage, read_storage
 from fgreg.drivers.ros_recordings import Recording
 from fgreg.errors import InputError
 from fgreg.live.config import read_config

@@ -33,7 +33,7 @@ A result (a session's folder, or its result.yaml), by the ending of OUT:
 \b
 Where session.yaml has no camera, --calibration FILE provides it: ROS camera_info or
 ost.txt (left and right: give the option twice), OpenCV FileStorage, Kalibr camchain,
-scikit-surgery's .l2r.txt, MATLAB's struct as JSON. Files that do not state the size of
+scikit-surgery's .l2r.txt, MATLAB's struct (.json, .mat). Files that do not state the size of
 the images need --calibration-size. A ROS 2 recording with camera_info topics needs none.
 \b
 Columns, topics and fields have usual names: a CSV has t, type (pair where absent),

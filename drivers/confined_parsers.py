@@ -1,16 +1,20 @@
-"""OpenCV FileStorage files (YAML, XML, JSON) as plain names and arrays; ``yaml.safe_load`` cannot read them.
+"""Files of OpenCV (FileStorage: YAML, XML, JSON) and MATLAB (``.mat`` before v7.3) as plain names and arrays.
 
-OpenCV's parser ends the process at deep nesting, and some damaged files make it abort or loop for ever. So this module
-is also a program that reads one file from standard input, within limits, and prints what it has found.
+Their parsers end the process at deep nesting or on damaged files, or loop for ever. So this module is also a program
+that reads one file from standard input, within limits, and prints what it has found.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
 import sys
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,8 +48,31 @@ def read_storage(path: Path, name: str) -> Storage:
     Raises:
         InputError: OpenCV cannot read it.
     """
+    answer = _confined("opencv", path, name, "OpenCV", "a file of cv2.FileStorage (YAML, XML, JSON)")
+    return {key: np.array(value) if isinstance(value, list) else value for key, value in answer.items()}
+
+
+def read_mat(path: Path, name: str) -> dict[str, object]:
+    """The variables of a ``.mat`` file: structs as mappings, arrays as lists of rows, char as text.
+
+    Args:
+        path: a regular file.
+        name: how messages name it.
+
+    Raises:
+        InputError: scipy cannot read it, or finds objects in it.
+    """
+    return _confined("mat", path, name, "scipy", "structs in a .mat file before v7.3")
+
+
+def _confined(parser: str, path: Path, name: str, library: str, expected: str) -> dict[str, Any]:
+    """What this module, run as a program, finds in a file.
+
+    Raises:
+        InputError: nothing that the library can read.
+    """
     data = read_bounded(path, name, SETUP_BYTES)
-    command = [sys.executable, "-P", "-m", "fgreg.drivers.opencv_storage"]
+    command = [sys.executable, "-P", "-m", "fgreg.drivers.confined_parsers", parser]
     try:
         done = subprocess.run(
             command,
@@ -59,12 +86,12 @@ def read_storage(path: Path, name: str) -> Storage:
     except subprocess.TimeoutExpired:
         answer = f"not within {4 * CONFINED_SECONDS} s"
     if isinstance(answer, str):
-        found = f"something that OpenCV cannot read ({answer})"
-        raise InputError(name, found, "a file of cv2.FileStorage (YAML, XML, JSON)")
-    return {key: np.array(value) if isinstance(value, list) else value for key, value in answer.items()}
+        raise InputError(name, f"something that {library} cannot read ({answer})", expected)
+    found: dict[str, Any] = answer
+    return found
 
 
-def _parse(data: bytes) -> dict[str, object]:
+def _parse_storage(data: bytes) -> dict[str, object]:
     """The file's top level, arrays as lists. Raises what OpenCV raises; may end the process."""
     # From memory, so that OpenCV takes the format from the content and not from the file's name.
     storage = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
@@ -90,14 +117,36 @@ def _value(node: cv2.FileNode) -> object:
     return None
 
 
+def _parse_mat(data: bytes) -> dict[str, object]:
+    """The file's variables. Raises anything on a damaged file; may end the process."""
+    from scipy.io import loadmat, matlab
+
+    stream: Any = io.BytesIO(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        stored = loadmat(stream, simplify_cells=True)
+
+    def plain(value: Any) -> object:
+        if isinstance(value, Mapping):
+            return {str(key): plain(entry) for key, entry in value.items()}
+        if isinstance(value, matlab.MatlabOpaque | matlab.MatlabFunction):
+            raise ValueError("an object, not its struct")
+        return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+    return {key: plain(value) for key, value in stored.items() if not key.startswith("__")}
+
+
+_PARSERS: dict[str, Callable[[bytes], dict[str, object]]] = {"opencv": _parse_storage, "mat": _parse_mat}
+
+
 def main() -> None:
-    """Print the top level of the file at standard input as JSON, or why it cannot be read."""
+    """Print what is in the file at standard input as JSON, or why it cannot be read."""
     confine()
     try:
-        answer: object = _parse(sys.stdin.buffer.read())
-    except (cv2.error, SystemError, ValueError, MemoryError) as error:
-        answer = " ".join(str(error).split())[-120:]
-    json.dump(answer, sys.stdout)
+        answer = json.dumps(_PARSERS[sys.argv[1]](sys.stdin.buffer.read()))
+    except Exception as error:  # on a damaged file a parser may raise anything
+        answer = json.dumps(" ".join(str(error).split())[-120:] or type(error).__name__)
+    sys.stdout.write(answer)
 
 
 if __name__ == "__main__":
