@@ -24,10 +24,11 @@ _MAX_GAP = 100_000
 
 @dataclass(slots=True)
 class FolderCapture:
-    """Pictures in order, and the time of each (s)."""
+    """Pictures in order, and the time of each (s); ``unreadable``: those that were left out up to now."""
 
     pictures: list[Path]
     times_s: list[float]
+    unreadable: list[Path] = field(default_factory=list)
     _next: int = field(default=0)
 
     @classmethod
@@ -74,6 +75,7 @@ class FolderCapture:
             self._next += 1
             if picture is not None:
                 return True, picture
+            self.unreadable.append(self.pictures[self._next - 1])
         return False, None
 
     def get(self, property_id: int, /) -> float:

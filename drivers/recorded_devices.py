@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgreg.detection.frame_files import to_display
 from fgreg.drivers.base import DeviceLost, MotionSample, StereoFrame, host_now
 from fgreg.drivers.ros_messages import IMAGE_TYPES, POSE_TYPES, picture_of, pose_of, stamp_ns
 from fgreg.drivers.ros_recordings import ECM_POSE, Recorded, Recording
@@ -166,7 +165,7 @@ class RecordedMotion(_RecordedDevice):
 
 
 class RecordedCamera(_RecordedDevice):
-    """A StereoCamera: recorded images, raw or compressed, in 8 bits, matched by the times in their headers.
+    """A StereoCamera: recorded images, raw or compressed, 8 or 16 bits as sent, matched by the times in their headers.
 
     Args:
         path: rosbag2 folder, .mcap, .db3 or .bag (ROS 1).
@@ -212,7 +211,7 @@ class RecordedCamera(_RecordedDevice):
         for recorded, index in self._player.due():
             message = self._player.recording.decode(recorded)
             try:
-                picture = to_display(picture_of(message))
+                picture = picture_of(message)
             except ValueError:
                 self._player.dropped += 1
                 continue

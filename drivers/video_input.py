@@ -135,7 +135,7 @@ class VideoInput:
 
     @property
     def dropped(self) -> int:
-        """Number of frames that were not fetched in time."""
+        """Number of frames that were not fetched in time, or could not be decoded."""
         return self._dropped
 
     def poll(self) -> list[Grabbed]:
@@ -188,12 +188,15 @@ class VideoInput:
                 return
             finally:
                 capture.release()
+            skipped = list(getattr(capture, "unreadable", ()))  # of a folder of pictures
+            self._dropped += len(skipped)
+            besides = f"; {len(skipped)} pictures could not be decoded, {skipped[0].name} first" if skipped else ""
             if self._timing.paced and delivered and not self._timing.loop and not self._stop.is_set():
                 self._ended = True
-                self._fail("played to its end")
+                self._fail(f"played to its end{besides}")
                 return
             if not (self._timing.loop and delivered):
-                self._fail("it delivers no more frames")
+                self._fail(f"it delivers no more frames{besides}")
                 self._stop.wait(_RETRY_S)
 
     def _opened(self) -> Capture | None:

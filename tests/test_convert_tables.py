@@ -125,6 +125,10 @@ def test_pictures_and_arrays_become_the_sessions_own_frames(tmp_path: Path) -> N
     assert np.load(tmp_path / "s" / pair["trus"]["frame"]).shape == (128, 16)
     assert len(list((tmp_path / "s" / "frames").iterdir())) == 3
     assert len(read_session(tmp_path / "s").events) == 3
+    cv2.imwrite(str(tmp_path / "raw" / "right.png"), np.zeros((480, 640, 4), np.uint8))
+    said = refused(table(tmp_path, text), tmp_path / "t", "--setup", setup(tmp_path))
+    assert "right.png: found a picture with transparent parts" in said
+    assert not (tmp_path / "t").exists()
 
 
 def test_moves_tracks_and_notes(tmp_path: Path) -> None:

@@ -134,3 +134,11 @@ def test_a_folder_of_deep_pictures_is_played_with_their_depth_and_a_turned_one_e
     (tmp_path / "0.png").write_bytes(png(DEEP, 0, 16, (b"eXIf", TURNED)))
     with pytest.raises(InputError, match=r"0\.png: found a picture with EXIF orientation 6"):
         played(tmp_path)
+
+
+def test_pictures_of_a_folder_that_cannot_be_decoded_are_told_and_counted(tmp_path: Path) -> None:
+    for number in range(4):
+        (tmp_path / f"{number}.png").write_bytes(png_bytes(GREY) if number % 3 == 0 else b"no picture")
+    found, why = played(tmp_path)
+    assert len(found) == 2
+    assert "played to its end; 2 pictures could not be decoded, 1.png first" in why

@@ -157,6 +157,13 @@ def test_raw_and_compressed_images_come_as_stereo_frames_matched_by_their_header
         assert frame.left.shape == (48, 64, 3)
 
 
+def test_deep_images_are_played_with_their_depth(tmp_path: Path) -> None:
+    deep = np.arange(24, dtype=np.uint16).reshape(4, 6) * 170
+    path = bags.write_bag(tmp_path / "bag", [("/left/image_raw", 0.0, bags.image(0.0, "mono16", deep))], mcap=True)
+    (frame,) = play(RecordedCamera(path, pace=Pace.of(path, 5.0)))
+    np.testing.assert_array_equal(frame.left, deep)
+
+
 def test_the_unrectified_raw_topic_of_a_side_is_preferred_and_ambiguity_is_reported(tmp_path: Path) -> None:
     grey = bags.image(0.0, "mono8", np.zeros((4, 6), np.uint8))
     names = ["/rig/left/image_raw", "/rig/left/image_rect", "/rig/right/image_rect", "/leftover/image_raw"]

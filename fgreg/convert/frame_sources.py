@@ -90,9 +90,9 @@ class FrameSources:
                 np.save(target, self._opened[path].frame(index), allow_pickle=False)
                 continue
             data = read_bounded(path, str(path), PICTURE_BYTES)
-            if path.suffix.lower() not in (".npy", ".png"):
-                picture = read_picture(path)
+            if not name.endswith(".npy"):
+                picture = read_picture(path)  # of a PNG too: one that solve would refuse is refused here
                 if picture is None:
                     raise InputError(str(path), "a file that is not an image", "a picture (PNG, JPEG, BMP, TIFF)")
-                data = png_bytes(picture)
+                data = data if path.suffix.lower() == ".png" else png_bytes(picture)
             target.write_bytes(data)
