@@ -10,7 +10,7 @@ import pytest
 
 from fgreg.convert.nrrd_sequence import read_nrrd_sequence
 from fgreg.errors import InputError
-from tests.test_convert_plus_sequences import IMAGES, by_hand, convert, events, refused, setup, three
+from tests.test_convert_plus_sequences import IMAGES, POSE, by_hand, convert, events, refused, setup, three
 
 nrrd: Any = pytest.importorskip("nrrd", reason="pynrrd is not installed (pip install 'fgreg[nrrd]')")
 
@@ -80,6 +80,25 @@ def test_slicers_volumes_of_one_slice_in_either_order_of_axes(tmp_path: Path, fi
     np.testing.assert_array_equal(sequence.images, IMAGES)
     assert [frame["Timestamp"] for frame in sequence.frames] == ["0.5", "0.75", "1.5"]
     assert sequence.frames[1]["StageAngle"] == "12.5"
+
+
+def test_slicers_times_in_ms_and_the_orientation_that_it_does_not_have(tmp_path: Path) -> None:
+    count, height, width = IMAGES.shape
+    head: dict[str, Any] = {"kinds": ["domain", "domain", "domain", "list"], "labels": ["", "", "", "time"]}
+    head |= {"units": ["mm", "mm", "mm", "ms"], "axis 3 index values": "500 750 1500"}
+    for i in range(count):
+        head |= {f"axis 3 item {i} StageAngle": "2.5", f"axis 3 item {i} MarkerToCameraTransform": POSE}
+    nrrd.write(str(tmp_path / "s.seq.nrrd"), IMAGES.reshape(count, 1, height, width), head, index_order="C")
+    words = (tmp_path / "s.seq.nrrd", tmp_path / "out", "--setup", setup(tmp_path, log_db=60))
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("format: fgreg-mapping/1\nimages: log\n", encoding="utf-8")
+    assert "found nothing, expected M or U and F or N" in refused(*words, "--map", str(mapping))
+    mapping.write_text("format: fgreg-mapping/1\nimages: log\norientation: UN\n", encoding="utf-8")
+    done = convert(*words, "--map", str(mapping))
+    assert done.exit_code == 0, done.output
+    pairs = [event for event in events(tmp_path / "out") if event["type"] == "pair"]
+    assert [pair["t"] for pair in pairs] == [0.5, 0.75, 1.5]
+    np.testing.assert_array_equal(np.load(tmp_path / "out" / pairs[1]["trus"]["frame"]), IMAGES[1][::-1, ::-1])
 
 
 def test_a_header_as_plus_itself_writes_it(tmp_path: Path) -> None:

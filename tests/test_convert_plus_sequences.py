@@ -203,7 +203,7 @@ def test_radio_frequency_frames_of_single_elements_become_channel_data(tmp_path:
 def test_a_header_with_its_pixels_in_a_file_beside_it(tmp_path: Path) -> None:
     path = by_hand(tmp_path / "scan.mhd", three())
     head, _, data = path.read_bytes().partition(b"LOCAL\n")
-    path.write_bytes(head + b"scan.raw\n")
+    path.write_bytes(head + b"scan.raw")  # some writers end the last line without a line feed
     (tmp_path / "scan.raw").write_bytes(data)
     images = read_sequence(path).images
     assert images is not None
@@ -387,6 +387,7 @@ def test_the_mapping_says_what_images_are_that_are_linear(tmp_path: Path) -> Non
         (b"Spacing = 1 1 1", b"Spacing = 0 0.2 1", "ElementSpacing: found '0 0.2 1'"),
         (
             b"Seq_Frame0000_Timestamp",
+            b"Seq_Frame0000_ImageToCroppedImageTransform = 1 0 0 -9 0 1 0 -7 0 0 1 0 0 0 0 1\n"
             b"Seq_Frame0000_ImageToProbeTransform = 0 0.25 0 9 0.1 0 0 0 0 0 1 0 0 0 0 1\nSeq_Frame0000_Timestamp",
             "pixels of 0.25 x 0.1 mm (depth, lateral), expected 0.1 x 0.2 mm",
         ),

@@ -17,9 +17,11 @@ array: {variable: rf, axes: [samples, elements, frames], wavelength_nm: 800}
 # PLUS
 fields: {marker: MarkerToCameraTransform, scan: StageAngle, pm: Pm}
 images: envelope
+orientation: MF
 frames: [3, 4, 17]
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,6 +59,9 @@ TF_ROLES = ("marker", "scan", "ecm")
 
 FIELDS = ("marker", "scan", "type", "pm", "sweep", "amplitude", "x_mm", "range_mm", "text")
 """Roles of the fields of a PLUS frame, besides its image and time."""
+
+
+ORIENTATIONS = tuple(a + b for a, b in itertools.product("MU", "FN")) + tuple(b + a for a in "MU" for b in "FN")
 
 
 def _by_name(name: str, known: tuple[str, ...], kind: Kind) -> Section:
@@ -220,6 +225,14 @@ class RecordingMapping:
         Key(
             "what a PLUS sequence's images are: linear or log-compressed pixels, or the data of single elements",
             Text.of(ImageKind, "a kind of images"),
+        ),
+    ] = None
+
+    orientation: Annotated[
+        str | None,
+        Key(
+            "directions of x and y of a sequence's images where it has none: M or U to a side, F or N in depth",
+            Text(allowed=ORIENTATIONS),
         ),
     ] = None
 

@@ -161,11 +161,14 @@ def _times(header: Mapping[str, Any], axis: int | None, count: int, name: str) -
     if axis is None or not values or axis >= len(labels) or str(labels[axis]).strip('"').lower() != "time":
         return []
     unit = str(units[axis]).strip('"') if axis < len(units) else "s"
-    if unit not in ("s", ""):
-        raise InputError(f"{name}: units", shown(unit), "s, of the times of the frames")
+    if unit not in ("s", "ms", ""):
+        raise InputError(f"{name}: units", shown(unit), "s or ms, of the times of the frames")
     if len(values) != count:
         raise InputError(f"{name}: axis {axis} index values", f"{len(values)} values", f"{count}, one for each frame")
-    return values
+    try:
+        return [repr(float(value) / 1000.0) for value in values] if unit == "ms" else values
+    except ValueError:
+        raise InputError(f"{name}: axis {axis} index values", shown(values[0]), "times in ms") from None
 
 
 def _spacing(header: Mapping[str, Any], domain: list[int]) -> str | None:

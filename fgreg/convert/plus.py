@@ -12,9 +12,10 @@ status are filled with identities or old values.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ _DEFAULTS = {
 }
 _ENDS = {"marker": ("Marker", "Camera"), "scan": ("Probe", "Stage")}
 """Coordinate frames, from and to, of the roles that may be transforms."""
-_IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+_NO_SCALE = 1e-6
+"""Of a transform's scale from 1: one between two images, or of a file that knows no millimetres."""
 _OF_IMAGE = re.compile(r"ImageTo[A-Z]\w*Transform")
 _TYPES = {"BRIGHTNESS": ImageKind.LOG, "RF_REAL": ImageKind.CHANNELS}
 """What PLUS's image types may be: a scanner's B-mode is log-compressed, its RF lines are beamformed unless the mapping
@@ -113,7 +115,7 @@ class _Frames:
                 raise InputError(f"{sequence.name}: fields.{role}", f"{shown(name)} in no frame", expected)
         self._chains = {role: self._chain(role, there, mapping) for role in _ENDS}
         self.told += [way.told for way in self._chains.values() if way is not None and way.told]
-        self._kind = mapping.images
+        self._kind, self._mapping = mapping.images, mapping
         self._next_pm = 0
 
     def _chain(self, role: str, there: set[str], mapping: RecordingMapping) -> Chain | None:
@@ -157,7 +159,8 @@ class _Frames:
             return None
         name = self._sequence.name
         shapes = frozenset((image.shape, image.dtype) for image in self.images.values())
-        return ImageClaim(self._image_kind(), shapes, _pixel_mm(self._sequence), f"{name}: images")
+        pixel_mm = _pixel_mm(self._sequence, _orientation(self._sequence, self._mapping))
+        return ImageClaim(self._image_kind(), shapes, pixel_mm, f"{name}: images")
 
     def _there(self, fields: Mapping[str, str], role: str) -> str | None:
         name = self._names[role]
@@ -226,7 +229,7 @@ class _Frames:
         if self._sequence.images is None or index >= len(self._sequence.images):
             raise PairRefused("there is no image")
         _valid(fields, "Image")
-        orientation = self._sequence.fields.get("UltrasoundImageOrientation", "").upper()
+        orientation = _orientation(self._sequence, self._mapping)
         name = f"frames/frame-{index:06d}.npy"
         image = self._sequence.images[index]
         self.images[name] = oriented(image, orientation, self._image_kind(), self._sequence.name)
@@ -262,34 +265,44 @@ def _valid(fields: Mapping[str, str], name: str) -> None:
         raise PairRefused(f"{'ImageStatus' if name == 'Image' else name} is {one_line(status, 40) or 'nothing'}")
 
 
-def _pixel_mm(sequence: SequenceFile) -> tuple[float, float] | None:
+def _orientation(sequence: SequenceFile, mapping: RecordingMapping) -> str:
+    """UltrasoundImageOrientation in capitals; of a file that has none, as 3D Slicer's, what the mapping says.
+
+    Raises:
+        InputError: the two contradict each other.
+    """
+    stated, mapped = (sequence.fields.get("UltrasoundImageOrientation", "").upper(), mapping.orientation or "")
+    if stated in ("", "XX") or not mapped or stated[:2] == mapped[:2]:
+        return mapped or stated
+    where = f"{sequence.name}: UltrasoundImageOrientation"
+    raise InputError(where, shown(stated), f"{mapped}, as orientation in the mapping says")
+
+
+def _pixel_mm(sequence: SequenceFile, orientation: str) -> tuple[float, float] | None:
     """Pitch (depth, lateral) in mm of the images, turned as they are; None where the file has PLUS's 1 x 1 for none.
 
     It is ElementSpacing, or the scale of a transform from the image's pixels, such as ``ImageToProbeTransform``.
     """
-    name, text = "ElementSpacing", sequence.fields.get("ElementSpacing", "1 1")
-    try:
-        along_x, along_y = (float(word) for word in text.split()[:2])
-        if along_x == along_y == 1.0:
-            name, text = next(filter(None, map(_scale_field, sequence.frames)), ("", _IDENTITY))
-            columns = np.array([float(word) for word in text.split()]).reshape(4, 4)[:3, :2]
-            along_x, along_y = (float(length) for length in np.linalg.norm(columns, axis=0))
-        if along_x == along_y == 1.0:
-            return None
-    except ValueError:
-        along_x = along_y = math.nan
-    if not (0.0 < along_x < math.inf and 0.0 < along_y < math.inf):
-        raise InputError(f"{sequence.name}: {name}", shown(text), "pixels of a size > 0")
-    lateral_is_x = sequence.fields.get("UltrasoundImageOrientation", "").upper()[:1] in ("M", "U")
-    return (along_y, along_x) if lateral_is_x else (along_x, along_y)
+    scales = ((name, text) for fields in sequence.frames for name, text in _scale_fields(fields))
+    for name, text in itertools.chain([("ElementSpacing", sequence.fields.get("ElementSpacing", "1 1"))], scales):
+        try:
+            numbers = np.array([float(word) for word in text.split()])
+            along = numbers[:2] if name == "ElementSpacing" else np.linalg.norm(numbers.reshape(4, 4)[:3, :2], axis=0)
+            along_x, along_y = (float(length) for length in along)
+        except ValueError:
+            along_x = along_y = math.nan
+        if not (0.0 < along_x < math.inf and 0.0 < along_y < math.inf):
+            raise InputError(f"{sequence.name}: {name}", shown(text), "pixels of a size > 0")
+        if max(abs(along_x - 1.0), abs(along_y - 1.0)) > _NO_SCALE:
+            return (along_y, along_x) if orientation[:1] in ("M", "U") else (along_x, along_y)
+    return None
 
 
-def _scale_field(fields: Mapping[str, str]) -> tuple[str, str] | None:
-    """A valid transform of a frame from the image's pixels, by its name."""
+def _scale_fields(fields: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Valid transforms of a frame from the image's pixels, by their names; one to a cropped image has no scale."""
     for name, text in fields.items():
         if _OF_IMAGE.fullmatch(name) and fields.get(f"{name}Status", "OK").upper() == "OK":
-            return name, text
-    return None
+            yield name, text
 
 
 def oriented(image: npt.NDArray[Any], orientation: str, kind: ImageKind, name: str) -> npt.NDArray[Any]:
@@ -305,7 +318,11 @@ def oriented(image: npt.NDArray[Any], orientation: str, kind: ImageKind, name: s
     across, down = orientation[:1], orientation[1:2]
     if {across, down} not in ({"M", "F"}, {"M", "N"}, {"U", "F"}, {"U", "N"}):
         found = shown(orientation) if orientation else "nothing"
-        raise InputError(f"{name}: UltrasoundImageOrientation", found, "M or U and F or N, such as MFA or FMA")
+        raise InputError(
+            f"{name}: UltrasoundImageOrientation",
+            found,
+            "M or U and F or N, such as MFA or FMA; or orientation in the mapping",
+        )
     lateral_is_x = across in "MU"
     depth_lateral = image if lateral_is_x else image.T
     if "N" in (across, down):

@@ -84,7 +84,7 @@ def _header(data: bytes, name: str) -> tuple[dict[str, str], int]:
     while at < len(data):
         end = data.find(b"\n", at)
         if end < 0:
-            break
+            end = len(data)  # an .mhd may end without a line feed
         line = data[at:end]
         at = end + 1
         key, equals, value = line.partition(b"=")
