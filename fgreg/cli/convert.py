@@ -2,13 +2,12 @@
 
 import os
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgreg.cli.options import warn_of_leftovers
+from fgreg.cli.options import refuse_given, warn_of_leftovers
 from fgreg.errors import InputError
 from fgreg.schema.limits import RECORDING_MEMORY, memory_at_most
 
@@ -89,21 +88,16 @@ def add_convert(app: typer.Typer) -> None:
         result = _result_file(source)
         if result is not None:
             unused = {"--setup": setup, "--map": mapping, "--calibration": calibration or None}
-            _refuse(unused, "a result", "a recording")
+            refuse_given(unused, "it with a result", "it with a recording only")
             line = _export(result, out, epoch, force, overwrite)
             if not quiet:
                 typer.echo(line)
             return
-        _refuse({"--epoch": epoch, "--force": force or None}, "a recording", "a result")
+        results_only = {"--epoch": epoch, "--force": force or None}
+        refuse_given(results_only, "it with a recording", "it with a result only")
         if setup is None:
             raise InputError("--setup", "nothing", "the session.yaml of the set-up")
         _import(source, out, setup, mapping, calibration or [], unit, size, rectified, overwrite, quiet)
-
-
-def _refuse(options: Mapping[str, object], given: str, of: str) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(name, f"it with {given}", f"it with {of} only")
 
 
 def _result_file(source: Path) -> Path | None:
@@ -186,9 +180,7 @@ def _import(
             sys.stderr.write(f"fgreg: warning: {warning}\n")
     else:
         alone = {"--rectified": rectified or None, "--calibration-unit": unit, "--calibration-size": size}
-        for option, value in alone.items():
-            if value is not None:
-                raise InputError(option, "it alone", "it with --calibration")
+        refuse_given(alone, "it alone", "it with --calibration")
     names = RecordingMapping() if mapping is None else read_mapping(mapping)
     with memory_at_most(RECORDING_MEMORY):
         written = write_session(_read(source, names), setup, out, rig=rig, overwrite=overwrite)

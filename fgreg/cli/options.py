@@ -1,6 +1,7 @@
 """Options that several commands share, and their settings."""
 
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -68,6 +69,17 @@ def refuse_stale(session: Path) -> None:
         found = stale(result, read_result(result))
     if found:
         raise InputError(str(result), found, "that of the session as it is (fgreg solve), or --force")
+
+
+def refuse_given(options: Mapping[str, object], found: str, expected: str) -> None:
+    """Refuse options, by name, that go with something else.
+
+    Raises:
+        InputError: one of them is given, that is, not None.
+    """
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(name, found, expected)
 
 
 def warn_of_leftovers(*paths: Path | None) -> None:
