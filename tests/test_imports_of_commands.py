@@ -23,6 +23,13 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "--help": ("numpy", "pydantic", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "solve --help": ("numpy", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "check POSES": ("rich", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "print marker PDF --dictionary DICT_4X4_50 --id 0 --size-mm 25": (
+        *SLOW[1:],
+        *SOLVER[1:],
+        *OTHER_COMMANDS,
+        *DRAWING,
+        *PROCESSES,
+    ),
     "schema events": ("rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve POSES": ("scipy.linalg", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve POSES --quiet": ("rich", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
@@ -54,7 +61,7 @@ finally:
 def test_a_command_loads_nothing_that_it_does_not_use(
     command: str, pose_session: Path, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
-    places = {"POSES": str(pose_session), "OUT": str(tmp_path / "out")}
+    places = {"POSES": str(pose_session), "OUT": str(tmp_path / "out"), "PDF": str(tmp_path / "m.pdf")}
     if "FRAMES" in command:
         places["FRAMES"] = str(request.getfixturevalue("raw_session"))
     if "NEW" in command:

@@ -27,6 +27,7 @@ from fgreg.cli.devices import add_devices
 from fgreg.cli.evaluate import add_commands
 from fgreg.cli.live import add_live
 from fgreg.cli.options import EstimateOption, LimitOption, solve_config, warn_of_leftovers
+from fgreg.cli.print import add_print
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
 from fgreg.cli.streams import print_crash, take_streams
@@ -407,6 +408,7 @@ add_replay(app, _summary_extras)
 add_verify(app, _progress)
 add_convert(app)
 add_devices(app)
+add_print(app)
 add_schema(app)
 
 

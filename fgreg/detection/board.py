@@ -105,8 +105,8 @@ def _spacing_px(corners_px: FloatArray, ids: IntArray, board: BoardModel) -> flo
     return float(gaps.min()) if gaps.size else 0.0
 
 
-def _find_charuco(image: Image, board: BoardModel, legacy: bool) -> tuple[FloatArray, IntArray] | None:
-    """Corners (n, 2) px and their ids (n,) of a board of one of the patterns; None where the board is not found."""
+def _charuco_pattern(board: BoardModel, legacy: bool) -> cv2.aruco.CharucoBoard:
+    """OpenCV's board of one of the patterns."""
     assert board.charuco is not None
     pattern = cv2.aruco.CharucoBoard(
         (board.columns + 1, board.rows + 1),
@@ -115,6 +115,19 @@ def _find_charuco(image: Image, board: BoardModel, legacy: bool) -> tuple[FloatA
         dictionary_named(board.charuco.dictionary),
     )
     pattern.setLegacyPattern(legacy)
+    return pattern
+
+
+def charuco_squares(board: BoardModel) -> IntArray:
+    """(markers, 2) column and row of the square with each marker of a ChArUco board, in the order of their ids."""
+    assert board.charuco is not None
+    corners_mm = np.asarray(_charuco_pattern(board, board.charuco.legacy).getObjPoints(), dtype=np.float64)
+    return np.asarray(corners_mm[:, :, :2].mean(axis=1) // board.square_mm, dtype=np.int64)
+
+
+def _find_charuco(image: Image, board: BoardModel, legacy: bool) -> tuple[FloatArray, IntArray] | None:
+    """Corners (n, 2) px and their ids (n,) of a board of one of the patterns; None where the board is not found."""
+    pattern = _charuco_pattern(board, legacy)
     detector = cv2.aruco.CharucoDetector(pattern, cv2.aruco.CharucoParameters(), detector_parameters())
     pad = BORDER_PX
     padded = cv2.copyMakeBorder(image, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=255)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from fgreg.detection.edges import Image
 from fgreg.errors import InputError
-from fgreg.geometry.transforms import FloatArray
+from fgreg.geometry.transforms import BoolArray, FloatArray
 
 BORDER_PX = 12
 """Padding of the image: a tag whose quiet zone is cut by the image's edge is then still a closed square."""
@@ -104,6 +104,12 @@ def drawn_tag(bits: int, cells: int) -> tuple[Image, FloatArray]:
 def tag_cells(name: str) -> int:
     """Cells along a tag's side, black border of one cell included."""
     return int(dictionary_named(name).markerSize) + 2
+
+
+def black_cells(name: str, tag_id: int) -> BoolArray:
+    """(n, n) cells of a tag as OpenCV draws it, its black border of one cell included; the first row is the top."""
+    cells = tag_cells(name)
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary_named(name), tag_id, cells)) < 128
 
 
 def detector_parameters() -> cv2.aruco.DetectorParameters:
