@@ -236,12 +236,7 @@ class Endoscope:
         layout = self._config.layout
         if layout in (Layout.MONO, Layout.SEPARATE):
             return picture, None
-        axis = 1 if layout is Layout.SIDE_BY_SIDE else 0
-        half, odd = divmod(picture.shape[axis], 2)
-        if odd or not half:
-            found = f"frames of {picture.shape[1]} x {picture.shape[0]} px"
-            raise InputError(f"endoscope {self.name}", found, f"frames that can be halved, as the layout is {layout}")
-        first, second = (np.ascontiguousarray(part) for part in np.split(picture, [half], axis=axis))
+        first, second = halves_of(picture, layout, f"endoscope {self.name}")
         return (second, first) if self._config.swap else (first, second)
 
 
@@ -272,16 +267,40 @@ class _Source:
             return cls(text, folder.again, played, "file")
         if not path.is_file():
             raise InputError(text, "nothing", "a video device, a stream, a video file, or a folder of pictures")
-        try:
-            capture = _capture(text, cv2.CAP_FFMPEG)
-        except OSError as error:
-            raise InputError(text, str(error), "a video") from None
-        try:
-            if not capture.isOpened():
-                raise InputError(text, "a file that FFMPEG cannot read", "a video")
-        finally:
-            capture.release()
+        open_video(path).release()  # so that errors are raised here, not later
         return cls(text, lambda: _capture(text, cv2.CAP_FFMPEG), played, "file")
+
+
+def open_video(path: Path) -> cv2.VideoCapture:
+    """A video file, by FFMPEG.
+
+    Raises:
+        InputError: it cannot be read, or its frames are too large.
+    """
+    text = str(path)
+    try:
+        capture = _capture(text, cv2.CAP_FFMPEG)
+    except OSError as error:
+        raise InputError(text, str(error), "a video") from None
+    if not capture.isOpened():
+        capture.release()
+        raise InputError(text, "a file that FFMPEG cannot read", "a video")
+    return capture
+
+
+def halves_of(picture: Picture, layout: Layout, name: str) -> tuple[Picture, Picture]:
+    """The first and the second view of a picture that holds both.
+
+    Raises:
+        InputError: its size is odd.
+    """
+    axis = 1 if layout is Layout.SIDE_BY_SIDE else 0
+    half, odd = divmod(picture.shape[axis], 2)
+    if odd or not half:
+        found = f"frames of {picture.shape[1]} x {picture.shape[0]} px"
+        raise InputError(name, found, f"frames that can be halved, as the layout is {layout}")
+    first, second = (np.ascontiguousarray(part) for part in np.split(picture, [half], axis=axis))
+    return first, second
 
 
 def _capture(*arguments: Any) -> cv2.VideoCapture:
