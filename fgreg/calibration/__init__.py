@@ -1,0 +1,1 @@
+"""Calibration of the endoscope's cameras from views of a board."""
