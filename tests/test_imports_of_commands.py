@@ -21,6 +21,7 @@ PROCESSES = ("multiprocessing", "concurrent.futures.process")
 
 FORBIDDEN: dict[str, tuple[str, ...]] = {
     "--help": ("numpy", "pydantic", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
+    "calibrate-camera --help": ("numpy", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "solve --help": ("numpy", "rich", "yaml", *SLOW, *SOLVER, *OTHER_COMMANDS, *PROCESSES),
     "check POSES": ("rich", *SLOW, *SOLVER, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "print marker PDF --dictionary DICT_4X4_50 --id 0 --size-mm 25": (

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
+from fgreg.cli.calibrate_camera import add_calibrate_camera
 from fgreg.cli.commission import add_commission
 from fgreg.cli.convert import add_convert
 from fgreg.cli.devices import add_devices
@@ -402,6 +403,7 @@ def simulate(
 
 
 add_commands(app, _progress)
+add_calibrate_camera(app, _progress)
 add_commission(app, _progress)
 add_live(app, _summary_extras)
 add_replay(app, _summary_extras)
