@@ -42,6 +42,7 @@ from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.pipeline.verify import VerifyReport as VerifyReport
 from fgreg.pipeline.verify import verify_session
 from fgreg.registration.checks import with_checks
+from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import solve as solve_batch
 from fgreg.session.session_reader import Session as Session
 from fgreg.session.session_reader import read_session as read_session
@@ -131,8 +132,9 @@ def solve_measurements(
     for where, problem in problems_of_all(measurements, checks):
         raise InputError(where, problem, "numbers that are a measurement")
     config = config or SolveConfig()
-    solved = solve_batch(measurements, tracks, model, config).as_session(model.name)
-    return with_checks(solved, checks, config.limit_mm, model.targets_mm)
+    solution = solve_batch(measurements, tracks, model, config)
+    rigs = rig_at_checks(model, solution.snapshot, checks)
+    return with_checks(solution.as_session(model.name), checks, config.limit_mm, model.targets_mm, rigs)
 
 
 def _path(path: str | Path | None) -> Path | None:

@@ -60,6 +60,9 @@ class BatchEngine:
         self.estimate = found = self._estimate(event)
         return found
 
+    def snapshot(self) -> None:
+        """None: constants as declared."""
+
     def refresh(self) -> OnlineEstimate:
         if self.estimate is None:
             raise AssertionError("nothing is known yet")

@@ -208,10 +208,9 @@ def difference_from_uninterrupted(folder: Path, source: Path) -> float:
     """Largest difference of registration and covariance: reopened, against the same events without an interruption."""
     with LiveSession.open(folder) as live:
         reopened, model, config = live.estimate, live.journal.model, live.config
-    feed, extractor = (
-        EpochFeed(online_engine(model, config), CheckPoints(config.limit_mm)),
-        MeasurementExtractor(model),
-    )
+    engine = online_engine(model, config)
+    feed = EpochFeed(engine, CheckPoints(model, config.limit_mm, engine.snapshot))
+    extractor = MeasurementExtractor(model)
     unbroken = None
     for event in read_session(folder).events:
         if isinstance(event, AimEvent | PairEvent):

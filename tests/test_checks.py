@@ -23,6 +23,7 @@ from fgreg.model.lens import project
 from fgreg.model.measurements import Check
 from fgreg.model.session_model import default_targets_mm
 from fgreg.model.solve_config import SolveConfig
+from fgreg.model.systematic import Systematic
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import LiveSession
 from fgreg.pipeline.replay import ReplayRequest, replay_session
@@ -39,6 +40,10 @@ from fgreg.registration.checks import (
 from fgreg.session.result_file import read_result
 from fgreg.session.session_reader import read_ground_truth, read_session
 from fgreg.simulation.config import default_rig
+from fgreg.simulation.deviations import drawn_deviations
+from fgreg.simulation.presets import FIRST_HIT
+from fgreg.simulation.simulate import simulate
+from fgreg.simulation.write import write_session
 from tests.session_files import diagonal
 
 PAPER = Path(__file__).parents[1] / "sessions" / "paper"
@@ -309,8 +314,26 @@ def test_solve_replay_and_live_say_the_same_of_the_checks(tmp_path: Path) -> Non
         for check, other in zip(found.checks, estimate.checks, strict=True):
             assert check.error_mm is not None
             assert other.error_mm is not None
-            assert_allclose(check.error_mm, other.error_mm, atol=1e-6)
-            assert check.nis == pytest.approx(other.nis, rel=1e-4)
+            # Online the constants follow the registration by their regression on it, not by the posterior's samples.
+            assert_allclose(check.error_mm, other.error_mm, atol=0.01)
+            assert check.nis == pytest.approx(other.nis, rel=0.05)
+
+
+def test_checks_that_the_cameras_locate_coarsely_raise_no_alarm(tmp_path: Path) -> None:
+    """A stereo rig that is off within its budget locates points wrongly, by millimetres along the sight."""
+    rng, statistics, verdicts = np.random.default_rng(4), [], []
+    sigmas = Systematic().sigmas(0.0, 0.0)
+    for seed in range(4):
+        config = replace(FIRST_HIT, aims=12, pairs=15, tracks_heard=0, tracks_silent=0, checks=4)
+        config = replace(config, deviations=drawn_deviations(sigmas, rng), camera_declared=True)
+        simulated = simulate(config, seed)
+        write_session(replace(simulated, events=[*simulated.events, *simulated.checks]), tmp_path / str(seed))
+        found = solve_session(SolveRequest(tmp_path / str(seed)), SolveConfig(limit_mm=5.0)).estimate
+        statistics += [check.nis for check in found.checks if check.nis is not None]
+        verdicts += [check.verdict for check in found.checks]
+        assert all("too coarse to bound an error of 5 mm" in check.reason for check in found.checks)
+    assert 1.0 < np.mean(statistics) < 5.0  # three degrees of freedom; some 17 where the constants are ignored
+    assert set(verdicts) == {Verdict.OK}
 
 
 def test_checks_refuse_queries_from_when_they_are_known(tmp_path: Path) -> None:

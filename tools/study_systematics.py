@@ -5,7 +5,8 @@ cell is KIND/NOISE/PAIRS or KIND/NOISE/PAIRS/two-sided.
 
   kind   as-declared  nothing deviates
          drawn        all constants drawn from the declared standard deviations, all at once; each PM beside its beam
-                      and each window's width varying, as declared. drawn-poses: in a session without a camera
+                      and each window's width varying, as declared. drawn-poses: in a session without a camera;
+                      drawn-checks: with three checks, located through the cameras
          careful      the constants of a careful lab, each at its magnitude with a random sign, and the same per PM
          3s-NAME      one constant off by three of its standard deviations, either sign (NAME: a key of `systematic`)
          else         one thing wrong, by far; --list has them all
@@ -222,7 +223,9 @@ def figures(outcomes: list[Outcome], limit_mm: float) -> dict[str, Figure]:
         "bound": rms(bound),
         "seen_rms": rms(np.array([o.seen for o in outcomes])),
         "predicted_over_true": root_ratio(np.array([o.predicted2 for o in outcomes]), true2),
-        "true_over_least": root_ratio(true2, np.array([o.least2 for o in outcomes])),
+        "true_over_least": root_ratio(
+            *(np.array([(o.true2, o.least2) for o in outcomes if o.epochs == o.places] or [(1.0, math.nan)]).T)
+        ),
         "nees": share(nees[np.isfinite(nees)]),
         "seconds": Figure(float(np.median([o.seconds for o in outcomes])), 0.0),
     }

@@ -18,7 +18,7 @@ from fgreg.simulation.deviations import NAMES, deviations_of, drawn_deviations
 from fgreg.simulation.presets import FIRST_HIT, PHANTOM
 
 LIMIT_MM = 3.0
-WITHIN = ("as-declared", "drawn", "drawn-poses")
+WITHIN = ("as-declared", "drawn", "drawn-poses", "drawn-checks")
 """Kinds of a lab that is within its budget."""
 NOISES = {
     "frames": NoiseModel((0.001, 0.001, 0.002), (5e-5, 5e-5, 5e-5), 0.0, (0.3, 0.3, 0.1), 0.24, 0.16),
@@ -193,8 +193,10 @@ def configuration(cell: Cell, seed: int, systematic: Systematic) -> SimulationCo
     sigmas = Systematic().sigmas(config.probe.sensitivity.edge_sigma_rad, config.noise.marker_bias_mm)
     if cell.kind == "as-declared":
         return config
-    if cell.kind in ("drawn", "drawn-poses"):
-        return replace(per_pm, deviations=drawn_deviations(sigmas, rng), camera_declared=cell.kind == "drawn")
+    if cell.kind.startswith("drawn"):
+        checks = 3 if cell.kind == "drawn-checks" else 0
+        declared = cell.kind != "drawn-poses"
+        return replace(per_pm, deviations=drawn_deviations(sigmas, rng), camera_declared=declared, checks=checks)
     if cell.kind == "careful":
         signs = rng.choice([-1.0, 1.0], len(CAREFUL))
         off = {name: float(sign * value) for (name, value), sign in zip(CAREFUL.items(), signs, strict=True)}

@@ -26,10 +26,10 @@ from fgreg.registration.register import Registration, labels_and_inliers, pack_s
 
 MOST_MOVES = 10
 """Largest number of moves that are looked for."""
-ALARM_ONCE, ALARM_EACH = 3.6, 1.5
+ALARM_ONCE, ALARM_EACH = 4.0, 2.2
 """Where all pairs are tested once a move is certain from a lower score than online, where each pair brings a test: from
-this score, and from this Bayes factor on average over all split points, as the sum grows with their number. One in 250
-steady sessions of 25 PMs reaches it."""
+this score, and from this Bayes factor on average over all split points, as the sum grows with their number. One in 100
+steady sessions of 25 PMs and constants within their budget reaches it."""
 LEAST_OUTLIERS, MOST_LEFT = 2, 0.5
 """Outliers that may hide a move, and the largest share of them that is left after it."""
 LEAST_SURE = 12

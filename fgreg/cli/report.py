@@ -368,6 +368,7 @@ def _checks(estimate: SessionEstimate) -> Iterator[RenderableType]:
     yield Padding(table, (0, 0, 0, 2))
     if len(compared) > MOST_ROWS:
         yield f"  and {len(compared) - MOST_ROWS} more"
+    yield from (bullet(text) for text in dict.fromkeys(check.reason for check in compared if check.reason))
     yield from (bullet(f"{check.t:.1f} s, not compared: {check.reason}") for check in checks if check.error_mm is None)
 
 

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from fgreg.model.estimate import Verdict, worst_verdict
 from fgreg.model.measurements import Check
+from fgreg.model.session_model import SessionModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.registration.checks import check_registration
+from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.verdict import verdict_of
+from fgreg.tracking.snapshot import Snapshot
 
 
 class CheckPoints:
     """The checks up to now. They never enter the estimate.
 
     Args:
+        model: the session's set-up.
         limit_mm: of the error.
+        snapshot: gives the engine's latest one, None where there is none.
     """
 
-    def __init__(self, limit_mm: float) -> None:
-        self._limit_mm = limit_mm
+    def __init__(self, model: SessionModel, limit_mm: float, snapshot: Callable[[], Snapshot | None]) -> None:
+        self._model, self._limit_mm, self._snapshot = model, limit_mm, snapshot
         self._checks: list[Check] = []
         self._last: tuple[OnlineEstimate, OnlineEstimate] | None = None
 
@@ -41,7 +47,8 @@ class CheckPoints:
         if not mine or estimate is None or estimate.trus_T_camera is None or estimate.covariance is None:
             return estimate
         if self._last is None or self._last[0] is not estimate:
-            found = check_registration(mine, estimate.trus_T_camera, estimate.covariance, self._limit_mm)
+            rig = rig_at_checks(self._model, self._snapshot(), mine).get(estimate.epoch)
+            found = check_registration(mine, estimate.trus_T_camera, estimate.covariance, self._limit_mm, rig)
             checked = replace(
                 estimate,
                 verdict=worst_verdict(estimate.verdict, verdict_of(found.conditions)),

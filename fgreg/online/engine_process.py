@@ -27,6 +27,7 @@ from fgreg.online.events import OnlineEvent
 from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
 from fgreg.online.snapshot_record import Layout
 from fgreg.tracking.query import track
+from fgreg.tracking.snapshot import Snapshot
 from fgreg.workers.worker_process import Work, WorkerProcess
 
 ANSWER_S, END_S = 60.0, 5.0
@@ -140,11 +141,21 @@ class EngineProcess:
 
     def track(self, query: Track) -> TrackEstimate:
         """Answer a query in this process, from the snapshot."""
-        reader = self.reader()
-        try:
-            return track(query, reader.snapshot())
-        except NoSnapshotError:
+        snapshot = self.snapshot()
+        if snapshot is None:
             return TrackEstimate(query.t, None, None, None, causal=True, reason="there is no estimate yet")
+        return track(query, snapshot)
+
+    def snapshot(self) -> Snapshot | None:
+        """The snapshot that was published last; None where there is none yet, or the process has ended."""
+        try:
+            reader = self.reader()
+        except FileNotFoundError:
+            return None
+        try:
+            return reader.snapshot()
+        except NoSnapshotError:
+            return None
         finally:
             reader.close()
 

@@ -40,6 +40,7 @@ from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
+from fgreg.tracking.snapshot import Snapshot
 
 Estimating = AimEvent | PairEvent | CameraMovedEvent | CheckEvent
 """Events that the estimate or its verdict depends on."""
@@ -61,6 +62,7 @@ class Engine(Protocol):
     def measurements(self) -> Measurements: ...
     def marker_T_laser(self) -> FloatArray | None: ...
     def restoring(self) -> AbstractContextManager[None]: ...
+    def snapshot(self) -> Snapshot | None: ...
     @property
     def estimate(self) -> OnlineEstimate | None: ...
     @property
@@ -147,7 +149,7 @@ class LiveSession:
 
     def _begin_with(self, engine: Engine) -> None:
         """Start with an engine that has taken in nothing yet."""
-        self._checks = CheckPoints(self.config.limit_mm)
+        self._checks = CheckPoints(self.journal.model, self.config.limit_mm, engine.snapshot)
         self._engine, self._feed = engine, EpochFeed(engine, self._checks)
         self._closures = 0  # loop closures that are recorded
         self._extractor = MeasurementExtractor(self.journal.model)

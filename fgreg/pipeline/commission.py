@@ -35,6 +35,7 @@ from fgreg.registration.commissioning import (
 )
 from fgreg.registration.error_budget import conflicts
 from fgreg.registration.register import Registration
+from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import solve
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.rig_file import RIG_FILE, not_made_from, same_rig, section_hashes, write_rig
@@ -218,7 +219,11 @@ def _solved(session: Session, model: SessionModel, use_checks: bool, done: Calla
     done()
     checks = tuple(extracted.checks.values()) if use_checks else ()
     estimate = with_checks(
-        solution.as_session(session.model.name), [*extracted.checks.values()], config.limit_mm, model.targets_mm
+        solution.as_session(session.model.name),
+        [*extracted.checks.values()],
+        config.limit_mm,
+        model.targets_mm,
+        rig_at_checks(model, solution.snapshot, [*extracted.checks.values()]),
     )
     if estimate.verdict is Verdict.REFUSED or solution.registration is None:
         return _Solved(session, None, "; ".join(estimate.reasons), checks)

@@ -169,7 +169,7 @@ class _Player:
     ) -> None:
         self._session, self._extracted, self._engine = session, extracted, engine
         self._viewer, self._speed = viewer, speed
-        self._checks = CheckPoints(config.limit_mm)
+        self._checks = CheckPoints(session.model, config.limit_mm, engine.snapshot)
         self._feed = EpochFeed(engine, self._checks)
         self._measured: dict[int, Aim | Pair | Track | Check] = {
             **extracted.checks,

@@ -36,6 +36,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.output.atomic_file import check_outputs
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
 from fgreg.registration.move_doubt import TELLING
+from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import Solution, solve
 from fgreg.registration.verdict import Condition
 from fgreg.session.ground_truth import GroundTruth
@@ -249,7 +250,8 @@ def session_estimate(
         elif isinstance(event, CheckEvent) and index not in checks:
             checks[index] = not_compared(event.t, reason)
     solved = solution.as_session(session.model.name)
-    checked = with_checks(solved, [checks[i] for i in sorted(checks)], config.limit_mm, session.model.targets_mm)
+    rigs = rig_at_checks(session.model, solution.snapshot, [*extracted.checks.values()])
+    checked = with_checks(solved, [checks[i] for i in sorted(checks)], config.limit_mm, session.model.targets_mm, rigs)
     if checked.epochs and checked.epochs[-1].verdict is Verdict.REFUSED is not solved.epochs[-1].verdict:
         for index in extracted.track_events:
             if extracted.epoch_of[index] == checked.epochs[-1].index:

@@ -1,14 +1,16 @@
 """The registration at check points: points known to both devices, which never enter the estimate.
 
-The error at a check is where the registration puts the camera's point, less where the TRUS probe has it. Its predicted
-covariance is the registration's at that point plus the check's own. The checks of one camera epoch give three tests,
+The error at a check is where the registration puts the camera's point, less where the TRUS probe has it, both moved by
+the estimate of the rig's constants. Its predicted covariance is that of registration and constants at that point plus
+the check's own. The checks of one camera epoch give three tests,
 whose false alarms together are 0.3 % of sessions:
 
 - a common shift of all of them, three degrees of freedom. Such a shift is what a refracting layer between fibre and
   tissue makes of a registration, and what line and arc cannot show;
 - each of them alone;
 - the mean error has to stay below the limit with its own 95 %: a bound that does not use the registration's covariance,
-  since that does not include what the checks are for.
+  since that does not include what the checks are for. Where cameras and scanner locate the checks too coarsely for it
+  (``COARSE``), there is none, and each check says so.
 
 What line and arc cannot show is *covered* where the first two tests would show it: an error of the registration, of the
 assumption's own kind and as large as the limit at the worst target, with probability ``COVERED_POWER``.
@@ -26,12 +28,15 @@ from fgreg.geometry.target_error import gaussian_quantile_mm, offset_quantile_mm
 from fgreg.geometry.transforms import FloatArray, hat
 from fgreg.model.estimate import Assumption, CheckEstimate, SessionEstimate, Verdict, worst_verdict
 from fgreg.model.measurements import Check
+from fgreg.registration.rig_at_checks import RigAtChecks
 from fgreg.registration.verdict import Condition, verdict_of
 
 SHIFT_P, ALONE_P = 2e-3, 1e-3
 """False alarms of the common shift, and of all checks of an epoch taken alone."""
 COVERED_POWER = 0.8
 """Probability of showing an error as large as the limit from which checks cover an assumption that could cause it."""
+COARSE = 0.5
+"""Share of the limit from which the mean of the checks, located 95 % as well, is too coarse to bound the error."""
 MAIN_SHARE = 0.8
 """Share of the error's length from which one axis alone is named."""
 NOT_REGISTERED = "there is no registration of its camera epoch"
@@ -56,22 +61,27 @@ class CheckedEpoch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Errors:
-    """Errors at n checks: ``each`` (n, 3), ``covariance`` (n, 3, 3) with the registration's, ``own`` without it.
+    """Errors at n checks: ``each`` (n, 3), ``covariance`` (n, 3, 3) with the registration's.
 
-    Of the mean, each check weighted by its own precision: ``share`` (n, 3, 3), ``mean`` (3,), ``mean_own`` and
-    ``mean_covariance`` (3, 3). All along the TRUS axes.
+    Of the mean, each check weighted by its own precision: ``share`` (n, 3, 3), ``mean`` (3,), ``mean_located`` (3, 3)
+    of the checks and of the constants by which the devices locate them, ``mean_covariance`` (3, 3) with the
+    registration's. All along the TRUS axes.
     """
 
     each: FloatArray
     covariance: FloatArray
     share: FloatArray
     mean: FloatArray
-    mean_own: FloatArray
+    mean_located: FloatArray
     mean_covariance: FloatArray
 
 
 def check_registration(
-    checks: Sequence[Check], trus_T_camera: FloatArray, covariance: FloatArray, limit_mm: float
+    checks: Sequence[Check],
+    trus_T_camera: FloatArray,
+    covariance: FloatArray,
+    limit_mm: float,
+    rig: RigAtChecks | None = None,
 ) -> CheckedEpoch:
     """Compare a registration with the checks of its camera epoch.
 
@@ -79,31 +89,52 @@ def check_registration(
         checks: at least one.
         trus_T_camera: (4, 4). covariance: (6, 6) over its right tangent.
         limit_mm: of the error.
+        rig: the constants and their covariance, joint with the registration's; None: they are as declared.
     """
-    errors, n = _errors(checks, trus_T_camera, covariance), len(checks)
+    errors, n = _errors(checks, trus_T_camera, covariance, rig), len(checks)
     nis = np.einsum("ni,ni->n", errors.each, np.linalg.solve(errors.covariance, errors.each[..., None])[..., 0])
     alone = chdtrc(3, nis) < ALONE_P / n
     shift_p = float(chdtrc(3, errors.mean @ np.linalg.solve(errors.mean_covariance, errors.mean)))
-    bound_mm = offset_quantile_mm(errors.mean, errors.mean_own)
+    located_mm = float(gaussian_quantile_mm(errors.mean_located[None])[0])
+    bound_mm = None
+    if located_mm < COARSE * limit_mm or rig is None:
+        bound_mm = offset_quantile_mm(errors.mean, errors.mean_located)
     quantiles = gaussian_quantile_mm(errors.covariance)
     off = alone | (shift_p < SHIFT_P)
     found = _conditions(checks, errors, alone, shift_p, bound_mm, limit_mm)
+    coarse = ""
+    if bound_mm is None:
+        coarse = (
+            f"cameras and scanner locate the checks to {located_mm:.1f} mm (95 %), too coarse to bound an error of "
+            f"{limit_mm:g} mm: calibrate the cameras, or commission the rig"
+        )
     estimates = tuple(
         CheckEstimate(
-            check.t, errors.each[i], float(quantiles[i]), float(nis[i]), Verdict.WARNING if off[i] else Verdict.OK
+            check.t,
+            errors.each[i],
+            float(quantiles[i]),
+            float(nis[i]),
+            Verdict.WARNING if off[i] else Verdict.OK,
+            coarse,
         )
         for i, check in enumerate(checks)
     )
     return CheckedEpoch(estimates, tuple(found))
 
 
-def _errors(checks: Sequence[Check], trus_T_camera: FloatArray, covariance: FloatArray) -> _Errors:
+def _errors(
+    checks: Sequence[Check], trus_T_camera: FloatArray, covariance: FloatArray, rig: RigAtChecks | None
+) -> _Errors:
     rotation, n = trus_T_camera[:3, :3], len(checks)
     camera_p = np.stack([check.camera_p_mm for check in checks])
     trus_p = np.stack([check.trus_p_mm for check in checks])
     error = camera_p @ rotation.T + trus_T_camera[:3, 3] - trus_p
     own = np.stack([rotation @ check.covariance @ rotation.T + check.trus_covariance for check in checks])
     gain = np.concatenate([-rotation @ hat(camera_p), np.broadcast_to(rotation, (n, 3, 3))], axis=-1)
+    if rig is not None:
+        by_constants = rotation @ rig.seen(camera_p) - rig.shown(trus_p)
+        error, covariance = error + by_constants @ rig.value, rig.covariance
+        gain = np.concatenate([gain, by_constants], axis=-1)
     predicted = own + gain @ covariance @ gain.swapaxes(1, 2)
     # One that was written down several times counts once.
     points = np.concatenate([camera_p, trus_p], axis=1)
@@ -114,7 +145,8 @@ def _errors(checks: Sequence[Check], trus_T_camera: FloatArray, covariance: Floa
     mean = np.einsum("nij,nj->i", share, error)
     mean_gain = np.einsum("nij,njk->ik", share, gain)
     spread = own_mean + mean_gain @ covariance @ mean_gain.T
-    return _Errors(error, predicted, share, mean, own_mean, spread)
+    located = own_mean + mean_gain[:, 6:] @ covariance[6:, 6:] @ mean_gain[:, 6:].T
+    return _Errors(error, predicted, share, mean, located, spread)
 
 
 def powers(
@@ -123,6 +155,7 @@ def powers(
     covariance: FloatArray,
     limit_mm: float,
     targets_mm: FloatArray,
+    rig: RigAtChecks | None = None,
 ) -> tuple[float, ...]:
     """With which probability the checks show an error as large as the limit at the worst target, per ``ASSUMPTIONS``.
 
@@ -130,10 +163,10 @@ def powers(
     That of a window turns them about the probe's axis.
 
     Args:
-        checks, trus_T_camera, covariance, limit_mm: as of :func:`check_registration`.
+        checks, trus_T_camera, covariance, limit_mm, rig: as of :func:`check_registration`.
         targets_mm: (m, 3) TRUS.
     """
-    errors = _errors(checks, trus_T_camera, covariance)
+    errors = _errors(checks, trus_T_camera, covariance, rig)
     trus_p = np.stack([check.trus_p_mm for check in checks])
     least = np.linalg.eigh(errors.mean_covariance)[1][:, -1]
     reach_mm = float(np.linalg.norm(targets_mm[:, 1:], axis=1).max())
@@ -151,7 +184,7 @@ def _power(moved: FloatArray, errors: _Errors) -> float:
 
 
 def _conditions(
-    checks: Sequence[Check], errors: _Errors, alone: FloatArray, shift_p: float, bound_mm: float, limit_mm: float
+    checks: Sequence[Check], errors: _Errors, alone: FloatArray, shift_p: float, bound_mm: float | None, limit_mm: float
 ) -> list[Condition]:
     found = []
     error, mean = errors.each, errors.mean
@@ -160,14 +193,14 @@ def _conditions(
     middle = np.mean([check.trus_p_mm for check in checks], axis=0)
     if shift_p < SHIFT_P:
         expected = float(gaussian_quantile_mm(errors.mean_covariance[None])[0])
-        surely_mm = 2.0 * norm - bound_mm
+        surely_mm = 2.0 * norm - offset_quantile_mm(mean, errors.mean_located)
         text = (
             f"the check{'s are' if several else ' is'} off by {norm:.1f} mm {direction_text(mean, middle)}, "
             f"{expected:.1f} mm expected at most: look for a layer of water or gel between fibre and tissue, and check "
             "radius, ranges and sensitivity window in session.yaml; register again, or locate the checks again"
         )
         found.append(Condition(Verdict.REFUSED if surely_mm > 2.0 * limit_mm else Verdict.WARNING, text))
-    if bound_mm >= limit_mm:
+    if bound_mm is not None and bound_mm >= limit_mm:
         advice = "register again" if shift_p < SHIFT_P else "locate the checks more accurately, or take more of them"
         text = (
             f"the mean error at the check{'s' if several else ''} is {norm:.1f} mm, at most {bound_mm:.1f} mm (95 %), "
@@ -208,7 +241,11 @@ def direction_text(error_mm: FloatArray, trus_p_mm: FloatArray) -> str:
 
 
 def with_checks(
-    estimate: SessionEstimate, checks: Sequence[Check | CheckEstimate], limit_mm: float, targets_mm: FloatArray
+    estimate: SessionEstimate,
+    checks: Sequence[Check | CheckEstimate],
+    limit_mm: float,
+    targets_mm: FloatArray,
+    rigs: Mapping[int, RigAtChecks] | None = None,
 ) -> SessionEstimate:
     """The estimate with its checks, their effect on the verdicts, and the assumptions that they cover.
 
@@ -217,6 +254,7 @@ def with_checks(
         checks: in event order; those that are not usable with the reason.
         limit_mm: of the error.
         targets_mm: (m, 3) TRUS points at which it matters.
+        rigs: the constants in each epoch, by its number; as declared where absent.
     """
     results: dict[int, CheckEstimate] = {}
     covered: tuple[tuple[int, ...], ...] = ((),) * len(ASSUMPTIONS)
@@ -226,11 +264,12 @@ def with_checks(
         mine = {i: at for i, at in enumerate(checks) if isinstance(at, Check) and at.epoch == epoch.index}
         if not mine or epoch.trus_T_camera is None or epoch.covariance is None:
             continue
-        found = check_registration([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm)
+        rig = (rigs or {}).get(epoch.index)
+        found = check_registration([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm, rig)
         results.update(zip(mine, found.checks, strict=True))
         conditions[epoch.index] = found.conditions
         if epoch.index == current and not found.conditions and epoch.verdict is not Verdict.REFUSED:
-            shown = powers([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm, targets_mm)
+            shown = powers([*mine.values()], epoch.trus_T_camera, epoch.covariance, limit_mm, targets_mm, rig)
             covered = tuple(tuple(mine) if power >= COVERED_POWER else () for power in shown)
     for i, at in enumerate(checks):
         if i not in results:
