@@ -21,6 +21,7 @@ where there are any.
 from __future__ import annotations
 
 import argparse
+import io
 import multiprocessing
 import os
 import resource
@@ -32,6 +33,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -122,7 +124,7 @@ def _work(name: str, seed: int, first: int, count: int, at: Any, connection: Any
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     signal.signal(signal.SIGALRM, _too_slow)
     target, result = TARGETS[name], Result()
-    with tempfile.TemporaryDirectory() as folder, _silence() as said:
+    with tempfile.TemporaryDirectory() as folder, _silenced() as said:
         for index in range(first, first + count):
             at.value = index
             data = make_input(target, seed, index)
@@ -130,43 +132,34 @@ def _work(name: str, seed: int, first: int, count: int, at: Any, connection: Any
             signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
             try:
                 result.accepted += read(target, data, Path(folder))
-                if text := said():
+                if text := said.getvalue():
                     raise AssertionError(f"on standard error: {text[:200]!r}")
             except Exception as error:
                 kind = _kind(error)
                 result.counts[kind] += 1
                 result.findings.setdefault(kind, (index, "".join(traceback.format_exception(error))))
-                said()
             finally:
+                said.truncate(0)
                 signal.setitimer(signal.ITIMER_REAL, 0.0)
             result.slowest_s = max(result.slowest_s, time.monotonic() - start)
             result.done += 1
     connection.send(result)
 
 
-class _silence:  # noqa: N801 - used as a function
-    """Standard error of the process, C libraries included, into a file; gives a function that takes what was said."""
-
-    def __enter__(self) -> Any:
-        self._file = tempfile.TemporaryFile()
-        self._before = os.dup(2)
-        os.dup2(self._file.fileno(), 2)
-        return self._take
-
-    def _take(self) -> str:
-        sys.stderr.flush()
-        if not os.fstat(self._file.fileno()).st_size:
-            return ""
-        self._file.seek(0)
-        text = self._file.read().decode("utf-8", "replace")
-        self._file.seek(0)
-        self._file.truncate()
-        return text
-
-    def __exit__(self, *_: object) -> None:
-        os.dup2(self._before, 2)
-        os.close(self._before)
-        self._file.close()
+@contextmanager
+def _silenced() -> Iterator[io.StringIO]:
+    """What Python writes on standard error; what C libraries write goes nowhere, as in the commands."""
+    before = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            yield said
+    finally:
+        os.dup2(before, 2)
+        os.close(before)
+        os.close(nowhere)
 
 
 def run(name: str, count: int, seed: int) -> Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import shutil
@@ -153,18 +154,16 @@ def _parse_yaml(data: bytes, _folder: Path) -> None:
     parse_yaml(data.decode("utf-8", "surrogateescape"), "file.yaml")
 
 
-@cache
 def _valid_rig() -> list[bytes]:
-    path = Path(__file__).resolve().parent.parent / "tests" / "data" / "rig.yaml"
-    if path.is_file():
-        return [path.read_bytes()]
-    return [_yaml({"format": "fgreg-rig/1", "values": {"radius_mm": 10.0}, "covariance": [[0.01]]})]
+    rig = {"format": "fgreg-rig/1", "names": ["radius_mm", "tag_size"], "values": [0.2, -0.01]}
+    rig |= {"covariance": [[0.01, 0.0], [0.0, 1e-6]], "prior_sigmas": [0.2, 0.003], "created": "today"}
+    return [_yaml({**rig, "sessions": [{"events.jsonl": 64 * "a"}]})]
 
 
 def _yaml_texts() -> list[bytes]:
     return [
         b"a: 1\nb: [1, 2, {c: d}]\ne: |\n  text\n  more\nf: &x {g: 1}\nh: *x\n",
-        b"'a b': \"\\x41\"\n? k\n: v\n- \n",
+        b"'a b': \"\\x41\"\nc:\n- 1\n- [2]\n",
         *(_yaml(document) for document in (session_files.setup(), session_files.truth())),
     ]
 
@@ -188,7 +187,8 @@ def _read_picture(data: bytes, folder: Path) -> None:
     from fgreg.session.frame_files import check_camera_frame
 
     path = _written(data, folder, "a.png")
-    check_camera_frame(path, "a.png", "line 1", (64, 48))
+    if data.startswith(b"\x89P"):
+        check_camera_frame(path, "a.png", "line 1", (64, 48))
     read_picture(path)
 
 
@@ -284,6 +284,56 @@ def _read_sequence(data: bytes, folder: Path) -> None:
     read_plus(_written(data, folder, "sequence.mha"), RecordingMapping())
 
 
+@cache
+def _valid_nrrd() -> list[bytes]:
+    pose = "1 0 0 5 0 1 0 6 0 0 1 120 0 0 0 1"
+    fields = "".join(
+        f"Seq_Frame{k:04d}_{key}:={value}\n"
+        for k in range(3)
+        for key, value in (
+            ("Timestamp", 8.5 + k),
+            ("MarkerToCameraTransform", pose),
+            ("MarkerToCameraTransformStatus", "OK"),
+            ("StageAngle", 2.0 * k),
+            ("FgregX", 3.0),
+            ("FgregRange", 30.0),
+        )
+    )
+    head = (
+        "NRRD0005\ntype: unsigned char\ndimension: 3\nsizes: 4 5 3\nkinds: domain domain list\nencoding: {packed}\n"
+        "ultrasound image orientation:=MFA\nUltrasoundImageOrientation:=MFA\nUltrasoundImageType:=BRIGHTNESS\n"
+    )
+    image = bytes(range(60))
+    whole = [(head.format(packed="raw") + fields + "\n").encode() + image]
+    return [*whole, (head.format(packed="gzip") + fields + "\n").encode() + gzip.compress(image, mtime=0)]
+
+
+def _read_nrrd(data: bytes, folder: Path) -> None:
+    from fgreg.convert.mapping import RecordingMapping
+    from fgreg.convert.plus import read_plus
+
+    read_plus(_written(data, folder, "sequence.nrrd"), RecordingMapping())
+
+
+@cache
+def _valid_matlab() -> list[bytes]:
+    from scipy.io import savemat
+
+    out = []
+    for packed in (False, True):
+        buffer: Any = io.BytesIO()
+        savemat(buffer, {"t": np.arange(3.0), "pm": np.arange(3), "scan_deg": np.ones(3)}, do_compression=packed)
+        out.append(buffer.getvalue())
+    return out
+
+
+def _read_matlab(data: bytes, folder: Path) -> None:
+    from fgreg.convert.child_reader import open_array_file
+    from fgreg.convert.mapping import RecordingMapping
+
+    open_array_file(_written(data, folder, "a.mat"), RecordingMapping())
+
+
 def _valid_tables() -> list[bytes]:
     pose = ",".join(f"m{row}{column}" for row in range(3) for column in range(4))
     values = "1,0,0,5,0,1,0,6,0,0,1,120"
@@ -318,13 +368,12 @@ def _read_mapping(data: bytes, folder: Path) -> None:
 def _valid_bags() -> list[bytes]:
     import tempfile
 
-    messages = []
+    messages: list[bags.Message] = []
     for k in range(3):
         messages += [
+            ("/fgreg/scan", 1.0 * k, bags.number(10.0 * k)),
+            ("/fgreg/frame", 1.0 * k, bags.image(1.0 * k, "32FC1", np.ones((16, 20), np.float32))),
             ("/marker", 1.0 * k, bags.pose_stamped(1.0 * k, (0.0, 0.01, 0.12))),
-            ("/scan", 1.0 * k, bags.number(0.1 * k)),
-            ("/pa", 1.0 * k, bags.multi_array(np.ones((4, 5), np.float32))),
-            ("/left", 1.0 * k, bags.image(1.0 * k, "mono8", np.ones((4, 6), np.uint8))),
         ]
     with tempfile.TemporaryDirectory() as folder:
         bag = bags.write_bag(Path(folder) / "bag", messages, mcap=True)
@@ -336,7 +385,7 @@ def _read_bag(data: bytes, folder: Path) -> None:
     from fgreg.convert.bag import read_bag
     from fgreg.convert.mapping import RecordingMapping
 
-    topics = {"marker": "/marker", "scan": "/scan", "photoacoustic": "/pa"}
+    topics = {"marker": "/marker"}
     suffix = "db3" if data.startswith(b"SQLite") else "mcap"
     imported = read_bag(_written(data, folder, f"a.{suffix}"), RecordingMapping(topics=topics))
     del imported
@@ -459,6 +508,8 @@ TARGETS: dict[str, Target] = {
         Target("array", "NPY frames", _valid_arrays, Form.BYTES, _read_array, 10.0),
         Target("calibration", "calibrations of other programs", _valid_calibrations, Form.TEXT, _read_calibration, 2.0),
         Target("sequence", "PLUS sequences", _valid_sequences, Form.TEXT, _read_sequence, 6.0),
+        Target("nrrd", "NRRD sequences", _valid_nrrd, Form.TEXT, _read_nrrd, 4.0),
+        Target("matlab", "MATLAB files, read by a process of their own", _valid_matlab, Form.BYTES, _read_matlab, 0.02),
         Target("table", "CSV tables", _valid_tables, Form.TEXT, _read_table, 6.0),
         Target("mapping", "mapping files", _valid_mappings, Form.YAML, _read_mapping, 3.0),
         Target("bag", "ROS recordings", _valid_bags, Form.BYTES, _read_bag, 2.0),

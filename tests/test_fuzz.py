@@ -1,0 +1,36 @@
+"""The fuzzers: each valid input is read, and 2,000 changed ones find nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fuzz import main, make_input
+from fuzz_inputs import Form
+from fuzz_targets import TARGETS
+
+
+@pytest.mark.parametrize("name", list(TARGETS))
+def test_what_the_fuzzers_change_is_valid(name: str, tmp_path: Path) -> None:
+    for data in TARGETS[name].valid():
+        TARGETS[name].read(data, tmp_path)
+
+
+def test_inputs_are_the_same_for_the_same_seed_and_differ_otherwise() -> None:
+    target = TARGETS["events"]
+    assert target.form is Form.LINES
+    inputs = [make_input(target, 0, index) for index in range(50)]
+    assert inputs == [make_input(target, 0, index) for index in range(50)]
+    assert len(set(inputs)) > 40
+    assert inputs != [make_input(target, 1, index) for index in range(50)]
+
+
+def test_two_thousand_changed_inputs_find_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["fuzz", "--inputs", "2000", "--seed", "3", "--findings", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0, capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
