@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+LONGEST_PART = 600
+"""Characters of the place of an error, of what was found, and of what was expected: more is not read."""
+
 
 def one_line(text: str, limit: int | None = None) -> str:
     """``text`` with line breaks, control characters and lone surrogates escaped, cut to ``limit`` characters."""
@@ -26,9 +29,9 @@ class InputError(FgregError):
     """
 
     def __init__(self, where: str, found: str, expected: str) -> None:
-        self.where = one_line(where)
-        self.found = one_line(found)
-        self.expected = one_line(expected)
+        self.where = one_line(where, LONGEST_PART)
+        self.found = one_line(found, LONGEST_PART)
+        self.expected = one_line(expected, LONGEST_PART)
         super().__init__(f"{self.where}: found {self.found}, expected {self.expected}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:

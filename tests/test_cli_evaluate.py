@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
+import os
 import re
+import secrets
+import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -149,3 +154,29 @@ def test_no_advice_without_a_registration(
     write_session(simulate(replace(PRESETS["first-hit"], pairs=2), 1), tmp_path / "two")
     assert run(monkeypatch, "advise", str(tmp_path / "two")) == 1
     assert "no advice" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="processes are found by Linux's /proc")
+def test_a_killed_evaluation_leaves_no_worker_process(pose_session: Path) -> None:
+    mark = f"FGREG_TEST={secrets.token_hex(8)}"
+
+    def marked() -> list[int]:
+        found = []
+        for entry in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if entry.name.isdigit() and mark.encode() in (entry / "environ").read_bytes():
+                    state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
+                    found += [int(entry.name)] if state != "Z" else []
+        return found
+
+    name, _, value = mark.partition("=")
+    words = [sys.executable, "-m", "fgreg", "evaluate", str(pose_session), "--jobs", "2", "-q"]
+    with subprocess.Popen(words, env={**os.environ, name: value}, stderr=subprocess.DEVNULL) as process:
+        deadline = time.monotonic() + 60.0
+        while len(marked()) < 3 and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.kill()
+    deadline = time.monotonic() + 20.0
+    while marked() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not marked()

@@ -101,19 +101,19 @@ COMMANDS = {
     "solve": Command(
         ("solve", "{s}", "--out", "{o}/result.yaml", "--rrd", "{o}/a.rrd", "-q"),
         {"result.yaml": _is_result, "a.rrd": _is_recording},
-        4.0,
+        2.5,
     ),
-    "replay": Command(("replay", "{s}", "--out", "{o}/result.yaml", "-q"), {"result.yaml": _is_result}, 4.0),
+    "replay": Command(("replay", "{s}", "--out", "{o}/result.yaml", "-q"), {"result.yaml": _is_result}, 2.5),
     "convert": Command(
-        ("convert", "{s}", "{o}/new.xml", "--overwrite", "--force", "-q"), {"new.xml": _is_transform}, 1.5
+        ("convert", "{s}", "{o}/new.xml", "--overwrite", "--force", "-q"), {"new.xml": _is_transform}, 0.8
     ),
     "evaluate": Command(
         ("evaluate", "{s}", "--csv", "{o}/figures.csv", "--subsets", "2", "--no-leave-one-out", "-q"),
         {"figures.csv": _is_table},
-        8.0,
+        4.0,
     ),
     "simulate": Command(
-        ("simulate", "{o}/made", "--preset", "first-hit", "--seed", "3", "--overwrite"), {"made": _is_session}, 2.0
+        ("simulate", "{o}/made", "--preset", "first-hit", "--seed", "3", "--overwrite"), {"made": _is_session}, 1.2
     ),
     "live": Command(
         ("live", "--no-viewer", "--duration", "8", "--width", "320", "--aims", "4", "--out", "{s}", "-q"),
@@ -265,12 +265,12 @@ def run(
         for what, value in condition.limits:
             resource.setrlimit(what, (value, value))
 
+    said = tempfile.TemporaryFile()  # noqa: SIM115 - closed below
     process = subprocess.Popen(
         [sys.executable, "-m", "fgreg", *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
+        stderr=said,  # not a pipe: whoever is left would keep it open
         env={**os.environ, MARK: mark},
         start_new_session=True,
         preexec_fn=limited,
@@ -293,13 +293,15 @@ def run(
         for pid in _processes(mark) if condition.stop_children else ():
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGCONT)
-    try:
-        _, said = process.communicate(timeout=LONGEST_S)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
-        return -999, "", mark
-    return process.returncode, said, mark
+    with said:
+        try:
+            process.wait(timeout=LONGEST_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return -999, "", mark
+        said.seek(0)
+        return process.returncode, said.read().decode("utf-8", "replace"), mark
 
 
 def faults(

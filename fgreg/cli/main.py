@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from fgreg.pipeline.solve import SolveReport
 
 EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_CRASH, EXIT_INTERRUPTED = 1, 2, 70, 130
+OUT_OF_MEMORY = ("failed to map segment", "annot allocate memory")
+"""What the loader of libraries says where memory is short."""
 GARBAGE_THRESHOLD = 50_000
 """New objects between garbage collections: imports leave no garbage, and the default 700 costs 5 % of a command."""
 
@@ -89,6 +91,11 @@ def _exit_status(arguments: list[str]) -> int:
         return EXIT_INTERRUPTED
     except MemoryError as error:
         return _fail(f"not enough memory ({error})" if str(error) else "not enough memory")
+    except ImportError as error:
+        if not any(word in str(error) for word in OUT_OF_MEMORY):
+            print_crash(error)
+            return EXIT_CRASH
+        return _fail(f"not enough memory to load a library ({error})")
     except BaseException as error:  # also what is no Exception: a panic of a library in Rust
         if isinstance(error, OSError) and (error.filename is not None or error.errno in OUT_OF):
             return _fail(f"{error.filename or 'this machine'}: {error.strerror}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -100,7 +101,9 @@ def to_display(picture: Picture) -> npt.NDArray[np.uint8]:
 def read_array(path: Path) -> npt.NDArray[Any] | None:
     """A probe frame as stored; None where the file cannot be read. Arrays of Python objects are refused."""
     try:
-        return np.asarray(np.load(path, allow_pickle=False))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # old headers are read all the same
+            return np.asarray(np.load(path, allow_pickle=False))
     except (ValueError, OSError, EOFError):
         return None
 

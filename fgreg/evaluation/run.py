@@ -20,6 +20,7 @@ from fgreg.model.estimate import PredictedTre, Verdict
 from fgreg.model.sensitivity import wrap_angle
 from fgreg.registration.solve import solve
 from fgreg.registration.verdict import Condition
+from fgreg.workers.parent import end_with_parent
 from fgreg.workers.threads import one_thread_each
 
 Progress = Callable[[str, int, int], None]
@@ -103,6 +104,12 @@ _work = _Work()
 
 def _load(cases: Sequence[Case], conditions: Sequence[Sequence[Condition]], config: EvaluationConfig) -> None:
     _work.cases, _work.conditions, _work.config = cases, conditions, config
+
+
+def _begin(cases: Sequence[Case], conditions: Sequence[Sequence[Condition]], config: EvaluationConfig) -> None:
+    """Start of a worker process."""
+    end_with_parent()
+    _load(cases, conditions, config)
 
 
 def _run(task: _Task) -> WholeSolve | Resolved:
@@ -237,7 +244,7 @@ def _results(
         return
     # spawn: a fork would inherit the threads of the linear algebra libraries in an undefined state.
     context = multiprocessing.get_context("spawn")
-    with one_thread_each(), ProcessPoolExecutor(jobs, context, _load, (cases, conditions, config)) as pool:
+    with one_thread_each(), ProcessPoolExecutor(jobs, context, _begin, (cases, conditions, config)) as pool:
         try:
             yield from pool.map(_run, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs))))
         except BaseException:

@@ -152,7 +152,8 @@ def normalized_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArra
 
     NaN where the lens model cannot be inverted: nothing within its reach is seen there.
     """
-    observed = (np.asarray(pixels, dtype=np.float64) - _principal_px(camera)) / focal_px(camera)
+    with np.errstate(over="ignore"):  # beyond what a double holds is beyond the lens too
+        observed = (np.asarray(pixels, dtype=np.float64) - _principal_px(camera)) / focal_px(camera)
     if not camera.distortion.any() and not camera.fisheye:
         return observed
     # Start: the root of the radial part, along the observed direction.

@@ -145,11 +145,13 @@ def transform_problem(matrix: FloatArray, max_translation_mm: float = math.inf) 
     """Why a (4, 4) matrix is not a rigid transform: (found, expected); None where it is one."""
     if not is_rigid(matrix):
         rotation = matrix[:3, :3]
-        off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+        with np.errstate(all="ignore"):  # of any numbers, for the message only
+            off = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+            determinant = float(np.linalg.det(rotation))
         if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > RIGID_TOLERANCE:
             found = f"the last row {shown(matrix[3].tolist())}"
         else:
-            found = f"a matrix that is not rigid (R'R - I up to {off:.2g}, det R {np.linalg.det(rotation):.4g})"
+            found = f"a matrix that is not rigid (R'R - I up to {off:.2g}, det R {determinant:.4g})"
         return found, f"a rigid transform (rotation to {RIGID_TOLERANCE:g}, last row [0, 0, 0, 1])"
     distance = math.hypot(*matrix[:3, 3].tolist())
     if distance > max_translation_mm:
