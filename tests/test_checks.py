@@ -314,8 +314,8 @@ def test_solve_replay_and_live_say_the_same_of_the_checks(tmp_path: Path) -> Non
         for check, other in zip(found.checks, estimate.checks, strict=True):
             assert check.error_mm is not None
             assert other.error_mm is not None
+            assert_allclose(check.error_mm, other.error_mm, atol=1e-6)
             # Online the constants follow the registration by their regression on it, not by the posterior's samples.
-            assert_allclose(check.error_mm, other.error_mm, atol=0.01)
             assert check.nis == pytest.approx(other.nis, rel=0.05)
 
 

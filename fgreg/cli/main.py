@@ -91,16 +91,13 @@ def _exit_status(arguments: list[str]) -> int:
         return EXIT_INTERRUPTED
     except MemoryError as error:
         return _fail(f"not enough memory ({error})" if str(error) else "not enough memory")
-    except ImportError as error:
-        if not any(word in str(error) for word in OUT_OF_MEMORY):
-            print_crash(error)
-            return EXIT_CRASH
-        return _fail(f"not enough memory to load a library ({error})")
     except BaseException as error:  # also what is no Exception: a panic of a library in Rust
         if isinstance(error, OSError) and (error.filename is not None or error.errno in OUT_OF):
             return _fail(f"{error.filename or 'this machine'}: {error.strerror}")
         if isinstance(error, SystemExit):
             raise
+        if isinstance(error, ImportError) and any(word in str(error) for word in OUT_OF_MEMORY):
+            return _fail(f"not enough memory to load a library ({error})")
         if interrupted:  # a library has made another error of it, as gtsam does while it is loaded
             return EXIT_INTERRUPTED
         print_crash(error)

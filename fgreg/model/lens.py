@@ -147,13 +147,13 @@ def reach(camera: CameraModel) -> float:
     return float(_radial_table(camera.distortion.tobytes(), camera.fisheye)[0][-1])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # beyond what a double holds is beyond the lens too
 def normalized_from_pixels(camera: CameraModel, pixels: FloatArray) -> FloatArray:
     """Ideal normalised points (..., 2) of pixels (..., 2), by Newton's method.
 
     NaN where the lens model cannot be inverted: nothing within its reach is seen there.
     """
-    with np.errstate(over="ignore"):  # beyond what a double holds is beyond the lens too
-        observed = (np.asarray(pixels, dtype=np.float64) - _principal_px(camera)) / focal_px(camera)
+    observed = (np.asarray(pixels, dtype=np.float64) - _principal_px(camera)) / focal_px(camera)
     if not camera.distortion.any() and not camera.fisheye:
         return observed
     # Start: the root of the radial part, along the observed direction.

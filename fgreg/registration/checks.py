@@ -1,8 +1,8 @@
 """The registration at check points: points known to both devices, which never enter the estimate.
 
-The error at a check is where the registration puts the camera's point, less where the TRUS probe has it, both moved by
-the estimate of the rig's constants. Its predicted covariance is that of registration and constants at that point plus
-the check's own. The checks of one camera epoch give three tests,
+The error at a check is where the registration puts the camera's point, less where the TRUS probe has it. For the tests
+both are moved by the estimate of the rig's constants. Its predicted covariance is that of registration and constants at
+that point plus the check's own. The checks of one camera epoch give three tests,
 whose false alarms together are 0.3 % of sessions:
 
 - a common shift of all of them, three degrees of freedom. Such a shift is what a refracting layer between fibre and
@@ -61,17 +61,21 @@ class CheckedEpoch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Errors:
-    """Errors at n checks: ``each`` (n, 3), ``covariance`` (n, 3, 3) with the registration's.
+    """Errors at n checks: ``plain`` (n, 3), ``each`` (n, 3) with the constants at their estimate, ``covariance``
+    (n, 3, 3) with the registration's and the constants'.
 
-    Of the mean, each check weighted by its own precision: ``share`` (n, 3, 3), ``mean`` (3,), ``mean_located`` (3, 3)
+    Of the mean, each check weighted by its own precision: ``share`` (n, 3, 3), ``mean`` and ``plain_mean`` (3,),
+    ``mean_located`` (3, 3)
     of the checks and of the constants by which the devices locate them, ``mean_covariance`` (3, 3) with the
     registration's. All along the TRUS axes.
     """
 
+    plain: FloatArray
     each: FloatArray
     covariance: FloatArray
     share: FloatArray
     mean: FloatArray
+    plain_mean: FloatArray
     mean_located: FloatArray
     mean_covariance: FloatArray
 
@@ -98,7 +102,7 @@ def check_registration(
     located_mm = float(gaussian_quantile_mm(errors.mean_located[None])[0])
     bound_mm = None
     if located_mm < COARSE * limit_mm or rig is None:
-        bound_mm = offset_quantile_mm(errors.mean, errors.mean_located)
+        bound_mm = offset_quantile_mm(errors.plain_mean, errors.mean_located)
     quantiles = gaussian_quantile_mm(errors.covariance)
     off = alone | (shift_p < SHIFT_P)
     found = _conditions(checks, errors, alone, shift_p, bound_mm, limit_mm)
@@ -111,7 +115,7 @@ def check_registration(
     estimates = tuple(
         CheckEstimate(
             check.t,
-            errors.each[i],
+            errors.plain[i],
             float(quantiles[i]),
             float(nis[i]),
             Verdict.WARNING if off[i] else Verdict.OK,
@@ -131,6 +135,7 @@ def _errors(
     error = camera_p @ rotation.T + trus_T_camera[:3, 3] - trus_p
     own = np.stack([rotation @ check.covariance @ rotation.T + check.trus_covariance for check in checks])
     gain = np.concatenate([-rotation @ hat(camera_p), np.broadcast_to(rotation, (n, 3, 3))], axis=-1)
+    plain = error
     if rig is not None:
         by_constants = rotation @ rig.seen(camera_p) - rig.shown(trus_p)
         error, covariance = error + by_constants @ rig.value, rig.covariance
@@ -142,11 +147,11 @@ def _errors(
     weight = np.linalg.inv(own) / times[:, None, None]
     own_mean = np.linalg.inv(weight.sum(axis=0))
     share = own_mean @ weight
-    mean = np.einsum("nij,nj->i", share, error)
+    mean, plain_mean = (np.einsum("nij,nj->i", share, one) for one in (error, plain))
     mean_gain = np.einsum("nij,njk->ik", share, gain)
     spread = own_mean + mean_gain @ covariance @ mean_gain.T
     located = own_mean + mean_gain[:, 6:] @ covariance[6:, 6:] @ mean_gain[:, 6:].T
-    return _Errors(error, predicted, share, mean, located, spread)
+    return _Errors(plain, error, predicted, share, mean, plain_mean, located, spread)
 
 
 def powers(
@@ -187,7 +192,7 @@ def _conditions(
     checks: Sequence[Check], errors: _Errors, alone: FloatArray, shift_p: float, bound_mm: float | None, limit_mm: float
 ) -> list[Condition]:
     found = []
-    error, mean = errors.each, errors.mean
+    error, mean = errors.plain, errors.plain_mean
     norm = float(np.linalg.norm(mean))
     several = len(checks) > 1
     middle = np.mean([check.trus_p_mm for check in checks], axis=0)
