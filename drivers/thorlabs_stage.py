@@ -184,15 +184,20 @@ class ThorlabsStage:
                 pass
 
     def _follow(self, now: float, position: int) -> None:
-        """Velocity from the positions, since the cube's own velocity differs between models."""
+        """Velocity from the positions, since the cube's own velocity differs between models.
+
+        A position may arrive late, but was read after the one before it arrived: the time between two positions is
+        taken as long as it can be, so that a late one is not a fast stage.
+        """
+        read_after = now if math.isinf(self._received_s) else self._received_s
         if self._before is None:
-            self._before = (now, position)
+            self._before = (read_after, position)
             return
         took = now - self._before[0]
         if took >= _SETTLE_S:
             turned = (position - self._before[1]) / COUNTS_PER_RAD
             self._velocity = self._model.direction * turned / took
-            self._before = (now, position)
+            self._before = (read_after, position)
 
     def _as_status(self) -> StageStatus:
         if self._status is None:

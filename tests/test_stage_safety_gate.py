@@ -385,6 +385,21 @@ def test_stage_that_leaps_within_its_way_is_stopped() -> None:
     assert "the stage turned by 3." in _halts(room.run(0.04))[0]
 
 
+def test_status_that_arrives_late_is_not_a_leap() -> None:
+    room = _room()
+    room.go(MotionKind.SEARCH, 25.0)
+    room.run(1.0)
+    angle = room.stage.status().scan_rad
+    late = room.now + 0.1  # the angle was read 0.1 s before its status arrived; the next one arrives at once
+    speed = math.copysign(math.radians(10.0), math.radians(25.0) - angle)
+    status = replace(room.stage.status(), scan_rad=angle, stamp=Stamp(late, late))
+    assert room.gate.tick(late, status) == []
+    after = replace(status, scan_rad=angle + 0.102 * speed, stamp=Stamp(late + 0.002, late + 0.002))
+    assert room.gate.tick(late + 0.002, after) == []
+    then = replace(after, scan_rad=angle + 0.3 * speed, stamp=Stamp(late + 0.004, late + 0.004))
+    assert "the stage turned by 2.0 deg in 4 ms" in _halts(room.gate.tick(late + 0.004, then))[0]
+
+
 def test_stage_that_creeps_is_stopped_in_the_end() -> None:
     room = _room()
     room.stage.wrong.speed_factor = 0.05

@@ -61,6 +61,7 @@ class Gate:
         self._request: tuple[MotionKind, float] | None = None
         self._motion: _Motion | None = None
         self._status: StageStatus | None = None
+        self._arrived_before_s: float | None = None  # the status before ``_status``
         self._halted_s: float | None = None
         self._braking: _Motion | None = None
         self._seen_moving = False
@@ -149,7 +150,7 @@ class Gate:
             reason = f"the clock jumped by {now - last:.3f} s: the watchdog did not run"
         else:
             return []
-        self._beat = self._status = None
+        self._beat = self._status = self._arrived_before_s = None
         return self._latch(reason)
 
     def _alive(self, now: float) -> bool:
@@ -311,9 +312,12 @@ class Gate:
         if before is not None and status.stamp.host_s < before.stamp.host_s:
             self._status = before
             return []
+        read_after_s = self._arrived_before_s  # the earlier of the two was asked for then, and may have come late
+        if before is not None and status.stamp.host_s > before.stamp.host_s:
+            self._arrived_before_s = before.stamp.host_s
         if self._motion is None:
             return self._at_rest(status, now)
-        reason = self._misbehaves(self._motion, before, status, now)
+        reason = self._misbehaves(self._motion, before, read_after_s, status, now)
         if reason is not None:
             return self._latch(reason)
         return self._ended(self._motion, status)
@@ -333,17 +337,31 @@ class Gate:
             self._halted_s = halted  # not braking: the stop is repeated at every status until it is at rest
         return actions
 
-    def _misbehaves(self, motion: _Motion, before: StageStatus | None, status: StageStatus, now: float) -> str | None:
+    def _misbehaves(
+        self,
+        motion: _Motion,
+        before: StageStatus | None,
+        read_after_s: float | None,
+        status: StageStatus,
+        now: float,
+    ) -> str | None:
+        """Why a motion must stop, or None.
+
+        A status is stamped when it arrives. Its angle was read between the arrival of the status before it and its
+        own, so the way between two statuses is compared with the time since ``read_after_s``.
+        """
         limits, here = self.limits, status.scan_rad
         if status.fault:
             return status.fault
-        bound = limits.overspeed * motion.speed_at(status.stamp.host_s if before is None else before.stamp.host_s)
+        since_s = status.stamp.host_s if before is None else before.stamp.host_s
+        since_s = since_s if read_after_s is None else read_after_s
+        bound = limits.overspeed * motion.speed_at(since_s)
         slack = limits.tolerance_rad
         if abs(status.velocity_rad_s) > bound + slack:
             return f"the stage turns at {math.degrees(abs(status.velocity_rad_s)):.1f} deg/s: too fast"
         found_zero = motion.command.kind is MotionKind.HOME and status.homed and not status.homing
         if before is not None and not found_zero:
-            took = status.stamp.host_s - before.stamp.host_s
+            took = status.stamp.host_s - since_s
             if abs(here - before.scan_rad) > bound * took + slack:
                 return f"the stage turned by {math.degrees(abs(here - before.scan_rad)):.1f} deg in {1e3 * took:.0f} ms"
         if motion.command.kind is MotionKind.HOME:
