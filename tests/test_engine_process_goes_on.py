@@ -37,8 +37,8 @@ PATIENCE_S = 120.0
 
 @pytest.fixture
 def session(tmp_path: Path) -> tuple[Path, Shots]:
-    """An empty session, and the events of 8 aims and 22 pairs in two epochs for it."""
-    config = replace(PRESETS["camera-move"], aims=8, pairs=22)
+    """An empty session, and the events of 8 aims and 18 pairs in two epochs for it."""
+    config = replace(PRESETS["camera-move"], aims=8, pairs=18)
     write_session(simulate(config, 3), tmp_path / "s")
     events = read_session(tmp_path / "s").events
     (tmp_path / "s" / "events.jsonl").unlink()
@@ -265,17 +265,17 @@ def test_a_recorder_goes_on_by_itself_and_nothing_waits_for_it(
 
         shots = [event for event in events if not isinstance(event, CameraMovedEvent)]
         try:
-            for event in shots[:14]:
+            for event in shots[:12]:
                 recorder.hand_over(event)
-            until(14, 1)
-            for made, start in enumerate((14, 22), 2):
+            until(12, 1)
+            for made, start in enumerate((12, 19), 2):
                 killer = threading.Timer(0.05, engines.kill)
                 killer.start()
-                for event in shots[start : start + 8]:
+                for event in shots[start : start + 7]:
                     recorder.hand_over(event)
                 killer.join()
-                until(start + 8, made)
-                recorder.hand_over(NoteEvent(shots[start + 7].t, 0, "after"))
+                until(start + 7, made)
+                recorder.hand_over(NoteEvent(shots[start + 6].t, 0, "after"))
         finally:
             recorder.close()
         assert recorder.state.refused == 0

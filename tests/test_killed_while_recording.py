@@ -8,10 +8,10 @@ from fgreg.session.journal import Journal
 from tests.kill import count_events, difference_from_uninterrupted, event_at, run_kills
 
 
-def test_two_hundred_kills_lose_no_acknowledged_event(tmp_path: Path) -> None:
-    toll = run_kills(tmp_path, kills=200, seed=1, estimate=False, longest=80, most_s=0.06)
-    assert (toll.lives, toll.missing, toll.damaged) == (200, 0, 0)
-    assert toll.taken >= 100  # the lives did something before they ended
+def test_eighty_kills_lose_no_acknowledged_event(tmp_path: Path) -> None:
+    toll = run_kills(tmp_path, kills=80, seed=1, estimate=False, longest=80, most_s=0.06)
+    assert (toll.lives, toll.missing, toll.damaged) == (80, 0, 0)
+    assert toll.taken >= 40  # the lives did something before they ended
     assert toll.unasked > 0  # and some ended between disk and acknowledgement
     for folder in toll.sessions:
         with Journal.open(folder) as journal:
