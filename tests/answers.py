@@ -77,4 +77,4 @@ def answer_from_truth(
         for i, aim in enumerate(measurements.aims)
     )
     laser = LaserEstimate(truth.marker_T_laser, LASER_COVARIANCE)
-    return SessionEstimate(session.name, verdict, reasons, laser, epochs, pairs, tracks, aims)
+    return SessionEstimate(session.name, verdict, reasons, laser, epochs, pairs, tracks, aims=aims)

@@ -110,6 +110,7 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("initial.marker_T_laser.0", 3, "initial.marker_T_laser", "3 as row 0", "4 lists of 4"),
     ("targets_mm", [], "targets_mm", "[]", "a list of points"),
     ("targets_mm.1", [1, 2], "targets_mm[1]", "[1, 2]", "a list of 3 numbers"),
+    ("targets", [{"name": "a", "trus_p_mm": [0, 0, 40]}], "targets", "together with targets_mm", "one of the two"),
     ("targets_mm.1.2", 3000, "targets_mm[1][2]", "3000", "within +-2000 mm"),
     ("probe.pich_mm", 1, "probe.pich_mm", "an unknown key", "one of elements"),
     ("colour", "red", "colour", "an unknown key", "a name that starts with x_"),

@@ -274,7 +274,16 @@ def test_the_plain_data_have_the_names_and_units_of_the_result_file() -> None:
     assert found["verdict"] == "warning"
     assert found["reasons"] == ["one"]
     epoch = found["epochs"][0]
-    assert set(epoch) == {"index", "start_s", "trus_T_camera", "covariance", "pairs", "verdict", "predicted_tre_mm"}
+    assert set(epoch) == {
+        "index",
+        "start_s",
+        "trus_T_camera",
+        "covariance",
+        "pairs",
+        "verdict",
+        "predicted_tre_mm",
+        "target_errors_mm",
+    }
     np.testing.assert_array_equal(epoch["trus_T_camera"], estimate.epochs[0].trus_T_camera)
     assert epoch["predicted_tre_mm"] == {"mean": 0.71, "p95": 1.12, "worst": 1.4}
     assert estimate.laser is not None

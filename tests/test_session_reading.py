@@ -24,7 +24,8 @@ from fgreg.model.events import (
     StageEvent,
     TrackEvent,
 )
-from fgreg.model.session_model import NoiseModel, default_targets_mm
+from fgreg.model.session_model import SESSION, NoiseModel, SessionModel, default_targets_mm
+from fgreg.schema.problems import FieldError
 from fgreg.session.session_reader import read_ground_truth, read_session
 from tests import session_files
 
@@ -66,6 +67,21 @@ def test_setup_in_radians_and_millimetres(tmp_path: Path) -> None:
     assert_allclose(model.initial_trus_T_camera, session_files.QUARTER, atol=1e-15)
     assert_allclose(model.targets_mm, [[0.0, 0.0, 40.0], [10.0, -5.0, 35.5]])
     assert session.warnings == ()
+
+
+def test_targets_have_names_or_numbers(tmp_path: Path) -> None:
+    def model(targets: object) -> SessionModel:
+        return SESSION.read({**setup, "targets": targets})  # type: ignore[no-any-return]
+
+    setup = yaml.safe_load((session_files.write(tmp_path) / "session.yaml").read_text(encoding="utf-8"))
+    assert SESSION.read(setup, tmp_path).target_names == ("1", "2")
+    del setup["targets_mm"]
+    apex, base = {"name": "apex", "trus_p_mm": [0, 0, 45]}, {"name": "base, left", "trus_p_mm": [-15, 8, 30]}
+    named = model([apex, base])
+    assert named.target_names == ("apex", "base, left")
+    assert_allclose(named.targets_mm, [[0, 0, 45], [-15, 8, 30]])
+    with pytest.raises(FieldError, match="'apex' again, expected each name once"):
+        model([apex, base, apex])
 
 
 def test_only_what_is_required(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from fgreg.model.estimate import (
 )
 from fgreg.model.measurements import Look
 from fgreg.model.session_model import SessionModel
-from fgreg.registration.error_budget import largest_causes
+from fgreg.model.systematic import largest_causes
 
 STYLES = {Verdict.OK: "bold green", Verdict.WARNING: "bold yellow", Verdict.REFUSED: "bold red"}
 MEANINGS = {

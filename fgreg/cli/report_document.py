@@ -29,6 +29,7 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
     out: dict[str, Any] = {
         "session": estimate.session,
         "inputs": dict(estimate.inputs),
+        "settings": None if estimate.settings is None else asdict(estimate.settings),
         "verdict": estimate.verdict.value,
         "reasons": list(estimate.reasons),
         "laser": None
@@ -117,6 +118,17 @@ def _epoch_dict(epoch: EpochEstimate) -> dict[str, Any]:
             **_figures(tre),
             **{name: _figures(part) for name in ("random", "systematic", "seen") if (part := getattr(tre, name))},
         },
+        "target_errors_mm": [
+            {
+                "name": target.name,
+                "trus_p_mm": target.trus_p_mm.tolist(),
+                "rms": _plain(target.rms_mm),
+                "p95": _plain(target.p95_mm),
+                "random_p95": _plain(target.random_mm),
+                "systematic_p95": _plain(target.systematic_mm),
+            }
+            for target in epoch.targets
+        ],
     }
 
 
@@ -145,6 +157,8 @@ def _pair_dict(pair: PairEstimate, model: SessionModel, look: Look | None) -> di
         "covariance": _rows(pair.covariance),
         "residual_mm": _plain(pair.residual_mm),
         "nis": _plain(pair.nis),
+        "nis_dof": pair.nis_dof,
+        "influence_mm": _plain(pair.influence_mm),
     }
 
 

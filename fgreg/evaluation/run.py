@@ -12,12 +12,12 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 
 from fgreg.evaluation.case import Case, EvaluationConfig, curve_sizes, folds_of, left_out_one_by_one, subsets_of
-from fgreg.evaluation.influence import Influence, influences
 from fgreg.evaluation.resolve import Resolved, resolve
 from fgreg.geometry.target_error import beam_error, tre_mm
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import PredictedTre, Verdict
 from fgreg.model.sensitivity import wrap_angle
+from fgreg.registration.influence import Influence, influences
 from fgreg.registration.solve import solve
 from fgreg.registration.verdict import Condition
 from fgreg.workers.parent import end_with_parent

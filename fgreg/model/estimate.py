@@ -87,6 +87,18 @@ class PredictedTre:
     ] = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetEstimate:
+    """Predicted error e at one target, mm."""
+
+    name: Annotated[str, Key("of the target; its number from 1 where it has none", Text())]
+    trus_p_mm: Annotated[FloatArray, Key("where it is", Numbers(3, _SIZE))]
+    rms_mm: Annotated[float, Key("sqrt(E|e|^2)", _TRE, name="rms")]
+    p95_mm: Annotated[float, Key("95 % quantile of |e|", _TRE, name="p95")]
+    random_mm: Annotated[float, Key("part of `p95` that more shots reduce", _TRE, name="random_p95")]
+    systematic_mm: Annotated[float, Key("part of `p95` of the rig's constants", _TRE, name="systematic_p95")]
+
+
 @dataclass(frozen=True, slots=True)
 class SystematicEstimate:
     """One of the rig's constants: what is known of it before and after the session, and what it does."""
@@ -115,9 +127,18 @@ class EpochEstimate:
     predicted_tre: Annotated[
         PredictedTre | None, Key("predicted target registration error", name="predicted_tre_mm", null=True)
     ]
+    targets: Annotated[
+        tuple[TargetEstimate, ...],
+        Key(
+            "the predicted error at each target, mm",
+            ListOf(record(TargetEstimate)),
+            name="target_errors_mm",
+            brief=True,
+        ),
+    ] = ()
 
 
-_USED = ("used", True)
+_USED, _UNUSED = ("used", True), ("used", False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +180,22 @@ class PairEstimate:
             required_if=_USED,
         ),
     ] = None
-    reason: Annotated[str, Key("why it was not used", brief=True, required_if=("used", False))] = ""
+    nis_dof: Annotated[
+        int | None,
+        Key(
+            "degrees of freedom of `nis`: 2 of one look, 5 more of each further one, 3 where it shares the marker",
+            _COUNT,
+        ),
+    ] = None
+    influence_mm: Annotated[
+        float | None,
+        Key(
+            "mean distance by which the targets move where this PM is left out; absent where the others do not "
+            "determine the registration",
+            _NOT_NEGATIVE,
+        ),
+    ] = None
+    reason: Annotated[str, Key("why it was not used", brief=True, required_if=_UNUSED)] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,14 +256,30 @@ class Assumption:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AimEstimate:
-    """One calibration shot: distance of the spot from the beam (mm), and its misfit (``nis`` as of a pair)."""
+    """One calibration shot. Figures are None where they are not known."""
 
-    t: float
-    used: bool
-    reason: str = ""
-    lambda_mm: float | None = None
-    residual_mm: float | None = None
-    nis: float | None = None
+    t: Annotated[float, Key("of the aim", SECONDS)]
+    used: Annotated[bool, Key("whether it is an inlier of the estimate")]
+    reason: Annotated[str, Key("why it was not used", brief=True, required_if=_UNUSED)] = ""
+    lambda_mm: Annotated[
+        float | None, Key("distance of the spot along the beam from the laser frame's origin", _SIZE)
+    ] = None
+    residual_mm: Annotated[float | None, Key("distance of the spot from the beam", _NOT_NEGATIVE)] = None
+    nis: Annotated[float | None, Key("as of a pair, two degrees of freedom", _NOT_NEGATIVE)] = None
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsUsed:
+    """The settings that a result was made with."""
+
+    limit_mm: Annotated[
+        float, Key("error (95 %) at the worst target up to which the verdict is ok", Number(0.0, 100.0, above=True))
+    ]
+    estimate: Annotated[
+        tuple[str, ...], Key("constants estimated by --estimate", ListOf(Text(), "a list of texts", empty=True))
+    ] = ()
+    detect_moves: Annotated[bool, Key("whether unreported camera moves were looked for")] = True
+    redetect: Annotated[bool, Key("whether frames were used even where events have poses")] = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,9 +303,10 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionEstimate:
-    """The whole estimate of a session: the contents of ``result.yaml``, and the calibration shots.
+    """The whole estimate of a session: the contents of ``result.yaml``.
 
-    ``timing``: only where events were taken in one by one.
+    ``timing``: only where events were taken in one by one. The required keys of the file come last: one that was cut
+    lacks one of them.
     """
 
     version: Annotated[str, Key("version of fgreg that made it", name="fgreg", required=True)] = field(
@@ -269,6 +322,9 @@ class SessionEstimate:
             brief=True,
         ),
     ] = field(default_factory=dict, kw_only=True)
+    settings: Annotated[SettingsUsed | None, Key("what it was made with", brief=True)] = field(
+        default=None, kw_only=True
+    )
     verdict: Annotated[Verdict, Key("ok: usable; warning: a condition is missed; refused: use no transform", VERDICT)]
     reasons: Annotated[
         tuple[str, ...],
@@ -284,6 +340,13 @@ class SessionEstimate:
     checks: Annotated[
         tuple[CheckEstimate, ...], Key("one per check event", ListOf(record(CheckEstimate), empty=True))
     ] = field(default=(), kw_only=True)
+    aims: Annotated[
+        tuple[AimEstimate, ...], Key("one per aim event", ListOf(record(AimEstimate), empty=True), brief=True)
+    ] = field(default=(), kw_only=True)
+    systematic: Annotated[
+        tuple[SystematicEstimate, ...],
+        Key("the rig's constants that are variables", ListOf(record(SystematicEstimate), empty=True), brief=True),
+    ] = field(default=(), kw_only=True)
     laser: Annotated[LaserEstimate | None, Key("the beam", null=True)]
     epochs: Annotated[
         tuple[EpochEstimate, ...],
@@ -293,11 +356,6 @@ class SessionEstimate:
         tuple[PairEstimate, ...], Key("one per look, in the order of events", ListOf(record(PairEstimate), empty=True))
     ]
     tracks: Annotated[tuple[TrackEstimate, ...], Key("one per track event", ListOf(record(TrackEstimate), empty=True))]
-    aims: tuple[AimEstimate, ...] = ()
-    systematic: Annotated[
-        tuple[SystematicEstimate, ...],
-        Key("the rig's constants that are variables", ListOf(record(SystematicEstimate), empty=True), brief=True),
-    ] = ()
     timing: Annotated[
         Timing | None, Key("of `fgreg replay` only; null where there was no such event", name="timing_ms")
     ] = None

@@ -28,6 +28,7 @@ from fgreg.schema.kinds import (
     POSITIVE_MM,
     SCAN_DEG,
     Integer,
+    ListOf,
     Number,
     Numbers,
     NumberTuple,
@@ -397,6 +398,14 @@ NAME = Text(check=_check_name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """A named TRUS point at which the error matters."""
+
+    name: Annotated[str, Key("in results and reports", NAME)]
+    trus_p_mm: Annotated[FloatArray, Key("where it is", POINT_MM)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SessionModel:
     """The set-up of a session: the contents of ``session.yaml``; ``targets_mm`` (n, 3)."""
 
@@ -423,6 +432,10 @@ class SessionModel:
             default="27 points: x -20, 0, 20; stage angle -30, 0, 30 deg; 22, 32, 42 mm beyond the probe's radius",
         ),
     ] = field(default_factory=lambda: as_float_array(np.zeros((0, 3))))
+    targets: Annotated[
+        tuple[Target, ...],
+        Key("the same with names, instead of `targets_mm`", ListOf(record(Target)), brief=True),
+    ] = ()
     systematic: Annotated[
         Systematic,
         Key(
@@ -440,6 +453,8 @@ class SessionModel:
     rig: Annotated[CommissionedRig | None, NotStored(None)] = None
 
     def __post_init__(self) -> None:
+        if self.targets:
+            self._take_named_targets()
         if not len(self.targets_mm):
             object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
         if not self.systematic.declared and (self.rig_file is not None or self.rig is not None):
@@ -447,6 +462,23 @@ class SessionModel:
             raise FieldError.of(
                 "none beside a rig", "one of the two, since a rig has standard deviations", "systematic"
             )
+
+    def _take_named_targets(self) -> None:
+        named = as_float_array([target.trus_p_mm for target in self.targets])
+        if len(self.targets_mm) and not np.array_equal(self.targets_mm, named):
+            raise FieldError.of("it together with targets_mm", "one of the two", "targets")
+        names = self.target_names
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise FieldError.of(f"{shown(name)} again", "each name once", "targets", i, "name")
+        object.__setattr__(self, "targets_mm", named)
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """One per target: its name, else its number from 1."""
+        if self.targets:
+            return tuple(target.name for target in self.targets)
+        return tuple(str(number) for number in range(1, len(self.targets_mm) + 1))
 
     @property
     def noise_per_pm(self) -> NoiseModel:

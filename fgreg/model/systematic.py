@@ -7,6 +7,7 @@ pixels; ratios for relative deviations.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
+from fgreg.model.estimate import SystematicEstimate
 from fgreg.schema.kinds import NOISE_MM, Converted, JsonSchema, Number, NumberTuple
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key, NotStored, record
@@ -194,3 +196,15 @@ def _texts() -> tuple[ConstantText, ...]:
 
 TEXTS = _texts()
 """One for each :class:`Constant`."""
+
+
+CAUSES = 3
+"""Number of causes that are named."""
+
+
+def largest_causes(constants: Sequence[SystematicEstimate], count: int = CAUSES) -> str:
+    """The constants that cause most of the error at the worst target, as text; empty where none does."""
+    texts = {text.name: text for text in TEXTS}
+    order = sorted(constants, key=lambda constant: -constant.worst_target_mm)[:count]
+    parts = [f"{texts[c.name].what} {c.worst_target_mm:.2f} mm" for c in order if c.worst_target_mm >= 0.005]
+    return ", ".join(parts)

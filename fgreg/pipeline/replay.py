@@ -29,6 +29,7 @@ from fgreg.pipeline.solve import (
     SolveReport,
     errors_where_known,
     result_place,
+    settings_used,
     show_frames,
     solve_extracted,
 )
@@ -146,7 +147,14 @@ def replay_session(
         player.play(on_step)
         taken, found, solution, estimate = solve_extracted(session, player.taken(), config)
         settled = engine.settle() if player.estimate is not None else None
-        estimate = replace(estimate, inputs=inputs, timing=player.timing(), tracks=player.answers(estimate.tracks))
+        used = settings_used(config, detect_moves=True, redetect=request.redetect)
+        estimate = replace(
+            estimate,
+            inputs=inputs,
+            settings=used,
+            timing=player.timing(),
+            tracks=player.answers(estimate.tracks),
+        )
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         viewer.result(session.model, taken.measurements, estimate, truth, extracted.tracks)
         write_result(estimate, session.model, result_path, __version__)

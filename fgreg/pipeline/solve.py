@@ -25,6 +25,7 @@ from fgreg.model.estimate import (
     CheckEstimate,
     PairEstimate,
     SessionEstimate,
+    SettingsUsed,
     TrackEstimate,
     Verdict,
 )
@@ -35,6 +36,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.output.atomic_file import check_outputs
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
+from fgreg.registration.influence import influences
 from fgreg.registration.move_doubt import TELLING
 from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import Solution, solve
@@ -145,7 +147,8 @@ def solve_session(
             progress=None if progress is None else lambda done, total: progress("looking at frames", done, total),
         )
         extracted, found, solution, estimate = solve_extracted(session, extracted, config, request.detect_moves)
-        estimate = replace(estimate, inputs=inputs)
+        used = settings_used(config, request.detect_moves, request.redetect)
+        estimate = replace(estimate, inputs=inputs, settings=used)
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         show(viewer, session, extracted, estimate, truth)
         write_result(estimate, session.model, result_path, __version__)
@@ -174,6 +177,12 @@ def solve_extracted(
         registration=found.registration,
     )
     return extracted, found, solution, session_estimate(session, extracted, solution, config)
+
+
+def settings_used(config: SolveConfig, detect_moves: bool, redetect: bool) -> SettingsUsed:
+    """What a result says of the settings it was made with."""
+    names = (("sound_speed", config.estimate_sound_speed), ("probe_radius", config.estimate_radius))
+    return SettingsUsed(config.limit_mm, tuple(name for name, wanted in names if wanted), detect_moves, redetect)
 
 
 def result_place(folder: Path, out: Path | None, rrd: Path | None) -> Path:
@@ -235,7 +244,7 @@ def session_estimate(
     session: Session, extracted: ExtractedMeasurements, solution: Solution, config: SolveConfig
 ) -> SessionEstimate:
     """The solution with every shot and check of the session in it, in event order; unused ones have their reason."""
-    pairs = dict(zip(extracted.pair_events, solution.pairs, strict=True))
+    pairs = dict(zip(extracted.pair_events, with_influence(solution, session.model), strict=True))
     tracks = dict(zip(extracted.track_events, solution.tracks, strict=True))
     aims = dict(zip(extracted.aim_events, solution.aims, strict=True))
     checks: dict[int, Check | CheckEstimate] = dict(extracted.checks)
@@ -263,6 +272,18 @@ def session_estimate(
         pairs=tuple(pairs[i] for i in sorted(pairs)),
         tracks=tuple(tracks[i] for i in sorted(tracks)),
         aims=tuple(aims[i] for i in sorted(aims)),
+    )
+
+
+def with_influence(solution: Solution, model: SessionModel) -> tuple[PairEstimate, ...]:
+    """The pairs of a solution with the influence of each PM that is an inlier."""
+    if solution.registration is None:
+        return solution.pairs
+    found = {(of.epoch, of.pm): of.moved_mm for of in influences(solution.registration, model.targets_mm)}
+    return tuple(
+        replace(pair, influence_mm=moved) if pair.used and np.isfinite(moved) else pair
+        for pair in solution.pairs
+        for moved in [found.get((pair.epoch, pair.pm), np.inf)]
     )
 
 

@@ -27,7 +27,7 @@ from fgreg.graph.columns import Columns
 from fgreg.graph.packing import pack_more
 from fgreg.graph.reduced_blocks import inner, look_rows
 from fgreg.graph.shared_state import SharedState
-from fgreg.model.estimate import PredictedPart, PredictedTre, SystematicEstimate, Verdict
+from fgreg.model.estimate import PredictedPart, PredictedTre, SystematicEstimate, TargetEstimate, Verdict
 from fgreg.model.measurements import Look, MarkerObservation, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -53,8 +53,6 @@ CERTAIN_SIGMAS = 4.0
 FAR_SIGMAS = 30.0
 """Prior standard deviations beyond which no figure is given."""
 Part = TypeVar("Part", PredictedPart, PredictedTre)
-CAUSES = 3
-"""Number of causes that are named."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,11 +62,13 @@ class Budget:
     Attributes:
         constants: one for each of the rig's constants that is a variable.
         predicted: the predicted error of each solved epoch with its parts, in the order of ``registration.epochs``.
+        targets: the same at each target.
         conditions: of constants that the data contradict.
     """
 
     constants: tuple[SystematicEstimate, ...]
     predicted: tuple[PredictedTre, ...]
+    targets: tuple[tuple[TargetEstimate, ...], ...]
     conditions: tuple[Condition, ...]
 
 
@@ -76,9 +76,7 @@ def error_budget(registration: Registration, posterior: Posterior, config: Solve
     """The budget of a registration at the optimum of the graph (before it is centred on the posterior's mean)."""
     model, columns = registration.model, registration.problem.columns
     sigmas, mean = constants_of(model, config)
-    predicted = tuple(
-        _predicted(registration, posterior, place, model.targets_mm) for place in range(len(registration.epochs))
-    )
+    predicted = [_predicted(registration, posterior, place) for place in range(len(registration.epochs))]
     last = len(registration.epochs) - 1
     causes = _causes_mm(registration, last)
     covariance, value = registration.covariance, registration.optimum.state.constants[0]
@@ -102,7 +100,12 @@ def error_budget(registration: Registration, posterior: Posterior, config: Solve
                 worst_target_mm=float(causes[place]),
             )
         )
-    return Budget(tuple(constants), predicted, tuple(conflicts(constants) or measured(constants)))
+    return Budget(
+        constants=tuple(constants),
+        predicted=tuple(whole for whole, _ in predicted),
+        targets=tuple(each for _, each in predicted),
+        conditions=tuple(conflicts(constants) or measured(constants)),
+    )
 
 
 def random_errors_only(model: SessionModel) -> list[Condition]:
@@ -114,14 +117,6 @@ def random_errors_only(model: SessionModel) -> list[Condition]:
         "stage, camera and prints are known"
     )
     return [Condition(Verdict.WARNING, text)]
-
-
-def largest_causes(constants: Sequence[SystematicEstimate], count: int = CAUSES) -> str:
-    """The constants that cause most of the error at the worst target, as text; empty where none does."""
-    texts = {text.name: text for text in TEXTS}
-    order = sorted(constants, key=lambda constant: -constant.worst_target_mm)[:count]
-    parts = [f"{texts[c.name].what} {c.worst_target_mm:.2f} mm" for c in order if c.worst_target_mm >= 0.005]
-    return ", ".join(parts)
 
 
 def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
@@ -159,6 +154,22 @@ def with_effects(predicted: PredictedTre, conditions: Sequence[Condition]) -> Pr
         more(predicted),
         systematic=None if predicted.systematic is None else more(predicted.systematic),
         seen=None if predicted.seen is None else more(predicted.seen),
+    )
+
+
+def targets_with_effects(
+    targets: Sequence[TargetEstimate], conditions: Sequence[Condition]
+) -> tuple[TargetEstimate, ...]:
+    """:func:`with_effects` at each target."""
+    effect = sum(condition.effect_mm for condition in conditions)
+    return tuple(
+        replace(
+            target,
+            rms_mm=float(np.hypot(target.rms_mm, effect)),
+            p95_mm=target.p95_mm + effect,
+            systematic_mm=target.systematic_mm + effect,
+        )
+        for target in targets
     )
 
 
@@ -222,11 +233,15 @@ def _traces(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,jk,nik->n", jacobian, covariance, jacobian))
 
 
-def _predicted(registration: Registration, posterior: Posterior, place: int, targets_mm: FloatArray) -> PredictedTre:
-    """Predicted error of one epoch, its random and systematic part, and that of targets which the scanner shows.
+def _predicted(
+    registration: Registration, posterior: Posterior, place: int
+) -> tuple[PredictedTre, tuple[TargetEstimate, ...]]:
+    """Predicted error of one epoch, its random and systematic part, and that of targets which the scanner shows; and
+    the error at each target.
 
     Total figures are those of the posterior's samples; the parts have the shares of the Gaussian at the optimum.
     """
+    targets_mm = registration.model.targets_mm
     total, root, quantiles = predicted_tre(posterior, place, targets_mm)
     transform = registration.optimum.state.trus_T_camera(place)[0]
     jacobian = target_jacobians(transform, targets_mm)
@@ -234,16 +249,26 @@ def _predicted(registration: Registration, posterior: Posterior, place: int, tar
     explained = cross @ np.linalg.solve(own, cross.T)
     share = np.clip(_traces(jacobian, explained) / np.maximum(_traces(jacobian, pose), 1e-30), 0.0, 1.0)
 
+    random, systematic = np.sqrt(1.0 - share), np.sqrt(share)
+
     def part(factor: FloatArray) -> PredictedPart:
         return PredictedPart(
             float((root * factor).mean()), float((quantiles * factor).mean()), float((quantiles * factor).max())
         )
 
-    return replace(
-        total,
-        random=part(np.sqrt(1.0 - share)),
-        systematic=part(np.sqrt(share)),
-        seen=_seen(registration, place, jacobian, targets_mm),
+    seen = _seen(registration, place, jacobian, targets_mm)
+    whole = replace(total, random=part(random), systematic=part(systematic), seen=seen)
+    return whole, tuple(
+        TargetEstimate(name, point, *(float(figure) for figure in figures))
+        for name, point, *figures in zip(
+            registration.model.target_names,
+            targets_mm,
+            root,
+            quantiles,
+            quantiles * random,
+            quantiles * systematic,
+            strict=True,
+        )
     )
 
 

@@ -96,6 +96,7 @@ def read_pairs(
             out.append(PairEstimate(pair.t, pair.pm, pair.epoch, used=False, reason=reason))
             continue
         pm, scan = int(problem.look_pm[look]), float(looks.scan_rad[look])
+        beams, seen = int(np.sum(problem.beam_pm == pm)), int(np.sum(problem.look_pm == pm))
         dy = float(points[pm, 1]) - radius * np.sin(scan)
         dz = float(points[pm, 2]) - radius * np.cos(scan)
         delta = float(wrap_angle(np.arctan2(dy, dz) - scan))
@@ -114,6 +115,7 @@ def read_pairs(
                 covariance=covariance[pm],
                 residual_mm=float(np.hypot(*at.look_residual[0, look, :2])),
                 nis=float(nis[pm]),
+                nis_dof=2 * beams + 3 * seen - 3,  # equations of beams and looks, less the PM's coordinates
             )
         )
         look += 1

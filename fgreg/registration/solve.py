@@ -27,14 +27,15 @@ from fgreg.model.estimate import (
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.model.systematic import largest_causes
 from fgreg.model.tissue_surface import fit_surface
 from fgreg.registration.camera_conditions import camera_conditions
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
 from fgreg.registration.error_budget import (
     Budget,
     error_budget,
-    largest_causes,
     random_errors_only,
+    targets_with_effects,
     with_effects,
 )
 from fgreg.registration.group_tests import group_conditions
@@ -121,8 +122,8 @@ class Solution:
             self.epochs,
             self.pairs,
             self.tracks,
-            self.aims,
-            self.systematic,
+            aims=self.aims,
+            systematic=self.systematic,
         )
 
 
@@ -353,6 +354,7 @@ def _epoch_verdicts(
                 pairs=count,
                 verdict=verdict_of([*common, *found]),
                 predicted_tre=tre,
+                targets=targets_with_effects(budget.targets[place], common),
             )
         out.append(EpochReport(estimate, tuple(found)))
     return tuple(out)

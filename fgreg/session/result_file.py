@@ -15,7 +15,9 @@ from fgreg.session.yaml_loader import load_yaml
 
 RESULT_FILE = "result.yaml"
 
-_ONE_LINE = frozenset({"predicted_tre_mm", "checks", "pairs", "tracks", "add", "track"})
+_ONE_LINE = frozenset(
+    {"predicted_tre_mm", "checks", "pairs", "tracks", "add", "track", "aims", "target_errors_mm", "settings"}
+)
 
 RESULT_KIND = FileKind("a result", (b"format: fgreg-result/",), file_name=RESULT_FILE)
 
@@ -42,8 +44,8 @@ def write_result(estimate: SessionEstimate, model: SessionModel, path: Path, ver
 def read_result(path: Path) -> SessionEstimate:
     """Read a result and check every field.
 
-    Times of the looks are not in the file: ``t`` of each pair is NaN; nor are the calibration shots. A predicted error
-    that is ``null`` reads as infinite.
+    Times of the looks are not in the file: ``t`` of each pair is NaN. A predicted error that is ``null`` reads as
+    infinite.
 
     Raises:
         InputError: the first problem of the file.

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.evaluation.influence import influences
 from fgreg.graph.packing import pack
 from fgreg.graph.reduced_solver import optimize
 from fgreg.graph.shared_state import step_between
 from fgreg.model.solve_config import SolveConfig
+from fgreg.registration.influence import influences
 from fgreg.registration.register import register
 from tests.forward import make_measurements
 
