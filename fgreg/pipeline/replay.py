@@ -132,7 +132,7 @@ def replay_session(
         )
     truth = read_ground_truth(request.folder)
     url = spawn_viewer() if request.live else None
-    with open_viewer(request.rrd, session.model.name, url) as viewer:
+    with open_viewer(request.rrd, session.model.name, url, inputs) as viewer:
         viewer.session(session.model)
         extracted = extract_measurements(
             session.events,

@@ -139,7 +139,7 @@ def solve_session(
     result_path = result_place(request.folder, request.out, request.rrd)
     session, inputs = read_with_hashes(request.folder)
     truth = read_ground_truth(request.folder)
-    with open_viewer(request.rrd, session.model.name) as viewer:
+    with open_viewer(request.rrd, session.model.name, made_from=inputs) as viewer:
         extracted = extract_measurements(
             session.events,
             session.model,

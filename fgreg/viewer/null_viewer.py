@@ -5,7 +5,7 @@ A run without a recording does not import Rerun or the code that draws.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -32,8 +32,12 @@ def _nothing(*_: Any, **__: Any) -> None:
     """Draw nothing."""
 
 
-def open_viewer(rrd: Path | None, session_name: str, url: str | None = None) -> Viewer | NullViewer:
+def open_viewer(
+    rrd: Path | None, session_name: str, url: str | None = None, made_from: Mapping[str, str] | None = None
+) -> Viewer | NullViewer:
     """A viewer that records to ``rrd`` and shows in the running viewer at ``url``; the null viewer where both are None.
+
+    ``made_from``: hashes of the session's files.
 
     Raises:
         InputError: ``rrd`` cannot be written, or is another file.
@@ -42,4 +46,4 @@ def open_viewer(rrd: Path | None, session_name: str, url: str | None = None) -> 
         return NullViewer()
     from fgreg.viewer.recording import Viewer
 
-    return Viewer(rrd, session_name, url)
+    return Viewer(rrd, session_name, url, made_from)

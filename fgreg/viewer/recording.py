@@ -17,7 +17,7 @@ Timelines: ``shot`` (number among all aims, pairs and tracks, from 0) and ``time
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -37,7 +37,7 @@ from fgreg.viewer import shapes as shapes
 from fgreg.viewer.blueprint import Contents, make_blueprint
 from fgreg.viewer.live import LiveDrawing, ViewerUpdate
 from fgreg.viewer.pa_frame import pa_picture, texture
-from fgreg.viewer.recording_file import RECORDING, is_complete
+from fgreg.viewer.recording_file import RECORDING, is_complete, recording_id
 from fgreg.viewer.result import ResultDrawing, Truth
 from fgreg.viewer.scene import ShotKind
 from fgreg.viewer.shapes import Image8
@@ -61,15 +61,19 @@ class Viewer:
         rrd: the file to write; its folder must exist. None: no file.
         session_name: the recording's name.
         url: of a running viewer that shows it too.
+        made_from: hashes of the session's files, by which the recording is told from that of another session.
 
     Raises:
         InputError: ``rrd`` cannot be written, or is another file.
     """
 
-    def __init__(self, rrd: Path | None, session_name: str, url: str | None = None) -> None:
+    def __init__(
+        self, rrd: Path | None, session_name: str, url: str | None = None, made_from: Mapping[str, str] | None = None
+    ) -> None:
         self._file = None if rrd is None else NewFile(rrd, RECORDING)
         try:
-            self._rec = shapes.Recorder(None if self._file is None else self._file.part, session_name, url)
+            file = None if self._file is None else self._file.part
+            self._rec = shapes.Recorder(file, session_name, url, recording_id(made_from or {}))
         except RuntimeError as error:
             self._drop_part()
             if rrd is None:

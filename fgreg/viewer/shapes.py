@@ -57,11 +57,11 @@ class Recorder:
     """A recording stream into a file, a running viewer, or both, with the timelines ``shot`` and ``time``.
 
     Args:
-        path: of the file. name: of the recording. url: of the viewer.
+        path: of the file. name: of the recording. url: of the viewer. own_id: of the recording; None: a random one.
     """
 
-    def __init__(self, path: Path | None, name: str, url: str | None = None) -> None:
-        self._stream = rr.RecordingStream("fgreg")
+    def __init__(self, path: Path | None, name: str, url: str | None = None, own_id: str | None = None) -> None:
+        self._stream = rr.RecordingStream("fgreg", recording_id=own_id)
         sinks: list[rr.FileSink | rr.GrpcSink] = []
         if path is not None:
             sinks.append(rr.FileSink(path))
