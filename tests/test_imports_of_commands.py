@@ -37,6 +37,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "solve POSES --quiet": ("rich", *SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "solve FRAMES": (*SLOW[1:], *OTHER_COMMANDS, *DRAWING, *PROCESSES),
     "verify POSES NEW": (*SLOW, *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
+    "report POSES": (*SLOW, *SOLVER[1:], *OTHER_COMMANDS, *DETECTORS, *DRAWING, *PROCESSES),
     "replay POSES": (*SLOW, *DETECTORS, "fgreg.simulation", "fgreg.evaluation", "fgreg.convert"),
     "evaluate POSES --jobs 1 --folds 0 --subsets 0 --no-leave-one-out": (
         *SLOW,
@@ -66,8 +67,9 @@ def test_a_command_loads_nothing_that_it_does_not_use(
     places = {"POSES": str(pose_session), "OUT": str(tmp_path / "out"), "PDF": str(tmp_path / "m.pdf")}
     if "FRAMES" in command:
         places["FRAMES"] = str(request.getfixturevalue("raw_session"))
-    if "NEW" in command:
+    if "NEW" in command or "report" in command:
         solve_session(SolveRequest(pose_session))
+    if "NEW" in command:
         lines = (pose_session / "events.jsonl").read_text().splitlines()
         places["NEW"] = str(tmp_path / "new.jsonl")
         event = json.loads(next(line for line in lines if '"pair"' in line))

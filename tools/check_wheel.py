@@ -1,7 +1,7 @@
 """Build the wheel, install it into an empty environment outside the tree, and use it there.
 
-Checks that the command runs, that a simulated session is solved, and that no top-level package `factors` or `drivers`
-came along. Exit status 0 where all holds.
+Checks that the command runs, that a simulated session is solved and reported, and that no top-level package `factors`
+or `drivers` came along. Exit status 0 where all holds.
 """
 
 from __future__ import annotations
@@ -57,6 +57,7 @@ def main() -> None:
         run(fgreg, "simulate", "poses", "--preset", "first-hit", "--pairs", "30", "--seed", "3", cwd=outside)
         run(fgreg, "check", "poses", cwd=outside)
         print(run(fgreg, "solve", "poses", cwd=outside))
+        print(run(fgreg, "report", "poses", cwd=outside))
         print(f"{wheel.name}: installed and used in an empty environment")
 
 

@@ -26,6 +26,7 @@ from fgreg.cli.commission import add_commission
 from fgreg.cli.convert import add_convert
 from fgreg.cli.devices import add_devices
 from fgreg.cli.evaluate import add_commands
+from fgreg.cli.html_report import add_report
 from fgreg.cli.live import add_live
 from fgreg.cli.options import EstimateOption, LimitOption, solve_config, warn_of_leftovers
 from fgreg.cli.print import add_print
@@ -415,6 +416,7 @@ add_verify(app, _progress)
 add_convert(app)
 add_devices(app)
 add_print(app)
+add_report(app, _progress)
 add_schema(app)
 
 
