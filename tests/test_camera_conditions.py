@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -159,7 +160,7 @@ def test_constants_that_are_exact_allow_no_deviation() -> None:
     for systematic in (EXACT, NONE):
         exact = replace(session(), systematic=systematic)
         (found,) = conditions(measurements, exact)
-        assert "0.3 +- 0.1 % smaller than size_mm" in found.text or "0.3 +- 0.0 % smaller than size_mm" in found.text
+        assert re.search(r"0\.3 % smaller than size_mm \(1 sigma 0\.[01] %\)", found.text)
 
 
 def test_without_frames_nothing_is_measured() -> None:
@@ -241,7 +242,7 @@ def test_frames_measure_the_printed_size(tmp_path: Path, percent: int) -> None:
     for size in measured_sizes:
         assert size.ratio == pytest.approx(1.0 + percent / 100.0, abs=0.001)
     way = "smaller" if percent > 0 else "larger"
-    assert f"% {way} than size_mm and the board" in found[0].text
+    assert re.search(rf"% {way} than size_mm \(1 sigma [\d.]+ %\) and the board", found[0].text)
 
 
 def test_solve_says_that_the_prints_are_smaller(tmp_path: Path) -> None:
@@ -252,7 +253,7 @@ def test_solve_says_that_the_prints_are_smaller(tmp_path: Path) -> None:
     assert error is not None
     assert epoch.predicted_tre is not None
     assert error.max() < epoch.predicted_tre.worst_mm  # which includes what is named
-    assert "the stereo views measure the tag 3.0 +- 0.5 % smaller than size_mm" in report.estimate.reasons[0]
+    assert "the stereo views measure the tag 3.0 % smaller than size_mm (1 sigma 0.5 %)" in report.estimate.reasons[0]
     for size in sizes(report.extracted.measurements, report.session.model):
         assert size.ratio == pytest.approx(1.03, abs=0.001)
 

@@ -161,7 +161,7 @@ def test_the_mean_error_with_its_own_95_percent_has_to_stay_below_the_limit() ->
     """Rough checks do not show that the registration is good, even where they agree with it."""
     assert texts(checks_at(np.zeros(3), sigma_mm=2.0)) == []
     (rough,) = texts(checks_at(np.zeros(3), sigma_mm=6.0))
-    assert "the mean error at the checks is 0.0 mm, at most 8.4 mm (95 %), and has to be below 3 mm" in rough
+    assert "the mean error at the checks is 0.0 mm, at most 8.4 mm (95 % bound), and has to be below 3 mm" in rough
     assert "locate the checks more accurately" in rough
     (near,) = texts(checks_at(np.array([0.9, 0.0, 0.0])), limit_mm=1.0)
     assert "at most 1.4 mm" in near

@@ -139,6 +139,11 @@ def test_advice_as_table_and_json(
     assert run(monkeypatch, "advise", str(session), "--json", "-n", "2") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["pairs"] == 8
+    # One figure under one name: the predicted TRE of the solve, of the advice, and with each pair.
+    assert run(monkeypatch, "evaluate", str(session), "--json", "--folds", "0", "--subsets", "1", "-j", "1") == 0
+    (found,) = json.loads(capsys.readouterr().out)["sessions"]
+    mean = found["epochs"][0]["predicted_tre_mm"]["mean"]
+    assert {document["expected_tre_mm"], *(i["expected_tre_mm"] for i in found["influence"])} == {mean}
     assert len(document["shots"]) == 2
     assert document["shots"][0]["expected_tre_mm"] < document["expected_tre_mm"]
     assert [look["sweep"] for look in document["shots"][0]["looks"]] == [1, -1]

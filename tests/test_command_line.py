@@ -164,6 +164,25 @@ def test_wrong_words_are_one_line_and_exit_status_2(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_help_usage_and_completion_are_those_of_a_command_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _run(monkeypatch, "evaluate", "-h") == 0
+    assert capsys.readouterr().out.startswith("Usage: fgreg evaluate [OPTIONS] {SESSION}...\n")
+    assert _run(monkeypatch, "solve", "--limt", "3") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("fgreg: error: No such option: --limt")
+    assert line.endswith("(usage: fgreg solve [OPTIONS] {SESSION}; help: fgreg solve -h)")
+    for name, value in {
+        "_FGREG_COMPLETE": "complete_bash",
+        "COMP_WORDS": "fgreg solve --lim",
+        "COMP_CWORD": "2",
+    }.items():
+        monkeypatch.setenv(name, value)
+    assert _run(monkeypatch) == 0
+    assert capsys.readouterr().out.strip() == "--limit-mm"
+
+
 @pytest.mark.parametrize("limit", ["0", "-1", "nan", "inf"])
 def test_a_limit_has_to_be_a_length(
     limit: str, pose_session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

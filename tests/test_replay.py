@@ -169,7 +169,7 @@ def test_lines_report_the_estimate_after_each_event(
     captured = capsys.readouterr()
     lines = captured.out.splitlines()
     assert captured.err == ""
-    for word in ("event", "epoch", "pairs", "NIS", "worst", "verdict"):
+    for word in ("event", "epoch", "pairs", "NIS", "95 % mm", "verdict"):
         assert word in lines[0]
     assert [line for line in lines if "aim" in line and "none yet" in line]
     rows = [line.split() for line in lines if " pair, PM " in line]

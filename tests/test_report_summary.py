@@ -115,8 +115,8 @@ def test_the_registration_is_given_as_translation_rotation_and_matrix() -> None:
     assert "translation    (1.25, -20.50, 150.00) mm" in text
     assert "rotation       30.00 deg about (0.0000, 0.6000, 0.8000)" in text
     # sqrt of the covariance's diagonal, 0.004, 0.003, 0.008 rad in degrees.
-    assert "(0.25, 0.20, 0.30) mm, (0.23, 0.17, 0.46) deg" in text
-    assert "mean 0.71, 95 % 1.12, worst 1.40 mm over 27 targets" in text
+    assert "(0.25, 0.20, 0.30) mm, (0.23, 0.17, 0.46) deg, camera x, y, z" in text
+    assert "mean 0.71, 95 % bound 1.12 mm, over 27 targets" in text
     lines = text.splitlines()
     last = next(i for i, line in enumerate(lines) if line.split() == ["0.000000", "0.000000", "0.000000", "1.000000"])
     printed = np.array([[float(word) for word in line.split()] for line in lines[last - 3 : last + 1]])

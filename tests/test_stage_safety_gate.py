@@ -245,8 +245,8 @@ def test_tracking_that_cannot_go_on_stops_and_does_not_search() -> None:
         (MotionKind.TRACK, 3.0, {"speed_deg_s": 10.1}, "speed 10.1 deg/s"),
         (MotionKind.TRACK, 3.0, {"speed_deg_s": -1.0}, "speed -1.0 deg/s"),
         (MotionKind.TRACK, 3.0, {"speed_deg_s": math.nan}, "speed nan"),
-        (MotionKind.TRACK, 3.0, {"sigma_deg": 2.1}, "sigma is 2.10 deg"),
-        (MotionKind.TRACK, 3.0, {"sigma_deg": math.nan}, "sigma is nan"),
+        (MotionKind.TRACK, 3.0, {"sigma_deg": 2.1}, "angle is 2.10 deg"),
+        (MotionKind.TRACK, 3.0, {"sigma_deg": math.nan}, "angle is nan"),
     ],
 )
 def test_order_that_is_not_allowed_is_refused_with_the_reason(

@@ -80,11 +80,11 @@ def test_the_plane_is_at_the_stage_s_angle_and_the_goal_at_the_beam_s_predicted_
         np.testing.assert_allclose(up, [0.0, math.sin(scan_rad), math.cos(scan_rad)], atol=1e-6)
     # The model's stage counts the other way from 5 degrees: its own angles are what is written.
     assert rows["/world/stage/label"][-1].values["Points3D:labels"] == ["image plane, stage -15.0°"]
-    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8°"]
+    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8° (1 sigma)"]
     text = page(rows, 0)
     assert text.startswith("# OK")
     assert "## Next: go on" in text
-    assert "at -15.0°; beam at -21.0° ± 0.8°, 6.0° away" in text
+    assert "at -15.0°; beam at -21.0° ± 0.8° (1 sigma), 6.0° away" in text
     assert "1.50 mm" in text
     assert "9 pairs in camera epoch 2" in text
     assert {"Now", "Verdict", "World: TRUS frame, mm (live)"} <= set(views(tmp_path / "a.rrd").values())
@@ -147,7 +147,10 @@ def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[s
 @pytest.mark.parametrize(
     ("shown", "expected"),
     [
-        (status(Verdict.OK), ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8°", "news [red]"]),
+        (
+            status(Verdict.OK),
+            ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8° (1 sigma)", "news [red]"],
+        ),
         (
             replace(status(Verdict.OK), tracking=None, invalid="the camera is moving"),
             ["REFUSED", "not known yet", "the camera is moving"],

@@ -184,7 +184,7 @@ def test_a_track_turns_the_plane_to_its_answer(recorded: Recorded) -> None:
     scan = math.radians(5.0 - TRACK_DEVICE_DEG)
     np.testing.assert_allclose(plane[:3], [0.0, math.sin(scan), math.cos(scan)], atol=1e-6)
     label = recorded.at("/world/stage/label", shot).values["Points3D:labels"][0]
-    assert label == "turn the stage to -12.0 ± 0.6°"
+    assert label == "turn the stage to -12.0° ± 0.6° (1 sigma)"
     spot = recorded.at("/world/shot/pm", shot).array("Points3D:positions")[0]
     np.testing.assert_allclose(spot, recorded.truth.trus_p_pm_mm[recorded.measurements.pairs[-1].pm], atol=1e-4)
 

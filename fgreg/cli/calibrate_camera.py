@@ -62,7 +62,10 @@ def add_calibrate_camera(app: typer.Typer, progress_bar: ProgressBar) -> None:
     @app.command(name="calibrate-camera", help=_HELP)
     def calibrate_camera_(
         pictures: Annotated[
-            list[Path], typer.Argument(metavar="LEFT [RIGHT]", help="Folders, patterns ('left/*.png') or videos.")
+            list[Path],
+            typer.Argument(
+                metavar="PICTURES", help="Of the left camera, then of the right: folders, 'left/*.png', videos."
+            ),
         ],
         out: Annotated[
             Path | None, typer.Option("--out", metavar="FILE", help="The camera's lines of session.yaml to write.")

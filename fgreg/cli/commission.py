@@ -29,7 +29,7 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
 
     @app.command()
     def commission(
-        sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions of one rig.")],
+        sessions: Annotated[list[Path], typer.Argument(metavar="SESSION", help="Folders of sessions of one rig.")],
         out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="The rig's file to write.")] = None,
         check: Annotated[
             Path | None,
@@ -99,7 +99,7 @@ def print_report(report: "CommissionReport") -> None:
     for title, by_sessions in (("Observed by the sessions", True), ("Held by their prior", False)):
         mine = [c for c in report.constants if c.by_sessions is by_sessions]
         if mine:
-            heads = ("value", "sigma", "prior", "observed")
+            heads = ("value", "1 sigma", "prior", "observed")
             typer.echo(f"\n{title:<{width}}" + "".join(f"{head:>10}" for head in heads))
         for c in sorted(mine, key=lambda c: -c.observed):
             factor, name = (1.0, c.name) if _unit(c.name) else (100.0, f"{c.name}, %")
@@ -130,7 +130,7 @@ def session_line(session: "CommissionedSession", names: list[str]) -> str:
     for k in named:
         factor = _text(names[k]).per_unit if _unit(names[k]) else 100.0
         change, sigma = (f"{factor * size:.2g}" for size in (chart.change[k], chart.change_sigma[k]))
-        said.append(f"{names[k]} changed by {change} +- {sigma} {_unit(names[k]) or '%'} (z {chart.z[k]:.1f})")
+        said.append(f"{names[k]} changed by {change} +- {sigma} {_unit(names[k]) or '%'} (1 sigma; z {chart.z[k]:.1f})")
     return f"{text}: {' or '.join(said)}"
 
 

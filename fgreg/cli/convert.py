@@ -1,6 +1,7 @@
 """The command ``fgreg convert``."""
 
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -190,7 +191,7 @@ def _import(
         sys.stderr.write(f"fgreg: warning: {more} more reasons why data were left out\n")
     if not quiet:
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(written.events.items()))
-        typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {out}")
+        typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {shlex.quote(str(out))}")
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

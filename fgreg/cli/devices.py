@@ -20,7 +20,7 @@ def add_devices(app: typer.Typer) -> None:
     @app.command()
     def devices(
         config: Annotated[
-            Path | None, typer.Argument(metavar="[CONFIG]", help="A CONFIG.yaml of fgreg live: asks its devices.")
+            Path | None, typer.Argument(metavar="CONFIG", help="A CONFIG.yaml of fgreg live: asks its devices.")
         ] = None,
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
     ) -> None:

@@ -28,7 +28,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
 
     @app.command()
     def evaluate(
-        sessions: Annotated[list[Path], typer.Argument(metavar="SESSION...", help="Folders of sessions.")],
+        sessions: Annotated[list[Path], typer.Argument(metavar="SESSION", help="Folders of sessions.")],
         folds: Annotated[int, typer.Option("--folds", help="Folds of the cross-validation; 0: none.")] = 5,
         one_by_one: Annotated[
             bool, typer.Option("--leave-one-out/--no-leave-one-out", help="Also leave out each PM alone.")
@@ -130,16 +130,18 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         from fgreg.evaluation.advised import advice_dict, print_advice
         from fgreg.model.solve_config import SolveConfig
         from fgreg.registration.next_shot import advise as run
-        from fgreg.registration.register import register
+        from fgreg.registration.solve import solve
 
         if count < 1:
             raise InputError("--count", str(count), "a number >= 1")
         with progress_bar(quiet or as_json) as progress:
-            case, _ = read_case(session, progress)
+            case, conditions = read_case(session, progress)
             try:
-                advice = run(
-                    register(case.measurements, case.model, SolveConfig()), count=count, both_sides=not one_look
-                )
+                found = solve(case.measurements, (), case.model, SolveConfig(), conditions)
+                if found.registration is None:
+                    raise EstimationError(found.reasons[0])
+                means = {e.index: e.predicted_tre.mean_mm for e in found.epochs if e.predicted_tre is not None}
+                advice = run(found.registration, predicted_mm=means, count=count, both_sides=not one_look)
             except EstimationError as error:
                 if as_json:
                     typer.echo(json.dumps({"session": case.name, "shots": [], "notes": [str(error)]}, indent=2))

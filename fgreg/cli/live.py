@@ -7,7 +7,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from fgreg.pipeline.solve import SolveReport
 
 MakeExtras = Callable[["SolveReport"], Any]
+Progress = Callable[[str, int, int], None]
+ProgressBar = Callable[[bool], AbstractContextManager[Progress]]
 EXIT_REFUSED = 1
 IN_CONFIG = {
     "seed": "room.seed",
@@ -40,15 +42,18 @@ MOST_REASONS, REASON_WIDTH = 2, 170
 """Limits of the verdict's reasons in the panel, which must fit a small terminal."""
 
 
-def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
-    """Register the command; ``make_extras`` gives what a summary has besides the estimate."""
+def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBar) -> None:
+    """Register the command; ``make_extras`` gives what a summary has besides the estimate.
+
+    ``progress_bar(quiet)`` shows progress on standard error.
+    """
 
     @app.command()
     def live(
         context: typer.Context,
         config: Annotated[
             Path | None,
-            typer.Argument(metavar="[CONFIG]", help="A driver per role (CONFIG.yaml). Default: a simulated room."),
+            typer.Argument(metavar="CONFIG", help="A driver per role (CONFIG.yaml). Default: a simulated room."),
         ] = None,
         out: Annotated[
             Path | None,
@@ -141,7 +146,8 @@ def add_live(app: typer.Typer, make_extras: MakeExtras) -> None:
             else:
                 setup, settings = _configured(stack, config, silent=silent, seen=seen)
             figures = _conduct(setup, folder, settings, duration, rrd, viewer=viewer, silent=silent)
-        report = solve_session(SolveRequest(folder, None, None), settings, None)
+        with progress_bar(silent) as progress:
+            report = solve_session(SolveRequest(folder, None, None), settings, progress)
         extras = make_extras(report)
         if as_json:
             document = summary_dict(report.session.model, report.estimate, extras)
@@ -322,7 +328,7 @@ def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> A
     if known.registered:
         row("registration", status.verdict.value.upper(), STYLES[status.verdict])
         tre = None if estimate is None or status.invalid else estimate.predicted_tre
-        row("predicted error", f"{error_line(tre)} (95 %, worst target)")
+        row("predicted error", f"{error_line(tre)} (95 % bound, worst target)")
     else:
         row("registration", "none yet")
     for reason in status.reasons[:MOST_REASONS]:

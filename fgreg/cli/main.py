@@ -11,6 +11,7 @@ import errno
 import gc
 import json
 import math
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -28,7 +29,7 @@ from fgreg.cli.devices import add_devices
 from fgreg.cli.evaluate import add_commands
 from fgreg.cli.html_report import add_report
 from fgreg.cli.live import add_live
-from fgreg.cli.options import EstimateOption, LimitOption, solve_config, warn_of_leftovers
+from fgreg.cli.options import EstimateOption, LimitOption, progress_columns, solve_config, warn_of_leftovers
 from fgreg.cli.print import add_print
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
 EXIT_REFUSED, EXIT_BAD_INPUT, EXIT_CRASH, EXIT_INTERRUPTED = 1, 2, 70, 130
 OUT_OF_MEMORY = ("failed to map segment", "annot allocate memory")
 """What the loader of libraries says where memory is short."""
+COMPLETE = "_FGREG_COMPLETE"
+"""By this variable a shell asks for completions."""
 GARBAGE_THRESHOLD = 50_000
 """New objects between garbage collections: imports leave no garbage, and the default 700 costs 5 % of a command."""
 
@@ -53,7 +56,8 @@ OUT_OF = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, e
 
 app = typer.Typer(
     name="fgreg",
-    add_completion=False,
+    add_completion=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Register a stereo endoscope to a rotating transrectal ultrasound probe by photoacoustic markers.\n\n"
@@ -87,7 +91,7 @@ def _exit_status(arguments: list[str]) -> int:
     except FgregError as error:
         return _fail(str(error))
     except UsageError as error:
-        return _fail(str(getattr(error, "format_message", error.__str__)()))
+        return _fail(str(getattr(error, "format_message", error.__str__)()) + _usage(error))
     except (KeyboardInterrupt, typer.Abort):
         return EXIT_INTERRUPTED
     except MemoryError as error:
@@ -125,6 +129,8 @@ def _run(arguments: list[str]) -> int:
     except OSError:
         raise InputError("the working folder", "none: it was removed", "one that exists") from None
     command = typer.main.get_command(app)
+    if COMPLETE in os.environ:  # the shell asks what may follow; else heavy to load
+        command.main(arguments, "fgreg", COMPLETE)
     try:
         with command.make_context("fgreg", arguments) as context:
             command.invoke(context)
@@ -137,6 +143,15 @@ def _fail(message: str) -> int:
     line = " ".join(message.split())
     sys.stderr.write(f"fgreg: error: {line}\n")
     return EXIT_BAD_INPUT
+
+
+def _usage(error: Exception) -> str:
+    """How the command that an error of usage is about is called, as its help says; on the error's one line."""
+    context: typer.Context | None = getattr(error, "ctx", None)
+    if context is None:
+        return ""
+    usage = " ".join(context.get_usage().split()).removeprefix("Usage: ")
+    return f" (usage: {usage}; help: {context.command_path} -h)"
 
 
 def _version(wanted: bool) -> None:
@@ -169,10 +184,9 @@ def _progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
         yield _no_progress
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*progress_columns(), console=Console(stderr=True), transient=True) as bar:
         tasks: dict[str, Any] = {}
 
         def report(step: str, done: int, total: int) -> None:
@@ -410,7 +424,7 @@ def simulate(
 add_commands(app, _progress)
 add_calibrate_camera(app, _progress)
 add_commission(app, _progress)
-add_live(app, _summary_extras)
+add_live(app, _summary_extras, _progress)
 add_replay(app, _summary_extras)
 add_verify(app, _progress)
 add_convert(app)

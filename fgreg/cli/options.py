@@ -11,10 +11,15 @@ import typer
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.progress import ProgressColumn
+
     from fgreg.model.solve_config import SolveConfig
 
 LimitOption = Annotated[
-    float, typer.Option("--limit-mm", help="Predicted error (95 %) at the worst target up to which the verdict is ok.")
+    float,
+    typer.Option(
+        "--limit-mm", help="95 % bound of the predicted error at the worst target up to which the verdict is ok."
+    ),
 ]
 EstimateOption = Annotated[
     str,
@@ -53,6 +58,14 @@ def solve_config(
         )
     except ValueError as error:
         raise InputError("--limit-mm", str(limit_mm), "a number of millimetres > 0") from error
+
+
+def progress_columns() -> "tuple[ProgressColumn, ...]":
+    """Of a progress bar: step, bar, items done, time left."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+    left = TimeRemainingColumn(compact=True, elapsed_when_finished=True)
+    return TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), left, TextColumn("left")
 
 
 def refuse_stale(session: Path) -> None:

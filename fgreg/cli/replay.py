@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import LimitOption, OnlineEstimateOption, solve_config, warn_of_leftovers
+from fgreg.cli.options import LimitOption, OnlineEstimateOption, progress_columns, solve_config, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ Progress = Callable[[str, int, int], None]
 MakeExtras = Callable[["SolveReport"], Any]
 EXIT_REFUSED = 1
 
-HEADING = f"{'t, s':>9}  {'event':<30} {'epoch':>5} {'pairs':>5} {'NIS':>6} {'worst':>6}  {'verdict':<8}"
-"""``worst``: the predicted 95 % error at the worst target, mm."""
+HEADING = f"{'t, s':>9}  {'event':<30} {'epoch':>5} {'pairs':>5} {'NIS':>6} {'95 % mm':>7}  {'verdict':<8}"
+"""``95 % mm``: the bound of the predicted error at the worst target."""
 
 
 def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
@@ -59,9 +59,10 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
 
         Each aim, pair and camera move is added in order, and a line shows the estimate after it: camera epoch,
         pairs used in it, the new pair's NIS (squared misfit over its predicted covariance, by the estimate without it:
-        above 6 is one in twenty), the predicted 95 % error at the worst target in mm, and the verdict. Tracking queries
-        are answered from the estimate at their time. At the end there is a full solve: the registration is that of
-        fgreg solve. Writes result.yaml with timing_ms added. Exit status 1 where the verdict is refused.
+        above 6 is one in twenty), the 95 % bound of the predicted error at the worst target in mm, and the verdict.
+        Tracking queries are answered from the estimate at their time. At the end there is a full solve: the
+        registration is that of fgreg solve. Writes result.yaml with timing_ms added. Exit status 1 where the verdict is
+        refused.
 
         Watch it in real time: fgreg replay SESSION --speed 1 --live. Or record it: --rrd FILE.
         """
@@ -108,12 +109,10 @@ def _display(quiet: bool) -> "Iterator[tuple[Progress | None, OnStep | None]]":
         yield None, None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
     console = Console(highlight=False, emoji=False, soft_wrap=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Bar(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Bar(*progress_columns(), console=console, transient=True, disable=not console.is_terminal) as bar:
         tasks: dict[str, Any] = {}
 
         def progress(step: str, done: int, total: int) -> None:
@@ -142,14 +141,14 @@ def step_line(step: "ReplayStep") -> "Text":
     line = Text(f"{step.event.t:9.2f}  ")
     if answer is not None and answer.stage_rad is not None and answer.sigma_rad is not None:
         turn, sigma = math.degrees(answer.stage_rad), math.degrees(answer.sigma_rad)
-        return line.append(f"{f'track: stage to {turn:.1f} +- {sigma:.1f} deg':<30}", style="cyan")
+        return line.append(f"{f'track: stage to {turn:.1f} +- {sigma:.1f} deg (1 sigma)':<30}", style="cyan")
     if answer is not None or step.refused:
         return line.append("".join(c if c.isprintable() else "?" for c in describe(step)), style="dim")
     line.append(f"{describe(step):<30.30}", style="bold" if isinstance(step.event, CameraMovedEvent) else "")
     if known is not None:
         nis = known.nis if isinstance(step.event, PairEvent) else None
         worst = None if known.predicted_tre is None else known.predicted_tre.worst_mm
-        line.append(f" {known.epoch:5d} {known.pairs:5d} {_figure(nis, 1)} {_figure(worst, 2)}  ")
+        line.append(f" {known.epoch:5d} {known.pairs:5d} {_figure(nis, 1)}  {_figure(worst, 2)}  ")
         if known.trus_T_camera is None:
             line.append("none yet", style="dim")
         else:

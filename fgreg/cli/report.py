@@ -7,6 +7,7 @@ names chosen by users, and fits 80 columns.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,9 +34,9 @@ from fgreg.model.systematic import largest_causes
 
 STYLES = {Verdict.OK: "bold green", Verdict.WARNING: "bold yellow", Verdict.REFUSED: "bold red"}
 MEANINGS = {
-    Verdict.OK: "the registration may be used",
-    Verdict.WARNING: "the registration may be used, but a condition was missed",
-    Verdict.REFUSED: "no transform below may be used",
+    Verdict.OK: "the probe may be turned by this registration",
+    Verdict.WARNING: "look first: read the reasons before the probe turns",
+    Verdict.REFUSED: "no transform below may be used: do not turn the probe",
 }
 MOST_ROWS = 40
 """Longer tables show only the unused looks and those with the largest NIS."""
@@ -221,17 +222,21 @@ def _epoch(
     if epoch.covariance is not None:
         sigma = np.sqrt(np.clip(np.diag(epoch.covariance), 0.0, None))
         turn, shift = _vector(np.degrees(sigma[:3]), 2), _vector(sigma[3:], 2)
-        grid.add_row("  sigma", f"{shift} mm, {turn} deg, camera axes")
+        grid.add_row("  1 sigma", f"{shift} mm, {turn} deg, camera x, y, z")
     tre = epoch.predicted_tre
     if tre is not None:
-        figures = f"mean {_number(tre.mean_mm, 2)}, 95 % {_number(tre.p95_mm, 2)}, worst {_number(tre.worst_mm, 2)} mm"
-        grid.add_row("  predicted TRE", f"{figures} over {len(model.targets_mm)} targets")
+        figures = f"mean {_number(tre.mean_mm, 2)}, 95 % bound {_number(tre.p95_mm, 2)} mm"
+        grid.add_row("  predicted TRE", f"{figures}, over {len(model.targets_mm)} targets")
+        at_worst = f"95 % bound {_number(tre.worst_mm, 2)} mm"
         if tre.random is not None and tre.systematic is not None:
-            parts = f"random {_number(tre.random.worst_mm, 2)}, systematic {_number(tre.systematic.worst_mm, 2)}"
-            seen = "" if tre.seen is None else f"; against what the scanner shows {_number(tre.seen.worst_mm, 2)}"
-            grid.add_row("    worst", f"{parts} mm{seen} mm" if seen else f"{parts} mm")
-            if largest:
-                grid.add_row("    causes", f"{largest} (RMS, at the worst target)")
+            at_worst += (
+                f": random {_number(tre.random.worst_mm, 2)}, systematic {_number(tre.systematic.worst_mm, 2)} mm"
+            )
+            if tre.seen is not None:
+                at_worst += f"; against what the scanner shows {_number(tre.seen.worst_mm, 2)} mm"
+        grid.add_row("    at worst", at_worst)
+        if tre.systematic is not None and largest:
+            grid.add_row("    causes", f"{largest} (1 sigma each, at the worst target)")
     mean, worst = _entry(truth.tre_mean_mm, epoch.index), _entry(truth.tre_worst_mm, epoch.index)
     if mean is not None or worst is not None:
         grid.add_row("  true TRE", f"mean {_number(mean, 2)}, worst {_number(worst, 2)} mm (against the ground truth)")
@@ -248,9 +253,9 @@ def _laser(laser: LaserEstimate) -> Iterator[RenderableType]:
     direction_rad, place_mm = laser_sigmas(laser)
     yield _heading("Laser line in the marker frame")
     grid = Table.grid(padding=(0, 2, 0, 0))
-    grid.add_row("  origin", f"{_vector(laser.marker_T_laser[:3, 3], 2)} mm, sigma {place_mm:.2f} mm across the beam")
+    grid.add_row("  origin", f"{_vector(laser.marker_T_laser[:3, 3], 2)} mm, 1 sigma {place_mm:.2f} mm across it")
     grid.add_row(
-        "  direction", f"{_vector(laser.marker_T_laser[:3, 2], 4)}, sigma {math.degrees(direction_rad):.2f} deg"
+        "  direction", f"{_vector(laser.marker_T_laser[:3, 2], 4)}, 1 sigma {math.degrees(direction_rad):.2f} deg"
     )
     yield grid
 
@@ -275,7 +280,7 @@ def _pairs(model: SessionModel, estimate: SessionEstimate, extra: SummaryExtras)
         *([("epoch", "")] if several else []),
         ("used", ""),
         ("scan", "deg"),
-        ("rotation", "deg"),
+        ("rotation", "deg, 1 sigma"),
         ("lambda", "mm"),
         ("range", "mm"),
         ("residual", "mm"),
@@ -327,7 +332,7 @@ def _tracks(estimate: SessionEstimate, truth: TruthFigures) -> Iterator[Renderab
     table = _table(
         ("time", "s"),
         ("turn stage to", "deg"),
-        ("sigma", "deg"),
+        ("1 sigma", "deg"),
         ("lambda", "mm"),
         *([("error", "deg")] if known else []),
     )
@@ -351,7 +356,7 @@ def _checks(estimate: SessionEstimate) -> Iterator[RenderableType]:
     compared = [check for check in checks if check.error_mm is not None]
     yield _heading(f"Checks: {len(compared)} of {len(checks)} compared (error of the registration, TRUS axes)")
     table = _table(
-        ("time", "s"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("length", "mm"), ("95 % below", "mm"), ("NIS", ""),
+        ("time", "s"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("length", "mm"), ("95 % bound", "mm"), ("NIS", ""),
         ("verdict", ""),
     )  # fmt: skip
     for check in compared[:MOST_ROWS]:
@@ -407,4 +412,6 @@ def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:
         if path is not None:
             yield Text(f"{title:<9}  {clean(str(path))}", no_wrap=True, overflow="ignore")
     if extra.rrd is not None:
-        yield Text(f"           (open it with: rerun {clean(str(extra.rrd))})", no_wrap=True, overflow="ignore")
+        yield Text(
+            f"           (open it with: rerun {clean(shlex.quote(str(extra.rrd)))})", no_wrap=True, overflow="ignore"
+        )

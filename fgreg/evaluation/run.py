@@ -140,6 +140,7 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
         right = stages[index] if index < len(stages) else None
         found = answer.stage_rad
         track_error.append(None if right is None or found is None else float(wrap_angle(found - right)))
+    means = {epoch.index: tre.mean_mm for epoch in solution.epochs if (tre := epoch.predicted_tre) is not None}
     return WholeSolve(
         verdict=solution.verdict,
         reasons=solution.reasons,
@@ -151,7 +152,7 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
         beam_offset_mm=offset,
         track_error_rad=tuple(track_error),
         track_sigma_rad=tuple(answer.sigma_rad for answer in solution.tracks),
-        influence=() if solution.registration is None else influences(solution.registration, model.targets_mm),
+        influence=() if solution.registration is None else influences(solution.registration, model.targets_mm, means),
     )
 
 

@@ -115,7 +115,7 @@ def _sessions(evaluations: Sequence[SessionEvaluation]) -> Table:
         ("pairs", ""),
         ("verdict", ""),
         ("predicted TRE", "mean, mm"),
-        ("", "95 %, mm"),
+        ("95 % bound", "mean, mm"),
         ("", "worst, mm"),
     )
     for item in evaluations:
@@ -166,7 +166,7 @@ def _cross_validation(evaluations: Sequence[SessionEvaluation]) -> Table:
         ("", "std"),
         ("", "95 %"),
         ("", "worst"),
-        ("NIS", "per degree"),
+        ("NIS per degree", "of freedom"),
         ("beyond", "95 %"),
     )
     folds = max((len(item.k_fold) for item in evaluations), default=0)
@@ -193,7 +193,7 @@ def _curve(points: Sequence[CurvePoint]) -> Table:
         ("subsets", ""),
         ("ambi-", "guous"),
         *([("TRE", "mean, mm"), ("", "95 %"), ("", "worst")] if known else []),
-        ("predicted", "TRE, mm"),
+        ("predicted TRE", "mean, mm"),
         ("pair residual", "mean, mm"),
         ("", "95 %"),
     )

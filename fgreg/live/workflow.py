@@ -360,7 +360,7 @@ class Workflow:
             return
         plane = self._model.stage.scan_from_device(tracking.stage_rad)
         if self._settings.follow and stage.requested is MotionKind.TRACK:
-            reason = f"following the beam, +- {math.degrees(tracking.sigma_rad):.1f} deg"
+            reason = f"following the beam, +- {math.degrees(tracking.sigma_rad):.1f} deg (1 sigma)"
             out.append(Follow(plane, tracking.sigma_rad, newest.t_s, reason))
         held = held_pose(inputs.poses, inputs.now_s)
         if held is None or abs(stage.scan_rad - plane) > CHECK_RAD:

@@ -192,7 +192,7 @@ def result_of(case: FullSolveCase, measurements: Measurements, solution: Solutio
     """The result of a case, from its batch solve."""
     report = _report(solution, case)
     if solution.registration is None:
-        return FullSolveResult(case.serial, case.epoch, why_none=solution.reasons[-1], report=report)
+        return FullSolveResult(case.serial, case.epoch, why_none=solution.reasons[0], report=report)
     return _registered(case, measurements, solution.registration, report)
 
 

@@ -6,6 +6,7 @@ detect in their frames -> compare. Nothing is added to the registration, and not
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -82,7 +83,9 @@ def verify_session(
     result_path = folder / RESULT_FILE
     session = read_session(folder)
     if not result_path.exists():
-        raise InputError(str(result_path), "nothing", f"a finished registration: run fgreg solve {folder}")
+        raise InputError(
+            str(result_path), "nothing", f"a finished registration: run fgreg solve {shlex.quote(str(folder))}"
+        )
     result = read_result(result_path)
     if result.verdict is Verdict.REFUSED or not result.epochs:
         raise InputError(str(result_path), "a refused registration", "one that may be used")

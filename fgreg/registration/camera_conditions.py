@@ -126,7 +126,8 @@ def _print_condition(
     for size in named:
         what, key = words[size.constant]
         way = "smaller" if size.ratio > 1.0 else "larger"
-        said.append(f"the {what} {100.0 * abs(size.ratio - 1.0):.1f} +- {100.0 * size.sigma:.1f} % {way} than {key}")
+        off = f"{100.0 * abs(size.ratio - 1.0):.1f} % {way} than {key} (1 sigma {100.0 * size.sigma:.1f} %)"
+        said.append(f"the {what} {off}")
         which.append(what)
     farthest_mm = max((float(np.linalg.norm(p, axis=1).max()) for p in camera_p), default=0.0)
     error = max(abs(size.ratio - 1.0) for size in named) * farthest_mm
@@ -158,7 +159,7 @@ def _group_condition(
     text = TEXTS[int(columns[0]) + CAMERA.start]
     scale, unit = (text.per_unit, f" {text.unit}") if text.unit else (100.0, " %")
     said = [
-        f"the {TEXTS[int(k) + CAMERA.start].what} changed by {scale * value:.3g} +- {scale * sigma:.2g}{unit}"
+        f"the {TEXTS[int(k) + CAMERA.start].what} changed by {scale * value:.3g} +- {scale * sigma:.2g}{unit} (1 sigma)"
         for k, value, sigma, size in zip(columns, c, np.sqrt(np.diag(covariance)), z, strict=True)
         if size >= min(NAMED_Z, z.max())
     ]
@@ -166,8 +167,9 @@ def _group_condition(
     changed[columns] = c
     error = _error_mm(changed, measurements, camera_p)
     sentence = (
-        f"the corners of tags and board fit better with {', '.join(said)} (declared to {scale * sigmas[columns[0]]:.2g}"
-        f"{unit}){_meaning(error)}: the camera's calibration does not hold, {text.remedy}"
+        f"the corners of tags and board fit better with {', '.join(said)} (declared to 1 sigma of "
+        f"{scale * sigmas[columns[0]]:.2g}{unit}){_meaning(error)}: the camera's calibration does not hold, "
+        f"{text.remedy}"
     )
     return [Condition(_severity(error, config), sentence, error)]
 

@@ -109,8 +109,8 @@ def check_registration(
     coarse = ""
     if bound_mm is None:
         coarse = (
-            f"cameras and scanner locate the checks to {located_mm:.1f} mm (95 %), too coarse to bound an error of "
-            f"{limit_mm:g} mm: calibrate the cameras, or commission the rig"
+            f"cameras and scanner locate the checks to {located_mm:.1f} mm (95 % bound), too coarse to bound an error "
+            f"of {limit_mm:g} mm: calibrate the cameras, or commission the rig"
         )
     estimates = tuple(
         CheckEstimate(
@@ -208,8 +208,8 @@ def _conditions(
     if bound_mm is not None and bound_mm >= limit_mm:
         advice = "register again" if shift_p < SHIFT_P else "locate the checks more accurately, or take more of them"
         text = (
-            f"the mean error at the check{'s' if several else ''} is {norm:.1f} mm, at most {bound_mm:.1f} mm (95 %), "
-            f"and has to be below {limit_mm:g} mm: {advice}"
+            f"the mean error at the check{'s' if several else ''} is {norm:.1f} mm, at most {bound_mm:.1f} mm (95 % "
+            f"bound), and has to be below {limit_mm:g} mm: {advice}"
         )
         found.append(Condition(Verdict.WARNING, text))
     if several:
@@ -303,10 +303,11 @@ def with_conditions(estimate: SessionEstimate, conditions: Mapping[int, Sequence
         for index, found in conditions.items()
         for condition in found
     ]
+    worse = any(verdict.severity > estimate.verdict.severity for verdict in verdicts.values())
     return replace(
         estimate,
         verdict=worst_verdict(estimate.verdict, *verdicts.values()),
-        reasons=(*estimate.reasons, *texts),
+        reasons=(*texts, *estimate.reasons) if worse else (*estimate.reasons, *texts),
         epochs=tuple(
             replace(epoch, verdict=worst_verdict(epoch.verdict, verdict_of(conditions.get(epoch.index, ()))))
             for epoch in estimate.epochs

@@ -129,7 +129,8 @@ def conflicts(constants: Sequence[SystematicEstimate]) -> list[Condition]:
     named = [first, *sorted(alike, key=lambda c: -abs(c.score))]
     texts = {text.name: text for text in TEXTS}
     which = " or ".join(
-        f"the {texts[c.name].what} ({_amount(c)} where it is declared to {_sigma(c)}, score {abs(c.score):.1f})"
+        f"the {texts[c.name].what} ({_amount(c)} where it is declared to 1 sigma of {_sigma(c)}, "
+        f"score {abs(c.score):.1f})"
         for c in named
     )
     remedies = "; ".join(dict.fromkeys(texts[c.name].remedy for c in named))
@@ -188,7 +189,7 @@ def measured(constants: Sequence[SystematicEstimate]) -> list[Condition]:
                 Condition(
                     Verdict.OK,
                     f"the shots measure the {text.what}, and it is taken into account: {_amount(constant)} "
-                    f"(declared to {_sigma(constant)}); correct what is declared",
+                    f"(declared to 1 sigma of {_sigma(constant)}); correct what is declared",
                 )
             )
     return found

@@ -6,6 +6,7 @@ The reduced problem is a sum over PMs, half cost = rest + part i. At the optimum
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ class Influence:
         step: (6,) right tangent by which leaving it out moves ``trus_T_camera``; infinite where the rest does not
             determine it.
         moved_mm: mean distance by which the targets then move; worst_moved_mm: the largest.
-        expected_mm, expected_without_mm: predicted TRE (mean over targets) with and without it.
+        expected_mm, expected_without_mm: predicted TRE (mean over targets) with and without it; with it, the solve's.
     """
 
     pm: int
@@ -38,8 +39,14 @@ class Influence:
     expected_without_mm: float
 
 
-def influences(registration: Registration, targets_mm: FloatArray) -> tuple[Influence, ...]:
-    """Influence of every PM that entered a registration, in order of first look."""
+def influences(
+    registration: Registration, targets_mm: FloatArray, predicted_mm: Mapping[int, float] | None = None
+) -> tuple[Influence, ...]:
+    """Influence of every PM that entered a registration, in order of first look.
+
+    The Gaussian at the optimum says by which factor the predicted TRE grows without a PM. ``predicted_mm``: the
+    predicted TRE of each of the session's epochs (mean over targets), from the whole posterior; None: that Gaussian's.
+    """
     problem, optimum = registration.problem, registration.optimum
     parts = pm_contributions(problem, optimum.state, optimum.evaluation.private)
     hessian = optimum.evaluation.hessian[0]
@@ -49,13 +56,15 @@ def influences(registration: Registration, targets_mm: FloatArray) -> tuple[Infl
         transform = optimum.state.trus_T_camera(place)[0]
         block = slice(6 * place, 6 * place + 6)
         rest = hessian - parts.hessian[index]
-        expected = float(expected_tre_mm(registration.covariance[block, block], transform, targets_mm).mean())
+        gaussian = float(expected_tre_mm(registration.covariance[block, block], transform, targets_mm).mean())
+        expected = gaussian if predicted_mm is None else predicted_mm[registration.epochs[place]]
         covariance = inverse_hessian(rest)
         step, without, moved = np.full(6, np.inf), np.inf, np.full(1, np.inf)
         if covariance is not None:
             step = (covariance @ parts.gradient[index])[block]
             moved = moved_mm(step, transform, targets_mm)
             without = float(expected_tre_mm(covariance[block, block], transform, targets_mm).mean())
+            without *= expected / gaussian
         out.append(
             Influence(
                 pm=pm,

@@ -14,6 +14,7 @@ which includes both.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,11 +140,20 @@ class Advice:
     notes: tuple[str, ...]
 
 
-def advise(registration: Registration, *, epoch: int | None = None, count: int = 5, both_sides: bool = True) -> Advice:
+def advise(
+    registration: Registration,
+    *,
+    predicted_mm: Mapping[int, float] | None = None,
+    epoch: int | None = None,
+    count: int = 5,
+    both_sides: bool = True,
+) -> Advice:
     """Rank the candidates for the next shot.
 
     Args:
         registration: of the session up to now.
+        predicted_mm: the predicted TRE of its epochs (mean over targets), from the whole posterior; None: of the
+            Gaussian at the optimum, which says by which factor a shot lowers it.
         epoch: the session's camera epoch to advise on; None: the last one with a registration.
         count: number of shots to list.
         both_sides: detect each PM from both sides; else from the side that the session has used less (from none where
@@ -176,7 +186,8 @@ def advise(registration: Registration, *, epoch: int | None = None, count: int =
         wrong = np.sqrt(separation.weight * (1.0 - separation.weight)) * np.exp(-separation.chi2 / 8.0)
         risk = square + wrong * separation.distance2_mm2
     order = np.argsort(risk, kind="stable")
-    before = float(expected_tre_mm(registration.covariance[block, block], transform, model.targets_mm).mean())
+    gaussian = float(expected_tre_mm(registration.covariance[block, block], transform, model.targets_mm).mean())
+    before = gaussian if predicted_mm is None else predicted_mm[epoch]
     shots = tuple(
         AdvisedShot(
             candidate=int(i),
@@ -186,7 +197,7 @@ def advise(registration: Registration, *, epoch: int | None = None, count: int =
             tilt_down_rad=float(found.tilt_rad[i, 1]),
             trus_p_mm=found.trus_p_mm[i],
             looks=_looks(found, int(i), model),
-            expected_mm=float(expected[i]),
+            expected_mm=float(expected[i]) * before / gaussian,
             separation=None if separation is None else float(separation.chi2[i]),
         )
         for i in _distinct(found, order, count)

@@ -72,6 +72,7 @@ from fgreg.registration.verdict import (
     two_sided,
     understated_noise,
     verdict_of,
+    worst_first,
 )
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot, make_snapshot
@@ -157,7 +158,7 @@ def solve(
         registration = registration or register(measurements, model, config, known, finished)
     except EstimationError as error:
         seen = camera_conditions(measurements, model, config)
-        return _no_solution(measurements, tracks, [*conditions, *seen, Condition(Verdict.REFUSED, str(error))])
+        return _no_solution(measurements, tracks, [Condition(Verdict.REFUSED, str(error)), *conditions, *seen])
     answered = posterior_mean(registration, config)
     posterior, centred = answered.posterior, answered.registration
     state = centred.optimum.state
@@ -180,7 +181,7 @@ def solve(
     steady = {k: _steadiness(registration, place, config.limit_mm) for place, k in enumerate(registration.epochs)}
     reports = _epoch_verdicts(measurements, centred, posterior, budget, pairs, model, config, common, steady, before)
     epochs, several = tuple(report.estimate for report in reports), len(reports) > 1
-    found = [f"epoch {k}: {c.text}" if several else c.text for k, of in enumerate(reports) for c in of.conditions]
+    found = [(c, f"epoch {k}: {c.text}" if several else c.text) for k, of in enumerate(reports) for c in of.conditions]
     reports = (*reports[:-1], replace(reports[-1], conditions=(*common, *reports[-1].conditions)))
     refused = {epoch.index: "" for epoch in epochs if epoch.verdict is Verdict.REFUSED}
     snapshot = track_snapshot(centred, model, config, readout.origin_shift_mm, refused)
@@ -190,7 +191,7 @@ def solve(
         verdict = Verdict.WARNING
     return Solution(
         verdict=verdict,
-        reasons=(*(condition.text for condition in common), *found),
+        reasons=worst_first([*((condition, condition.text) for condition in common), *found]),
         laser=readout.laser,
         epochs=epochs,
         pairs=pairs,
@@ -207,7 +208,7 @@ def solve(
 def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions: Sequence[Condition]) -> Solution:
     """A refused solution: nothing could be computed."""
     reasons = tuple(condition.text for condition in conditions)
-    why = reasons[-1]
+    why = reasons[0]
     return Solution(
         verdict=Verdict.REFUSED,
         reasons=reasons,

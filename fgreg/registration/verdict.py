@@ -64,16 +64,30 @@ class Condition:
     """One missed condition: its severity, and the sentence for ``reasons``.
 
     ``effect_mm``: error at the worst target of what the sentence names, which the posterior does not include.
+    ``is_error``: it is the predicted error itself, which others may cause.
     """
 
     verdict: Verdict
     text: str
     effect_mm: float = 0.0
+    is_error: bool = False
 
 
 def verdict_of(conditions: Iterable[Condition]) -> Verdict:
     """The most severe verdict of the missed conditions."""
     return worst_verdict(*(condition.verdict for condition in conditions))
+
+
+def worst_first(reasons: Iterable[tuple[Condition, str]]) -> tuple[str, ...]:
+    """The sentences of conditions, in the order to look at them: refusals, known causes of the error, the error."""
+
+    def place(condition: Condition) -> int:
+        refused = condition.verdict is Verdict.REFUSED
+        if refused and not condition.is_error:
+            return 0
+        return 1 if condition.effect_mm else 2 if refused else 4 - condition.verdict.severity
+
+    return tuple(text for _, text in sorted(reasons, key=lambda reason: place(reason[0])))
 
 
 def ambiguity(
@@ -337,7 +351,7 @@ def consistency(cost: float, degrees_of_freedom: int) -> list[Condition]:
 def estimated(name: str, value: float, sigma: float, prior: float, prior_sigma: float, unit: str) -> Condition:
     """The estimate of a session-wide variable; a warning where it is outside its prior."""
     far = abs(value - prior) > SUSPICIOUS_SIGMAS * prior_sigma
-    text = f"estimated {name} {value:.4g} +- {sigma:.2g}{unit} (given {prior:.4g} +- {prior_sigma:.2g}{unit})"
+    text = f"estimated {name} {value:.4g} +- {sigma:.2g}{unit} (given {prior:.4g} +- {prior_sigma:.2g}{unit}; 1 sigma)"
     if far:
         return Condition(Verdict.WARNING, f"{text}: farther than its prior allows; correct it in session.yaml")
     return Condition(Verdict.OK, text)
@@ -396,8 +410,9 @@ def accuracy(
     return [
         Condition(
             Verdict.REFUSED if far else Verdict.WARNING,
-            f"the predicted error at the worst target is {tre.worst_mm:.1f} mm (95 %), the limit {config.limit_mm:.1f} "
-            f"mm: {advice}",
+            f"the predicted error at the worst target is {tre.worst_mm:.1f} mm (95 % bound), the limit "
+            f"{config.limit_mm:.1f} mm: {advice}",
+            is_error=True,
         )
     ]
 

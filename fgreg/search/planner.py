@@ -168,7 +168,9 @@ class SearchPlanner:
         if self.detected and sigma <= self.settings.stop_sigma_rad:
             return Found(self._belief.best_rad(), sigma, count)
         if count >= self.settings.most_positions:
-            return NotFound(f"still not known better than {math.degrees(sigma):.1f} deg after {count} positions", count)
+            return NotFound(
+                f"still not known better than {math.degrees(sigma):.1f} deg (1 sigma) after {count} positions", count
+            )
         if not self.detected or sigma > self._model.reach_rad:  # the PM may (still or again) be anywhere
             if self._queue:
                 return self._queued(self._queue[0])
@@ -188,7 +190,7 @@ class SearchPlanner:
     def _queued(self, position: float) -> Turn:
         if self._prediction is not None:
             where = f"predicted {math.degrees(self._prediction.scan_rad):.1f} deg"
-            reason = f"{where} +- {math.degrees(self._prediction.sigma_rad):.1f} deg"
+            reason = f"{where} +- {math.degrees(self._prediction.sigma_rad):.1f} deg (1 sigma)"
             return Turn(position, Phase.PREDICTED, reason)
         return Turn(position, Phase.SWEEP, f"sweep, position {len(self._looks) + 1}: nothing detected yet")
 
@@ -204,7 +206,7 @@ class SearchPlanner:
         high = min(self._high, self._belief.quantile(0.98) + reach)
         candidates = np.linspace(low, high, max(2, math.ceil((high - low) / CANDIDATE_RAD) + 1))
         position = best_position(candidates, self._belief.expected_sigma(candidates), self._stands)
-        return Turn(position, Phase.REFINE, f"known to {math.degrees(sigma):.2f} deg: refine")
+        return Turn(position, Phase.REFINE, f"known to {math.degrees(sigma):.2f} deg (1 sigma): refine")
 
 
 def best_position(candidates: FloatArray, expected_sigma: FloatArray, stands_rad: float) -> float:

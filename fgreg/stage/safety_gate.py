@@ -284,7 +284,7 @@ class Gate:
             return None
         if command.sigma_rad is None or not 0.0 <= command.sigma_rad <= limits.track_sigma_rad:
             sigma = "none" if command.sigma_rad is None else f"{math.degrees(command.sigma_rad):.2f} deg"
-            return f"sigma is {sigma}, at most {math.degrees(limits.track_sigma_rad):.2f} deg allowed"
+            return f"1 sigma of the angle is {sigma}, at most {math.degrees(limits.track_sigma_rad):.2f} deg allowed"
         return self._untrackable(now)
 
     def _untrackable(self, now: float) -> str | None:

@@ -241,7 +241,7 @@ def update_markdown(update: ViewerUpdate) -> str:
     worst = "not known" if tre is None else f"{tre.worst_mm:.2f} mm"
     state = "No registration yet" if update.trus_T_camera is None else f"At {update.t:.1f} s: {update.verdict.value}"
     lines = [f"# {state}", "", f"After {update.note}.", "", f"Pairs used in this camera epoch: {update.pairs}.", ""]
-    lines += [f"Predicted 95 % error at the worst target: {worst}.", ""]
+    lines += [f"Predicted error at the worst target, 95 % bound: {worst}.", ""]
     return "\n".join([*lines, *(f"- {reason}" for reason in update.reasons)])
 
 

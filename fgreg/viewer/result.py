@@ -184,8 +184,8 @@ class ResultDrawing:
         if answer.stage_rad is None:
             self._say("track", False, answer.reason, None)
             return
-        sigma = "" if answer.sigma_rad is None else f" ± {math.degrees(answer.sigma_rad):.1f}"
-        turn = f"turn the stage to {math.degrees(answer.stage_rad):.1f}{sigma}°"
+        sigma = "" if answer.sigma_rad is None else f" ± {math.degrees(answer.sigma_rad):.1f}° (1 sigma)"
+        turn = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°{sigma}"
         self._stage(self.model.stage.scan_from_device(answer.stage_rad), turn)
         self._say(f"track: {turn}", True, "", None)
 

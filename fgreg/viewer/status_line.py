@@ -79,7 +79,7 @@ def goal_line(now: Now, stage: StageModel) -> str:
     """The stage angle at which the PM will be detected, or the reason why it is unknown."""
     if now.goal_rad is None:
         return now.reason
-    spread = "" if now.sigma_rad is None else f" ± {math.degrees(now.sigma_rad):.1f}°"
+    spread = "" if now.sigma_rad is None else f" ± {math.degrees(now.sigma_rad):.1f}° (1 sigma)"
     return f"{math.degrees(stage.device_from_scan(now.goal_rad)):.1f}°{spread}"
 
 
@@ -112,7 +112,7 @@ def now_markdown(
     if not now.ended:
         lines += [f"## Next: {next_line(now)}", ""]
     lines += [f"**Stage:** {stage_line(now, stage)}", ""]
-    lines += [f"**Predicted error at the worst target (95 %):** {error_line(tre)}", ""]
+    lines += [f"**Predicted error at the worst target (95 % bound):** {error_line(tre)}", ""]
     lines += [f"**Session:** {now.stage}; {pairs} pairs in camera epoch {epoch}", ""]
     if now.news and now.news != now.task:
         lines += [f"**Last message:** {now.news}", ""]

@@ -10,9 +10,9 @@ from fgreg.model.estimate import EpochEstimate, SessionEstimate, Verdict
 from fgreg.model.session_model import SessionModel
 
 HEADINGS = {
-    Verdict.OK: "# OK: the registration may be used",
-    Verdict.WARNING: "# WARNING: usable, but a condition was missed",
-    Verdict.REFUSED: "# REFUSED: do not use this registration",
+    Verdict.OK: "# OK: the probe may be turned by this registration",
+    Verdict.WARNING: "# WARNING: look first: read the reasons before the probe turns",
+    Verdict.REFUSED: "# REFUSED: do not use this registration, do not turn the probe",
 }
 LEGEND = """
 **What is drawn.** Grey: the TRUS probe. Cyan: its image plane, and the arc on which the probe detected each source
@@ -42,7 +42,7 @@ def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_erro
         "",
         f"Predicted error at {len(model.targets_mm)} targets, mm:",
         "",
-        "| camera epoch | verdict | pairs | mean | 95 % | worst |",
+        "| camera epoch | verdict | pairs | mean | 95 % bound, mean | 95 % bound, worst target |",
         "|---|---|---|---|---|---|",
     ]
     lines += [_epoch_row(epoch) for epoch in estimate.epochs]
@@ -82,7 +82,7 @@ def _checks(estimate: SessionEstimate) -> list[str]:
         "",
         "Checks, error in TRUS axes:",
         "",
-        "| t | x | y | z | 95 % below | NIS | verdict |",
+        "| t | x | y | z | 95 % bound | NIS | verdict |",
         "|---|---|---|---|---|---|---|",
     ]
     for check in compared:
