@@ -4,12 +4,13 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test check clean
+.PHONY: help demo test check docs clean
 
 help:
 	@echo "make demo   set up, then solve sessions/phantom from its raw frames and write out/phantom.rrd"
 	@echo "make test   set up, then run the tests"
 	@echo "make check  set up, then lint, types, import layers, and a wheel in an empty environment"
+	@echo "make docs   set up, then build the guide into out/site; links that lead nowhere fail it"
 	@echo "make clean  remove the environment and all that was built"
 
 $(VENV)/.ready: pyproject.toml
@@ -35,5 +36,13 @@ check: $(VENV)/.ready
 	$(BIN)/lint-imports
 	$(BIN)/python tools/check_wheel.py
 
+# Its own environment: the tests need none of it.
+docs:
+	$(PYTHON) -m venv $(VENV)-docs
+	$(VENV)-docs/bin/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(VENV)-docs/bin/python -m pip install --quiet --group docs
+	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet --site-dir out/site
+	@echo "Look at it with a browser: out/site/index.html"
+
 clean:
-	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-docs out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

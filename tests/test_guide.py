@@ -1,0 +1,78 @@
+"""The guide: its commands run, it has every sentence that fgreg can say, and every public name."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import fgreg
+from fgreg.cli import evaluate
+from fgreg.cli.main import main
+
+ROOT = Path(__file__).parents[1]
+GUIDE = ROOT / "docs" / "guide"
+SYMPTOMS = runpy.run_path(str(ROOT / "tools" / "make_symptoms.py"))
+BLOCK = re.compile(r"(<!-- needs [a-z ]+ -->\n)?```console\n(.*?)```", re.DOTALL)
+NOT_FGREG = {"pip"}
+
+
+def commands() -> list[tuple[str, list[str]]]:
+    """(page, words) of each command of fgreg; of those that need more than a session, with --help."""
+    found = []
+    for page in sorted(GUIDE.glob("*.md")):
+        for needs, block in BLOCK.findall(page.read_text(encoding="utf-8")):
+            for line in block.splitlines():
+                prompt, name, *words = shlex.split(line)
+                assert prompt == "$", f"{page.name}: {line}"
+                assert name == "fgreg" or name in NOT_FGREG, f"{page.name}: {line}"
+                if name == "fgreg":
+                    found.append((page.name, [words[0], "--help"] if needs else words))
+    return found
+
+
+def test_every_command_of_the_guide_runs(
+    pose_session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one folder, by the pages' names, after session-01 was solved: ten PMs, and four as the new shots."""
+    session = pose_session.rename(pose_session.with_name("session-01"))
+    monkeypatch.chdir(session.parent)
+    lines = [
+        (json.loads(line).get("pm", 0), f"{line}\n") for line in (session / "events.jsonl").read_text().splitlines()
+    ]
+    (session / "events.jsonl").write_text("".join(line for pm, line in lines if pm < 10))
+    Path("new-shots.jsonl").write_text("".join(line for pm, line in lines if pm >= 16))
+    monkeypatch.setattr(evaluate, "_cores", lambda: 1)
+    listed = commands()
+    assert len(listed) > 20
+    for page, words in [("", ["solve", "session-01"]), *listed]:
+        monkeypatch.setattr(sys, "argv", ["fgreg", *words])
+        with pytest.raises(SystemExit) as done:
+            main()
+        assert done.value.code == 0, f"{page}: fgreg {shlex.join(words)}: {capsys.readouterr().err}"
+
+
+def test_every_sentence_has_its_cause() -> None:
+    page = (GUIDE / "symptoms.md").read_text(encoding="utf-8")
+    assert SYMPTOMS["with_sentences"](page) == page, "run python tools/make_symptoms.py"
+    sections = yaml.safe_load((ROOT / "tools" / "symptoms.yaml").read_text(encoding="utf-8"))
+    assert set(re.findall(r"<!-- sentences: (\w+) -->", page)) == set(sections)
+    verdict = sections["verdict"]
+    del verdict["says"]["two registrations explain the"]
+    with pytest.raises(ValueError, match=r"without a cause:\n.*verdict\.py: two registrations explain the … pairs"):
+        SYMPTOMS["table_of"](verdict)
+    verdict["says"] |= {"two registrations explain the": "", "what nobody says": ""}
+    with pytest.raises(ValueError, match="no longer said:\nwhat nobody says"):
+        SYMPTOMS["table_of"](verdict)
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    names = re.search(r"members: \[(.*?)\]", (GUIDE / "api.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert names is not None
+    assert sorted(names[1].replace("\n", " ").replace(" ", "").split(",")) == sorted(fgreg.__all__)
