@@ -148,7 +148,7 @@ def test_the_file_that_the_mistakes_are_made_in_is_read_as_it_says(tmp_path: Pat
     assert (config.settings.hearing_threshold, config.settings.aims, config.solve.limit_mm) == (12.5, 6, 2.0)
     limits = MotionLimits.of_session(config.model.stage, **config.stage_limits)
     assert limits.sweep_rad == pytest.approx((math.radians(-40), math.radians(30.5)))
-    assert (limits.search_speed, limits.home_speed) == pytest.approx((math.radians(20), math.radians(10)))
+    assert (limits.search_speed_rad_s, limits.home_speed_rad_s) == pytest.approx((math.radians(20), math.radians(10)))
     assert limits.track_sigma_rad == pytest.approx(math.radians(1.5))
     with ExitStack() as stack:
         stage = config.live_setup(stack, lambda _: None).stage
@@ -184,8 +184,8 @@ def test_the_gate_uses_the_deceleration_that_the_stage_is_set_to(tmp_path: Path)
     with ExitStack() as stack:
         setup = read_config(live_configs.write(tmp_path, data)).live_setup(stack, lambda _: None).stage
     assert setup is not None
-    assert setup.limits["deceleration"] == pytest.approx(math.radians(5.0))
-    assert setup.limits["search_speed"] == pytest.approx(math.radians(20.0))
+    assert setup.limits["deceleration_rad_s2"] == pytest.approx(math.radians(5.0))
+    assert setup.limits["search_speed_rad_s"] == pytest.approx(math.radians(20.0))
 
 
 SESSIONS: list[tuple[str, str, str]] = [

@@ -41,7 +41,7 @@ def read(folder: Path, content: bytes) -> LiveConfig | None:
     if isinstance(found, InputError):
         return None
     limits = MotionLimits.of_session(found.model.stage, **found.stage_limits)
-    assert 0 < limits.track_speed < 0.53
+    assert 0 < limits.track_speed_rad_s < 0.53
     assert limits.marker_age_s <= 0.2
     assert found.settings.hearing_threshold > 0
     for several in found.devices.values():

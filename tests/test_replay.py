@@ -286,7 +286,7 @@ def test_the_recording_shows_the_registration_as_it_moves(short: Path, tmp_path:
     assert drawn >= 5 + 2  # five pairs with an estimate, and the queries after them
     pages = [row.values["TextDocument:text"][0] for row in found["/summary"] if row.shot is not None]
     assert "No registration yet" in pages[0]
-    assert any("the registration may be used" in page or "usable" in page for page in pages[-2:])
+    assert any("the probe may be turned" in page or "look first" in page for page in pages[-2:])
     assert {"online/predicted_worst_mm", "online/nis", "online/pairs"} <= {origin.lstrip("/") for origin in views(rrd)}
     assert len([row for row in found["/world/looks/arc"] if row.shot is not None]) == 9
 

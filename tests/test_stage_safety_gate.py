@@ -154,7 +154,7 @@ def test_held_tracking_goes_on_when_the_marker_is_back_even_the_other_way() -> N
 @pytest.mark.parametrize("delay", [0, 3, 10])
 @pytest.mark.parametrize("between_s", [0.0, 0.1, 0.5])
 def test_search_asked_for_while_tracking_turns_about_without_a_latch(delay: int, between_s: float) -> None:
-    fast = replace(LIMITS, track_speed=math.radians(20.0), search_speed=math.radians(5.0))
+    fast = replace(LIMITS, track_speed_rad_s=math.radians(20.0), search_speed_rad_s=math.radians(5.0))
     room = _room(limits=fast)
     room.delay = delay
     room.go(MotionKind.TRACK, 35.0, speed_deg_s=20.0)
@@ -182,7 +182,7 @@ def test_search_asked_for_while_tracking_turns_about_without_a_latch(delay: int,
 def test_good_stage_is_never_latched_however_it_is_turned_about(
     delay: int, orders: list[tuple[float, float, int]], acceleration: float
 ) -> None:
-    room = _room(limits=replace(LIMITS, track_speed=math.radians(20.0)))
+    room = _room(limits=replace(LIMITS, track_speed_rad_s=math.radians(20.0)))
     room.stage._acceleration, room.delay = math.radians(acceleration), delay
     room.request(MotionKind.TRACK)
     for target, speed, ticks in orders:
@@ -216,7 +216,7 @@ def test_stage_that_goes_on_where_it_should_turn_about_is_found_within_its_brake
 
 
 def test_reach_is_what_is_turned_before_the_order_and_what_the_brakes_need() -> None:
-    limits = replace(LIMITS, deceleration=math.radians(20.0))
+    limits = replace(LIMITS, deceleration_rad_s2=math.radians(20.0))
     # by hand: 20 deg/s for 0.05 s of status and 0.1 s of the driver's call, then 20^2 / (2 * 20)
     assert math.degrees(limits.reach_rad(math.radians(20.0), 0.05)) == pytest.approx(3.0 + 10.0)
     assert limits.reach_rad(0.0, 0.3) == 0.0

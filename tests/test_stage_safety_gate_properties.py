@@ -23,9 +23,9 @@ STAGE = StageModel(math.radians(2.0), (math.radians(-30.0), math.radians(70.0)),
 LIMITS = MotionLimits(
     STAGE,
     (math.radians(SWEEP_DEG[0]), math.radians(SWEEP_DEG[1])),
-    home_speed=math.radians(SPEED_DEG_S["home"]),
-    search_speed=math.radians(SPEED_DEG_S["search"]),
-    track_speed=math.radians(SPEED_DEG_S["track"]),
+    home_speed_rad_s=math.radians(SPEED_DEG_S["home"]),
+    search_speed_rad_s=math.radians(SPEED_DEG_S["search"]),
+    track_speed_rad_s=math.radians(SPEED_DEG_S["track"]),
 )
 KINDS = st.sampled_from(list(MotionKind))
 ANGLES = st.one_of(

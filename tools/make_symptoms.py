@@ -43,12 +43,24 @@ def _texts(node: ast.AST) -> Iterator[str]:
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         yield node.value
     if isinstance(node, ast.JoinedStr):
-        yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        yield "".join(str(p.value) if isinstance(p, ast.Constant) else _value(p) for p in node.values)
         inner: list[ast.AST] = [part.value for part in node.values if isinstance(part, ast.FormattedValue)]
     else:
         inner = list(ast.iter_child_nodes(node))
     for child in inner:
         yield from _texts(child)
+
+
+def _value(node: ast.expr) -> str:
+    """What stands for a value: an ellipsis, or the two words of a choice."""
+    choice = node.value if isinstance(node, ast.FormattedValue) else node
+    if not isinstance(choice, ast.IfExp):
+        return "…"
+    words = [word.value for word in (choice.body, choice.orelse) if isinstance(word, ast.Constant)]
+    if len(words) < 2 or not all(isinstance(word, str) for word in words):
+        return "…"
+    shown = [str(word) for word in words if word]
+    return "/".join(shown) if len(shown) > 1 else f"({shown[0].strip()})" + " " * shown[0].endswith(" ")
 
 
 def table_of(section: dict[str, Any], name: str = "") -> str:

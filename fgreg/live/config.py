@@ -134,7 +134,7 @@ class LiveConfig:
         options = {"path": os.fspath(context.room)} if chosen[0].entry.room and context.room else own
         limits = dict(self.stage_limits)
         if (acceleration := own.get("acceleration_deg_s2")) is not None:
-            limits["deceleration"] = math.radians(acceleration)  # the driver brakes with this acceleration
+            limits["deceleration_rad_s2"] = math.radians(acceleration)  # the driver brakes with this acceleration
         return StageSetup(f"fgreg.drivers.{chosen[0].entry.factory}", options, limits)
 
 

@@ -73,7 +73,7 @@ def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSet
     stage = StageSetup(
         "fgreg.drivers.simulated:open_stage",
         {"path": os.fspath(path)},
-        {"search_speed": SPEED_RAD_S, "track_speed": SPEED_RAD_S, "home_speed": SPEED_RAD_S},
+        {"search_speed_rad_s": SPEED_RAD_S, "track_speed_rad_s": SPEED_RAD_S, "home_speed_rad_s": SPEED_RAD_S},
     )
     return LiveSetup(
         setup_text(document),

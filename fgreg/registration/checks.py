@@ -200,7 +200,7 @@ def _conditions(
         expected = float(gaussian_quantile_mm(errors.mean_covariance[None])[0])
         surely_mm = 2.0 * norm - offset_quantile_mm(mean, errors.mean_located)
         text = (
-            f"the check{'s are' if several else ' is'} off by {norm:.1f} mm {direction_text(mean, middle)}, "
+            f"the {'checks are' if several else 'check is'} off by {norm:.1f} mm {direction_text(mean, middle)}, "
             f"{expected:.1f} mm expected at most: look for a layer of water or gel between fibre and tissue, and check "
             "radius, ranges and sensitivity window in session.yaml; register again, or locate the checks again"
         )

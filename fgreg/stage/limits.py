@@ -42,7 +42,7 @@ class MotionLimits:
         status_age_s: longest time between statuses of a moving stage.
         clock_gap_s: longest time between two clock readings of the watchdog; a longer gap means that it did not run.
         tolerance_rad: of positions: reading, settling, overshoot.
-        deceleration: least deceleration of a stage that is stopped or reversed, rad/s^2.
+        deceleration_rad_s2: least deceleration of a stage that is stopped or reversed, rad/s^2.
         overspeed: factor above the commanded speed that counts as a fault.
         stop_s: time in which a stopped stage has to come to rest, unless its deceleration needs more.
         slack_s: time that a motion may take beyond its distance divided by its speed.
@@ -58,14 +58,14 @@ class MotionLimits:
             example="[-60, 60]",
         ),
     ]
-    home_speed: Annotated[float, Key("highest speed to the zero position", _SPEED, name="home_speed_deg_s")] = (
+    home_speed_rad_s: Annotated[float, Key("highest speed to the zero position", _SPEED, name="home_speed_deg_s")] = (
         math.radians(10.0)
     )
-    search_speed: Annotated[float, Key("highest speed of a search", _SPEED, name="search_speed_deg_s")] = math.radians(
-        10.0
+    search_speed_rad_s: Annotated[float, Key("highest speed of a search", _SPEED, name="search_speed_deg_s")] = (
+        math.radians(10.0)
     )
-    track_speed: Annotated[float, Key("highest speed after the beam", _SPEED, name="track_speed_deg_s")] = math.radians(
-        10.0
+    track_speed_rad_s: Annotated[float, Key("highest speed after the beam", _SPEED, name="track_speed_deg_s")] = (
+        math.radians(10.0)
     )
     home_travel_rad: float | None = None
     track_sigma_rad: Annotated[
@@ -86,16 +86,23 @@ class MotionLimits:
         600.0
     )
     tolerance_rad: float = math.radians(0.5)
-    deceleration: float = math.radians(20.0)
+    deceleration_rad_s2: float = math.radians(20.0)
     overspeed: float = 1.25
     stop_s: float = 1.5
     slack_s: float = 3.0
 
     def __post_init__(self) -> None:
         for name in (
-            *("home_speed", "search_speed", "track_speed", "track_sigma_rad", "marker_age_s", "heartbeat_s"),
+            *(
+                "home_speed_rad_s",
+                "search_speed_rad_s",
+                "track_speed_rad_s",
+                "track_sigma_rad",
+                "marker_age_s",
+                "heartbeat_s",
+            ),
             *("command_age_s", "status_age_s", "clock_gap_s", "request_s", "tolerance_rad", "stop_s", "slack_s"),
-            "deceleration",
+            "deceleration_rad_s2",
         ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
@@ -134,9 +141,9 @@ class MotionLimits:
     def speed(self, kind: MotionKind) -> float:
         """Highest speed of a kind."""
         speeds = {
-            MotionKind.HOME: self.home_speed,
-            MotionKind.SEARCH: self.search_speed,
-            MotionKind.TRACK: self.track_speed,
+            MotionKind.HOME: self.home_speed_rad_s,
+            MotionKind.SEARCH: self.search_speed_rad_s,
+            MotionKind.TRACK: self.track_speed_rad_s,
         }
         return speeds[kind]
 
@@ -146,12 +153,12 @@ class MotionLimits:
         It continues at its speed until the order reaches it, at most one driver call from now, and then brakes:
         ``speed (age + call) + speed^2 / (2 deceleration)``.
         """
-        return speed * (age_s + MAX_CALL_S) + speed * speed / (2.0 * self.deceleration)
+        return speed * (age_s + MAX_CALL_S) + speed * speed / (2.0 * self.deceleration_rad_s2)
 
     def standing_s(self) -> float:
         """Time after a stop by which the stage has to report that it is at rest."""
         fastest = max(self.speed(kind) for kind in MotionKind)
-        return max(self.stop_s, MAX_CALL_S + fastest / self.deceleration + self.status_age_s)
+        return max(self.stop_s, MAX_CALL_S + fastest / self.deceleration_rad_s2 + self.status_age_s)
 
     def homing_travel(self) -> float:
         """Largest travel of homing; by default the span of the limits."""

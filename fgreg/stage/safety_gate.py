@@ -205,7 +205,7 @@ class Gate:
             travel = max(abs(target - low), abs(target - high))
             low, high = min(low, target), max(high, target)
         deadline = now + 1.5 * travel / command.speed_rad_s + limits.slack_s
-        until = now + MAX_CALL_S + carried / limits.deceleration
+        until = now + MAX_CALL_S + carried / limits.deceleration_rad_s2
         self._seen_moving = False
         self._motion = _Motion(command, now, here, low, high, deadline, carried, until)
         if command.kind is MotionKind.HOME:
@@ -224,7 +224,7 @@ class Gate:
             speed = old.speed_at(now)
         elif self._braking is not None and self._halted_s is not None:
             old, braked_s = self._braking, status.stamp.host_s - self._halted_s - MAX_CALL_S
-            speed = max(0.0, old.speed_at(self._halted_s) - limits.deceleration * max(0.0, braked_s))
+            speed = max(0.0, old.speed_at(self._halted_s) - limits.deceleration_rad_s2 * max(0.0, braked_s))
         if old is None or old.command.kind is MotionKind.HOME:
             return here, here, 0.0
         reach = limits.reach_rad(speed, now - status.stamp.host_s)
