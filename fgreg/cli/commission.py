@@ -99,7 +99,7 @@ def print_report(report: "CommissionReport") -> None:
     for title, by_sessions in (("Observed by the sessions", True), ("Held by their prior", False)):
         mine = [c for c in report.constants if c.by_sessions is by_sessions]
         if mine:
-            heads = ("value", "1 sigma", "prior", "observed")
+            heads = ("value", "1 sigma", "prior 1 s.", "observed")
             typer.echo(f"\n{title:<{width}}" + "".join(f"{head:>10}" for head in heads))
         for c in sorted(mine, key=lambda c: -c.observed):
             factor, name = (1.0, c.name) if _unit(c.name) else (100.0, f"{c.name}, %")

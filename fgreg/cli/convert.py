@@ -3,6 +3,8 @@
 import os
 import shlex
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +17,9 @@ from fgreg.schema.limits import RECORDING_MEMORY, memory_at_most
 if TYPE_CHECKING:
     from fgreg.convert.drafts import Imported
     from fgreg.convert.mapping import RecordingMapping
+
+Progress = Callable[[str, int, int], None]
+ProgressBar = Callable[[bool], AbstractContextManager[Progress]]
 
 _HELP = """Convert recordings to sessions, and results to files for other programs.
 
@@ -52,8 +57,8 @@ only, and the file says so.
 """
 
 
-def add_convert(app: typer.Typer) -> None:
-    """Register the command."""
+def add_convert(app: typer.Typer, progress_bar: ProgressBar) -> None:
+    """Register the command; ``progress_bar(quiet)`` shows progress on standard error."""
 
     @app.command(help=_HELP)
     def convert(
@@ -98,7 +103,7 @@ def add_convert(app: typer.Typer) -> None:
         refuse_given(results_only, "it with a recording", "it with a result only")
         if setup is None:
             raise InputError("--setup", "nothing", "the session.yaml of the set-up")
-        _import(source, out, setup, mapping, calibration or [], unit, size, rectified, overwrite, quiet)
+        _import(source, out, setup, mapping, calibration or [], unit, size, rectified, overwrite, quiet, progress_bar)
 
 
 def _result_file(source: Path) -> Path | None:
@@ -160,6 +165,7 @@ def _import(
     rectified: bool,
     overwrite: bool,
     quiet: bool,
+    progress_bar: ProgressBar,
 ) -> None:
     from fgreg.convert.mapping import RecordingMapping, read_mapping
     from fgreg.convert.write import MOST_SAID, write_session
@@ -183,8 +189,15 @@ def _import(
         alone = {"--rectified": rectified or None, "--calibration-unit": unit, "--calibration-size": size}
         refuse_given(alone, "it alone", "it with --calibration")
     names = RecordingMapping() if mapping is None else read_mapping(mapping)
-    with memory_at_most(RECORDING_MEMORY):
-        written = write_session(_read(source, names), setup, out, rig=rig, overwrite=overwrite)
+    with memory_at_most(RECORDING_MEMORY), progress_bar(quiet) as progress:
+        written = write_session(
+            _read(source, names),
+            setup,
+            out,
+            rig=rig,
+            overwrite=overwrite,
+            progress=lambda done, total: progress("checking events and frames", done, total),
+        )
     for warning in [*written.left_out[:MOST_SAID], *written.warnings]:
         sys.stderr.write(f"fgreg: warning: {warning}\n")
     if (more := len(written.left_out) - MOST_SAID) > 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +35,13 @@ class Written:
 
 
 def write_session(
-    imported: Imported, setup: Path, out: Path, *, rig: StereoRig | None = None, overwrite: bool = False
+    imported: Imported,
+    setup: Path,
+    out: Path,
+    *,
+    rig: StereoRig | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Written:
     """Write a session folder.
 
@@ -45,6 +51,7 @@ def write_session(
         out: the folder.
         rig: the endoscope's calibration, where the setup has none.
         overwrite: replace an existing session.
+        progress: called with (events done, events) after each.
 
     Raises:
         InputError: an event that the format does not allow, with its place in the recording; nothing is written.
@@ -70,7 +77,7 @@ def write_session(
             for declared in imported.declared:
                 imported.told += declared.check(read.probe)
         imported.write_frames(folder)
-        lines, frames = _lines(imported.drafts, folder, read)
+        lines, frames = _lines(imported.drafts, folder, read, progress)
         note = {"type": "note", "t": imported.drafts[0].t, "text": _summary(imported)}
         (folder / EVENTS_FILE).write_bytes(b"".join([event_line(note, "note"), *lines]))
         problems, warnings = check_session(folder)
@@ -101,7 +108,9 @@ def _read_setup(path: Path, name: str, session: str, source: Path) -> Setup:
     return found
 
 
-def _lines(drafts: list[Draft], folder: Path, setup: Setup) -> tuple[list[bytes], int]:
+def _lines(
+    drafts: list[Draft], folder: Path, setup: Setup, progress: Callable[[int, int], None] | None
+) -> tuple[list[bytes], int]:
     """The events' lines, each checked by reading it back, and the number of frames."""
     out: list[bytes] = []
     uses: dict[Path, FrameUse] = {}
@@ -120,6 +129,8 @@ def _lines(drafts: list[Draft], folder: Path, setup: Setup) -> tuple[list[bytes]
         if wrong := check_frames(fresh, setup.probe, size):
             raise InputError(_place(draft, wrong[0]), wrong[0].found, wrong[0].expected)
         uses |= {use.path: use for use in fresh}
+        if progress is not None:
+            progress(len(out), len(drafts))
     return out, len(uses)
 
 

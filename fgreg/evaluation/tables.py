@@ -140,7 +140,7 @@ def _spread_cells(figures: Spread | None, decimals: int = 2) -> list[str]:
 
 
 def _against_truth(evaluations: Sequence[SessionEvaluation]) -> Table:
-    table = _table(("what", ""), ("n", ""), ("mean", ""), ("std", ""), ("95 %", ""), ("worst", ""))
+    table = _table(("what", ""), ("n", ""), ("mean", ""), ("std", ""), ("95 % below", ""), ("worst", ""))
 
     def row(what: str, figures: Spread | None, decimals: int = 2) -> None:
         if figures is not None:
@@ -164,7 +164,7 @@ def _cross_validation(evaluations: Sequence[SessionEvaluation]) -> Table:
         ("PMs", ""),
         ("pair residual", "mean, mm"),
         ("", "std"),
-        ("", "95 %"),
+        ("95 %", "below"),
         ("", "worst"),
         ("NIS per degree", "of freedom"),
         ("beyond", "95 %"),
@@ -192,10 +192,10 @@ def _curve(points: Sequence[CurvePoint]) -> Table:
         ("pairs", ""),
         ("subsets", ""),
         ("ambi-", "guous"),
-        *([("TRE", "mean, mm"), ("", "95 %"), ("", "worst")] if known else []),
+        *([("TRE", "mean, mm"), ("95 %", "below"), ("", "worst")] if known else []),
         ("predicted TRE", "mean, mm"),
         ("pair residual", "mean, mm"),
-        ("", "95 %"),
+        ("95 %", "below"),
     )
     for point in points:
         tre, residual = point.tre_mm, point.pair_residual_mm
