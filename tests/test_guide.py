@@ -21,6 +21,11 @@ GUIDE = ROOT / "docs" / "guide"
 SYMPTOMS = runpy.run_path(str(ROOT / "tools" / "make_symptoms.py"))
 BLOCK = re.compile(r"(<!-- needs [a-z ]+ -->\n)?```console\n(.*?)```", re.DOTALL)
 NOT_FGREG = {"pip"}
+SAYS = re.compile(
+    r"(?<!class )\b(Condition|EstimationError|NotFound|EventRefused|PairRefused|JournalError|ViewerError|EngineGone|"
+    r"StageError|StageLost|DeviceLost|Tell|Halt|Refusal)\(f?\"|Condition\("
+)
+"""What makes a reason, a refusal, a stop or a prompt."""
 
 
 def commands() -> list[tuple[str, list[str]]]:
@@ -63,6 +68,10 @@ def test_every_sentence_has_its_cause() -> None:
     assert SYMPTOMS["with_sentences"](page) == page, "run python tools/make_symptoms.py"
     sections = yaml.safe_load((ROOT / "tools" / "symptoms.yaml").read_text(encoding="utf-8"))
     assert set(re.findall(r"<!-- sentences: (\w+) -->", page)) == set(sections)
+    listed = {module for section in sections.values() for module in section["modules"]}
+    sources = [path for folder in ("fgreg", "drivers") for path in (ROOT / folder).rglob("*.py")]
+    says = {str(path.relative_to(ROOT)) for path in sources if SAYS.search(path.read_text(encoding="utf-8"))}
+    assert says <= listed, "a module that says something to the user is not in tools/symptoms.yaml"
     verdict = sections["verdict"]
     del verdict["says"]["two registrations explain the"]
     with pytest.raises(ValueError, match=r"without a cause:\n.*verdict\.py: two registrations explain the … pairs"):
