@@ -139,6 +139,25 @@ def _read_rig(data: bytes, folder: Path) -> None:
     read_rig(_written(data, folder, "rig.yaml"))
 
 
+def _valid_recording() -> list[bytes]:
+    pose = [[1, 0, 0, 5], [0, 1, 0, -2], [0, 0, 1, 120], [0, 0, 0, 1]]
+    lines = [
+        {"type": "medium", "t": 0, "sound_speed_m_s": 1482, "sigma_m_s": 2},
+        {"type": "target", "t": 0, "target": 0, "depth_mm": 25.1, "depth_sigma_mm": 0.2},
+        {"type": "target", "t": 0, "target": 1, "from": 0, "apart_mm": 41.2, "towards": ["+y", "-x"]},
+        {"type": "pulse", "t": 1, "target": 0, "scan_deg": -26, "x_mm": -4.1, "range_mm": 25.6, "amplitude": 31},
+        {"type": "stage", "t": 2, "scan_deg": -11.9},
+        {"type": "marker", "t": 3, "camera_T_marker": pose},
+    ]
+    return [_lines(lines)]
+
+
+def _read_recording(data: bytes, folder: Path) -> None:
+    from fgreg.session.recording_reader import read_recording
+
+    read_recording(_written(data, folder, "recording.jsonl"))
+
+
 def _read_live(data: bytes, folder: Path) -> None:
     from fgreg.live.config import read_config
 
@@ -502,6 +521,7 @@ TARGETS: dict[str, Target] = {
         Target("truth", "ground_truth.yaml", _of(session_files.truth), Form.YAML, _read_truth, 2.0),
         Target("result", "result.yaml", _of(session_files.result), Form.YAML, _read_result, 1.0),
         Target("rig", "rig.yaml", _valid_rig, Form.YAML, _read_rig, 3.0),
+        Target("recording", "set-up recordings", _valid_recording, Form.LINES, _read_recording, 3.0),
         Target("live", "the configuration of a live session", _of(live_configs.config), Form.YAML, _read_live, 1.0),
         Target("yaml", "any YAML", _yaml_texts, Form.YAML, _parse_yaml, 3.0),
         Target("picture", "PNG and JPEG frames", _valid_pictures, Form.BYTES, _read_picture, 10.0),

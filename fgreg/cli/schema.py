@@ -18,6 +18,7 @@ class Document(StrEnum):
     RESULT = "result"
     RIG = "rig"
     LIVE = "live"
+    RECORDING = "recording"
 
 
 DESCRIPTIONS = {
@@ -26,6 +27,10 @@ DESCRIPTIONS = {
     Document.RESULT: ("fgreg.model.estimate:RESULT", "result.yaml: the result of a session"),
     Document.RIG: ("fgreg.model.commissioned_rig:RIG", "rig.yaml: the constants of a commissioned rig"),
     Document.LIVE: ("fgreg.live.config_keys:LIVE", "CONFIG.yaml: devices of a live session"),
+    Document.RECORDING: (
+        "fgreg.model.setup_recording:SETUP_LINES",
+        "a line of a set-up recording: what fgreg setup finds signs and constants from",
+    ),
 }
 """Module and name of each description, and its title."""
 
@@ -35,12 +40,14 @@ def add_schema(app: typer.Typer) -> None:
 
     @app.command()
     def schema(
-        document: Annotated[Document, typer.Argument(metavar="DOCUMENT", help="session, events, result, rig or live.")],
+        document: Annotated[
+            Document, typer.Argument(metavar="DOCUMENT", help="session, events, result, rig, live or recording.")
+        ],
     ) -> None:
         """Print the JSON Schema (draft 2020-12) of a document: for editors, and for programs that write sessions.
 
         A schema checks keys, types and bounds. `fgreg check` knows more: rigid matrices, covariances, and what an event
-        needs of its session. Of events, each line is one document.
+        needs of its session. Of events and recordings, each line is one document.
         """
         typer.echo(json.dumps(document_schema(document), indent=2, ensure_ascii=False))
 

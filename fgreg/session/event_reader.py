@@ -46,7 +46,7 @@ class _RefusedJsonError(ValueError):
     """Well-formed JSON that is not allowed here: a duplicate key, NaN or infinity."""
 
 
-class _CutShortError(ValueError):
+class CutShortError(ValueError):
     """A last line without line break that is the beginning of an event's line."""
 
 
@@ -68,10 +68,10 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
     last: tuple[float, int] | None = None
     pairs = 0
     with stream:
-        for number, line in _lines(stream, file, problems):
+        for number, line in lines_of(stream, file, problems):
             try:
                 read = read_line(line, number, file, folder, setup, last)
-            except _CutShortError:
+            except CutShortError:
                 log.cut_short = f"{file}: line {number}: cut short, dropped ({len(line)} bytes)"
                 continue
             problems += read.problems
@@ -110,8 +110,8 @@ def read_line(
     t: float | None = None
     problems: list[Problem] = []
     try:
-        document = _parse(line)
-        t, problems = _time(document, last)
+        document = parse_line(line)
+        t, problems = time_of(document, last)
         event = EVENTS.read(document, folder, line=number)
         problems += _misfits(event, setup)
     except FieldError as error:
@@ -120,7 +120,7 @@ def read_line(
     return LineRead(None if errors else event, t, errors)
 
 
-def _time(document: Mapping[str, object], last: tuple[float, int] | None) -> tuple[float | None, list[Problem]]:
+def time_of(document: Mapping[str, object], last: tuple[float, int] | None) -> tuple[float | None, list[Problem]]:
     """The time of an event, None where it has none, and its problems."""
     if "t" not in document:
         return None, []  # reported with the other missing keys
@@ -198,7 +198,8 @@ def _lacks_camera(marker: MarkerRecord, path: tuple[str | int, ...], setup: Setu
         yield Problem((*path, "left"), found, "marker there, or camera_T_marker here")
 
 
-def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator[tuple[int, bytes]]:
+def lines_of(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator[tuple[int, bytes]]:
+    """Lines with their numbers, from 1; appends a problem of the file as a whole to ``problems``."""
     number = 0
     while True:
         try:
@@ -225,8 +226,8 @@ def _lines(stream: IO[bytes], file: str, problems: list[InputError]) -> Iterator
         yield number, line
 
 
-def _parse(line: bytes) -> Mapping[str, object]:
-    """The object on a line. Raises FieldError where it is invalid, _CutShortError where a last line is truncated."""
+def parse_line(line: bytes) -> Mapping[str, object]:
+    """The object on a line. Raises FieldError where it is invalid, CutShortError where a last line is truncated."""
     if len(line) > LINE_BYTES:
         raise FieldError.of(f"{len(line)} bytes", f"at most {LINE_BYTES}")
     expected = "one JSON object"
@@ -243,7 +244,7 @@ def _parse(line: bytes) -> Mapping[str, object]:
         found = "nesting too deep"
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         if not line.endswith(b"\n") and is_cut_short(line):
-            raise _CutShortError from None
+            raise CutShortError from None
         if other := _other_content(line):
             found, expected = other, "UTF-8 text, one JSON object on each line"
         elif isinstance(error, UnicodeDecodeError):
