@@ -1,0 +1,1 @@
+"""Signs and constants of probe and stage from a few simple recordings: pure functions (docs/setup.md)."""
