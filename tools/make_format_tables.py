@@ -1,4 +1,4 @@
-"""Write the tables of README.md and sessions/README.md from the described classes. Run it when these change.
+"""Write the tables of README.md, sessions/README.md and docs/setup.md from the described classes, when these change.
 
     python tools/make_format_tables.py
 
@@ -18,13 +18,15 @@ from fgreg.model.commissioned_rig import RIG
 from fgreg.model.estimate import RESULT
 from fgreg.model.events import EVENTS, MarkerRecord, PlaneRecord, TrusRecord
 from fgreg.model.session_model import SESSION
+from fgreg.model.setup_recording import SETUP_LINES
 from fgreg.schema.kinds import Converted, Kind, ListOf
 from fgreg.schema.record import Field, Record, record
 from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.ground_truth import GROUND_TRUTH
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "sessions" / "README.md")
+PAGES = (ROOT / "README.md", ROOT / "sessions" / "README.md", ROOT / "docs" / "setup.md")
+_LINES = {"events": EVENTS, "recording": SETUP_LINES}
 _PARTS = {MarkerRecord: "marker", TrusRecord: "trus", PlaneRecord: "plane"}
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -39,8 +41,10 @@ def _table(name: str) -> str:
         drivers = [(f"`{e.role}`", f"`{e.name}`", e.help, f"`{e.extra}`" if e.extra else "") for e in ENTRIES]
         lines = [f"| {' | '.join(cells)} |" for cells in drivers]
         return "\n".join(["| role | driver | device | extra |", "|---|---|---|---|", *lines]) + "\n"
-    if name == "events":
-        lines = [f"| `{kind}` | {line}" for kind, of in EVENTS.records.items() for line in _rows(of, nested=False)]
+    if name in _LINES:
+        lines = [
+            f"| `{kind}` | {line}" for kind, of in _LINES[name].records.items() for line in _rows(of, nested=False)
+        ]
         lines = [line for line in lines if "| `t` |" not in line]
         return "\n".join(["| `type` | key | | value | default |", "|---|---|---|---|---|", *lines]) + "\n"
     records = {

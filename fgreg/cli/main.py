@@ -33,6 +33,7 @@ from fgreg.cli.options import EstimateOption, LimitOption, progress_columns, sol
 from fgreg.cli.print import add_print
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
+from fgreg.cli.setup import add_setup
 from fgreg.cli.streams import print_crash, take_streams
 from fgreg.cli.verify import add_verify
 from fgreg.errors import FgregError, InputError
@@ -432,6 +433,7 @@ add_devices(app)
 add_print(app)
 add_report(app, _progress)
 add_schema(app)
+add_setup(app, _progress)
 
 
 if __name__ == "__main__":
