@@ -16,6 +16,8 @@ from fgreg.model.estimate import Verdict as Verdict
 from fgreg.model.events import AimEvent as AimEvent
 from fgreg.model.events import CameraMovedEvent as CameraMovedEvent
 from fgreg.model.events import CheckEvent as CheckEvent
+from fgreg.model.events import ExcludeEvent as ExcludeEvent
+from fgreg.model.events import IncludeEvent as IncludeEvent
 from fgreg.model.events import MarkerRecord as MarkerRecord
 from fgreg.model.events import PairEvent as PairEvent
 from fgreg.model.events import TrackEvent as TrackEvent
@@ -36,6 +38,7 @@ from fgreg.online.estimate import OnlineEstimate as OnlineEstimate
 from fgreg.online.events import CameraMoved as CameraMoved
 from fgreg.online.events import StaticTags as StaticTags
 from fgreg.online.live_session import LiveSession as LiveSession
+from fgreg.pipeline.exclude import ShotNames
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.pipeline.solve import SolveReport as SolveReport
 from fgreg.pipeline.solve import SolveRequest, solve_session
@@ -56,6 +59,8 @@ def solve(
     rrd: str | Path | None = None,
     redetect: bool = False,
     detect_moves: bool = True,
+    without_pms: Sequence[int] = (),
+    without_aims: Sequence[int] = (),
 ) -> SolveReport:
     """Solve a recorded session as a whole, as ``fgreg solve`` does.
 
@@ -66,11 +71,13 @@ def solve(
         rrd: where a Rerun recording is written; none where None.
         redetect: look at the frames even where events bring poses.
         detect_moves: look for unreported camera moves.
+        without_pms, without_aims: left out by hand; aims by their place among the session's aims, from 0.
 
     Raises:
         InputError: bad input; no result is left behind, not even an older one.
     """
-    return solve_session(SolveRequest(Path(session), _path(out), _path(rrd), redetect, detect_moves), config)
+    without = ShotNames(tuple(without_pms), tuple(without_aims))
+    return solve_session(SolveRequest(Path(session), _path(out), _path(rrd), redetect, detect_moves, without), config)
 
 
 def replay(

@@ -123,6 +123,9 @@ def events() -> list[dict[str, Any]]:
             "right": [300, 250.5],
             "trus": {"scan_deg": 4.0, "x_mm": 1.0, "range_mm": 30.0, "covariance": diagonal(0.04, 0.04)},
         },
+        {"type": "exclude", "t": 13.0, "pm": 0, "reason": "the fibre was bumped", "by": "A. N."},
+        {"type": "exclude", "t": 13.0, "line": 2},
+        {"type": "include", "t": 14.0, "pm": 0, "reason": "it was not"},
     ]
     return cast(list[dict[str, Any]], json.loads(json.dumps(data)))
 

@@ -23,6 +23,8 @@ from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
     Event,
+    ExcludeEvent,
+    IncludeEvent,
     MarkerRecord,
     NoteEvent,
     OtherRecord,
@@ -87,6 +89,9 @@ def every_kind(rng: np.random.Generator, folder: Path) -> list[Event]:
         RefusedEvent(1.0, 0, {"type": "pair", "t": 0.2}, "earlier than the last"),
         StageEvent(1.1, 0, "turn", -0.1, "track"),
         StageEvent(1.1, 0, "home"),
+        ExcludeEvent(1.2, 0, 3, reason="bumped", by="A. N."),
+        ExcludeEvent(1.2, 0, shot_line=2),
+        IncludeEvent(1.3, 0, 3),
     ]
 
 
@@ -94,7 +99,7 @@ def test_every_kind_of_event_is_read_back_bit_by_bit(folder: Path) -> None:
     with Journal.open(folder) as journal:
         kept = [journal.append(event).event for event in every_kind(np.random.default_rng(1), folder)]
     read = read_session(folder).events
-    assert [event.line for event in read] == list(range(1, 16))
+    assert [event.line for event in read] == list(range(1, 19))
     assert [type(event) for event in read] == [type(event) for event in kept]
     for before, after in zip(kept, read, strict=True):
         assert event_line(event_document(before, folder), "") == event_line(event_document(after, folder), "")

@@ -228,7 +228,7 @@ def test_calibration_shots_detection_time_and_files_close_the_summary() -> None:
     lines = plain(model, replace(estimate, aims=aims), extra).splitlines()
     # sqrt((0.3^2 + 0.4^2) / 2) = 0.354
     assert "Calibration shots: 2 of 3 used, spot to beam 0.35 mm rms, 0.40 worst" in lines
-    assert "  - 3.0 s, not used: no marker was found" in lines
+    assert "  - aim 2, 3.0 s, not used: no marker was found" in lines
     assert "Detection: marker in 9 of 10 shots, source in 7 of 8 frames" in lines
     assert "Solved in 1.3 s" in lines
     assert "Result     result.yaml" in lines

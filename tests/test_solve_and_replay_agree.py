@@ -69,6 +69,24 @@ def _refused(events: Events, rng: np.random.Generator) -> Events:
     return [*events, {**refused, "reason": "by hand"}]
 
 
+def _left_out(events: Events, rng: np.random.Generator) -> Events:
+    """Two PMs and an aim are left out while the session goes on, and one of the PMs counts again at the end."""
+    place = events.index(_pairs(events)[6])
+    first, second = (int(pm) for pm in rng.choice(6, 2, replace=False))
+    choices = [
+        {"type": "exclude", "pm": first, "reason": "the fibre was bumped", "by": "A. N."},
+        {"type": "exclude", "pm": second},
+        {"type": "exclude", "line": 3, "reason": "beside the corner"},
+    ]
+    now, end = ({"t": events[at]["t"]} for at in (place, -1))
+    return [
+        *events[:place],
+        *({**c, **now} for c in choices),
+        *events[place:],
+        {"type": "include", "pm": second, **end},
+    ]
+
+
 def _no_noise(events: Events, _rng: np.random.Generator) -> Events:
     for event in events:
         event.pop("covariance", None)
@@ -83,7 +101,7 @@ def _huge_noise(events: Events, rng: np.random.Generator) -> Events:
     return events
 
 
-@pytest.mark.parametrize("change", [_outliers, _repeated, _moved, _refused, _no_noise, _huge_noise])
+@pytest.mark.parametrize("change", [_outliers, _repeated, _moved, _refused, _left_out, _no_noise, _huge_noise])
 def test_pairs_reasons_and_verdict_are_the_same(
     change: Callable[[Events, np.random.Generator], Events], small_session: Path, tmp_path: Path
 ) -> None:
@@ -99,9 +117,15 @@ def test_pairs_reasons_and_verdict_are_the_same(
     ]
     assert (replayed.verdict, replayed.reasons) == (solved.verdict, solved.reasons)
     assert [(a.t, a.used, a.reason) for a in replayed.aims] == [(a.t, a.used, a.reason) for a in solved.aims]
-    unused = {shot.reason for shot in check(folder).unused}
-    assert unused <= {p.reason for p in solved.pairs}
-    assert bool(unused) == (change is _refused)
+    assert replayed.excluded == solved.excluded
+    unused = {left.reason for left in check(folder).unused}
+    assert unused <= {p.reason for p in solved.pairs} | {a.reason for a in solved.aims}
+    assert bool(unused) == (change in (_refused, _left_out))
+    if change is _left_out:
+        aim, pair = sorted(solved.excluded, key=lambda shot: shot.type)
+        assert [pair.reason, aim.reason] == ["the fibre was bumped", "beside the corner"]
+        assert [p.reason for p in solved.pairs if p.pm == pair.pm] == [pair.text]
+        assert (aim.aim, solved.aims[2].reason) == (2, aim.text)
 
 
 def test_a_negative_variance_of_a_detector_is_a_reason_everywhere(

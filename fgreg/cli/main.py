@@ -27,6 +27,7 @@ from fgreg.cli.commission import add_commission
 from fgreg.cli.convert import add_convert
 from fgreg.cli.devices import add_devices
 from fgreg.cli.evaluate import add_commands
+from fgreg.cli.exclude import add_exclude, shot_names
 from fgreg.cli.html_report import add_report
 from fgreg.cli.live import add_live
 from fgreg.cli.options import EstimateOption, LimitOption, progress_columns, solve_config, warn_of_leftovers
@@ -217,6 +218,12 @@ def solve(
         bool,
         typer.Option("--detect-moves/--no-detect-moves", help="Find unreported camera moves, by the pairs."),
     ] = True,
+    without_pm: Annotated[
+        str, typer.Option("--without-pm", metavar="N,N", help="Leave out these PMs, in this solve only.")
+    ] = "",
+    without_aim: Annotated[
+        str, typer.Option("--without-aim", metavar="N,N", help="Leave out these aims, counted from 0.")
+    ] = "",
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -229,9 +236,10 @@ def solve(
     from fgreg.pipeline.solve import SolveRequest, solve_session
 
     config = solve_config(limit_mm, estimate)
+    without = shot_names(without_pm, without_aim, ("--without-pm", "--without-aim"))
     warn_of_leftovers(session, out, rrd)
     with _progress(quiet or as_json) as progress:
-        report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves), config, progress)
+        report = solve_session(SolveRequest(session, out, rrd, redetect, detect_moves, without), config, progress)
     if as_json or not quiet:
         _show(report, as_json)
     if report.estimate.verdict is Verdict.REFUSED:
@@ -425,6 +433,7 @@ def simulate(
 add_commands(app, _progress)
 add_calibrate_camera(app, _progress)
 add_commission(app, _progress)
+add_exclude(app)
 add_live(app, _summary_extras, _progress)
 add_replay(app, _summary_extras)
 add_verify(app, _progress)

@@ -395,7 +395,9 @@ def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
             f", spot to beam {math.sqrt(float(np.mean(np.square(residuals)))):.2f} mm rms, {max(residuals):.2f} worst"
         )
     yield text
-    yield from (bullet(f"{aim.t:.1f} s, not used: {aim.reason}") for aim in aims if not aim.used)
+    for number, aim in enumerate(aims):
+        if not aim.used:
+            yield bullet(f"aim {number}, {aim.t:.1f} s, not used: {aim.reason}")
 
 
 def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:

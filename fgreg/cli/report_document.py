@@ -66,6 +66,7 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
             for check in estimate.checks
         ],
         "assumptions": [{"text": entry.text, "checks": list(entry.checks)} for entry in estimate.assumptions],
+        "excluded": [asdict(shot) for shot in estimate.excluded],
         "aims": [
             {
                 "t": aim.t,

@@ -12,7 +12,7 @@ from fgreg.model.camera_model import STEREO_RIG, StereoRig
 from fgreg.output.session_folder import new_session
 from fgreg.schema.limits import EVENT_LINES, SETUP_BYTES
 from fgreg.schema.yaml_writer import one_line_yaml
-from fgreg.session.event_reader import frames_of, read_line
+from fgreg.session.event_reader import ShotsSeen, frames_of, read_line
 from fgreg.session.event_writer import event_line
 from fgreg.session.frame_files import FrameUse, check_frames
 from fgreg.session.rig_file import copy_rig
@@ -114,14 +114,14 @@ def _lines(
     """The events' lines, each checked by reading it back, and the number of frames."""
     out: list[bytes] = []
     uses: dict[Path, FrameUse] = {}
-    last: tuple[float, int] | None = None
+    seen = ShotsSeen()
     for draft in drafts:
         line = event_line(draft.document, draft.where)
-        read = read_line(line, len(out) + 2, EVENTS_FILE, folder.resolve(), setup, last)
+        read = read_line(line, len(out) + 2, EVENTS_FILE, folder.resolve(), setup, seen)
         if read.event is None:
             problem = read.problems[0]
             raise InputError(_place(draft, problem), problem.found, problem.expected)
-        last = (draft.t, len(out) + 2)
+        seen.add(read.event)
         out.append(line)
         size = None if setup.camera is None else setup.camera.left.image_size
         uses_here = frames_of(read.event, EVENTS_FILE, folder.resolve())

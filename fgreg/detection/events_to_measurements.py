@@ -28,6 +28,7 @@ from fgreg.detection.results import (
 from fgreg.geometry.rig import CAMERA
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.camera_dependence import nominal_pose_dependence, nominal_spot_dependence
+from fgreg.model.estimate import ExcludedShot
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
@@ -42,6 +43,7 @@ from fgreg.model.events import (
     needs_marker_frames,
     refused_lines,
 )
+from fgreg.model.excluded_shots import excluded_shots
 from fgreg.model.measurement_checks import look_problem, marker_problem, spot_problem
 from fgreg.model.measurements import (
     Aim,
@@ -70,13 +72,15 @@ class ExtractedMeasurements:
         measurements: usable aims, pairs and epochs.
         tracks: tracking queries whose marker was found.
         aim_events, pair_events, track_events: index into the session's events of each aim, pair, track.
-        unused: reason, by event index, for every unused aim, pair, track or check; unused_aims: indices of unused aims.
+        unused: reason, by event index, for every unused aim, pair, track or check; unused_aims: indices of unused aims,
+            without those left out by hand.
         markers: detection of each event whose marker came from frames.
         boards: the same for the board.
         finds: PA localisation in each frame, by (event index, look).
         marker_noise, board_noise: pooled corner noise.
         epoch_of: camera epoch of every event.
         checks: usable checks, by event index.
+        excluded: aims and looks left out by hand. set_aside: their measurements, by event index, where there are any.
     """
 
     measurements: Measurements
@@ -93,6 +97,8 @@ class ExtractedMeasurements:
     board_noise: CornerNoise
     epoch_of: tuple[int, ...]
     checks: Mapping[int, Check] = field(default_factory=dict)
+    excluded: tuple[ExcludedShot, ...] = ()
+    set_aside: Mapping[int, Aim | Pair] = field(default_factory=dict)
 
 
 def _marker_key(record: MarkerRecord, *, redetect: bool) -> object:
@@ -117,8 +123,10 @@ def extract_measurements(
         InputError: a frame is missing or invalid.
     """
     found = _detect(events, model, redetect, progress)
-    marker_fits = [fit for fit in found.markers.values() if isinstance(fit, MarkerFit)]
-    board_fits = [fit for fit in found.boards.values() if isinstance(fit, BoardFit)]
+    refused, by_hand = refused_lines(events), excluded_shots(events)
+    taken = {index for index, event in enumerate(events) if event.line not in refused and event.line not in by_hand}
+    marker_fits = [fit for index, fit in found.markers.items() if index in taken and isinstance(fit, MarkerFit)]
+    board_fits = [fit for index, fit in found.boards.items() if index in taken and isinstance(fit, BoardFit)]
     builder = _Builder(
         model,
         found,
@@ -127,10 +135,13 @@ def extract_measurements(
         redetect,
     )
     starts, epoch_of = number_epochs(events)
-    refused = refused_lines(events)
+    set_aside: dict[int, Aim | Pair] = {}
     for index, event in enumerate(events):
         if event.line not in refused:
             builder.add(index, event, epoch_of[index])
+            if event.line in by_hand:
+                set_aside |= builder.take_out(index)
+                builder.unused[index] = by_hand[event.line].text
         elif isinstance(event, AimEvent | PairEvent | TrackEvent | CheckEvent):
             builder.unused[index] = f"it was refused when it was taken: {refused[event.line]}"
     return ExtractedMeasurements(
@@ -140,7 +151,9 @@ def extract_measurements(
         pair_events=tuple(builder.pair_events),
         track_events=tuple(builder.track_events),
         unused=builder.unused,
-        unused_aims=tuple(i for i in sorted(builder.unused) if isinstance(events[i], AimEvent)),
+        unused_aims=tuple(
+            i for i in sorted(builder.unused) if isinstance(events[i], AimEvent) and events[i].line not in by_hand
+        ),
         markers=found.markers,
         boards=found.boards,
         finds=found.finds,
@@ -148,6 +161,8 @@ def extract_measurements(
         board_noise=builder.board_noise,
         epoch_of=epoch_of,
         checks=builder.checks,
+        excluded=tuple(by_hand.values()),
+        set_aside=set_aside,
     )
 
 
@@ -247,6 +262,13 @@ class _Builder:
         scan = None if event.scan_deg is None else self.model.stage.scan_from_device(math.radians(event.scan_deg))
         self.tracks.append(Track(event.t, epoch, marker, tuple(looks), scan))
         self.track_events.append(index)
+
+    def take_out(self, index: int) -> dict[int, Aim | Pair]:
+        """Take out what the event just added gave: its aim or pair by its index, or nothing."""
+        for events, measured in ((self.aim_events, self.aims), (self.pair_events, self.pairs)):
+            if events and events[-1] == index:
+                return {events.pop(): measured.pop()}
+        return {}
 
     def _marker(self, index: int, event: AimEvent | PairEvent | TrackEvent) -> MarkerObservation | str:
         record = event.marker

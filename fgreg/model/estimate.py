@@ -283,6 +283,29 @@ class SettingsUsed:
 
 
 @dataclass(frozen=True, slots=True)
+class ExcludedShot:
+    """An aim or a look that was left out by hand."""
+
+    type: Annotated[str, Key("aim or pair", Text(allowed=("aim", "pair")))]
+    line: Annotated[int, Key("of the shot, in events.jsonl", Integer(1, 2**31 - 1))]
+    t: Annotated[float, Key("of the shot", SECONDS)]
+    pm: Annotated[int | None, Key("of a look; absent for an aim", _COUNT)] = None
+    aim: Annotated[int | None, Key("of an aim: its place among the aims, from 0; absent for a look", _COUNT)] = None
+    reason: Annotated[str, Key("why", brief=True)] = ""
+    by: Annotated[str, Key("who decided it", brief=True)] = ""
+
+    @property
+    def name(self) -> str:
+        """PM or aim, with its number."""
+        return f"aim {self.aim}" if self.pm is None else f"PM {self.pm}"
+
+    @property
+    def text(self) -> str:
+        """Why it is not used."""
+        return "left out by hand" + (f": {self.reason}" if self.reason else "") + (f" ({self.by})" if self.by else "")
+
+
+@dataclass(frozen=True, slots=True)
 class Quantiles:
     """Quantiles of durations, ms."""
 
@@ -336,6 +359,14 @@ class SessionEstimate:
     assumptions: Annotated[
         tuple[Assumption, ...],
         Key("what the session's data cannot show", ListOf(record(Assumption), empty=True)),
+    ] = field(default=(), kw_only=True)
+    excluded: Annotated[
+        tuple[ExcludedShot, ...],
+        Key(
+            "shots that were left out by hand; of these looks `pairs` has a line, too",
+            ListOf(record(ExcludedShot), empty=True),
+            brief=True,
+        ),
     ] = field(default=(), kw_only=True)
     checks: Annotated[
         tuple[CheckEstimate, ...], Key("one per check event", ListOf(record(CheckEstimate), empty=True))

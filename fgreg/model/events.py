@@ -286,6 +286,36 @@ class RefusedEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class _HandChoice:
+    """What ``exclude`` and ``include`` have in common: a PM (all its looks), or the line of one aim or look."""
+
+    JSON_RULES: ClassVar = ({"oneOf": [{"required": ["pm"]}, {"required": ["line"]}]},)
+
+    t: Seconds
+    line: int
+    pm: Annotated[int | None, Key("all looks at this PM up to now", Integer(0, 2**31 - 1))] = None
+    shot_line: Annotated[
+        int | None, Key("one aim or look instead: its line in this file", Integer(1, 2**31 - 1), name="line")
+    ] = None
+    reason: Annotated[str, Key("why", brief=True)] = ""
+    by: Annotated[str, Key("who decided it", brief=True)] = ""
+
+    def __post_init__(self) -> None:
+        if (self.pm is None) == (self.shot_line is None):
+            raise FieldError.of("neither" if self.pm is None else "both", "pm or line")
+
+
+@dataclass(frozen=True, slots=True)
+class ExcludeEvent(_HandChoice):
+    """Earlier shots that are left out by hand from here on, until an ``include``. Nothing is deleted."""
+
+
+@dataclass(frozen=True, slots=True)
+class IncludeEvent(_HandChoice):
+    """Takes an ``exclude`` back."""
+
+
+@dataclass(frozen=True, slots=True)
 class StageEvent:
     """A command to the stage; it has no effect on the estimate."""
 
@@ -305,7 +335,20 @@ class NoteEvent:
     text: Annotated[str, Key("for the record")]
 
 
-Event = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent | RefusedEvent | StageEvent | NoteEvent
+HandChoice = ExcludeEvent | IncludeEvent
+"""A choice of shots by hand."""
+
+Event = (
+    AimEvent
+    | PairEvent
+    | TrackEvent
+    | CameraMovedEvent
+    | CheckEvent
+    | HandChoice
+    | RefusedEvent
+    | StageEvent
+    | NoteEvent
+)
 
 EVENTS = Tagged(
     "type",
@@ -315,6 +358,8 @@ EVENTS = Tagged(
         "track": TrackEvent,
         "camera_moved": CameraMovedEvent,
         "check": CheckEvent,
+        "exclude": ExcludeEvent,
+        "include": IncludeEvent,
         "refused": RefusedEvent,
         "stage": StageEvent,
         "note": NoteEvent,

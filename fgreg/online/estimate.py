@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fgreg.geometry.target_error import gaussian_quantile_mm, target_jacobians
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.estimate import CheckEstimate, PredictedTre, Verdict
+from fgreg.model.estimate import CheckEstimate, PredictedTre, Verdict, worst_verdict
+from fgreg.registration.verdict import Condition, verdict_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +46,14 @@ class OnlineEstimate:
     optimum_trus_T_camera: FloatArray | None
     settled: bool
     checks: tuple[CheckEstimate, ...] = ()
+
+
+def with_conditions(estimate: OnlineEstimate, conditions: Sequence[Condition]) -> OnlineEstimate:
+    """The estimate with conditions of the whole session; they come first."""
+    if not conditions:
+        return estimate
+    reasons = (*(condition.text for condition in conditions), *estimate.reasons)
+    return replace(estimate, verdict=worst_verdict(estimate.verdict, verdict_of(conditions)), reasons=reasons)
 
 
 def gaussian_tre(covariance: FloatArray, trus_T_camera: FloatArray, targets_mm: FloatArray) -> PredictedTre:

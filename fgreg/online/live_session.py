@@ -16,12 +16,13 @@ from fgreg.detection.check_points import check_measurement
 from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.estimate import TrackEstimate
+from fgreg.model.estimate import ExcludedShot, TrackEstimate
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
     CheckEvent,
     Event,
+    HandChoice,
     NoteEvent,
     PairEvent,
     RefusedEvent,
@@ -29,20 +30,22 @@ from fgreg.model.events import (
     TrackEvent,
     refused_lines,
 )
+from fgreg.model.excluded_shots import excluded_shots
 from fgreg.model.measurements import Aim, Check, EpochStart, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.checks import CheckPoints
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.engine_process import GONE, EngineGone
-from fgreg.online.estimate import OnlineEstimate
+from fgreg.online.estimate import OnlineEstimate, with_conditions
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
+from fgreg.registration.verdict import by_hand
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
 from fgreg.tracking.snapshot import Snapshot
 
-Estimating = AimEvent | PairEvent | CameraMovedEvent | CheckEvent
+Estimating = AimEvent | PairEvent | CameraMovedEvent | CheckEvent | HandChoice
 """Events that the estimate or its verdict depends on."""
 
 
@@ -152,12 +155,19 @@ class LiveSession:
         self._checks = CheckPoints(self.journal.model, self.config.limit_mm, engine.snapshot)
         self._engine, self._feed = engine, EpochFeed(engine, self._checks)
         self._closures = 0  # loop closures that are recorded
+        self._excluded: tuple[ExcludedShot, ...] = ()  # left out by hand
+        self._shots = 0  # aims and pairs in the estimate
         self._extractor = MeasurementExtractor(self.journal.model)
 
     @property
     def estimate(self) -> OnlineEstimate | None:
         """After the last event that was taken in, with the checks of its epoch; None before the first."""
-        return self._checks.applied(self._estimate)
+        return self._with_all(self._estimate)
+
+    def _with_all(self, estimate: OnlineEstimate | None) -> OnlineEstimate | None:
+        """The engine's estimate with the checks, and with what was left out by hand."""
+        checked = self._checks.applied(estimate)
+        return None if checked is None else with_conditions(checked, by_hand(self._excluded, self._shots))
 
     @classmethod
     def open(
@@ -185,7 +195,7 @@ class LiveSession:
         return found
 
     def revive(self) -> OnlineEstimate | None:
-        """Replace an engine whose process has ended by a new one, from the journal.
+        """Replace the engine (its process has ended, or shots were left out by hand) by a new one, from the journal.
 
         Nothing is lost, and the session stays open. An event at which that has happened :data:`MOST_DEATHS` times is
         recorded as refused.
@@ -222,10 +232,11 @@ class LiveSession:
 
     def _take_up(self, events: Sequence[Event]) -> None:
         """Take in recorded events, with one estimate at the end."""
-        refused = refused_lines(events)
+        refused, excluded = refused_lines(events), excluded_shots(events)
+        self._excluded = tuple(excluded.values())
         with self._engine.restoring():
             for event in events:
-                if event.line not in refused:
+                if event.line not in refused and event.line not in excluded:
                     with contextlib.suppress(EventRefused):  # the refusal is noted now: it was not recorded before
                         self._take(event)
         if self._estimate is not None:
@@ -237,7 +248,8 @@ class LiveSession:
     def add(self, event: Estimating) -> OnlineEstimate | None:
         """Record an event, take it in, and return the estimate.
 
-        A shot in whose frames the marker or the PM is not found is recorded and changes nothing.
+        A shot in whose frames the marker or the PM is not found is recorded and changes nothing. An ``exclude`` or
+        ``include`` event begins the estimate again from the journal.
 
         Raises:
             InputError: not an event that a session may hold; recorded as refused.
@@ -255,6 +267,8 @@ class LiveSession:
         self._untaken.append(kept)
         if gone is not None:
             raise gone
+        if isinstance(kept, HandChoice):
+            return self.revive()
         try:
             self._take_in()
         finally:
@@ -315,7 +329,7 @@ class LiveSession:
     def settle(self) -> OnlineEstimate:
         """Run the full solve of everything now."""
         self._estimate = settled = self._engine.settle()
-        return self._checks.applied(settled) or settled
+        return self._with_all(settled) or settled
 
     def measurements(self) -> Measurements:
         """All measurements that were taken in."""
@@ -371,6 +385,7 @@ class LiveSession:
                 if isinstance(found, Aim | Pair):
                     try:
                         estimate = self._feed.add(found)
+                        self._shots += 1
                     except BaseException:  # nor may its frames count: the session opened again would lack them
                         self._extractor.take_back()
                         raise

@@ -30,7 +30,7 @@ class UnusedShot:
 
     @property
     def text(self) -> str:
-        return f"{EVENTS_FILE}: line {self.line}: this {self.kind} cannot be used: {self.reason}"
+        return f"{EVENTS_FILE}: line {self.line}: this {self.kind} is not used: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)

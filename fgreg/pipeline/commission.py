@@ -22,7 +22,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import TEXTS
 from fgreg.output.atomic_file import check_output
-from fgreg.pipeline.solve import detection_conditions
+from fgreg.pipeline.solve import detection_conditions, hand_conditions
 from fgreg.registration.checks import with_checks
 from fgreg.registration.commissioning import (
     OBSERVED,
@@ -56,7 +56,7 @@ class CommissionedSession:
         folder: as given. name: of the session.
         reason: why it was left out; empty where it is used.
         chart: against the rig of the others, or against the rig given; None where left out, or the only one.
-        warnings: of its reader.
+        warnings: of its reader, and that shots were left out by hand.
     """
 
     folder: Path
@@ -110,6 +110,7 @@ class _Solved:
     registration: Registration | None
     reason: str
     checks: tuple[Check, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def commission_sessions(
@@ -228,12 +229,15 @@ def _solved(session: Session, model: SessionModel, use_checks: bool, done: Calla
     if estimate.verdict is Verdict.REFUSED or solution.registration is None:
         return _Solved(session, None, "; ".join(estimate.reasons), checks)
     registration = solution.registration
-    return _Solved(session, registration, "", checks)
+    left_out = tuple(condition.text for condition in hand_conditions(extracted))
+    return _Solved(session, registration, "", checks, left_out)
 
 
 def _outcome(solved: _Solved, chart: Chart | None) -> CommissionedSession:
     session = solved.session
-    return CommissionedSession(session.folder, session.model.name, solved.reason, chart, session.warnings)
+    return CommissionedSession(
+        session.folder, session.model.name, solved.reason, chart, (*session.warnings, *solved.warnings)
+    )
 
 
 def _constants(found: Commissioned) -> tuple[ConstantReport, ...]:

@@ -17,13 +17,24 @@ import numpy as np
 
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.errors import EventRefused, InputError
-from fgreg.model.estimate import Quantiles, Timing, TrackEstimate, Verdict
-from fgreg.model.events import AimEvent, CameraMovedEvent, CheckEvent, PairEvent, TrackEvent, refused_lines
+from fgreg.model.estimate import ExcludedShot, Quantiles, Timing, TrackEstimate, Verdict
+from fgreg.model.events import (
+    AimEvent,
+    CameraMovedEvent,
+    CheckEvent,
+    ExcludeEvent,
+    HandChoice,
+    IncludeEvent,
+    PairEvent,
+    TrackEvent,
+    refused_lines,
+)
+from fgreg.model.excluded_shots import excluded_shots
 from fgreg.model.measurements import Aim, Check, Pair, Track
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.checks import CheckPoints
-from fgreg.online.estimate import OnlineEstimate
-from fgreg.online.live_session import Engine, EpochFeed, MakeEngine, online_engine
+from fgreg.online.estimate import OnlineEstimate, with_conditions
+from fgreg.online.live_session import EpochFeed, MakeEngine, online_engine
 from fgreg.pipeline.solve import (
     Progress,
     SolveReport,
@@ -34,6 +45,7 @@ from fgreg.pipeline.solve import (
     solve_extracted,
 )
 from fgreg.registration.checks import CHECKS_REFUSE
+from fgreg.registration.verdict import by_hand
 from fgreg.schema.limits import REPLAYED_PAIRS
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import write_result
@@ -45,7 +57,7 @@ from fgreg.viewer.spawn import spawn_viewer
 if TYPE_CHECKING:
     from fgreg.viewer.recording import Viewer
 
-Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent
+Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent | HandChoice
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,11 +154,11 @@ def replay_session(
         )
         # Moves that were detected during recording are events: they are used as recorded, without a new search.
         recorded = any(isinstance(event, CameraMovedEvent) and event.detected for event in session.events)
-        engine = (make_engine or partial(online_engine, find_moves=not recorded))(session.model, config)
-        player = _Player(session, extracted, engine, viewer, request.speed, config)
+        make_engine = make_engine or partial(online_engine, find_moves=not recorded)
+        player = _Player(session, extracted, make_engine, viewer, request.speed, config)
         player.play(on_step)
         taken, found, solution, estimate = solve_extracted(session, player.taken(), config)
-        settled = engine.settle() if player.estimate is not None else None
+        settled = player.settle()
         used = settings_used(config, detect_moves=True, redetect=request.redetect)
         estimate = replace(
             estimate,
@@ -170,31 +182,60 @@ class _Player:
         self,
         session: Session,
         extracted: ExtractedMeasurements,
-        engine: Engine,
+        make_engine: MakeEngine,
         viewer: Viewer | NullViewer,
         speed: float | None,
         config: SolveConfig,
     ) -> None:
-        self._session, self._extracted, self._engine = session, extracted, engine
+        self._session, self._extracted = session, extracted
+        self._make_engine, self._config = make_engine, config
         self._viewer, self._speed = viewer, speed
-        self._checks = CheckPoints(session.model, config.limit_mm, engine.snapshot)
-        self._feed = EpochFeed(engine, self._checks)
         self._measured: dict[int, Aim | Pair | Track | Check] = {
             **extracted.checks,
+            **extracted.set_aside,
             **dict(zip(extracted.aim_events, extracted.measurements.aims, strict=True)),
             **dict(zip(extracted.pair_events, extracted.measurements.pairs, strict=True)),
             **dict(zip(extracted.track_events, extracted.tracks, strict=True)),
         }
-        self._unused = dict(extracted.unused)
         self._add_ms: list[float] = []
         self._track_ms: list[float] = []
         self._answers: dict[int, TrackEstimate] = {}
+        self._excluded: dict[int, ExcludedShot] = {}  # by line, as the events up to now have it
+        self._begin()
+
+    def _begin(self) -> None:
+        """Start with an engine that has taken in nothing yet."""
+        self._engine = self._make_engine(self._session.model, self._config)
+        self._checks = CheckPoints(self._session.model, self._config.limit_mm, self._engine.snapshot)
+        self._feed = EpochFeed(self._engine, self._checks)
+        self._unused = {i: why for i, why in self._extracted.unused.items() if i not in self._extracted.set_aside}
         self._estimate: OnlineEstimate | None = None  # without the checks
+        self._shots = 0
 
     @property
     def estimate(self) -> OnlineEstimate | None:
-        """After the last event, with the checks of its epoch; None before the first."""
-        return self._checks.applied(self._estimate)
+        """After the last event, with the checks of its epoch and what is left out by hand; None before the first."""
+        checked = self._checks.applied(self._estimate)
+        out = tuple(self._excluded.values())
+        return None if checked is None else with_conditions(checked, by_hand(out, self._shots))
+
+    def settle(self) -> OnlineEstimate | None:
+        """The engine's estimate after a full solve; None where it has taken in nothing."""
+        return None if self._estimate is None else self._engine.settle()
+
+    def _choose(self, index: int) -> None:
+        """Begin again with the shots that count from here on, as a recorder does."""
+        events = self._session.events
+        excluded = excluded_shots(events[: index + 1])
+        if excluded.keys() == self._excluded.keys():
+            return
+        self._excluded = excluded
+        self._begin()
+        refused = refused_lines(events)
+        for earlier, event in enumerate(events[:index]):
+            counts = event.line not in refused and event.line not in excluded
+            if counts and isinstance(event, AimEvent | PairEvent | CameraMovedEvent | CheckEvent):
+                self._take(earlier, event)
 
     def play(self, on_step: OnStep | None) -> None:
         """Replay all events, each at its time where there is a speed."""
@@ -209,6 +250,8 @@ class _Player:
             if self._speed is not None:
                 wait = began + (event.t - shown[0][1].t) / self._speed - time.monotonic()
                 time.sleep(max(0.0, wait))
+            if isinstance(event, HandChoice) and not any(isinstance(e, HandChoice) for _, e in shown[done : done + 1]):
+                self._choose(index)  # the last one of several
             step = replace(self._take(index, event), done=done, total=len(shown))
             if isinstance(event, AimEvent | PairEvent | TrackEvent):
                 show_frames(self._viewer, self._session, self._extracted, index, event, shot)
@@ -239,6 +282,7 @@ class _Player:
                 self._add_ms.append(elapsed_ms)
                 self._estimate = estimate or self._estimate
                 noticed = self._feed.noticed > before
+                self._shots += not isinstance(event, CameraMovedEvent)
             except EventRefused as error:
                 refused = self._unused[index] = error.reason
         return ReplayStep(event, 0, 0, self.estimate, answer, refused, elapsed_ms, noticed)
@@ -271,6 +315,7 @@ class _Player:
     def taken(self) -> ExtractedMeasurements:
         """The session's measurements without the events that the engine refused, and without its queries."""
         extracted, measurements = self._extracted, self._extracted.measurements
+        unused = {**self._unused, **{i: extracted.unused[i] for i in extracted.set_aside}}
         aims = [i for i, event in enumerate(extracted.aim_events) if event not in self._unused]
         pairs = [i for i, event in enumerate(extracted.pair_events) if event not in self._unused]
         return replace(
@@ -284,7 +329,7 @@ class _Player:
             pair_events=tuple(extracted.pair_events[i] for i in pairs),
             tracks=(),
             track_events=(),
-            unused=self._unused,
+            unused=unused,
         )
 
     def answers(self, unanswered: Sequence[TrackEstimate]) -> tuple[TrackEstimate, ...]:
@@ -331,6 +376,9 @@ def describe(step: ReplayStep) -> str:
             what = "camera moved" + (" (found out)" if event.detected else "")
         case CheckEvent():
             what = "check"
+        case ExcludeEvent() | IncludeEvent():
+            shot = f"PM {event.pm}" if event.pm is not None else f"line {event.shot_line}"
+            what = f"{shot} " + ("left out by hand" if isinstance(event, ExcludeEvent) else "counts again")
     if step.refused:
         what += f", not used: {step.refused}"
     elif isinstance(event, PairEvent) and left_out(step.estimate):

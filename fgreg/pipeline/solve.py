@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,12 +35,13 @@ from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.output.atomic_file import check_outputs
+from fgreg.pipeline.exclude import ShotNames, without_shots
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
 from fgreg.registration.influence import influences
 from fgreg.registration.move_doubt import TELLING
 from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import Solution, solve
-from fgreg.registration.verdict import Condition
+from fgreg.registration.verdict import Condition, by_hand
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import RESULT_FILE, RESULT_KIND, write_result
@@ -68,6 +69,7 @@ class SolveRequest:
         folder: the session. out: result file; None: ``result.yaml`` in the session's folder.
         rrd: the recording to write, if any. redetect: detect in frames even where poses are recorded.
         detect_moves: detect unreported camera moves, and split the session into epochs at them.
+        without: shots left out besides those of the session's ``exclude`` events.
     """
 
     folder: Path
@@ -75,6 +77,7 @@ class SolveRequest:
     rrd: Path | None = None
     redetect: bool = False
     detect_moves: bool = True
+    without: ShotNames = field(default_factory=ShotNames)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +141,7 @@ def solve_session(
     config = config or SolveConfig()
     result_path = result_place(request.folder, request.out, request.rrd)
     session, inputs = read_with_hashes(request.folder)
+    session = without_shots(session, request.without, ("--without-pm", "--without-aim"))
     truth = read_ground_truth(request.folder)
     with open_viewer(request.rrd, session.model.name, made_from=inputs) as viewer:
         extracted = extract_measurements(
@@ -227,9 +231,15 @@ def move_conditions(found: EpochsFound, split: Measurements) -> list[Condition]:
     return conditions
 
 
+def hand_conditions(extracted: ExtractedMeasurements) -> list[Condition]:
+    """Conditions of the verdict from shots that were left out by hand."""
+    shots = extracted.measurements
+    return by_hand(extracted.excluded, len(shots.aims) + len(shots.pairs))
+
+
 def detection_conditions(extracted: ExtractedMeasurements) -> list[Condition]:
-    """Conditions of the verdict from the frames: unusable calibration shots."""
-    found = []
+    """Conditions of the verdict from before the solve: shots left out by hand, unusable calibration shots."""
+    found = hand_conditions(extracted)
     lost_aims, used = extracted.unused_aims, len(extracted.measurements.aims)
     if lost_aims and len(lost_aims) >= TOO_FEW_AIMS * (used + len(lost_aims)):
         text = (
@@ -272,6 +282,7 @@ def session_estimate(
         pairs=tuple(pairs[i] for i in sorted(pairs)),
         tracks=tuple(tracks[i] for i in sorted(tracks)),
         aims=tuple(aims[i] for i in sorted(aims)),
+        excluded=extracted.excluded,
     )
 
 

@@ -20,7 +20,7 @@ from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import InputError
 from fgreg.geometry.target_error import tre_mm
 from fgreg.model.estimate import EpochEstimate, Verdict
-from fgreg.model.events import CameraMovedEvent, Event, PairEvent, refused_lines
+from fgreg.model.events import CameraMovedEvent, Event, HandChoice, PairEvent, refused_lines
 from fgreg.model.measurements import Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
@@ -112,7 +112,7 @@ def verify_session(
 
 
 def _new_events(new: Path, session: Session) -> tuple[tuple[Event, ...], SessionModel]:
-    """The new events that were not refused, and the set-up to measure them by."""
+    """The new events that were not refused (those left out by hand are among them), and the set-up to measure by."""
     model = session.model
     if new.is_dir():
         other = read_session(new)
@@ -143,11 +143,15 @@ def _content(shot: PairEvent) -> tuple[object, ...]:
 def _new_pairs(
     events: Sequence[Event], model: SessionModel, progress: Progress | None
 ) -> tuple[tuple[Pair, ...], tuple[UnusedShot, ...]]:
-    shots = [event for event in events if isinstance(event, PairEvent)]
+    shots = [event for event in events if isinstance(event, PairEvent | HandChoice)]
     extracted = extract_measurements(
         shots, model, progress=None if progress is None else lambda done, total: progress("new frames", done, total)
     )
-    unused = tuple(UnusedShot(shots[i].t, shots[i].pm, reason) for i, reason in sorted(extracted.unused.items()))
+    unused = tuple(
+        UnusedShot(shot.t, shot.pm, reason)
+        for i, reason in sorted(extracted.unused.items())
+        if isinstance(shot := shots[i], PairEvent)
+    )
     return extracted.measurements.pairs, unused
 
 

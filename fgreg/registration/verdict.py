@@ -12,13 +12,14 @@ from scipy.special import bdtrc, chdtrc, chdtri
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.graph.split_points import ALARM
-from fgreg.model.estimate import PredictedTre, Verdict, worst_verdict
+from fgreg.model.estimate import ExcludedShot, PredictedTre, Verdict, worst_verdict
 from fgreg.model.measurements import Pair
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.move_doubt import MoveDoubt
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.outliers import OUTLIER_P
 from fgreg.registration.register import Registration
+from fgreg.schema.problems import numbers_text
 
 SUSPICIOUS_P = 1e-3
 IMPOSSIBLE_P = 1e-9
@@ -196,6 +197,31 @@ def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Con
             f"noise, probe and marker in session.yaml, and take {out} {what} again",
         )
     ]
+
+
+def by_hand(excluded: Sequence[ExcludedShot], used: int) -> list[Condition]:
+    """Shots left out by hand: evidence that no test has seen.
+
+    Predicted errors are those of the shots that are left. They hold where a shot was left out for a cause that was seen
+    when it was taken, such as a bumped fibre. Where shots are chosen by how they fit, the tests of residuals, outliers
+    and camera moves pass more easily, and no covariance says so.
+
+    Args:
+        excluded: all that were left out.
+        used: aims and looks that were not, and that were measured.
+    """
+    if not excluded:
+        return []
+    pms = {shot.pm for shot in excluded if shot.pm is not None}
+    aims = {shot.aim for shot in excluded if shot.aim is not None}
+    names = [f"{what} {numbers_text(some)}" for what, some in (("PM", pms), ("aim", aims)) if some]
+    count = len(excluded)
+    text = (
+        f"{count} of {count + used} shots {'was' if count == 1 else 'were'} left out by hand ({'; '.join(names)}): no "
+        "test has seen them, and the predicted error holds only if they were left out for a cause seen when they were "
+        "taken, not for how they fit; solve with them too and compare, or have check points"
+    )
+    return [Condition(Verdict.WARNING, text)]
 
 
 def side_of_a_move(first: int, last: int, out: int) -> list[Condition]:

@@ -125,3 +125,15 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
     by_lower = {name.lower(): name for name in known}
     matches = difflib.get_close_matches(word[:80].lower(), list(by_lower), n=1, cutoff=0.7)
     return by_lower[matches[0]] if matches else None
+
+
+def numbers_text(numbers: Iterable[int]) -> str:
+    """Numbers as text, runs of them shortened: ``0 to 4, 7``; ``none`` where there are none."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    texts = [str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
+    return ", ".join(texts) or "none"

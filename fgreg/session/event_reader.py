@@ -15,6 +15,7 @@ from fgreg.model.events import (
     AimEvent,
     CheckEvent,
     Event,
+    HandChoice,
     MarkerRecord,
     PairEvent,
     RefusedEvent,
@@ -24,7 +25,7 @@ from fgreg.model.events import (
 from fgreg.schema.files import FrameKind
 from fgreg.schema.kinds import SECONDS
 from fgreg.schema.limits import DIGITS, EVENT_LINES, LINE_BYTES, PAIRS, PROBLEMS
-from fgreg.schema.problems import FieldError, Problem, input_error, path_text, shown
+from fgreg.schema.problems import FieldError, Problem, input_error, numbers_text, path_text, shown
 from fgreg.session.frame_files import FrameUse
 from fgreg.session.setup_reader import Setup
 from fgreg.session.yaml_loader import open_file
@@ -40,6 +41,36 @@ class EventLog:
 
     events: list[Event] = field(default_factory=list)
     cut_short: str = ""
+
+
+@dataclass(slots=True)
+class ShotsSeen:
+    """What the lines up to now hold that later lines refer to.
+
+    Attributes:
+        last: time and line of the last event with a time, None before the first.
+        pms: of the looks. lines: of the aims and looks.
+    """
+
+    last: tuple[float, int] | None = None
+    pms: set[int] = field(default_factory=set)
+    lines: set[int] = field(default_factory=set)
+
+    def add(self, event: Event) -> None:
+        """One more event."""
+        self.last = (event.t, event.line)
+        if isinstance(event, AimEvent | PairEvent):
+            self.lines.add(event.line)
+        if isinstance(event, PairEvent):
+            self.pms.add(event.pm)
+
+    def missing(self, event: HandChoice) -> Problem | None:
+        """The problem of a choice of shots that are not there; None where they are."""
+        if event.pm is not None and event.pm not in self.pms:
+            return Problem(("pm",), str(event.pm), f"the PM of an earlier pair: {numbers_text(self.pms)}")
+        if event.shot_line is not None and event.shot_line not in self.lines:
+            return Problem(("line",), str(event.shot_line), "the line of an earlier aim or pair")
+        return None
 
 
 class _RefusedJsonError(ValueError):
@@ -65,19 +96,20 @@ def read_events(path: Path, file: str, folder: Path, setup: Setup | None, proble
     except InputError as error:
         problems.append(error)
         return log
-    last: tuple[float, int] | None = None
+    seen = ShotsSeen()
     pairs = 0
     with stream:
         for number, line in lines_of(stream, file, problems):
             try:
-                read = read_line(line, number, file, folder, setup, last)
+                read = read_line(line, number, file, folder, setup, seen)
             except CutShortError:
                 log.cut_short = f"{file}: line {number}: cut short, dropped ({len(line)} bytes)"
                 continue
             problems += read.problems
             if read.t is not None:
-                last = (read.t, number)
+                seen.last = (read.t, number)
             if read.event is not None:
+                seen.add(read.event)
                 log.events.append(read.event)
                 pairs += isinstance(read.event, PairEvent)
             if pairs > PAIRS:
@@ -95,25 +127,23 @@ class LineRead:
     problems: tuple[InputError, ...]
 
 
-def read_line(
-    line: bytes, number: int, file: str, folder: Path, setup: Setup | None, last: tuple[float, int] | None
-) -> LineRead:
+def read_line(line: bytes, number: int, file: str, folder: Path, setup: Setup | None, seen: ShotsSeen) -> LineRead:
     """Read one line.
 
     Args:
         line: with its line break.
         number: of the line, from 1.
         file, folder, setup: as of :func:`read_events`.
-        last: time and line of the event before, None for the first.
+        seen: what the lines before hold; this one is not added.
     """
     event: Event | None = None
     t: float | None = None
     problems: list[Problem] = []
     try:
         document = parse_line(line)
-        t, problems = time_of(document, last)
+        t, problems = time_of(document, seen.last)
         event = EVENTS.read(document, folder, line=number)
-        problems += _misfits(event, setup)
+        problems += _misfits(event, setup, seen)
     except FieldError as error:
         problems += error.problems
     errors = tuple(input_error(problem, file, line=number) for problem in dict.fromkeys(problems))
@@ -158,12 +188,14 @@ def _records(event: Event) -> Iterator[tuple[tuple[str | int, ...], MarkerRecord
             yield ("looks", i), look
 
 
-def _misfits(event: Event, setup: Setup | None) -> Iterator[Problem]:
+def _misfits(event: Event, setup: Setup | None, seen: ShotsSeen) -> Iterator[Problem]:
     """Problems of an event with respect to its session or its place in the file."""
     if isinstance(event, RefusedEvent):
         line = event.refused_line
         if line is not None and not 0 < line < event.line:
             yield Problem(("event",), f"line {line}", "an earlier line of this file")
+    if isinstance(event, HandChoice) and (missing := seen.missing(event)) is not None:
+        yield missing
     if setup is None:
         return
     if isinstance(event, CheckEvent) and event.left is not None and not {"camera", "camera.right"} <= setup.present:

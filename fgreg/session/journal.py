@@ -21,7 +21,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.output.atomic_file import FileKind, write_file
 from fgreg.output.session_folder import CUT_SUFFIX
 from fgreg.session.append_only_file import AppendFile, sync_path
-from fgreg.session.event_reader import frames_of, read_line
+from fgreg.session.event_reader import ShotsSeen, frames_of, read_line
 from fgreg.session.event_writer import event_document, event_line, type_of
 from fgreg.session.frame_files import check_frames
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session, session_place
@@ -54,7 +54,9 @@ class Journal:
     ) -> None:
         self.folder, self.model, self.warnings = folder, model, tuple(warnings)
         self._setup, self._file, self._recorded = setup, file, recorded.events
-        self._last = (recorded.events[-1].t, recorded.events[-1].line) if recorded.events else None
+        self._seen = ShotsSeen()
+        for event in recorded.events:
+            self._seen.add(event)
         self._lock = Lock()
 
     @classmethod
@@ -90,12 +92,12 @@ class Journal:
     @property
     def last_t(self) -> float | None:
         """Time of the last event, s; None where there is none."""
-        return None if self._last is None else self._last[0]
+        return None if self._seen.last is None else self._seen.last[0]
 
     @property
     def lines(self) -> int:
         """Events on disk."""
-        return 0 if self._last is None else self._last[1]
+        return 0 if self._seen.last is None else self._seen.last[1]
 
     def take_recorded(self) -> tuple[Event, ...]:
         """The events that were in the file at opening; the journal releases them."""
@@ -125,12 +127,12 @@ class Journal:
             JournalError: the disk fails; nothing is recorded, and the file is unchanged.
         """
         with self._lock:
-            if late and self._last is not None and event.t < self._last[0]:
-                event = replace(event, t=self._last[0])
+            if late and self.last_t is not None and event.t < self.last_t:
+                event = replace(event, t=self.last_t)
             number = self.lines + 1
             place = f"{type_of(event)} event"
             line = event_line(event_document(event, self.folder), place)
-            read = read_line(line, number, place, self.folder, self._setup, self._last)
+            read = read_line(line, number, place, self.folder, self._setup, self._seen)
             if read.event is None:
                 raise read.problems[0]
             frames = [*frames_of(read.event, place, self.folder)]
@@ -140,7 +142,7 @@ class Journal:
                 raise problems[0]
             self._sync_frames({use.path for use in frames})
             offset = self._file.append(line, durable=durable)
-            self._last = (read.event.t, number)
+            self._seen.add(read.event)
             return Appended(offset, read.event)
 
     def _sync_frames(self, frames: set[Path]) -> None:

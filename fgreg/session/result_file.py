@@ -16,7 +16,18 @@ from fgreg.session.yaml_loader import load_yaml
 RESULT_FILE = "result.yaml"
 
 _ONE_LINE = frozenset(
-    {"predicted_tre_mm", "checks", "pairs", "tracks", "add", "track", "aims", "target_errors_mm", "settings"}
+    {
+        "predicted_tre_mm",
+        "excluded",
+        "checks",
+        "pairs",
+        "tracks",
+        "add",
+        "track",
+        "aims",
+        "target_errors_mm",
+        "settings",
+    }
 )
 
 RESULT_KIND = FileKind("a result", (b"format: fgreg-result/",), file_name=RESULT_FILE)

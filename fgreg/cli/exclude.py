@@ -1,0 +1,88 @@
+"""The commands ``fgreg exclude`` and ``fgreg include``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fgreg.errors import InputError
+
+if TYPE_CHECKING:
+    from fgreg.pipeline.exclude import ShotNames
+
+SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
+PmOption = Annotated[str, typer.Option("--pm", metavar="N,N", help="All looks at these PMs.")]
+AimOption = Annotated[
+    str, typer.Option("--aim", metavar="N,N", help="These aims, by their place among the session's aims, from 0.")
+]
+ReasonOption = Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; it is recorded.")]
+ByOption = Annotated[str, typer.Option("--by", metavar="NAME", help="Who decides it; it is recorded.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No text.")]
+
+
+def shot_names(pms: str, aims: str, options: tuple[str, str]) -> "ShotNames":
+    """Shots as options name them. Raises InputError."""
+    from fgreg.pipeline.exclude import ShotNames
+
+    return ShotNames(_numbers(options[0], pms), _numbers(options[1], aims))
+
+
+def _numbers(option: str, text: str) -> tuple[int, ...]:
+    """The numbers of ``3,7``; none of an empty text."""
+    parts = [part.strip() for part in text.split(",")] if text.strip() else []
+    for part in parts:
+        if not (part.isascii() and part.isdigit() and len(part) < 10):
+            raise InputError(option, text, "numbers with commas between, such as 3,7")
+    return tuple(int(part) for part in parts)
+
+
+def add_exclude(app: typer.Typer) -> None:
+    """Register the commands."""
+
+    @app.command()
+    def exclude(
+        session: SessionArgument,
+        pm: PmOption = "",
+        aim: AimOption = "",
+        reason: ReasonOption = "",
+        by: ByOption = "",
+        quiet: QuietOption = False,
+    ) -> None:
+        """Leave shots of a session out by hand. That is recorded as an event; nothing is deleted.
+
+        They take no part in solves and replays from then on. The result lists them with the reason, and its verdict is
+        a warning at best, since no test sees what they say against the registration. For one solve only: fgreg solve
+        SESSION --without-pm 3,7.
+
+        Try: fgreg exclude SESSION --pm 3 --reason "the fibre was bumped"
+        """
+        _record(session, pm, aim, reason, by, include=False, quiet=quiet)
+
+    @app.command()
+    def include(
+        session: SessionArgument,
+        pm: PmOption = "",
+        aim: AimOption = "",
+        reason: ReasonOption = "",
+        by: ByOption = "",
+        quiet: QuietOption = False,
+    ) -> None:
+        """Take back that shots of a session are left out by hand (fgreg exclude). That is recorded, too."""
+        _record(session, pm, aim, reason, by, include=True, quiet=quiet)
+
+
+def _record(session: Path, pm: str, aim: str, reason: str, by: str, *, include: bool, quiet: bool) -> None:
+    from fgreg.cli.report import clean
+    from fgreg.pipeline.exclude import record_choice
+
+    names = shot_names(pm, aim, ("--pm", "--aim"))
+    if not names.pms and not names.aims:
+        raise InputError("--pm and --aim", "nothing", "the PMs or aims that are meant, such as --pm 3,7")
+    left = record_choice(session, names, reason=reason, by=by, include=include)
+    if quiet:
+        return
+    if not left:
+        typer.echo(f"{session}: no shot is left out by hand")
+    for shot in left:
+        typer.echo(f"{session}: {shot.name} at {shot.t:.1f} s: {clean(shot.text)}")
+    typer.echo(f"Now solve it again: fgreg solve {session}")

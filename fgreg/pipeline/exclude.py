@@ -1,0 +1,84 @@
+"""Leaves shots of a recorded session out by hand, for one solve or for good: ``fgreg exclude``, ``fgreg include``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fgreg.errors import InputError
+from fgreg.model.estimate import ExcludedShot
+from fgreg.model.events import AimEvent, Event, ExcludeEvent, IncludeEvent, PairEvent
+from fgreg.model.excluded_shots import excluded_shots
+from fgreg.schema.problems import numbers_text
+from fgreg.session.journal import Journal
+from fgreg.session.session_reader import Session, read_session
+
+
+@dataclass(frozen=True, slots=True)
+class ShotNames:
+    """Shots as a user names them: PMs by number, aims by their place among the session's aims, from 0."""
+
+    pms: tuple[int, ...] = ()
+    aims: tuple[int, ...] = ()
+
+
+def without_shots(session: Session, names: ShotNames, options: tuple[str, str]) -> Session:
+    """The session as if it ended with ``exclude`` events for these shots; its files stay as they are.
+
+    ``options``: those that named PMs and aims, for messages and reasons.
+
+    Raises:
+        InputError: a PM or an aim that is not there.
+    """
+    chosen = _chosen(session.events, names, options)
+    t, line = (session.events[-1].t, session.events[-1].line) if session.events else (0.0, 0)
+    events = [
+        ExcludeEvent(t, line + number, pm, of_line, f"option {option}")
+        for number, (pm, of_line, option) in enumerate(chosen, 1)
+    ]
+    return replace(session, events=(*session.events, *events)) if events else session
+
+
+def record_choice(
+    folder: Path, names: ShotNames, *, reason: str = "", by: str = "", include: bool = False
+) -> tuple[ExcludedShot, ...]:
+    """Append ``exclude`` events for these shots to a session, or ``include`` events; returns all that it leaves out.
+
+    Raises:
+        InputError: a PM or an aim that is not there, or (``include``) not left out; nothing is recorded.
+        JournalError: another program records to the session, or the disk fails.
+    """
+    read_session(folder)  # a session without events gets no file
+    with Journal.open(folder) as journal:
+        events = list(journal.take_recorded())
+        out = excluded_shots(events).values()
+        if include:
+            _present("--pm", names.pms, {shot.pm for shot in out}, "a PM that is left out")
+            _present("--aim", names.aims, {shot.aim for shot in out}, "an aim that is left out")
+        kind, t = IncludeEvent if include else ExcludeEvent, journal.last_t or 0.0
+        chosen = [kind(t, 0, pm, line, reason, by) for pm, line, _ in _chosen(events, names, ("--pm", "--aim"))]
+        events += [journal.append(event).event for event in chosen]
+        return tuple(excluded_shots(events).values())
+
+
+def _chosen(
+    events: Sequence[Event], names: ShotNames, options: tuple[str, str]
+) -> list[tuple[int | None, int | None, str]]:
+    """PM or line of each shot that is named, and the option that names it."""
+    aims = [event.line for event in events if isinstance(event, AimEvent)]
+    pms = {event.pm for event in events if isinstance(event, PairEvent)}
+    _present(options[0], names.pms, pms, "a PM of the session")
+    _present(options[1], names.aims, set(range(len(aims))), "an aim of the session, counted from 0")
+    return [
+        *((pm, None, options[0]) for pm in dict.fromkeys(names.pms)),
+        *((None, aims[aim], options[1]) for aim in dict.fromkeys(names.aims)),
+    ]
+
+
+def _present(option: str, named: Sequence[int], there: AbstractSet[int | None], expected: str) -> None:
+    for number in named:
+        if number not in there:
+            there_text = numbers_text(one for one in there if one is not None)
+            raise InputError(option, str(number), f"{expected}: {there_text}")
