@@ -46,6 +46,7 @@ __all__ = [  # noqa: F405
     "TrusRecord",
     "Verdict",
     "VerifyReport",
+    "picked_pm",
     "read_session",
     "replay",
     "solve",

@@ -49,6 +49,7 @@ from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import solve as solve_batch
 from fgreg.session.session_reader import Session as Session
 from fgreg.session.session_reader import read_session as read_session
+from fgreg.viewer.picker import picked_pm as picked_pm
 
 
 def solve(

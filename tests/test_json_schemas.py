@@ -158,7 +158,7 @@ def test_no_setup_that_the_reader_takes_is_refused(folder: Path, data: Any) -> N
 
 
 @QUICK
-@given(data=mutated(lambda: session_files.events()[3]), other=st.sampled_from(range(16)), more=st.data())
+@given(data=mutated(lambda: session_files.events()[3]), other=st.sampled_from(range(19)), more=st.data())
 def test_no_event_that_the_reader_takes_is_refused(folder: Path, data: Any, other: int, more: st.DataObject) -> None:
     session_files.write(folder)
     event = more.draw(mutated(lambda: session_files.events()[other]))
