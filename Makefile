@@ -8,17 +8,22 @@ JOBS ?= 2
 
 help:
 	@echo "make demo   set up, then solve sessions/phantom from its raw frames and write out/phantom.rrd"
-	@echo "make test   set up, then run the tests"
+	@echo "make test   set up, with the tools of the tests, then run them"
 	@echo "make check  set up, then lint, types, import layers, and a wheel in an empty environment"
 	@echo "make docs   set up, then build the guide into out/site; links that lead nowhere fail it"
 	@echo "make clean  remove the environment and all that was built"
 
+# What the demo needs; the tools of tests and checks come on top of it.
 $(VENV)/.ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "fgreg needs Python 3.11 or newer; try: make PYTHON=python3.12"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --editable . --group test --group check
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.ready-%: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --editable . --group $*
 	@touch $@
 
 demo: $(VENV)/.ready
@@ -26,10 +31,10 @@ demo: $(VENV)/.ready
 	$(BIN)/fgreg solve sessions/phantom --out out/phantom.yaml --rrd out/phantom.rrd
 	@echo "Look at it with: $(BIN)/rerun out/phantom.rrd"
 
-test: $(VENV)/.ready
+test: $(VENV)/.ready-test
 	$(BIN)/python -m pytest -n $(JOBS)
 
-check: $(VENV)/.ready
+check: $(VENV)/.ready-test $(VENV)/.ready-check
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -1,7 +1,7 @@
 """The registry of drivers: what a configuration can name, by role, with options, factory, and the extra it needs.
 
-CONFIG.yaml, its example, its JSON Schema, README's table and ``fgreg devices`` are made from :data:`ENTRIES`. A
-driver's module is imported when it is opened, not before: nothing here needs a device library.
+CONFIG.yaml, its example, its JSON Schema, the table of docs/devices.md and ``fgreg devices`` are made from
+:data:`ENTRIES`. A driver's module is imported when it is opened, not before: nothing here needs a device library.
 """
 
 from __future__ import annotations

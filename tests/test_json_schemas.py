@@ -186,8 +186,8 @@ def test_no_config_that_the_reader_takes_is_refused(tmp_path_factory: Any, data:
         assert accepts(Document.LIVE, data)
 
 
-def test_the_readme_has_the_drivers_of_today() -> None:
-    page = (ROOT / "README.md").read_text(encoding="utf-8")
+def test_the_page_of_devices_has_the_drivers_of_today() -> None:
+    page = (ROOT / "docs" / "devices.md").read_text(encoding="utf-8")
     assert TABLES["with_tables"](page) == page, "run python tools/make_format_tables.py"
     assert all(f"| `{entry.role}` | `{entry.name}` |" in page for entry in ENTRIES)
 

@@ -458,9 +458,9 @@ def test_devices_that_play_one_recording_share_its_time(tmp_path: Path) -> None:
         entry.checked(replace(options, topic="/other"))
 
 
-def test_the_readme_shows_a_config_that_reads(tmp_path: Path) -> None:
-    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    (block,) = [part.split("```")[0] for part in readme.split("```yaml\n")[1:] if part.startswith("format: fgreg-live")]
+def test_the_page_of_devices_shows_a_config_that_reads(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "devices.md").read_text(encoding="utf-8")
+    (block,) = [part.split("```")[0] for part in page.split("```yaml\n")[1:] if part.startswith("format: fgreg-live")]
     config = read_config(live_configs.write(tmp_path, block))
     assert {role.value for role in config.devices} == {"camera", "photoacoustic", "stage", "sinks", "operator"}
 

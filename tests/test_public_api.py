@@ -1,4 +1,4 @@
-"""The public names: content and imports of ``import fgreg``, and README's Python, which needs nothing else."""
+"""The public names: content and imports of ``import fgreg``, and the documented Python, which needs nothing else."""
 
 from __future__ import annotations
 
@@ -88,7 +88,8 @@ def test_measurements_are_solved_as_in_their_session(pose_session: Path) -> None
 
 
 def test_the_readme_s_python_runs_with_public_names_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    pages = (CHECKOUT / "README.md", CHECKOUT / "docs" / "python.md")
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     program = "\n".join(part.split("```")[0] for part in text.split("```python\n")[1:])
     tree = ast.parse(program)
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]

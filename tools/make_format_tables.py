@@ -1,4 +1,4 @@
-"""Write the tables of README.md, sessions/README.md and docs/setup.md from the described classes, when these change.
+"""Write the tables of docs/devices.md, sessions/README.md and docs/setup.md from the described classes, when these change.
 
     python tools/make_format_tables.py
 
@@ -25,7 +25,7 @@ from fgreg.schema.yaml_writer import one_line_yaml
 from fgreg.session.ground_truth import GROUND_TRUTH
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "sessions" / "README.md", ROOT / "docs" / "setup.md")
+PAGES = (ROOT / "docs" / "devices.md", ROOT / "sessions" / "README.md", ROOT / "docs" / "setup.md")
 _LINES = {"events": EVENTS, "recording": SETUP_LINES}
 _PARTS = {MarkerRecord: "marker", TrusRecord: "trus", PlaneRecord: "plane"}
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
