@@ -142,6 +142,20 @@ def test_the_commands_record_who_and_why_and_delete_nothing(pose_session: Path) 
     assert sum(isinstance(event, TrackEvent) for event in read_session(pose_session).events) == 4
 
 
+def test_a_registration_without_shots_is_verified_as_it_is(pose_session: Path, tmp_path: Path) -> None:
+    events = _lines(pose_session)
+    new = [event for event in events if event.get("pm", 0) >= 16]
+    kept = [event for event in events if event not in new and event["type"] != "track"]
+    (pose_session / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in kept))
+    limit = SolveConfig(limit_mm=10.0)
+    assert fgreg.solve(pose_session, limit, without_pms=[3], without_aims=[2]).estimate.verdict is Verdict.WARNING
+    choice = {"type": "exclude", "t": new[-1]["t"], "pm": 18, "reason": "bumped"}
+    (tmp_path / "new.jsonl").write_text("".join(json.dumps(event) + "\n" for event in [*new, choice]))
+    found = fgreg.verify(pose_session, tmp_path / "new.jsonl", limit)
+    assert [shot.pm for shot in found.verification.shots] == [16, 17, 19]
+    assert [(shot.pm, shot.reason) for shot in found.unused] == [(18, "left out by hand: bumped")]
+
+
 WRONG = {
     "--without-pm: found 99, expected a PM of the session: 0 to 19": ["solve", "--without-pm", "3,99"],
     "--without-aim: found 12, expected an aim of the session, counted from 0: 0 to 11": [

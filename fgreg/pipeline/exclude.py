@@ -41,6 +41,16 @@ def without_shots(session: Session, names: ShotNames, options: tuple[str, str]) 
     return replace(session, events=(*session.events, *events)) if events else session
 
 
+def without_lines(session: Session, excluded: Sequence[ExcludedShot]) -> Session:
+    """The session as a result has it that leaves out these shots, be it by its events or by options."""
+    t, line = (session.events[-1].t, session.events[-1].line) if session.events else (0.0, 0)
+    events = [
+        ExcludeEvent(t, line + number, shot_line=shot.line, reason=shot.reason, by=shot.by)
+        for number, shot in enumerate(excluded, 1)
+    ]
+    return replace(session, events=(*session.events, *events)) if events else session
+
+
 def record_choice(
     folder: Path, names: ShotNames, *, reason: str = "", by: str = "", include: bool = False
 ) -> tuple[ExcludedShot, ...]:

@@ -24,6 +24,7 @@ from fgreg.model.events import CameraMovedEvent, Event, HandChoice, PairEvent, r
 from fgreg.model.measurements import Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.pipeline.exclude import without_lines
 from fgreg.pipeline.solve import Progress, detection_conditions, with_moves
 from fgreg.registration.solve import solve
 from fgreg.session.result_file import RESULT_FILE, read_result
@@ -90,7 +91,7 @@ def verify_session(
     if result.verdict is Verdict.REFUSED or not result.epochs:
         raise InputError(str(result_path), "a refused registration", "one that may be used")
     events, model = _new_events(new, session)
-    snapshot = _solved_again(session, result.epochs, config, progress)
+    snapshot = _solved_again(without_lines(session, result.excluded), result.epochs, config, progress)
     epoch = snapshot.epoch(result.epochs[-1].index)
     if epoch is None:
         raise AssertionError("the registration of the last epoch was compared")
