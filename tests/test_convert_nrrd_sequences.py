@@ -141,6 +141,12 @@ Seq_Frame0000_Status:=OK
         (b"sizes: 4 5 3", b"sizes: 4 5 2", "Seq_Frame0002_FrameNumber: found it, expected frames below 2"),
         (b"sizes: 4 5 3", b"sizes: 99999999 99999999 3", "found 29999999400000003 pixels"),
         (b"domain domain list", b"vector domain list", "of kinds vector domain list, expected two axes"),
+        (b"sizes: 4 5 3", b"sizes: ", "kinds: found sizes"),
+        (
+            b"encoding: raw",
+            b"encoding: raw\ndata file: ..",
+            "data file: found '..', expected LOCAL, or a file beside it",
+        ),
         (b"encoding: raw", b"encoding: hex", "encoding: found 'hex', expected raw, gzip or bzip2"),
         (b"encoding: raw", b"encoding: gzip", "compressed data that are damaged"),
         (b"encoding: raw", b"encoding: raw\nbyte skip: -1", "byte skip: found -1, expected 0"),

@@ -219,6 +219,12 @@ def test_a_header_with_its_pixels_in_a_file_beside_it(tmp_path: Path) -> None:
         (b"ObjectType = Image", b"\x89PNG", "found no header of key = value lines"),
         (b"ObjectType = Image", b"ObjectType = Tube", "found another file"),
         (b"ElementDataFile = LOCAL\n", b"", "found no header of key = value lines"),
+        (
+            b"ElementDataFile = LOCAL",
+            b"ElementDataFile = ",
+            "ElementDataFile: found '', expected LOCAL, or a file beside",
+        ),
+        (b"ElementDataFile = LOCAL", b"ElementDataFile = ..", "ElementDataFile: found '..', expected LOCAL"),
         (b"DimSize = 4 5 3", b"DimSize = 4 5", "scan.mha: Seq_Frame0002: found it, expected frames below 1"),
         (b"DimSize = 4 5 3", b"DimSize = 4 x 3", "DimSize: found '4 x 3'"),
         (b"DimSize = 4 5 3", b"DimSize = 4 50 3", "found 60 bytes of pixels, expected 600"),

@@ -1,4 +1,4 @@
-"""Write the tables of docs/devices.md, sessions/README.md and docs/setup.md from the described classes, when these change.
+"""Write the tables of docs/devices.md, sessions/README.md and docs/setup.md from the described classes.
 
     python tools/make_format_tables.py
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.convert.sequence_file import SequenceFile
+from fgreg.convert.sequence_file import SequenceFile, read_beside
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.schema.limits import SEQUENCE_BYTES
 from fgreg.schema.problems import shown
@@ -101,7 +101,12 @@ def _axes(header: Mapping[str, Any], sizes: list[int], name: str) -> tuple[int |
     frames = [i for i, kind in enumerate(kinds) if kind in ("list", "time")]
     domain = [i for i, kind in enumerate(kinds) if kind in ("domain", "space")]
     flat = [i for i in domain[2:] if sizes[i] == 1]
-    if min(sizes) < 1 or len(frames) > 1 or len(frames) + len(domain) != len(sizes) or len(domain) - len(flat) != 2:
+    if (
+        min(sizes, default=0) < 1
+        or len(frames) > 1
+        or len(frames) + len(domain) != len(sizes)
+        or len(domain) - len(flat) != 2
+    ):
         found = f"sizes {' '.join(map(str, sizes))} of kinds {' '.join(kinds)}"
         raise InputError(f"{name}: kinds", found, "two axes of a grey image (domain) and one of frames (list)")
     return (frames[0] if frames else None), domain[:2]
@@ -115,9 +120,9 @@ def _pixel_bytes(header: Mapping[str, Any], data: bytes, path: Path, points: int
             raise InputError(f"{name}: {key}", str(header[key]), "0: pixels right after the header")
     stored = header.get("data file", header.get("datafile"))
     if stored is not None:
-        if Path(str(stored)).name != stored or str(stored).startswith("LIST") or "%" in str(stored):
+        if str(stored).startswith("LIST") or "%" in str(stored):
             raise InputError(f"{name}: data file", shown(str(stored)), "one file beside it")
-        data = read_bounded(path.with_name(str(stored)), str(stored), SEQUENCE_BYTES)
+        data = read_beside(path, str(stored), "data file")
     if points > SEQUENCE_BYTES:
         raise InputError(f"{name}: sizes", f"{points} pixels", f"at most {SEQUENCE_BYTES}")
     most = min(8 * points, SEQUENCE_BYTES) + 1

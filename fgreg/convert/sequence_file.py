@@ -111,6 +111,13 @@ def _numbers(fields: Mapping[str, str], key: str, name: str) -> list[int]:
     return [int(word) for word in words]
 
 
+def read_beside(path: Path, stored: str, key: str) -> bytes:
+    """The pixels' file that a header names. Raises InputError: not a file of the header's folder."""
+    if not stored or Path(stored).name != stored or stored == "..":
+        raise InputError(f"{path.name}: {key}", shown(stored), "LOCAL, or a file beside it")
+    return read_bounded(path.with_name(stored), stored, SEQUENCE_BYTES)
+
+
 def _images(
     fields: Mapping[str, str], data: bytes | memoryview, path: Path, shape: tuple[int, int, int]
 ) -> npt.NDArray[Any]:
@@ -129,9 +136,7 @@ def _images(
         raise InputError(f"{name}: TransformMatrix", shown(" ".join(axes)), "that of axes as stored: 1 0 0 0 1 0 0 0 1")
     stored = fields["ElementDataFile"]
     if stored.upper() != "LOCAL":
-        if Path(stored).name != stored:
-            raise InputError(f"{name}: ElementDataFile", shown(stored), "LOCAL, or a file beside it")
-        data = read_bounded(path.with_name(stored), stored, SEQUENCE_BYTES)
+        data = read_beside(path, stored, "ElementDataFile")
     item = np.dtype(kind).newbyteorder(">" if _big(fields) else "<")
     needed = item.itemsize * math.prod(shape)
     if needed > SEQUENCE_BYTES:
