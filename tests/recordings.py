@@ -58,11 +58,16 @@ def transform_of(row: Row) -> FloatArray:
     return out
 
 
-def views(path: Path) -> dict[str, str]:
-    """Origin of each view of the blueprint, with its shown name."""
+def views_of(path: Path) -> list[tuple[str, str]]:
+    """Origin and shown name of each view of the blueprint."""
     rows = [row for rows in read_recording(path, blueprint=True).values() for row in rows]
-    return {
-        row.values["ViewBlueprint:space_origin"][0]: row.values["ViewBlueprint:display_name"][0]
+    return [
+        (row.values["ViewBlueprint:space_origin"][0], row.values["ViewBlueprint:display_name"][0])
         for row in rows
         if "ViewBlueprint:space_origin" in row.values
-    }
+    ]
+
+
+def views(path: Path) -> dict[str, str]:
+    """Origin of each view of the blueprint, with its shown name (of one view where several have the origin)."""
+    return dict(views_of(path))

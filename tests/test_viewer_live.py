@@ -24,7 +24,7 @@ from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.shapes import CANVAS, canvas
 from fgreg.viewer.status_line import Now
-from tests.recordings import Row, read_recording, transform_of, views
+from tests.recordings import Row, read_recording, transform_of, views, views_of
 from tests.test_viewer_recording import make_model
 
 SCAN_RAD, GOAL_RAD = math.radians(20.0), math.radians(26.0)
@@ -61,7 +61,7 @@ def update(number: int, now: Now, verdict: Verdict | None = Verdict.OK) -> Viewe
 
 def recorded(path: Path, shown: list[tuple[ViewerUpdate, BmodeFrame | None]]) -> dict[str, list[Row]]:
     with Viewer(path, "live") as viewer:
-        viewer.session(make_model())
+        viewer.session(make_model(), 3.0)
         for one, picture in shown:
             viewer.bmode(one.t, one.number, picture)
             viewer.update(one)
@@ -79,15 +79,15 @@ def test_the_plane_is_at_the_stage_s_angle_and_the_goal_at_the_beam_s_predicted_
         up = transform_of(rows[entity][-1])[:3, :3] @ [0.0, 0.0, 1.0]
         np.testing.assert_allclose(up, [0.0, math.sin(scan_rad), math.cos(scan_rad)], atol=1e-6)
     # The model's stage counts the other way from 5 degrees: its own angles are what is written.
-    assert rows["/world/stage/label"][-1].values["Points3D:labels"] == ["image plane, stage -15.0°"]
-    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8° (1 sigma)"]
+    assert "image plane, stage -15.0°" in rows["/world/shot/labels"][-1].values["Points3D:labels"]
+    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8°"]
     text = page(rows, 0)
     assert text.startswith("# OK")
     assert "## Next: go on" in text
     assert "at -15.0°; beam at -21.0° ± 0.8° (1 sigma), 6.0° away" in text
     assert "1.50 mm" in text
     assert "9 pairs in camera epoch 2" in text
-    assert {"Now", "Verdict", "World: TRUS frame, mm (live)"} <= set(views(tmp_path / "a.rrd").values())
+    assert {"Now", "Verdict", "Scene (live)"} <= {name for _, name in views_of(tmp_path / "a.rrd")}
 
 
 def test_a_bmode_picture_lies_in_the_plane_with_its_pixels_size_and_goes_when_its_scanner_goes(tmp_path: Path) -> None:

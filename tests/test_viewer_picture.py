@@ -33,19 +33,24 @@ def test_the_world_is_seen_with_its_beams_and_sources(tool: ModuleType, tmp_path
     model, measurements, truth = make_measurements(rng, aims=0, pairs=8, noise=False)
     recording, picture = tmp_path / "a.rrd", tmp_path / "a.png"
     with open_viewer(recording, model.name) as viewer:
-        viewer.session(model)
+        viewer.session(model, 3.0)
         viewer.result(model, measurements, answer_from_truth(rng, model, measurements, truth))
     try:
-        tool.render(recording, picture, size=(900, 600), view="World", settle_s=1.0)
+        tool.render(recording, picture, size=(900, 600), view="Scene", settle_s=1.0)
     except tool.RenderError as error:
         if str(error) != tool.NO_DRIVER:
             raise
         pytest.skip(str(error))
     pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
     red, green, blue = pixels[..., 0], pixels[..., 1], pixels[..., 2]
-    assert ((green > 150) & (red < 0.6 * green) & (blue < 0.7 * green)).sum() > 100  # beams
+    assert ((green > 110) & (red < 0.4 * green) & (blue < 0.9 * green)).sum() > 100  # beams
     assert ((red > 180) & (green > 0.5 * red) & (blue < 0.5 * green)).sum() > 20  # sources
     assert ((np.ptp(pixels, axis=-1) < 25) & (red > 100)).sum() > 1000  # probe
+    # What is drawn fills most of the height and of the width.
+    drawn = np.abs(pixels - [18, 20, 24]).max(axis=-1)[30:] > 40
+    for axis, share in ((0, 0.6), (1, 0.75)):
+        places = np.flatnonzero(drawn.any(axis=axis))
+        assert np.ptp(places) > share * drawn.shape[1 - axis]
 
 
 def test_what_cannot_be_rendered_is_one_line_and_status_2(

@@ -16,29 +16,33 @@ import pytest
 from PIL import Image
 
 from fgreg.errors import InputError
-from fgreg.geometry.transforms import as_float_array, inverse
+from fgreg.geometry.transforms import FloatArray, as_float_array, inverse
 from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.estimate import SessionEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import ChannelModel, MarkerModel, SessionModel, StageModel, TagModel
-from fgreg.viewer import shapes
+from fgreg.simulation.lens import project_points
+from fgreg.viewer import endoscope_view, palette, scene, shapes
+from fgreg.viewer.blueprint import WORLD_PX
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
 from tests.answers import REGISTRATION_COVARIANCE, answer_from_truth
 from tests.forward import Truth, make_measurements, make_session
-from tests.recordings import Row, read_recording, transform_of, views
+from tests.recordings import Row, read_recording, transform_of, views, views_of
 
 AIMS, PAIRS = 2, 6
 UNUSED = 3
 TRACK_T = 100.0
 TRACK_DEVICE_DEG = -12.0
+LIMIT_MM = 3.0
+WORST_MM = 1.4
 
 
 def make_model() -> SessionModel:
     """A session with everything: stereo, marker, channels, a stage that counts the other way from 5 degrees."""
     base = make_session()
     matrix = as_float_array([[300.0, 0.0, 160.0], [0.0, 310.0, 90.0], [0.0, 0.0, 1.0]])
-    camera = CameraModel((320, 180), matrix, as_float_array(np.zeros(5)))
+    camera = CameraModel((320, 180), matrix, as_float_array([-0.3, 0.1, 0.0, 0.0, 0.0]))
     right_T_left = np.eye(4)
     right_T_left[0, 3] = -5.0
     return replace(
@@ -65,6 +69,14 @@ class Recorded:
         (found,) = [row for row in self.rows[entity] if row.shot == shot]
         return found
 
+    def look(self, part: str, shot: int) -> Row:
+        """A part of what stays drawn of a look, which appears with its shot."""
+        return self.at(f"/world/looks/{shot}/{part}", shot)
+
+    def words(self, shot: int) -> list[str]:
+        """The labels of the scene at a shot."""
+        return [str(word) for word in self.at("/world/shot/labels", shot).values["Points3D:labels"]]
+
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
@@ -82,7 +94,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     right = np.zeros((180, 320, 3), dtype=np.uint8)
     right[..., 0] = 250
     with open_viewer(path, model.name) as viewer:
-        viewer.session(model)
+        viewer.session(model, LIMIT_MM)
         viewer.shot_images(
             1.0, "aim", 0, left, right, [np.array([[1.0, 2], [3, 2], [3, 4], [1, 4]])], np.array([7.0, 8])
         )
@@ -120,9 +132,9 @@ def test_beams_end_at_their_photoacoustic_markers(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.measurements.pairs):
         shot = AIMS + i
         if i == UNUSED:
-            assert all(row.shot != shot for row in recorded.rows["/world/looks/beam"])
+            assert f"/world/looks/{shot}/beam" not in recorded.rows
             continue
-        for entity in ("/world/looks/beam", "/world/shot/beam"):
+        for entity in (f"/world/looks/{shot}/beam", "/world/shot/beam"):
             row = recorded.at(entity, shot)
             tip = row.array("Arrows3D:origins") + row.array("Arrows3D:vectors")
             np.testing.assert_allclose(tip[0], recorded.truth.trus_p_pm_mm[pair.pm], atol=1e-4)
@@ -138,7 +150,7 @@ def test_the_beam_of_an_aim_ends_at_its_spot(recorded: Recorded) -> None:
 
 def test_arcs_pass_through_their_photoacoustic_markers(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.measurements.pairs):
-        strip = np.array(recorded.at("/world/looks/arc", AIMS + i).values["LineStrips3D:strips"][0])
+        strip = np.array(recorded.look("arc", AIMS + i).values["LineStrips3D:strips"][0])
         pm = recorded.truth.trus_p_pm_mm[pair.pm]
         # The arc is drawn through 25 points: between two of them it bulges by less than 0.02 mm.
         segment = np.diff(strip, axis=0)
@@ -151,10 +163,13 @@ def test_arcs_pass_through_their_photoacoustic_markers(recorded: Recorded) -> No
 
 def test_ellipsoids_are_the_covariances(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.estimate.pairs):
-        row = recorded.at("/world/looks/pm_95", AIMS + i)
+        row = recorded.look("pm_95", AIMS + i)
         assert pair.trus_p_pm_mm is not None
         assert pair.covariance is not None
-        centre = recorded.at("/world/looks/pm", AIMS + i).array("Points3D:positions")[0]
+        if pair.used:
+            centre = recorded.look("pm", AIMS + i).array("Points3D:positions")[0]
+        else:  # a cross about it
+            centre = np.mean(recorded.look("not_used", AIMS + i).values["LineStrips3D:strips"], axis=(0, 1))
         np.testing.assert_allclose(centre, pair.trus_p_pm_mm, atol=1e-5)
         np.testing.assert_allclose(row.array("Ellipsoids3D:centers")[0], pair.trus_p_pm_mm, atol=1e-5)
         half, (x, y, z, w) = row.array("Ellipsoids3D:half_sizes")[0], row.array("Ellipsoids3D:quaternions")[0]
@@ -174,8 +189,8 @@ def test_the_stage_turns_to_each_look_and_its_label_shows_the_device_angle(recor
         t = pair.look.scan_rad
         plane = transform_of(recorded.at("/world/stage", AIMS + i)) @ [0.0, 0.0, 1.0, 0.0]
         np.testing.assert_allclose(plane[:3], [0.0, math.sin(t), math.cos(t)], atol=1e-6)
-        label = recorded.at("/world/stage/label", AIMS + i).values["Points3D:labels"][0]
-        assert label == f"image plane, stage {5.0 - math.degrees(t):.1f}°"
+        assert f"image plane, stage {5.0 - math.degrees(t):.1f}°" in recorded.words(AIMS + i)
+        assert f"PM {pair.pm}" + (", not used" if i == UNUSED else "") in recorded.words(AIMS + i)
 
 
 def test_a_track_turns_the_plane_to_its_answer(recorded: Recorded) -> None:
@@ -183,8 +198,7 @@ def test_a_track_turns_the_plane_to_its_answer(recorded: Recorded) -> None:
     plane = transform_of(recorded.at("/world/stage", shot)) @ [0.0, 0.0, 1.0, 0.0]
     scan = math.radians(5.0 - TRACK_DEVICE_DEG)
     np.testing.assert_allclose(plane[:3], [0.0, math.sin(scan), math.cos(scan)], atol=1e-6)
-    label = recorded.at("/world/stage/label", shot).values["Points3D:labels"][0]
-    assert label == "turn the stage to -12.0° ± 0.6° (1 sigma)"
+    assert {"turn the stage to -12.0° ± 0.6° (1 sigma)", "predicted spot"} <= set(recorded.words(shot))
     spot = recorded.at("/world/shot/pm", shot).array("Points3D:positions")[0]
     np.testing.assert_allclose(spot, recorded.truth.trus_p_pm_mm[recorded.measurements.pairs[-1].pm], atol=1e-4)
 
@@ -206,23 +220,31 @@ def test_plots_hold_the_figures_of_their_shots(recorded: Recorded) -> None:
     assert plot("/plots/residual_mm/aim") == {i: aim.residual_mm for i, aim in enumerate(recorded.estimate.aims)}
 
 
-def test_targets_carry_the_predicted_error(recorded: Recorded) -> None:
-    row = recorded.rows["/world/targets"][0]
-    np.testing.assert_allclose(row.array("Ellipsoids3D:centers"), recorded.model.targets_mm, atol=1e-5)
-    # The trace of a target's covariance, worked out without its Jacobian: variances of translation, plus those of the
-    # rotation about each camera axis times the squared distance from it.
-    trus_T_camera = recorded.truth.trus_T_camera[0]
-    camera_p = (np.c_[recorded.model.targets_mm, np.ones(27)] @ inverse(trus_T_camera).T)[:, :3]
-    variance = np.diag(REGISTRATION_COVARIANCE)
-    square = camera_p**2
-    trace = variance[3:].sum() + (square.sum(axis=1)[:, None] - square) @ variance[:3]
-    shown = np.sum(row.array("Ellipsoids3D:half_sizes") ** 2, axis=1) / 7.814728
-    np.testing.assert_allclose(shown, trace, rtol=1e-4)
+def test_targets_carry_the_bound_of_the_predicted_error_in_size_and_colour(recorded: Recorded) -> None:
+    row = recorded.rows["/world/targets/bound_95"][0]
+    targets, trus_T_camera = recorded.model.targets_mm, recorded.truth.trus_T_camera[0]
+    np.testing.assert_allclose(row.array("Points3D:positions"), targets, atol=1e-5)
+    # By drawing registrations; the largest bound is the one that the epoch states.
+    draws = np.random.default_rng(3).multivariate_normal(np.zeros(6), REGISTRATION_COVARIANCE, 20_000)
+    camera_p = (np.c_[targets, np.ones(27)] @ inverse(trus_T_camera).T)[:, :3]
+    errors = np.linalg.norm(np.cross(draws[:, None, :3], camera_p[None]) + draws[:, None, 3:], axis=2)
+    bounds = np.quantile(errors, 0.95, axis=0)
+    bounds += WORST_MM - bounds.max()
+    np.testing.assert_allclose(row.array("Points3D:radii"), np.maximum(bounds, 0.6), atol=0.04)
+    within = [int(color) >> 8 for color in row.values["Points3D:colors"]]
+    # The limit is 3 mm: nothing is beyond half of it.
+    assert set(within) == {int.from_bytes(bytes(palette.ERRORS[0]), "big")}
+    assert recorded.rows["/world/targets/worst"][0].values["Points3D:labels"] == [f"worst: {WORST_MM:.2f} mm"]
+    dots = recorded.rows["/scale/targets"][0].array("Points2D:positions")
+    np.testing.assert_allclose(dots[:, 0], 100.0 * bounds / LIMIT_MM, atol=1.5)
+    edges = recorded.rows["/scale/edges"][0].values["Points2D:labels"]
+    assert edges == ["0 mm", "1.5", "limit 3.0 mm", "refused from 6.0 mm"]
 
 
 def test_images_come_back_as_they_went_in(recorded: Recorded) -> None:
     def image(entity: str, shot: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-        (blob,) = recorded.at(entity, shot).values["EncodedImage:blob"]
+        rows = [row for row in recorded.rows[entity] if row.shot == shot and "EncodedImage:blob" in row.values]
+        (blob,) = rows[0].values["EncodedImage:blob"]
         data = blob.encode() if isinstance(blob, str) else bytes(blob)
         return np.asarray(Image.open(io.BytesIO(data)))
 
@@ -286,7 +308,10 @@ def test_the_truth_is_shown_beside_the_estimate(recorded: Recorded) -> None:
 def test_the_blueprint_shows_world_images_text_and_plots(recorded: Recorded) -> None:
     shown = views(recorded.path)
     assert set(shown) == {
+        "verdict",
         "world",
+        "scale",
+        "legend",
         "world/camera/left",
         "world/camera/right",
         "pa",
@@ -297,22 +322,73 @@ def test_the_blueprint_shows_world_images_text_and_plots(recorded: Recorded) -> 
         "plots/rotation_deg",
         "plots/lambda_mm",
     }
-    assert "REFUSED" not in shown["world"]
+    names = [name for origin, name in views_of(recorded.path) if origin == "world"]
+    assert sorted(names) == ["Predicted error at the targets: 95 % bound, mm", "Scene"]
+    # A title of more than this is cut at 1600 px; the errors have the widest view.
+    assert all(len(name) <= 40 for origin, name in views_of(recorded.path) if origin != "world")
 
 
 def test_the_summary_says_ok_and_the_log_why_a_look_was_left_out(recorded: Recorded) -> None:
     (page,) = recorded.rows["/summary"]
     assert page.values["TextDocument:text"][0].startswith("# OK")
-    said = recorded.at("/log", AIMS + UNUSED)
+    said = recorded.at(f"/log/{AIMS + UNUSED}", AIMS + UNUSED)
     assert "range is 4.1 sigma off" in said.values["TextLog:text"][0]
     assert said.values["TextLog:level"][0] == "WARN"
+
+
+def test_the_endoscope_shows_pms_beam_and_plane_where_its_bent_picture_has_them(recorded: Recorded) -> None:
+    assert recorded.model.camera is not None
+    camera = recorded.model.camera.left
+    shot = AIMS + 2
+    pair = recorded.measurements.pairs[2]
+    camera_T_trus = inverse(recorded.truth.trus_T_camera[pair.epoch])
+
+    def pixels(points: FloatArray) -> FloatArray:
+        return project_points(camera, (np.c_[points, np.ones(len(points))] @ camera_T_trus.T)[:, :3])
+
+    known = np.array([recorded.truth.trus_p_pm_mm[p.pm] for p in recorded.measurements.pairs[:3]])
+    spots = recorded.at(f"/{endoscope_view.PATH}/pms", shot).array("Points2D:positions")
+    np.testing.assert_allclose(spots, pixels(known), atol=0.01)
+    beam = np.array(recorded.at(f"/{endoscope_view.PATH}/beam", shot).values["LineStrips2D:strips"][0])
+    np.testing.assert_allclose(beam[-1], spots[-1], atol=0.01)
+    straight = beam[0] + np.linspace(0.0, 1.0, len(beam))[:, None] * (beam[-1] - beam[0])
+    across = np.abs(np.cross(np.append(beam[-1] - beam[0], 0.0), np.c_[beam - straight, np.zeros(len(beam))])[:, 2])
+    assert across.max() / np.linalg.norm(beam[-1] - beam[0]) > 0.05  # px: the lens bends it
+    plane = np.array(recorded.at(f"/{endoscope_view.PATH}/plane", shot).values["LineStrips2D:strips"][0])
+    scan, half = pair.look.scan_rad, 0.5 * recorded.model.probe.elements * recorded.model.probe.pitch_mm
+    radius = recorded.model.probe.radius_mm
+    face = np.array([[side * half, radius * math.sin(scan), radius * math.cos(scan)] for side in (-1.0, 1.0)])
+    np.testing.assert_allclose(plane[[0, endoscope_view.POINTS - 1]], pixels(face), atol=0.01)
+
+
+def test_frames_are_named_and_labels_do_not_cover_each_other(recorded: Recorded) -> None:
+    blueprint = read_recording(recorded.path, blueprint=True)
+    controls = [row for rows in blueprint.values() for row in rows if "EyeControls3D:position" in row.values]
+    eyes = [
+        scene.Eye(row.array("EyeControls3D:position")[0], row.array("EyeControls3D:look_target")[0]) for row in controls
+    ]
+    scores = []
+    for eye in eyes:
+        shared = 0.0
+        for row in recorded.rows["/world/shot/labels"]:
+            words = row.values["Points3D:labels"]
+            seen = eye.seen(row.array("Points3D:positions"))
+            boxes = [scene.label_box(word, at, WORLD_PX) for word, at in zip(words, seen, strict=True)]
+            for i, first in enumerate(boxes):
+                for second in boxes[:i]:
+                    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
+                    shared += float(np.prod(np.maximum(sides, 0.0)))
+        scores.append(shared)
+    assert min(scores) == pytest.approx(0.0, abs=1.0)  # by the scene's eye; the other is that of the errors
+    named = set(recorded.words(AIMS + 1))
+    assert {"TRUS x: rotation axis", "y", "z", "camera", "marker", "laser", "TRUS probe"} <= named
 
 
 def record(
     path: Path, model: SessionModel, measurements: Measurements, estimate: SessionEstimate
 ) -> dict[str, list[Row]]:
     with open_viewer(path, model.name) as viewer:
-        viewer.session(model)
+        viewer.session(model, LIMIT_MM)
         viewer.result(model, measurements, estimate)
     return read_recording(path)
 
@@ -325,25 +401,29 @@ def test_a_refused_registration_says_so_everywhere(tmp_path: Path) -> None:
     )
     path = tmp_path / "refused.rrd"
     rows = record(path, model, measurements, estimate)
-    assert rows["/world/verdict"][0].values["Points3D:labels"] == ["REFUSED: do not use"]
+    assert rows["/verdict/word"][0].values["Points2D:labels"][0].startswith("REFUSED: do not use")
     page = rows["/summary"][0].values["TextDocument:text"][0]
     assert page.startswith("# REFUSED: do not use this registration")
-    assert "- two registrations fit" in page
-    shown = views(path)
-    assert "REFUSED" in shown["world"]
-    assert not {"pa", "world/camera/left"} & set(shown)
-    # The last colour logged is the one shown.
-    colors = [row.values["Pinhole:color"][0] for row in rows["/world/camera/left"]]
-    red, green, blue = (colors[-1] >> shift & 255 for shift in (24, 16, 8))
-    assert red > 200 > 100 > max(green, blue)
+    assert "- two registrations fit → [from shot 0 (PM " in page
+    shown = [name for origin, name in views_of(path) if origin == "world"]
+    assert "Scene: REFUSED" in shown
+    assert not {"pa", "world/camera/left"} & set(views(path))
+    # Told by the camera's colour, by what crosses its picture out, and by its name.
+    colors = [row.values["Pinhole:color"][0] for row in rows["/world/camera/left"] if "Pinhole:color" in row.values]
+    assert colors == [int.from_bytes(bytes((*palette.REFUSED, 255)), "big")]
+    assert len(rows["/world/camera/crossed"][-1].values["LineStrips3D:strips"]) == 2
+    assert "camera: REFUSED" in rows["/world/shot/labels"][-1].values["Points3D:labels"]
+    # Nothing in the endoscope's picture says where PMs and image plane are.
+    assert not {f"/{endoscope_view.PATH}/{name}" for name in ("plane", "pms", "beam")} & rows.keys()
+    assert f"/{endoscope_view.PATH}/refused" in rows
     blueprint = read_recording(path, blueprint=True)
-    (background,) = [
+    backgrounds = {
         row.values["Background:color"][0]
         for entity in blueprint.values()
         for row in entity
         if "Background:color" in row.values
-    ]
-    assert background >> 24 & 255 > 2 * (background >> 16 & 255)
+    }
+    assert any(color >> 24 & 255 > 2 * (color >> 16 & 255) for color in backgrounds)
 
 
 def test_an_epoch_without_a_registration_hides_its_camera_instead_of_standing_at_the_origin(tmp_path: Path) -> None:
@@ -358,8 +438,8 @@ def test_an_epoch_without_a_registration_hides_its_camera_instead_of_standing_at
     # To a frame that is nowhere. A scale of 0 is a mistake to Rerun 0.41, which then draws the camera at the origin.
     assert second.values["Transform3D:parent_frame"] == ["not known"]
     assert "Transform3D:translation" not in second.values
-    assert [row.shot for row in rows["/world/looks/beam"]] == [0, 1]
-    assert [row.shot for row in rows["/world/looks/arc"]] == [0, 1, 2, 3]
+    assert [shot for shot in range(4) if f"/world/looks/{shot}/beam" in rows] == [0, 1]
+    assert [shot for shot in range(4) if f"/world/looks/{shot}/arc" in rows] == [0, 1, 2, 3]
 
 
 def test_what_was_not_detected_or_is_not_finite_is_left_out(tmp_path: Path) -> None:
@@ -374,16 +454,16 @@ def test_what_was_not_detected_or_is_not_finite_is_left_out(tmp_path: Path) -> N
     heard = replace(measurements, pairs=(measurements.pairs[0], measurements.pairs[2]))
     rows = record(tmp_path / "part.rrd", model, heard, replace(estimate, pairs=pairs))
     assert [row.shot for row in rows["/plots/nis/pair"] if row.shot is not None] == [2]
-    assert [row.shot for row in rows["/world/looks/arc"]] == [0, 2]
-    sizes = {row.shot: len(row.values["Ellipsoids3D:half_sizes"]) for row in rows["/world/looks/pm_95"]}
-    assert sizes == {0: 0, 2: 1}
+    assert [shot for shot in range(3) if f"/world/looks/{shot}/arc" in rows] == [0, 2]
+    sizes = [len(rows[f"/world/looks/{shot}/pm_95"][0].values["Ellipsoids3D:half_sizes"]) for shot in (0, 2)]
+    assert sizes == [0, 1]
 
 
 def test_a_session_without_shots_makes_a_recording(tmp_path: Path) -> None:
     estimate = SessionEstimate("empty", Verdict.REFUSED, ("no pairs",), None, (), (), ())
     rows = record(tmp_path / "empty.rrd", make_session(), Measurements((), (), ()), estimate)
     assert "/world/probe" in rows
-    assert "/world/verdict" in rows
+    assert "/verdict" in rows
 
 
 def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None:
@@ -392,7 +472,7 @@ def test_a_crash_leaves_neither_a_file_nor_a_changed_one(tmp_path: Path) -> None
 
     def crash() -> None:
         with open_viewer(path, "phantom") as viewer:
-            viewer.session(make_session())
+            viewer.session(make_session(), LIMIT_MM)
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -405,7 +485,7 @@ def test_a_recording_takes_the_place_of_an_older_one_and_leaves_no_other_file(tm
     path = tmp_path / "phantom.rrd"
     for _ in range(2):
         with open_viewer(path, "phantom") as viewer:
-            viewer.session(make_session())
+            viewer.session(make_session(), LIMIT_MM)
     assert "/world/probe" in read_recording(path)
     assert "world" in views(path)
     assert list(tmp_path.iterdir()) == [path]
@@ -428,7 +508,7 @@ def test_a_recording_that_is_not_written_to_its_end_leaves_the_older_one(
 
     monkeypatch.setattr(shapes.Recorder, "close", close)
     with pytest.raises(InputError, match="a recording that cannot be written"), open_viewer(path, "phantom") as viewer:
-        viewer.session(make_session())
+        viewer.session(make_session(), LIMIT_MM)
     assert path.read_bytes() == b"RRF2 an older one of fgreg"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -463,7 +543,7 @@ def test_the_null_viewer_takes_every_call_and_writes_nothing(tmp_path: Path, mon
     rng = np.random.default_rng(15)
     model, measurements, truth = make_measurements(rng, aims=1, pairs=2)
     with viewer:
-        viewer.session(model)
+        viewer.session(model, LIMIT_MM)
         viewer.result(model, measurements, answer_from_truth(rng, model, measurements, truth))
     assert not list(tmp_path.iterdir())
 

@@ -32,6 +32,7 @@ from fgreg.live.launch import running
 from fgreg.live.simulated_room import room_setup
 from fgreg.live.viewer_feed import viewer_feed
 from fgreg.model.events import CameraMovedEvent, PairEvent
+from fgreg.model.solve_config import SolveConfig
 from fgreg.session.session_reader import read_session
 from fgreg.simulation.room import room_config
 from fgreg.workers.threads import NAMES
@@ -57,7 +58,7 @@ def measure(options: argparse.Namespace, making: Making, folder: Path) -> dict[s
         room = stack.enter_context(RoomProcess(run=play))
         feed = stack.enter_context(viewer_feed(options.rrd, "load", live=False, say=print))
         with running(room_setup(room.path, making.config), session_folder, None, feed.taken) as session:
-            feed.session(session.model)
+            feed.session(session.model, SolveConfig().limit_mm)
             processes, watch = Processes(), Watch(session)
             until = time.monotonic() + options.seconds
 

@@ -5,7 +5,7 @@ recording or at a moment of one of its timelines:
 
     python tools/render_recording.py session.rrd picture.png
     python tools/render_recording.py session.rrd shot5.png --timeline shot --at 5
-    python tools/render_recording.py session.rrd world.png --view "World"
+    python tools/render_recording.py session.rrd scene.png --view "Scene"
 
 It starts Rerun's own viewer in its headless mode on a free local port and ends it again. That needs a Vulkan driver;
 where there is no graphics card a software one will do (on Debian and Ubuntu the package mesa-vulkan-drivers).

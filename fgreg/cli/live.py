@@ -216,7 +216,7 @@ def _conduct(
         before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
         try:
             with running(setup, folder, config, feed.taken, say) as session:
-                feed.session(session.model)
+                feed.session(session.model, config.limit_mm)
                 until = math.inf if duration_s is None else time.monotonic() + duration_s
                 shown = -math.inf
 

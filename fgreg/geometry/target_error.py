@@ -68,6 +68,18 @@ def gaussian_quantile_mm(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(c1 + (chi2 - freedom) * np.sqrt(c2 / freedom), 0.0)))
 
 
+def target_bounds_mm(
+    covariance: FloatArray, trus_T_camera: FloatArray, targets_mm: FloatArray, worst_mm: float
+) -> FloatArray:
+    """(n,) 95 % bounds of the error at targets (n, 3), of which the largest is ``worst_mm``.
+
+    Those of the covariance (6, 6), right tangent, and what a verdict adds at every target for causes that it names.
+    """
+    jacobian = target_jacobians(trus_T_camera, targets_mm)
+    bounds = gaussian_quantile_mm(jacobian @ covariance @ jacobian.swapaxes(1, 2))
+    return np.asarray(np.maximum(bounds + worst_mm - bounds.max(), 0.0))
+
+
 def offset_quantile_mm(mean_mm: FloatArray, covariance: FloatArray) -> float:
     """95 % quantile of |e| for a Gaussian error e of mean (3,) and covariance (3, 3).
 

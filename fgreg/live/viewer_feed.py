@@ -44,8 +44,8 @@ INSTEAD = (
 class ViewerFeed:
     """A session's display; this one shows nothing."""
 
-    def session(self, model: SessionModel) -> None:
-        """The session begins."""
+    def session(self, model: SessionModel, limit_mm: float) -> None:
+        """The session begins; ``limit_mm``: of the predicted error."""
 
     def taken(self, event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
         """An event was taken in (called on the recorder's thread)."""
@@ -84,10 +84,10 @@ class RerunFeed(ViewerFeed):
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
         self.left_out = 0
 
-    def session(self, model: SessionModel) -> None:
+    def session(self, model: SessionModel, limit_mm: float) -> None:
         """The session begins."""
         self._model = model
-        self._viewer.session(model)
+        self._viewer.session(model, limit_mm)
         self._thread.start()
 
     def taken(self, event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:

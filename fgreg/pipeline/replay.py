@@ -145,7 +145,7 @@ def replay_session(
     truth = read_ground_truth(request.folder)
     url = spawn_viewer() if request.live else None
     with open_viewer(request.rrd, session.model.name, url, inputs) as viewer:
-        viewer.session(session.model)
+        viewer.session(session.model, config.limit_mm)
         extracted = extract_measurements(
             session.events,
             session.model,

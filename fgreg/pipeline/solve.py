@@ -154,7 +154,7 @@ def solve_session(
         used = settings_used(config, request.detect_moves, request.redetect)
         estimate = replace(estimate, inputs=inputs, settings=used)
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
-        show(viewer, session, extracted, estimate, truth)
+        show(viewer, session, extracted, estimate, truth, config.limit_mm)
         write_result(estimate, session.model, result_path, __version__)
     elapsed = time.perf_counter() - start
     return SolveReport(session, extracted, solution, estimate, truth, errors, result_path, request.rrd, elapsed)
@@ -339,12 +339,13 @@ def show(
     extracted: ExtractedMeasurements,
     estimate: SessionEstimate,
     truth: GroundTruth | None,
+    limit_mm: float,
 ) -> None:
     """Draw the frames with their detections, then the result."""
     if isinstance(viewer, NullViewer):
         return  # spares reading the frames again
     model = session.model
-    viewer.session(model)
+    viewer.session(model, limit_mm)
     shot = 0
     for index, event in enumerate(session.events):
         if isinstance(event, AimEvent | PairEvent | TrackEvent):

@@ -9,12 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from fgreg.geometry.transforms import FloatArray
-from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
+from fgreg.geometry.target_error import target_bounds_mm
+from fgreg.geometry.transforms import FloatArray, transform_points
+from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict, worst_verdict
 from fgreg.model.measurements import Aim, Look, Pair, Track
 from fgreg.model.session_model import SessionModel
-from fgreg.viewer import scene as scene
-from fgreg.viewer import shapes as shapes
+from fgreg.viewer import banner, endoscope_view, palette, scene, shapes, shot_labels, target_map
+from fgreg.viewer.blueprint import WORLD_PX
+from fgreg.viewer.endoscope_view import Seen
+from fgreg.viewer.palette import Color
+from fgreg.viewer.scene import Eye
 from fgreg.viewer.status_line import Now, goal_line, now_markdown
 
 LARGEST_PLOTTED_MM = 30.0
@@ -60,10 +64,20 @@ class ViewerUpdate:
 
 
 class LiveDrawing:
-    """Draws updates in order into a recording that :meth:`fgreg.viewer.recording.Viewer.session` started."""
+    """Draws updates in order into a recording that :meth:`fgreg.viewer.recording.Viewer.session` started.
 
-    def __init__(self, rec: shapes.Recorder, model: SessionModel) -> None:
-        self._rec, self._model = rec, model
+    Attributes:
+        eye: of the scene, for its labels.
+    """
+
+    def __init__(self, rec: shapes.Recorder, model: SessionModel, limit_mm: float) -> None:
+        self._rec, self._model, self._limit_mm = rec, model, limit_mm
+        self.eye: Eye | None = None
+        self._refused: bool | None = None
+        self._banner: tuple[str, Color, Verdict | None] | None = None
+        self._pms: list[FloatArray] = []
+        self._unused: list[FloatArray] = []
+        self._plane_words: tuple[str, FloatArray] | None = None
         self._plane_is_plain = False
         self._last = (0.0, 0)
         beyond = float(np.linalg.norm(model.targets_mm[:, 1:], axis=1).max()) - model.probe.radius_mm
@@ -83,22 +97,56 @@ class LiveDrawing:
             self._rec.clear("world/shot/arc", "world/shot/sound")
         if not isinstance(shot, Aim):
             self._plane(textured)
+        beam = spot = None
         match shot:
             case Pair():
-                self._pair(update, shot)
+                beam, spot = self._pair(update, shot)
             case Track():
-                self._track(update, shot)
+                beam, spot = self._track(update, shot)
             case _:
                 self._rec.clear("world/shot/pm", "world/shot/beam")
         if update.now is not None:
-            self._now(update, update.now)
+            self._now(update.now)
+        if (shown := verdict_shown(update)) != self._banner:
+            self._banner = shown
+            word, color, verdict = shown
+            banner.draw(self._rec, verdict, word, color)
+        lost = update.now is not None and "camera" in update.now.lost
+        self._words(update, None if lost else spot)
+        self._see(update, None if lost else beam)
         self._figures(update)
 
-    def _now(self, update: ViewerUpdate, now: Now) -> None:
-        """Draw the current and the desired stage angle, and the verdict as a colour."""
+    def _words(self, update: ViewerUpdate, spot: tuple[str, FloatArray] | None) -> None:
+        shot_labels.draw(
+            self._rec,
+            self._model,
+            (self.eye, WORLD_PX),
+            trus_T_camera=update.trus_T_camera,
+            refused=update.verdict is Verdict.REFUSED,
+            camera_T_marker=None if update.shot is None else update.shot.marker.camera_T_marker,
+            marker_T_laser=update.marker_T_laser,
+            spot=spot,
+            plane=self._plane_words,
+        )
+
+    def _see(self, update: ViewerUpdate, beam: FloatArray | None) -> None:
+        """Draw into the endoscope's picture what the surgeon would see there."""
+        if self._model.camera is None:
+            return
+        left = self._model.camera.left
+        if update.trus_T_camera is not None and update.verdict is Verdict.REFUSED:
+            endoscope_view.say_refused(self._rec, left)
+            return
+        plane = None if self._plane_words is None else self._plane_words[1]
+        seen = Seen(plane, beam, np.reshape(self._pms, (-1, 3)), np.reshape(self._unused, (-1, 3)))
+        endoscope_view.draw(self._rec, left, update.trus_T_camera, seen)
+
+    def _now(self, now: Now) -> None:
+        """Draw the current and the desired stage angle."""
         rec, stage = self._rec, self._model.stage
         if now.scan_rad is None:
             rec.log("world/stage", shapes.transform(None))
+            self._plane_words = None
         else:
             device_deg = math.degrees(stage.device_from_scan(now.scan_rad))
             self._stage(now.scan_rad, f"image plane, stage {device_deg:.1f}°")
@@ -109,24 +157,24 @@ class LiveDrawing:
             goal_deg = math.degrees(stage.device_from_scan(now.goal_rad))
             corners = scene.plane_corners_mm(self._model.probe, self._depth_mm)
             rec.log("world/goal", shapes.transform(scene.trus_T_plane(now.goal_rad)))
-            rec.log("world/goal/outline", shapes.plane_outline(corners, shapes.GOAL))
+            rec.log("world/goal/outline", shapes.plane_outline(corners, palette.GOAL))
             label = f"beam at {goal_line(now, stage)}"
-            rec.log("world/goal/label", shapes.point(corners[3], shapes.GOAL, 1.0, label))
+            rec.log("world/goal/label", shapes.point(corners[3], palette.GOAL, 1.0, label))
             rec.log("online/stage_deg/beam", rr.Scalars(goal_deg))
-        word, color = banner(update)
-        rec.log("verdict", shapes.flat(color))
-        rec.log("verdict/word", shapes.points_2d(np.array([[shapes.BANNER[1] / 2.0, 0.0]]), shapes.MARKER, 0.5, [word]))
 
     def _registration(self, update: ViewerUpdate) -> None:
         transform, covariance = update.trus_T_camera, update.covariance
         self._rec.log("world/camera", shapes.transform(transform))
-        if transform is None or covariance is None or update.verdict is Verdict.REFUSED:
-            self._rec.clear("world/targets")
+        refused = update.verdict is Verdict.REFUSED
+        if transform is not None and refused is not self._refused:
+            self._refused = refused
+            shapes.color_cameras(self._rec, self._model, shapes.IMAGE_DISTANCE_MM, refused=refused)
+        worst_mm = math.inf if update.tre is None else update.tre.worst_mm
+        if transform is None or covariance is None or not math.isfinite(worst_mm):
+            target_map.clear(self._rec)
             return
-        targets = self._model.targets_mm
-        spread = scene.target_covariances(transform, covariance, targets)
-        centres = shapes.small_points(targets, shapes.TARGET, 1.2)
-        self._rec.log("world/targets", shapes.ellipsoids(targets, spread, shapes.TARGET), centres)
+        bounds = target_bounds_mm(covariance, transform, self._model.targets_mm, worst_mm)
+        target_map.draw(self._rec, self._model.targets_mm, bounds, self._limit_mm)
 
     def _plane(self, textured: bool) -> None:
         if textured:
@@ -137,49 +185,58 @@ class LiveDrawing:
             self._rec.log("world/stage/outline", shapes.plane_outline(corners))
             self._plane_is_plain = True
 
-    def _pair(self, update: ViewerUpdate, pair: Pair) -> None:
-        strip = self._arc(pair.look, keep=True)
+    def _pair(self, update: ViewerUpdate, pair: Pair) -> tuple[FloatArray | None, tuple[str, FloatArray] | None]:
+        strip = self._arc(pair.look, keep=update.number)
         used = update.used
-        spot = self._beam(update, pair, nearest_on(strip), keep=used)
-        if spot is None:
+        beam = self._beam(update, pair, nearest_on(strip), keep=update.number if used else None)
+        if beam is None:
             self._rec.clear("world/shot/pm")
-            return
-        color = shapes.PM if used else shapes.UNUSED
-        self._rec.log("world/looks/pm", shapes.small_points(spot[None], color, 3.5))
-        self._rec.log(
-            "world/shot/pm", shapes.point(spot, color, 5.0, f"PM {pair.pm}" + ("" if used else " (not used)"))
-        )
+            return None, None
+        spot, look = beam[1], f"world/looks/{update.number}"
+        color = palette.PM if used else palette.UNUSED
+        (self._pms if used else self._unused).append(spot)
+        if used:
+            self._rec.log(f"{look}/pm", shapes.small_points(spot[None], color, 3.5))
+        else:
+            self._rec.log(f"{look}/not_used", shapes.cross(spot, color))
+        self._rec.log("world/shot/pm", shapes.point(spot, color, 5.0))
+        return beam, (f"PM {pair.pm}" + ("" if used else ", not used"), spot)
 
-    def _track(self, update: ViewerUpdate, query: Track) -> None:
+    def _track(self, update: ViewerUpdate, query: Track) -> tuple[FloatArray | None, tuple[str, FloatArray] | None]:
         answer = update.answer
         if query.looks:
-            self._arc(query.looks[-1], keep=False)
+            self._arc(query.looks[-1], keep=None)
         lambda_mm = None if answer is None else answer.lambda_mm
-        spot = self._beam(update, query, lambda _origin, _direction: lambda_mm, keep=False)
-        if spot is None:
+        beam = self._beam(update, query, lambda _origin, _direction: lambda_mm, keep=None)
+        if beam is None:
             self._rec.clear("world/shot/pm")
         else:
-            self._rec.log("world/shot/pm", shapes.point(spot, shapes.PM, 5.0, "predicted spot"))
+            self._rec.log("world/shot/pm", shapes.point(beam[1], palette.PM, 5.0))
         if update.now is None and answer is not None and answer.stage_rad is not None:
             label = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°"
             self._stage(self._model.stage.scan_from_device(answer.stage_rad), label)
+        return beam, None if beam is None else ("predicted spot", beam[1])
 
-    def _arc(self, look: Look, *, keep: bool) -> FloatArray:
+    def _arc(self, look: Look, *, keep: int | None) -> FloatArray:
         strip = scene.arc_strip_mm(look, self._model.probe)
-        if keep:
-            self._rec.log("world/looks/arc", shapes.strips([strip], shapes.SOUND, 1.0))
-        self._rec.log("world/shot/arc", shapes.strips([strip], shapes.SOUND, 3.0))
+        if keep is not None:
+            self._rec.log(f"world/looks/{keep}/arc", shapes.strips([strip], palette.SOUND, 1.0))
+        self._rec.log("world/shot/arc", shapes.strips([strip], palette.SOUND, 3.0))
         device_deg = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
         self._stage(look.scan_rad, f"image plane, stage {device_deg:.1f}°")
         return strip
 
     def _stage(self, scan_rad: float, label: str) -> None:
-        self._rec.log("world/stage", shapes.transform(scene.trus_T_plane(scan_rad)))
-        corner = scene.plane_corners_mm(self._model.probe, self._depth_mm)[2]
-        self._rec.log("world/stage/label", shapes.point(corner, shapes.SOUND, 1.0, label))
+        trus_T_plane = scene.trus_T_plane(scan_rad)
+        self._rec.log("world/stage", shapes.transform(trus_T_plane))
+        corners = scene.plane_corners_mm(self._model.probe, self._depth_mm)
+        self._plane_words = label, transform_points(trus_T_plane, corners)
 
-    def _beam(self, update: ViewerUpdate, shot: Pair | Track, reach: Reach, *, keep: bool) -> FloatArray | None:
-        """Draw the shot's beam; returns its end (3,), TRUS mm. ``reach`` gives its length, ``keep`` keeps it drawn."""
+    def _beam(self, update: ViewerUpdate, shot: Pair | Track, reach: Reach, *, keep: int | None) -> FloatArray | None:
+        """Draw the shot's beam; returns the laser frame's origin and its end (2, 3), TRUS mm.
+
+        ``reach`` gives its length; ``keep``: the shot to keep it drawn for.
+        """
         transform, laser = update.trus_T_camera, update.marker_T_laser
         if transform is None or laser is None:
             self._rec.clear("world/shot/beam")
@@ -190,10 +247,10 @@ class LiveDrawing:
             self._rec.clear("world/shot/beam")
             return None
         origin, tip = scene.laser_origin_and_tip(trus_T_laser, lambda_mm)
-        if keep:
-            self._rec.log("world/looks/beam", shapes.arrow(origin, tip, shapes.BEAM, 0.7))
-        self._rec.log("world/shot/beam", shapes.arrow(origin, tip, shapes.BEAM, 2.5, "laser beam"))
-        return tip
+        if keep is not None:
+            self._rec.log(f"world/looks/{keep}/beam", shapes.arrow(origin, tip, palette.BEAM, 0.7))
+        self._rec.log("world/shot/beam", shapes.arrow(origin, tip, palette.BEAM, 2.5))
+        return np.stack([origin, tip])
 
     def _figures(self, update: ViewerUpdate) -> None:
         rec = self._rec
@@ -207,7 +264,7 @@ class LiveDrawing:
             state = update.verdict.value
             if update.trus_T_camera is None:
                 level, state = "INFO", "no registration yet"
-            rec.log("log", rr.TextLog(f"{update.note} [{state}]", level=level))
+            rec.log(f"log/{update.number}", rr.TextLog(f"{update.note} [{state}]", level=level))
         rec.log("summary", rr.TextDocument(self._page(update), media_type="text/markdown"))
 
     def _page(self, update: ViewerUpdate) -> str:
@@ -223,16 +280,14 @@ class LiveDrawing:
         self._rec.at(*self._last)
 
 
-def banner(update: ViewerUpdate) -> tuple[str, shapes.Color]:
-    """The verdict as a word and a colour; a lost device overrides the colour of a good registration."""
+def verdict_shown(update: ViewerUpdate) -> tuple[str, Color, Verdict | None]:
+    """The verdict as a word, a colour and a sign; a lost device overrides those of a good registration."""
     lost = () if update.now is None else update.now.lost
     gone = f"; LOST: {', '.join(lost)}" if lost else ""
     if update.trus_T_camera is None:
-        return f"no registration yet{gone}", shapes.WARNING if lost else shapes.UNUSED
-    word = f"{update.verdict.value.upper()}{gone}"
-    if update.verdict is Verdict.REFUSED:
-        return word, shapes.REFUSED
-    return word, shapes.WARNING if lost or update.verdict is Verdict.WARNING else shapes.BEAM
+        return f"no registration yet{gone}", palette.VERDICTS[Verdict.WARNING] if lost else palette.UNUSED, None
+    shown = worst_verdict(update.verdict, Verdict.WARNING if lost else Verdict.OK)
+    return f"{update.verdict.value.upper()}{gone}", palette.VERDICTS[shown], shown
 
 
 def update_markdown(update: ViewerUpdate) -> str:

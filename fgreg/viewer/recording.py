@@ -3,14 +3,17 @@
 Entities, all in TRUS millimetres unless a parent's transform says otherwise:
 
 - ``world/probe``, ``world/trus``: the housing and the axes of TRUS.
-- ``world/stage``: rotated to the shot's plane; ``plane`` (with the shot's frame on it), ``elements``, ``label`` below.
-- ``world/looks/{arc,beam,pm,pm_95}``: one entry per look; the blueprint shows all up to the time cursor.
-- ``world/shot/{arc,beam,pm,sound}``: those of the shot at the cursor, bold, with labels.
+- ``world/stage``: rotated to the shot's plane; ``plane`` (with the shot's frame on it) and ``elements`` below.
+- ``world/looks/N/{arc,beam,pm,pm_95,not_used}``: those of shot N, from its time on; links in the summary select them.
+- ``world/shot/{arc,beam,pm,sound}``: those of the shot at the cursor, bold; ``labels``: the words of the view.
 - ``world/camera``: ``trus_T_camera`` of the epoch; ``left`` and ``right`` are pinholes with the endoscope's images,
-  ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines below.
-- ``world/targets``: 95 % ellipsoids of the predicted error; ``world/truth``: PMs and camera where they are known.
-- In a live session: ``world/goal``, the plane in which the PM will be detected; ``bmode``; ``verdict``.
-- ``pa``: the shot's photoacoustic frame with its detection; ``plots/*``; ``summary``; ``log``.
+  ``crossed`` marks it as refused, ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines and ``laser``.
+- ``world/camera/left/seen``: PMs, beam and image plane as the lens shows them, in pixels.
+- ``world/targets``: spheres of the 95 % bound of the predicted error; ``scale``: their colours and the limit.
+- ``world/truth``: PMs and camera where they are known.
+- In a live session: ``world/goal``, the plane in which the PM will be detected; ``bmode``.
+- ``pa``: the shot's photoacoustic frame with its detection; ``verdict``; ``legend``; ``plots/*``; ``summary``;
+  ``log/N``.
 
 Timelines: ``shot`` (number among all aims, pairs and tracks, from 0) and ``time`` (seconds, as in the events).
 """
@@ -31,10 +34,10 @@ from fgreg.geometry.transforms import FloatArray, exp_so3
 from fgreg.model.estimate import SessionEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import ProbeModel, SessionModel
+from fgreg.model.solve_config import SolveConfig
 from fgreg.output.atomic_file import NewFile
-from fgreg.viewer import scene as scene
-from fgreg.viewer import shapes as shapes
-from fgreg.viewer.blueprint import Contents, make_blueprint
+from fgreg.viewer import legend, palette, scene, shapes, shot_labels, target_map
+from fgreg.viewer.blueprint import WORLD_PX, Contents, Eyes, make_blueprint
 from fgreg.viewer.live import LiveDrawing, ViewerUpdate
 from fgreg.viewer.pa_frame import pa_picture, texture
 from fgreg.viewer.recording_file import RECORDING, is_complete, recording_id
@@ -84,6 +87,7 @@ class Viewer:
             raise
         self._live: LiveDrawing | None = None
         self._model: SessionModel | None = None
+        self._limit_mm = SolveConfig().limit_mm
         self._shown: set[str] = set()
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._pa_size: tuple[int, int] | None = None
@@ -100,7 +104,7 @@ class Viewer:
         """Finish and rename the file, or remove it after an exception."""
         try:
             if not self._finished and self._live is None:
-                self._rec.blueprint(make_blueprint(self._contents(result=False), None, None))
+                self._rec.blueprint(make_blueprint(self._contents(result=False), None, Eyes()))
             failure = "its end is missing"
             try:
                 self._rec.close()
@@ -117,34 +121,36 @@ class Viewer:
         if self._file is not None:
             self._file.drop()
 
-    def session(self, model: SessionModel) -> None:
-        """Draw the static parts: probe, array, axes, cameras, the marker's outline, the plots' styles."""
-        self._model = model
+    def session(self, model: SessionModel, limit_mm: float) -> None:
+        """Draw the static parts: probe, array, axes, cameras, the marker's outline, legend, scale, the plots' styles.
+
+        ``limit_mm``: of the predicted 95 % error at the worst target.
+        """
+        self._model, self._limit_mm = model, limit_mm
         rec, probe = self._rec, model.probe
         length = scene.array_length_mm(probe)
         rec.static("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        reach = np.array([length / 2.0 + 4.0, 0.0, 0.0]) + probe.radius_mm + 14.0
-        rec.static("world/trus", shapes.axes(reach))
-        rec.static("world/trus/labels", shapes.axis_labels(reach, ("x: rotation axis", "y", "z")))
+        rec.static("world/trus", shapes.axes(shot_labels.axes_reach_mm(model)))
         rec.static("world/probe", shapes.probe(length + 8.0, probe.radius_mm * 0.98))
         face = np.array([[-length / 2.0, 0.0, probe.radius_mm], [length / 2.0, 0.0, probe.radius_mm]])
-        rec.static("world/stage/elements", shapes.strips([face], shapes.SOUND, 3.0))
-        shapes.draw_cameras(rec, model, shapes.CAMERA)
+        rec.static("world/stage/elements", shapes.strips([face], palette.SOUND, 3.0))
+        shapes.draw_cameras(rec, model)
+        legend.draw(rec)
+        target_map.draw_scale(rec, limit_mm)
         if model.marker is not None:
             outlines = scene.marker_outlines_mm(model.marker)
-            rec.static("world/camera/marker/tags", shapes.strips(outlines, shapes.MARKER, 1.5))
+            rec.static("world/camera/marker/tags", shapes.strips(outlines, palette.MARKER, 1.5))
         rec.static("world/camera/marker/axes", shapes.axes(8.0))
-        rec.static("world/camera/marker/label", shapes.point([0.0, 0.0, 0.0], shapes.MARKER, 1.0, "marker"))
-        limit = rr.SeriesLines(colors=[shapes.UNUSED], names=["95 % of inlier looks are below"], widths=[1.0])
+        limit = rr.SeriesLines(colors=[palette.UNUSED], names=["95 % bound of an inlier"], widths=[1.0])
         rec.static("plots/nis/limit_95", limit)
-        for name, color in (("plane", shapes.SOUND), ("beam", shapes.GOAL)):
+        for name, color in (("plane", palette.SOUND), ("beam", palette.GOAL)):
             rec.static(f"online/stage_deg/{name}", rr.SeriesLines(colors=[color], names=[name], widths=[2.0]))
         for plot in ("residual_mm", "nis", "rotation_deg", "lambda_mm"):
             for name, color, shape in (
-                ("pair", shapes.PM, rr.components.MarkerShape.Circle),
-                ("pair_not_used", shapes.UNUSED, rr.components.MarkerShape.Cross),
-                ("aim", shapes.BEAM, rr.components.MarkerShape.Diamond),
-                ("track", shapes.SOUND, rr.components.MarkerShape.Up),
+                ("pair", palette.PM, rr.components.MarkerShape.Circle),
+                ("pair_not_used", palette.UNUSED, rr.components.MarkerShape.Cross),
+                ("aim", palette.BEAM, rr.components.MarkerShape.Diamond),
+                ("track", palette.SOUND, rr.components.MarkerShape.Up),
             ):
                 name_shown = name.replace("_", " ")
                 style = rr.SeriesPoints(colors=[color], names=[name_shown], markers=[shape], marker_sizes=[4.0])
@@ -182,11 +188,11 @@ class Viewer:
         rec.clear("world/camera/left/marker", "world/camera/left/corner")
         outlines = [np.vstack([corners, corners[:1]]) for corners in marker_outlines_px or ()]
         if outlines:
-            rec.log("world/camera/left/marker/outline", shapes.strips_2d(outlines, shapes.BEAM, 1.5))
+            rec.log("world/camera/left/marker/outline", shapes.strips_2d(outlines, palette.BEAM, 1.5))
         if corner_px is not None:
             label = f"{kind}: laser on this corner"
             corner = np.asarray(corner_px).reshape(1, 2)
-            rec.log("world/camera/left/corner/spot", shapes.points_2d(corner, shapes.PM, 4.0, [label]))
+            rec.log("world/camera/left/corner/spot", shapes.points_2d(corner, palette.PM, 4.0, [label]))
 
     def pa_frame(
         self,
@@ -225,7 +231,7 @@ class Viewer:
         # The caption has the shot's number, because the frame stays at later shots without one.
         found = "no source found" if x_mm is None or range_mm is None else f"x {x_mm:.1f} mm, range {range_mm:.1f} mm"
         above = np.array([[0.5 * picture.image.shape[1], -0.1 * picture.image.shape[0]]])
-        rec.log("pa/caption", shapes.points_2d(above, shapes.PM, 0.5, [f"shot {index}: {found}"]))
+        rec.log("pa/caption", shapes.points_2d(above, palette.PM, 0.5, [f"shot {index}: {found}"]))
         rec.clear("pa/detection")
         if x_mm is None or range_mm is None:
             return
@@ -235,17 +241,17 @@ class Viewer:
             for k in range(4)
         ]
         cross = [picture.pixels(x_mm + tick[:, 0], range_mm + tick[:, 1]) for tick in ticks]
-        rec.log("pa/detection/spot", shapes.strips_2d(cross, shapes.PM, 1.2))
+        rec.log("pa/detection/spot", shapes.strips_2d(cross, palette.PM, 1.2))
         if covariance is not None:
             outline = scene.ellipse_95(np.array([x_mm, range_mm]), covariance)
             strip = picture.pixels(outline[:, 0], outline[:, 1])
-            rec.log("pa/detection/ellipse", shapes.strips_2d([strip], shapes.PM, 0.8))
+            rec.log("pa/detection/ellipse", shapes.strips_2d([strip], palette.PM, 0.8))
         if picture.wavefront:
             # Dots, so that the wave is visible between them.
             x = np.sort(probe.element_x_mm)[::5]
             front = picture.pixels(x, np.hypot(x - x_mm, range_mm))
             front = front[front[:, 1] <= picture.image.shape[0]]
-            rec.log("pa/detection/wavefront", shapes.points_2d(front, shapes.PM, 1.3))
+            rec.log("pa/detection/wavefront", shapes.points_2d(front, palette.PM, 1.3))
 
     def bmode(self, t: float, index: int, picture: BmodePicture | None) -> None:
         """Show a B-mode image in its view and, where its geometry is known, on the image plane.
@@ -263,13 +269,13 @@ class Viewer:
         if picture is None:
             if "bmode" in self._shown:
                 rec.log("bmode", shapes.no_picture((shapes.CANVAS, shapes.CANVAS, 3)))
-                rec.log("bmode/caption", shapes.points_2d(caption, shapes.REFUSED, 0.5, ["no picture"]))
+                rec.log("bmode/caption", shapes.points_2d(caption, palette.REFUSED, 0.5, ["no picture"]))
             return
         image, pixel_mm, origin_mm = picture.image, picture.pixel_mm, picture.origin_mm
         self._shown.add("bmode")
         rec.log("bmode", shapes.picture(shapes.canvas(image)))
         text = f"t = {t:.1f} s" + ("" if pixel_mm and origin_mm else "; its position in the plane is not known")
-        rec.log("bmode/caption", shapes.points_2d(caption, shapes.SOUND, 0.5, [text]))
+        rec.log("bmode/caption", shapes.points_2d(caption, palette.SOUND, 0.5, [text]))
         if pixel_mm is None or origin_mm is None:
             return
         self._textured.add(index)
@@ -308,23 +314,27 @@ class Viewer:
             truth=truth,
             tracks=tuple(tracks),
             textured=frozenset(self._textured),
+            limit_mm=self._limit_mm,
+            view=WORLD_PX,
         )
         if self._live is None:
             drawing.draw()
         else:
             self._live.to_end()
             drawing.draw_end(from_now=True)
-        eye = scene.best_eye(drawing.eye_points(), trus_view=drawing.trus_view())
-        self._rec.blueprint(make_blueprint(self._contents(result=True), estimate.verdict, eye))
+        shots = 0 if self._live is not None else len(scene.shots_of(estimate))
+        eyes = Eyes(drawing.eye(), target_map.eye(model))
+        self._rec.blueprint(make_blueprint(self._contents(result=True, shots=shots), estimate.verdict, eyes))
         self._finished = True
 
-    def _contents(self, *, result: bool) -> Contents:
+    def _contents(self, *, result: bool, shots: int = 0) -> Contents:
         shown = self._shown
         return Contents(
             "left" in shown,
             "right" in shown,
             self._pa_size,
             result,
+            shots,
             self._live is not None,
             "bmode" in shown,
             "now" in shown,
@@ -339,21 +349,20 @@ class Viewer:
         if self._model is None:
             raise AssertionError("the session comes first")
         if self._live is None:
-            self._live = LiveDrawing(self._rec, self._model)
+            self._live = LiveDrawing(self._rec, self._model, self._limit_mm)
         if update.now is not None:
             self._shown.add("now")
-            if update.trus_T_camera is not None and update.verdict is not Verdict.REFUSED:
-                self._shown.add("registered")
+        if update.trus_T_camera is not None and update.verdict is not Verdict.REFUSED:
+            self._shown.add("registered")
         contents = self._contents(result=True)
         if contents != self._arranged:  # rare, because it resets a view that the user may have rotated
             self._arranged = contents
-            eye = None
-            if update.now is not None:
-                points = scene.live_points_mm(self._model.probe, self._model.targets_mm)
-                if update.trus_T_camera is not None and contents.registered:
-                    points = np.vstack([points, update.trus_T_camera[:3, 3]])
-                eye = scene.best_eye(points)
-            self._rec.blueprint(make_blueprint(contents, None, eye))
+            points = scene.live_points_mm(self._model.probe, self._model.targets_mm)
+            if update.trus_T_camera is not None and contents.registered:
+                points = np.vstack([points, update.trus_T_camera[:3, 3]])
+            self._live.eye = scene.best_eye(points, WORLD_PX)
+            eyes = Eyes(self._live.eye, target_map.eye(self._model))
+            self._rec.blueprint(make_blueprint(contents, None, eyes))
         if update.now is not None and "camera" in update.now.lost:  # an old image would look like a new one
             self._rec.at(update.t, update.number)
             for side, shape in self._shapes.items():

@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 import rerun as rr
 
+from fgreg.geometry.target_error import target_bounds_mm
 from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
 from fgreg.model.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Look, MarkerObservation, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
-from fgreg.viewer import scene as scene
-from fgreg.viewer import shapes as shapes
-from fgreg.viewer.summary_page import summary_markdown
+from fgreg.viewer import banner, endoscope_view, palette, scene, shapes, shot_labels, target_map
+from fgreg.viewer.endoscope_view import Seen
+from fgreg.viewer.scene import Eye
+from fgreg.viewer.summary_page import HEADINGS, summary_markdown
 
+PICTURE_AT = 0.25
+"""Where the camera's picture is drawn: this part of the way to the markers."""
 FAR_MM = 1000.0
 """A camera farther from the probe than this is not included in the initial view."""
 
@@ -40,6 +44,8 @@ class ResultDrawing:
         model, measurements, estimate, truth: of the session.
         tracks: the queries of ``estimate.tracks`` whose marker was found.
         textured: numbers of the shots whose frame is already on the image plane.
+        limit_mm: of the predicted error.
+        view: size of the 3D view for which labels are placed, px.
     """
 
     rec: shapes.Recorder
@@ -49,10 +55,13 @@ class ResultDrawing:
     truth: Truth | None
     tracks: tuple[Track, ...]
     textured: frozenset[int]
+    limit_mm: float
+    view: tuple[int, int]
 
     def draw(self) -> None:
         """Draw everything."""
         looks = measured_pairs(self.estimate.pairs, self.measurements)
+        eye = self.eye()
         markers_of_aims = {aim.t: aim.marker for aim in self.measurements.aims}
         epoch, plane_is_plain = -1, False
         for shot in scene.shots_of(self.estimate):
@@ -61,7 +70,7 @@ class ResultDrawing:
                 epoch = now
                 self._epoch(epoch)
             if shot.kind == "aim":
-                self._aim(shot.position, markers_of_aims.get(shot.t), epoch)
+                self._aim(shot, markers_of_aims.get(shot.t), epoch, eye)
                 continue
             # A frame stays on the plane until the next shot, which has its own or none.
             if shot.number in self.textured:
@@ -72,152 +81,208 @@ class ResultDrawing:
                 self.rec.log("world/stage/outline", shapes.plane_outline(corners))
                 plane_is_plain = True
             if shot.kind == "pair":
-                self._pair(self.estimate.pairs[shot.position], looks[shot.position])
+                self._pair(shot, looks[shot.position], eye)
             else:
-                self._track(shot.position, epoch)
+                self._track(shot, epoch, eye)
         self.draw_end()
 
     def draw_end(self, *, from_now: bool = False) -> None:
-        """Draw what does not belong to a shot: plots, summary, the true PMs.
+        """Draw what does not belong to a shot: verdict, plots, summary, the true PMs.
 
         ``from_now``: the verdict holds from the present moment on, not for all times.
         """
-        if self.estimate.verdict is Verdict.REFUSED:
-            shapes.draw_cameras(self.rec, self.model, shapes.REFUSED)
+        verdict = self.estimate.verdict
+        words = HEADINGS[verdict].removeprefix("# ")
+        banner.draw(self.rec, verdict, words, palette.VERDICTS[verdict], static=not from_now)
         self._plots()
         self._static(self.rec.log if from_now else self.rec.static)
+
+    def eye(self) -> Eye:
+        """The eye of the 3D view."""
+        lens = None if self.model.camera is None else self.model.camera.left
+        picture = None
+        for epoch in self.estimate.epochs:
+            if _is_near(epoch.trus_T_camera):
+                corners = scene.frustum_strips_mm(lens, self._picture_mm())[0][:4]
+                picture = transform_points(epoch.trus_T_camera, corners)
+        return scene.best_eye(self.eye_points(), self.view, picture)
 
     def eye_points(self) -> FloatArray:
         """(n, 3) points that the initial view must contain: probe, planes, cameras and markers."""
         probe = self.model.probe
-        half = scene.array_length_mm(probe) / 2.0 + 10.0
         corners = scene.plane_corners_mm(probe, self._depth_mm())
         scans = [pair.look.scan_rad for pair in self.measurements.pairs] or [0.0]
-        points = [np.array([[-half, 0.0, -probe.radius_mm], [half, 0.0, -probe.radius_mm]])]
+        points = [scene.probe_points_mm(probe)]
         points += [transform_points(scene.trus_T_plane(scan), corners) for scan in (min(scans), max(scans))]
-        for epoch in range(len(self.estimate.epochs)):
-            trus_T_camera = self._trus_T_camera(epoch)
-            if trus_T_camera is None or np.linalg.norm(trus_T_camera[:3, 3]) > FAR_MM:
-                continue
-            origins = [pair.marker.camera_T_marker[:3, 3] for pair in self.measurements.pairs if pair.epoch == epoch]
-            points.append(transform_points(trus_T_camera, np.array([np.zeros(3), *origins])))
+        for epoch in self.estimate.epochs:
+            if _is_near(epoch.trus_T_camera):
+                mine = [pair.marker.camera_T_marker for pair in self.measurements.pairs if pair.epoch == epoch.index]
+                origins = [camera_T_marker[:3, 3] for camera_T_marker in mine]
+                points.append(transform_points(epoch.trus_T_camera, np.array([np.zeros(3), *origins])))
+        if self.truth is not None:
+            points += [true[:3, 3][None] for true in self.truth.trus_T_camera if _is_near(true)]
         return np.concatenate(points)
 
-    def trus_view(self) -> FloatArray | None:
-        """(3,) the direction in which the last camera looks."""
-        for epoch in reversed(self.estimate.epochs):
-            if epoch.trus_T_camera is not None:
-                return np.asarray(epoch.trus_T_camera[:3, 2])
-        return None
+    def _picture_mm(self) -> float:
+        """Distance from the camera at which its picture is drawn."""
+        depths = [pair.marker.camera_T_marker[2, 3] for pair in self.measurements.pairs]
+        return PICTURE_AT * float(np.median(depths)) if depths else shapes.IMAGE_DISTANCE_MM
 
     # ---- one shot ----
 
     def _epoch(self, epoch: int) -> None:
         trus_T_camera = self._trus_T_camera(epoch)
-        covariance = self.estimate.epochs[epoch].covariance if epoch < len(self.estimate.epochs) else None
         self.rec.log("world/camera", shapes.transform(trus_T_camera))
-        if trus_T_camera is None or covariance is None:
-            self.rec.clear("world/targets")
+        shapes.color_cameras(self.rec, self.model, self._picture_mm(), refused=self._refused(epoch))
+        known = self.estimate.epochs[epoch] if epoch < len(self.estimate.epochs) else None
+        if trus_T_camera is None or known is None or known.covariance is None or known.predicted_tre is None:
+            target_map.clear(self.rec)
         else:
-            targets = self.model.targets_mm
-            covariances = scene.target_covariances(trus_T_camera, covariance, targets)
-            centres = shapes.small_points(targets, shapes.TARGET, 1.2)
-            self.rec.log("world/targets", shapes.ellipsoids(targets, covariances, shapes.TARGET), centres)
+            targets, worst_mm = self.model.targets_mm, known.predicted_tre.worst_mm
+            bounds = target_bounds_mm(known.covariance, trus_T_camera, targets, worst_mm)
+            target_map.draw(self.rec, targets, bounds, self.limit_mm)
         if self.truth is not None and epoch < len(self.truth.trus_T_camera):
             camera = None if self.model.camera is None else self.model.camera.left
-            outline = scene.frustum_strips_mm(camera, shapes.IMAGE_DISTANCE_MM / 3.0)
+            outline = scene.frustum_strips_mm(camera, self._picture_mm() / 3.0)
             outline = [transform_points(self.truth.trus_T_camera[epoch], strip) for strip in outline]
-            self.rec.log("world/truth/camera", shapes.strips(outline, shapes.TRUTH, 1.2))
+            self.rec.log("world/truth/camera", shapes.strips(outline, palette.TRUTH, 1.2))
 
-    def _pair(self, pair: PairEstimate, measured: Pair | None) -> None:
-        color = shapes.PM if pair.used else shapes.UNUSED
+    def _pair(self, shot: scene.Shot, measured: Pair | None, eye: Eye) -> None:
+        pair = self.estimate.pairs[shot.position]
+        color = palette.PM if pair.used else palette.UNUSED
         marker = None if measured is None else measured.marker
         self._marker(marker)
-        self._beam(marker, pair.lambda_mm if pair.used else None, pair.epoch, keep=True)
-        self._sound(pair, None if measured is None else measured.look)
+        beam = self._beam(marker, pair.lambda_mm if pair.used else None, pair.epoch, keep=shot.number)
+        plane = self._sound(shot.number, pair, None if measured is None else measured.look)
+        spot = None
         if pair.trus_p_pm_mm is None:
             self.rec.clear("world/shot/pm")
         else:
-            label = f"PM {pair.pm}" + ("" if pair.used else " (not used)")
-            self.rec.log("world/shot/pm", shapes.point(pair.trus_p_pm_mm, color, 5.0, label))
-            # The point has the same size at every zoom, for ellipsoids that are too small to see.
-            centre = shapes.small_points(pair.trus_p_pm_mm[None], color, 3.5)
-            self.rec.log("world/looks/pm", centre)
+            spot = f"PM {pair.pm}" + ("" if pair.used else ", not used"), pair.trus_p_pm_mm
+            self.rec.log("world/shot/pm", shapes.point(pair.trus_p_pm_mm, color, 5.0))
+            look = f"world/looks/{shot.number}"
+            if pair.used:
+                # The point has the same size at every zoom, for ellipsoids that are too small to see.
+                self.rec.log(f"{look}/pm", shapes.small_points(pair.trus_p_pm_mm[None], color, 3.5))
+            else:
+                self.rec.log(f"{look}/not_used", shapes.cross(pair.trus_p_pm_mm, color))
             if pair.covariance is not None:
                 one = shapes.ellipsoids(pair.trus_p_pm_mm[None], pair.covariance[None], color)
-                self.rec.log("world/looks/pm_95", one)
-        self._say(f"pair, PM {pair.pm}", pair.used, pair.reason, pair.residual_mm)
+                self.rec.log(f"{look}/pm_95", one)
+        self._words(eye, pair.epoch, marker, spot, plane)
+        self._see(shot, pair.epoch, beam, None if plane is None else plane[1])
+        self._say(shot, f"pair, PM {pair.pm}", pair.used, pair.reason, pair.residual_mm)
 
-    def _sound(self, pair: PairEstimate, look: Look | None) -> None:
-        """Draw the arc, the sound path, and the image plane of a look."""
+    def _sound(self, number: int, pair: PairEstimate, look: Look | None) -> tuple[str, FloatArray] | None:
+        """Draw the arc, the sound path, and the image plane of a look; returns the plane's words and corners."""
         if look is None:
             self.rec.clear("world/shot/arc", "world/shot/sound")
-            return
-        probe, color = self.model.probe, shapes.SOUND if pair.used else shapes.UNUSED
+            return None
+        probe, color = self.model.probe, palette.SOUND if pair.used else palette.UNUSED
         strip = scene.arc_strip_mm(look, probe)
-        self.rec.log("world/looks/arc", shapes.strips([strip], color, 1.0))
+        self.rec.log(f"world/looks/{number}/arc", shapes.strips([strip], color, 1.0))
         self.rec.log("world/shot/arc", shapes.strips([strip], color, 3.0))
         theta = look.scan_rad if pair.theta_rad is None else pair.theta_rad
         way = np.stack([scene.element_centre_mm(look, probe), scene.arc_point_mm(look, probe, theta)])
-        self.rec.log("world/shot/sound", shapes.strips([way], color, 1.5, f"sound, {look.range_mm:.1f} mm"))
+        self.rec.log("world/shot/sound", shapes.strips([way], color, 1.5))
         device_deg = math.degrees(self.model.stage.device_from_scan(look.scan_rad))
-        self._stage(look.scan_rad, f"image plane, stage {device_deg:.1f}°")
+        return self._stage(look.scan_rad, f"image plane, stage {device_deg:.1f}°")
 
-    def _aim(self, position: int, marker: MarkerObservation | None, epoch: int) -> None:
-        aim = self.estimate.aims[position]
+    def _aim(self, shot: scene.Shot, marker: MarkerObservation | None, epoch: int, eye: Eye) -> None:
+        aim = self.estimate.aims[shot.position]
         self.rec.clear("world/shot/arc", "world/shot/sound", "world/shot/pm")
         self._marker(marker)
-        self._beam(marker, aim.lambda_mm, epoch, keep=False)
-        self._say("calibration shot", aim.used, aim.reason, aim.residual_mm)
+        beam = self._beam(marker, aim.lambda_mm, epoch)
+        self._words(eye, epoch, marker, None, None)
+        self._see(shot, epoch, beam, None)
+        self._say(shot, "calibration shot", aim.used, aim.reason, aim.residual_mm)
 
-    def _track(self, position: int, epoch: int) -> None:
-        answer = self.estimate.tracks[position]
+    def _track(self, shot: scene.Shot, epoch: int, eye: Eye) -> None:
+        answer = self.estimate.tracks[shot.position]
         query = self._query_of(answer)
         marker = None if query is None else query.marker
         self.rec.clear("world/shot/arc", "world/shot/sound")
         self._marker(marker)
-        spot = self._beam(marker, answer.lambda_mm, epoch, keep=False)
-        if spot is None:
+        beam = self._beam(marker, answer.lambda_mm, epoch)
+        spot = plane = None
+        if beam is None:
             self.rec.clear("world/shot/pm")
         else:
-            self.rec.log("world/shot/pm", shapes.point(spot, shapes.PM, 5.0, "predicted spot"))
+            spot = "predicted spot", beam[1]
+            self.rec.log("world/shot/pm", shapes.point(beam[1], palette.PM, 5.0))
         if answer.stage_rad is None:
-            self._say("track", False, answer.reason, None)
-            return
-        sigma = "" if answer.sigma_rad is None else f" ± {math.degrees(answer.sigma_rad):.1f}° (1 sigma)"
-        turn = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°{sigma}"
-        self._stage(self.model.stage.scan_from_device(answer.stage_rad), turn)
-        self._say(f"track: {turn}", True, "", None)
+            self._say(shot, "track", False, answer.reason, None)
+        else:
+            sigma = "" if answer.sigma_rad is None else f" ± {math.degrees(answer.sigma_rad):.1f}° (1 sigma)"
+            turn = f"turn the stage to {math.degrees(answer.stage_rad):.1f}°{sigma}"
+            plane = self._stage(self.model.stage.scan_from_device(answer.stage_rad), turn)
+            self._say(shot, f"track: {turn}", True, "", None)
+        self._words(eye, epoch, marker, spot, plane)
+        self._see(shot, epoch, beam, None if plane is None else plane[1])
 
-    def _stage(self, scan_rad: float, label: str) -> None:
-        probe = self.model.probe
-        self.rec.log("world/stage", shapes.transform(scene.trus_T_plane(scan_rad)))
-        corner = scene.plane_corners_mm(probe, self._depth_mm())[2]
-        self.rec.log("world/stage/label", shapes.point(corner, shapes.SOUND, 1.0, label))
+    def _stage(self, scan_rad: float, words: str) -> tuple[str, FloatArray]:
+        """Turn the image plane; returns its words and its corners (4, 3), TRUS mm."""
+        trus_T_plane = scene.trus_T_plane(scan_rad)
+        self.rec.log("world/stage", shapes.transform(trus_T_plane))
+        return words, transform_points(trus_T_plane, scene.plane_corners_mm(self.model.probe, self._depth_mm()))
 
     def _marker(self, marker: MarkerObservation | None) -> None:
         self.rec.log("world/camera/marker", shapes.transform(None if marker is None else marker.camera_T_marker))
 
+    def _words(
+        self,
+        eye: Eye,
+        epoch: int,
+        marker: MarkerObservation | None,
+        spot: tuple[str, FloatArray] | None,
+        plane: tuple[str, FloatArray] | None,
+    ) -> None:
+        shot_labels.draw(
+            self.rec,
+            self.model,
+            (eye, self.view),
+            trus_T_camera=self._trus_T_camera(epoch),
+            refused=self._refused(epoch),
+            camera_T_marker=None if marker is None else marker.camera_T_marker,
+            marker_T_laser=None if self.estimate.laser is None else self.estimate.laser.marker_T_laser,
+            spot=spot,
+            plane=plane,
+        )
+
+    def _see(self, shot: scene.Shot, epoch: int, beam: FloatArray | None, plane: FloatArray | None) -> None:
+        """Draw into the endoscope's picture what the surgeon would see there."""
+        if self.model.camera is None:
+            return
+        if self._refused(epoch):
+            endoscope_view.say_refused(self.rec, self.model.camera.left)
+            return
+        spots: dict[bool, list[FloatArray]] = {True: [], False: []}
+        for pair in self.estimate.pairs:
+            if pair.t <= shot.t and pair.trus_p_pm_mm is not None:
+                spots[pair.used].append(pair.trus_p_pm_mm)
+        seen = Seen(plane, beam, np.reshape(spots[True], (-1, 3)), np.reshape(spots[False], (-1, 3)))
+        endoscope_view.draw(self.rec, self.model.camera.left, self._trus_T_camera(epoch), seen)
+
     def _beam(
-        self, marker: MarkerObservation | None, lambda_mm: float | None, epoch: int, *, keep: bool
+        self, marker: MarkerObservation | None, lambda_mm: float | None, epoch: int, *, keep: int | None = None
     ) -> FloatArray | None:
-        """Draw the beam from the laser frame's origin to its spot (3,), which is returned; ``keep`` keeps it drawn."""
+        """Draw the beam; returns the laser frame's origin and the spot (2, 3). ``keep``: shot to keep it drawn for."""
         trus_T_camera, laser = self._trus_T_camera(epoch), self.estimate.laser
         if marker is None or lambda_mm is None or trus_T_camera is None or laser is None:
             self.rec.clear("world/shot/beam")
             return None
         trus_T_laser = trus_T_camera @ marker.camera_T_marker @ laser.marker_T_laser
         origin, tip = scene.laser_origin_and_tip(trus_T_laser, lambda_mm)
-        if keep:
-            self.rec.log("world/looks/beam", shapes.arrow(origin, tip, shapes.BEAM, 0.7))
-        self.rec.log("world/shot/beam", shapes.arrow(origin, tip, shapes.BEAM, 2.5, "laser beam"))
-        return tip
+        if keep is not None:
+            self.rec.log(f"world/looks/{keep}/beam", shapes.arrow(origin, tip, palette.BEAM, 0.7))
+        self.rec.log("world/shot/beam", shapes.arrow(origin, tip, palette.BEAM, 2.5))
+        return np.stack([origin, tip])
 
-    def _say(self, what: str, used: bool, reason: str, residual_mm: float | None) -> None:
-        words = [what] if used else [what, f"not used: {reason}"]
+    def _say(self, shot: scene.Shot, what: str, used: bool, reason: str, residual_mm: float | None) -> None:
+        words = [f"shot {shot.number}: {what}"] if used else [f"shot {shot.number}: {what}", f"not used: {reason}"]
         if residual_mm is not None:
             words.append(f"residual {residual_mm:.3f} mm")
-        self.rec.log("log", rr.TextLog(", ".join(words), level="INFO" if used else "WARN"))
+        self.rec.log(f"log/{shot.number}", rr.TextLog(", ".join(words), level="INFO" if used else "WARN"))
 
     # ---- once ----
 
@@ -251,17 +316,14 @@ class ResultDrawing:
     def _static(self, log: Callable[..., None]) -> None:
         if self.truth is not None and self.truth.trus_p_pm_mm:
             known = np.array(list(self.truth.trus_p_pm_mm.values()))
-            self.rec.static("world/truth/pms", shapes.small_points(known, shapes.TRUTH, 2.5))
-        page = summary_markdown(self.model, self.estimate, self._camera_errors())
+            self.rec.static("world/truth/pms", shapes.small_points(known, palette.TRUTH, 2.5))
+        page = summary_markdown(self.model, self.estimate, self._camera_errors(), self.limit_mm)
         if self.estimate.laser is not None:
             fibre = np.array([np.zeros(3), self.estimate.laser.marker_T_laser[:3, 3]])
-            self.rec.static("world/camera/marker/fibre", shapes.strips([fibre], shapes.MARKER, 1.0))
+            self.rec.static("world/camera/marker/fibre", shapes.strips([fibre], palette.MARKER, 1.0))
+            laser = shapes.transform(self.estimate.laser.marker_T_laser)
+            self.rec.static("world/camera/marker/laser", laser, shapes.axes(6.0))
         log("summary", rr.TextDocument(page, media_type="text/markdown"))
-        if self.estimate.verdict is Verdict.REFUSED:
-            points = self.eye_points()
-            above = (points.min(axis=0) + points.max(axis=0)) / 2.0
-            above[2] = points[:, 2].max() + 5.0
-            log("world/verdict", shapes.point(above, shapes.REFUSED, 9.0, "REFUSED: do not use"))
 
     def _camera_errors(self) -> list[tuple[float, float]]:
         """Per epoch with a known truth: error of the camera, mm and rad."""
@@ -276,6 +338,11 @@ class ResultDrawing:
 
     def _trus_T_camera(self, epoch: int) -> FloatArray | None:
         return self.estimate.epochs[epoch].trus_T_camera if epoch < len(self.estimate.epochs) else None
+
+    def _refused(self, epoch: int) -> bool:
+        """Whether an epoch's registration, or that of the session, is not to be used."""
+        refused = self.estimate.verdict is Verdict.REFUSED
+        return refused or (epoch < len(self.estimate.epochs) and self.estimate.epochs[epoch].verdict is Verdict.REFUSED)
 
     def _epoch_of(self, shot: scene.Shot) -> int:
         if shot.kind == "pair":
@@ -293,6 +360,11 @@ class ResultDrawing:
         ranges = [pair.look.range_mm for pair in self.measurements.pairs]
         beyond = float(np.linalg.norm(self.model.targets_mm[:, 1:], axis=1).max()) - self.model.probe.radius_mm
         return max([*ranges, beyond]) + 5.0
+
+
+def _is_near(trus_T_camera: FloatArray | None) -> TypeGuard[FloatArray]:
+    """Whether a camera is included in the initial view."""
+    return trus_T_camera is not None and float(np.linalg.norm(trus_T_camera[:3, 3])) <= FAR_MM
 
 
 def measured_pairs(pairs: Sequence[PairEstimate], measurements: Measurements) -> tuple[Pair | None, ...]:

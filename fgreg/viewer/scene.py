@@ -12,12 +12,13 @@ from typing import Literal
 
 import numpy as np
 
-from fgreg.geometry.transforms import FloatArray, exp_so3, hat, log_so3, make_transform, transform_points
+from fgreg.geometry.transforms import FloatArray, exp_so3, log_so3, make_transform, transform_points
 from fgreg.model.camera_model import CameraModel
 from fgreg.model.estimate import SessionEstimate
 from fgreg.model.measurements import Look
 from fgreg.model.sensitivity import arc_of_rotation
 from fgreg.model.session_model import MarkerModel, ProbeModel
+from fgreg.viewer.palette import Color
 
 ShotKind = Literal["aim", "pair", "track"]
 CHI2_95_3 = 7.814728
@@ -56,6 +57,13 @@ def arc_strip_mm(look: Look, probe: ProbeModel, points: int = 25) -> FloatArray:
 def array_length_mm(probe: ProbeModel) -> float:
     """Length of the array along x."""
     return probe.elements * probe.pitch_mm
+
+
+def probe_points_mm(probe: ProbeModel) -> FloatArray:
+    """(n, 3) points about the housing, round ends included."""
+    half, radius = array_length_mm(probe) / 2.0 + 4.0, probe.radius_mm
+    ring = [[side * half, y * radius, z * radius] for side in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    return np.array([*ring, [-half - radius, 0.0, 0.0], [half + radius, 0.0, 0.0]])
 
 
 def plane_corners_mm(probe: ProbeModel, depth_mm: float) -> FloatArray:
@@ -113,18 +121,6 @@ def quaternion_xyzw(rotation: FloatArray) -> FloatArray:
     return np.array([*(math.sin(angle / 2.0) * axis), math.cos(angle / 2.0)])
 
 
-def target_covariances(trus_T_camera: FloatArray, covariance: FloatArray, targets_mm: FloatArray) -> FloatArray:
-    """(n, 3, 3) covariances of targets (n, 3) in TRUS axes, mm^2, from the registration's (right tangent).
-
-    A camera point moves by ``R (rotation x p + translation)`` with the tangent, so ``J = R [-hat(p), I]``.
-    """
-    rotation = trus_T_camera[:3, :3]
-    camera_p = (targets_mm - trus_T_camera[:3, 3]) @ rotation
-    jacobian = np.concatenate([-hat(camera_p), np.broadcast_to(np.eye(3), (len(targets_mm), 3, 3))], axis=2)
-    jacobian = rotation @ jacobian
-    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))
-
-
 def laser_origin_and_tip(a_T_laser: FloatArray, lambda_mm: float) -> tuple[FloatArray, FloatArray]:
     """The beam's origin (3,) and its point (3,) at ``lambda_mm``, in frame a."""
     ends = transform_points(a_T_laser, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, lambda_mm]]))
@@ -179,6 +175,12 @@ def live_points_mm(probe: ProbeModel, targets_mm: FloatArray) -> FloatArray:
     return np.vstack([ends, targets_mm])
 
 
+VIEW_TANGENT = 0.52
+"""Tangent of half the vertical angle of Rerun's 3D view."""
+MARGIN = 0.88
+"""Part of the view that the points fill."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
     """Viewpoint of the 3D view: its position and the point it looks at, (3,) TRUS mm; up is TRUS +z."""
@@ -186,36 +188,70 @@ class Eye:
     position_mm: FloatArray
     target_mm: FloatArray
 
+    def axes(self) -> FloatArray:
+        """(3, 3) rows: right, down and forward."""
+        forward = self.target_mm - self.position_mm
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(forward, right), forward])
+
+    def seen(self, points_mm: FloatArray) -> FloatArray:
+        """(n, 2) where points (n, 3) are seen: right and down, as tangents of the angles to the view's middle."""
+        turned = (np.reshape(points_mm, (-1, 3)) - self.position_mm) @ self.axes().T
+        return np.asarray(turned[:, :2] / np.maximum(turned[:, 2:], 1e-6))
+
+    def shifted(self, point_mm: FloatArray, shift: FloatArray) -> FloatArray:
+        """(n, 3) the points that are seen by ``shift`` (n, 2) right and down of a point (3,), as far away as it."""
+        axes = self.axes()
+        depth = float((point_mm - self.position_mm) @ axes[2])
+        return np.asarray(point_mm + depth * shift @ axes[:2])
+
 
 def best_eye(
-    points_mm: FloatArray, half_height: float = 0.45, half_width: float = 0.42, trus_view: FloatArray | None = None
+    points_mm: FloatArray, size_px: tuple[int, int], picture_mm: FloatArray | None = None, margin: float = MARGIN
 ) -> Eye:
-    """The eye from which points (n, 3) fill the view, from above and obliquely to the probe's axis.
+    """The eye from which points (n, 3) fill a view of this size, from above and obliquely to the probe's axis.
 
     Along the axis the probe is a disc; across it the arcs are lines. So the eye is 40 to 60 degrees off the axis and 20
-    to 35 degrees up, in the quadrant with the largest spread of the points in the view that does not show the
-    endoscope's image edge on.
+    to 50 degrees up, where the rectangle about the points fills most of the view. The endoscope's picture should
+    neither cover the rest nor be seen edge on.
 
     Args:
         points_mm: points that must be in view.
-        half_height, half_width: of the view, at distance 1 (tangents of half its angles, less a margin).
-        trus_view: (3,) the direction in which the camera looks, where there is one; a unit vector.
+        size_px: width and height of the view.
+        picture_mm: (4, 3) corners of the picture, where there is one, in order; not among ``points_mm``.
+        margin: part of the view that the points fill.
     """
-    best, best_spread = (np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])), -1.0
-    offsets = points_mm - points_mm.mean(axis=0)
-    for elevation in np.radians([20.0, 27.0, 35.0]):
+    rest = points_mm
+    if picture_mm is not None:
+        points_mm = np.concatenate([points_mm, picture_mm])
+    half_height = margin * VIEW_TANGENT
+    half_width = half_height * size_px[0] / size_px[1]
+    best, best_fill = None, -1.0
+    for elevation in np.radians([20.0, 27.0, 35.0, 42.0, 50.0]):
         for azimuth in np.radians([40.0, 50.0, 60.0, 120.0, 130.0, 140.0, 220.0, 230.0, 240.0, 300.0, 310.0, 320.0]):
-            flat = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
-            away = np.array([*(math.cos(elevation) * flat[:2]), math.sin(elevation)])
-            right = np.array([-flat[1], flat[0], 0.0])
-            up = np.cross(away, right)
-            spread = float(np.linalg.svd(offsets @ np.column_stack([right, up]), compute_uv=False)[1])
-            if trus_view is not None:
-                spread *= 0.2 + max(0.0, float(-away @ trus_view))
-            if spread > best_spread:
-                best, best_spread = (away, right, up), spread
-    away, right, up = best
-    axes = np.column_stack([right, up, away])
+            eye = _eye_from(points_mm, float(elevation), float(azimuth), half_height, half_width)
+            extent = np.ptp(eye.seen(points_mm), axis=0)
+            fill = float(extent[0] * extent[1])
+            if picture_mm is not None:
+                shown, others = eye.seen(picture_mm), eye.seen(rest)
+                (ax, ay), (bx, by) = shown[2] - shown[0], shown[3] - shown[1]
+                area = 0.5 * abs(ax * by - ay * bx)
+                boxes = [np.concatenate([part.min(axis=0), part.max(axis=0)]) for part in (shown, others)]
+                fill *= math.sqrt(area) * (1.0 - _overlap(*boxes) / max(float(np.prod(np.ptp(shown, axis=0))), 1e-9))
+            if fill > best_fill:
+                best, best_fill = eye, fill
+    assert best is not None
+    return best
+
+
+def _eye_from(points_mm: FloatArray, elevation: float, azimuth: float, half_height: float, half_width: float) -> Eye:
+    """The nearest eye in a direction from which points (n, 3) are all in view."""
+    flat = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    away = np.array([*(math.cos(elevation) * flat[:2]), math.sin(elevation)])
+    right = np.array([-flat[1], flat[0], 0.0])
+    axes = np.column_stack([right, np.cross(away, right), away])
     seen = points_mm @ axes
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2.0
     for _ in range(6):  # under perspective the centre of the view is not that of the points
@@ -231,3 +267,67 @@ def _distance_that_shows(centred: FloatArray, half_height: float, half_width: fl
     """Least distance from which points (n, 3), as right, up and towards the eye, are all in view."""
     fit = np.maximum(np.abs(centred[:, 0]) / half_width, np.abs(centred[:, 1]) / half_height) + centred[:, 2]
     return max(float(fit.max()), 1.0)
+
+
+LABEL_PX = (7.2, 14.0, 22.0)
+"""Of a label: width of a letter, of its margins together, and height; Rerun centres it below its point."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Label:
+    """Words in the 3D view, and the points (k, 3) mm that they may stand at, the best first."""
+
+    text: str
+    places_mm: FloatArray
+    color: Color
+
+
+def place_labels(labels: list[Label], eye: Eye | None, size_px: tuple[int, int]) -> list[Label]:
+    """The labels with one place each, such that they do not cover each other as seen by the eye.
+
+    A label stands at, above, below or beside one of its points, where it overlaps those before it and the view's edge
+    least; the first have the first choice. Without an eye each stands at its first point.
+    """
+    placed: list[Label] = []
+    taken: list[FloatArray] = []
+    for label in labels:
+        at = label.places_mm[0]
+        if eye is not None:
+            shifts = label_shifts(label.text, size_px)
+            places = np.concatenate([eye.shifted(place, shifts) for place in label.places_mm])
+            boxes = [label_box(label.text, seen, size_px) for seen in eye.seen(places)]
+            covered = [2.0 * _outside(box, size_px) + sum(_overlap(box, other) for other in taken) for box in boxes]
+            best = int(np.argmin(np.round(covered, 3)))
+            at = places[best]
+            taken.append(boxes[best])
+        placed.append(Label(label.text, at[None], label.color))
+    return placed
+
+
+def label_shifts(text: str, size_px: tuple[int, int]) -> FloatArray:
+    """(n, 2) from a label's point to where it may stand: at it, above, beside, below; as tangents."""
+    letter, margin, height = LABEL_PX
+    half = 0.5 * (letter * len(text) + margin) + 8.0
+    steps = [(0.0, 0.0), (0.0, -1.4), (1.0, -0.5), (-1.0, -0.5), (0.0, 1.0), (1.0, -1.6), (-1.0, -1.6), (1.0, 0.6)]
+    steps += [(-1.0, 0.6), (0.0, -2.6), (0.0, 2.1), (1.0, 1.7), (-1.0, 1.7)]
+    return np.asarray(np.array(steps) * [half, height] * 2.0 * VIEW_TANGENT / size_px[1])
+
+
+def label_box(text: str, seen: FloatArray, size_px: tuple[int, int]) -> FloatArray:
+    """(4,) left, top, right and bottom, px from the middle of the view, of a label whose point is ``seen`` (2,)."""
+    letter, margin, height = LABEL_PX
+    x, y = np.asarray(seen) * 0.5 * size_px[1] / VIEW_TANGENT
+    half = 0.5 * (letter * len(text) + margin)
+    return np.array([x - half, y, x + half, y + height])
+
+
+def _overlap(first: FloatArray, second: FloatArray) -> float:
+    """Area that two boxes share, px^2."""
+    sides = np.minimum(first[2:], second[2:]) - np.maximum(first[:2], second[:2])
+    return float(np.prod(np.maximum(sides, 0.0)))
+
+
+def _outside(box: FloatArray, size_px: tuple[int, int]) -> float:
+    """Area of a box that is outside the view, px^2."""
+    half = 0.5 * np.array(size_px, dtype=np.float64)
+    return float(np.prod(box[2:] - box[:2])) - _overlap(box, np.array([*-half, *half]))

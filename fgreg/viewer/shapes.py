@@ -5,6 +5,7 @@ This module imports Rerun, which takes more than half a second; see :mod:`fgreg.
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,33 +19,17 @@ from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.model.camera_model import CameraModel
 from fgreg.model.session_model import SessionModel
 from fgreg.viewer.pa_frame import PaPicture
-from fgreg.viewer.scene import ellipsoid_95, frustum_strips_mm, quaternion_xyzw
+from fgreg.viewer.palette import AXES, CAMERA, PLANE, PROBE, REFUSED, UNUSED, Color
+from fgreg.viewer.scene import Label, ellipsoid_95, frustum_strips_mm, quaternion_xyzw
 
-Color = tuple[int, int, int]
 Image8 = npt.NDArray[np.uint8]
 
-PROBE: Color = (150, 155, 165)
-PLANE: Color = (60, 150, 190)
-SOUND: Color = (70, 190, 250)
-BEAM: Color = (70, 240, 110)
-PM: Color = (255, 175, 50)
-CAMERA: Color = (120, 150, 255)
-REFUSED: Color = (255, 60, 60)
-GOAL: Color = (70, 240, 110)
-WARNING: Color = (240, 160, 30)
-UNUSED: Color = (130, 130, 130)
-MARKER: Color = (245, 245, 245)
-TARGET: Color = (120, 112, 165)
-TRUTH: Color = (255, 80, 210)
-AXES: tuple[Color, ...] = ((235, 90, 90), (90, 210, 100), (100, 140, 255))
 IMAGE_DISTANCE_MM = 28.0
-"""Distance from the camera at which its image is drawn."""
+"""Distance from the camera at which its image is drawn, where no shot tells how far away the marker is."""
 LARGEST_ELLIPSOID_MM = 50.0
 """Larger ellipsoids (half size) are not drawn."""
 CANVAS = 512
 """Side of the canvas for images of changing size, px."""
-BANNER = (6, 160)
-"""Rows and columns of a strip of one colour."""
 NOWHERE = "not known"
 """Name of a frame that nothing else is connected to."""
 JPEG_QUALITY = 80
@@ -128,9 +113,20 @@ def axes(lengths_mm: FloatArray | float) -> rr.Arrows3D:
     return rr.Arrows3D(origins=np.zeros((3, 3)), vectors=vectors, colors=AXES, radii=[ui(1.5)])
 
 
-def axis_labels(lengths_mm: FloatArray, labels: Sequence[str]) -> rr.Points3D:
-    """Names at the ends of :func:`axes`."""
-    return rr.Points3D(np.diag(lengths_mm), colors=AXES, radii=[ui(0.5)], labels=labels)
+def labels(placed: Sequence[Label]) -> rr.Points3D:
+    """Words at points, always shown."""
+    return rr.Points3D(
+        [label.places_mm[0] for label in placed],
+        colors=[label.color for label in placed],
+        radii=[ui(0.5)],
+        labels=[label.text for label in placed],
+        show_labels=True,
+    )
+
+
+def spheres(centres_mm: FloatArray, radii_mm: FloatArray, colors: Sequence[Color]) -> rr.Points3D:
+    """Solid spheres (n, 3) of radii (n,), each with its colour."""
+    return rr.Points3D(centres_mm, radii=radii_mm, colors=colors)
 
 
 def point(p_mm: FloatArray | Sequence[float], color: Color, size: float, label: str | None = None) -> rr.Points3D:
@@ -175,6 +171,12 @@ def small_points(points_mm: FloatArray, color: Color, size: float) -> rr.Points3
     return rr.Points3D(points_mm, colors=[color], radii=[ui(size)])
 
 
+def cross(p_mm: FloatArray, color: Color, half_mm: float = 1.5) -> rr.LineStrips3D:
+    """Three short lines through a point: a shot that was not used."""
+    ends = half_mm * np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return strips([np.stack([p_mm - end, p_mm + end]) for end in ends], color, 1.2)
+
+
 def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) -> rr.Mesh3D:
     """The image plane: transparent, with an optional image (rows, columns, 3) on it.
 
@@ -207,34 +209,51 @@ def probe(length_mm: float, radius_mm: float) -> rr.Capsules3D:
         rotation_axis_angles=[rr.RotationAxisAngle([0.0, 1.0, 0.0], degrees=90.0)],
         colors=[PROBE],
         fill_mode="solid",
-        labels=["TRUS probe"],
-        show_labels=True,
     )
 
 
-def pinhole(camera: CameraModel, color: Color) -> rr.Pinhole:
-    """A camera's frustum, without its distortion."""
-    return rr.Pinhole(
+def draw_cameras(rec: Recorder, model: SessionModel) -> None:
+    """Draw the endoscope under ``world/camera``, for all times but for its colour (:func:`color_cameras`)."""
+    rec.static("world/camera/axes", axes(10.0))
+    if model.camera is None:
+        return
+    rec.static("world/camera/left", _pinhole(model.camera.left))
+    if model.camera.right is not None and model.camera.right_T_left is not None:
+        left_T_right = transform(inverse(model.camera.right_T_left))
+        rec.static("world/camera/right", left_T_right, _pinhole(model.camera.right))
+
+
+def _pinhole(camera: CameraModel) -> rr.Pinhole:
+    """A camera without its distortion, colour and picture's distance."""
+    return rr.Pinhole.from_fields(
         image_from_camera=camera.matrix,
         resolution=camera.image_size,
         camera_xyz=rr.ViewCoordinates.RDF,
-        image_plane_distance=IMAGE_DISTANCE_MM,
-        color=color,
-        line_width=ui(2.0),
+        line_width=ui(1.5),
     )
 
 
-def draw_cameras(rec: Recorder, model: SessionModel, color: Color) -> None:
-    """Draw the endoscope under ``world/camera`` in a colour; a second call changes the colour."""
-    rec.static("world/camera/label", point([0.0, 0.0, 0.0], color, 4.0, "camera"))
-    rec.static("world/camera/axes", axes(10.0))
+def color_cameras(rec: Recorder, model: SessionModel, distance_mm: float, *, refused: bool) -> None:
+    """Draw the endoscope as usable or as refused, its picture at ``distance_mm``, from the present time on.
+
+    A refused one has another colour and its picture is crossed out.
+    """
+    color = REFUSED if refused else CAMERA
+    rec.log("world/camera/origin", point([0.0, 0.0, 0.0], color, 4.0))
+    camera = None if model.camera is None else model.camera.left
+    frustum = frustum_strips_mm(camera, distance_mm)
     if model.camera is None:
-        rec.static("world/camera/outline", strips(frustum_strips_mm(None, IMAGE_DISTANCE_MM / 2.0), color, 1.5))
-        return
-    rec.static("world/camera/left", pinhole(model.camera.left, color))
-    if model.camera.right is not None and model.camera.right_T_left is not None:
-        left_T_right = transform(inverse(model.camera.right_T_left))
-        rec.static("world/camera/right", left_T_right, pinhole(model.camera.right, color))
+        rec.log("world/camera/outline", strips(frustum, color, 1.5))
+    else:
+        sides = ("left",) if model.camera.right is None else ("left", "right")
+        for side in sides:
+            fields = rr.Pinhole.from_fields(color=color, image_plane_distance=distance_mm)
+            rec.log(f"world/camera/{side}", fields)
+    if refused:
+        corners = frustum[0]
+        rec.log("world/camera/crossed", strips([corners[[0, 2]], corners[[1, 3]]], color, 3.0))
+    else:
+        rec.clear("world/camera/crossed")
 
 
 def picture(image: Image8) -> rr.EncodedImage | rr.Image:
@@ -243,9 +262,13 @@ def picture(image: Image8) -> rr.EncodedImage | rr.Image:
     return rr.Image(image, color_model="BGR" if image.ndim == 3 else "L").compress(jpeg_quality=JPEG_QUALITY)
 
 
-def flat(color: Color) -> rr.Image:
-    """A strip of one colour."""
-    return rr.Image(np.full((*BANNER, 3), color, dtype=np.uint8))
+def exact(image: Image8) -> rr.EncodedImage:
+    """A (h, w, 3) RGB image as PNG: small where it is plain, and its colours stay as they are."""
+    from PIL import Image  # comes with rerun-sdk
+
+    png = io.BytesIO()
+    Image.fromarray(image).save(png, format="PNG", optimize=True)
+    return rr.EncodedImage(contents=png.getvalue(), media_type="image/png")
 
 
 def no_picture(shape: tuple[int, ...]) -> rr.EncodedImage | rr.Image:
@@ -269,6 +292,11 @@ def canvas(image: Image8) -> Image8:
 def points_2d(pixels: FloatArray, color: Color, size: float, labels: Sequence[str] | None = None) -> rr.Points2D:
     """Points (n, 2) on an image, with their labels shown."""
     return rr.Points2D(pixels, colors=[color], radii=[ui(size)], labels=labels, show_labels=labels is not None)
+
+
+def coloured_points_2d(pixels: FloatArray, colors: Sequence[Color], size: float) -> rr.Points2D:
+    """Points (n, 2) on an image, each with its colour."""
+    return rr.Points2D(pixels, colors=colors, radii=[ui(size)])
 
 
 def strips_2d(strips_px: Sequence[FloatArray], color: Color, size: float) -> rr.LineStrips2D:

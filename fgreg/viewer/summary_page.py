@@ -8,31 +8,32 @@ import numpy as np
 
 from fgreg.model.estimate import EpochEstimate, SessionEstimate, Verdict
 from fgreg.model.session_model import SessionModel
+from fgreg.viewer.reason_links import WORST_TARGET, linked
 
 HEADINGS = {
     Verdict.OK: "# OK: the probe may be turned by this registration",
     Verdict.WARNING: "# WARNING: look first: read the reasons before the probe turns",
     Verdict.REFUSED: "# REFUSED: do not use this registration, do not turn the probe",
 }
-LEGEND = """
-**What is drawn.** Grey: the TRUS probe. Cyan: its image plane, and the arc on which the probe detected each source
-(the plane is thick, so the source may be off it). Green: the laser beam from the fibre's marker (white squares).
-Orange: photoacoustic markers with their 95 % ellipsoids. Blue (red where refused): the endoscope camera. Small
-wire balls: targets with the 95 % ellipsoid of their predicted error. Magenta: the truth, where it is known.
-Bold is the shot at the time cursor, thin are those before it.
+NOTE = """
+A link selects its shot in the scene and in the log; the log's times move the cursor. Spheres: radius (drawn no larger
+than leaves room for the next) and colour are the 95 % bound of the error there. Bold is the shot at the cursor.
 """
 
 
-def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_errors: list[tuple[float, float]]) -> str:
-    """The page: verdict, reasons, registration, pairs, and a legend of the colours.
+def summary_markdown(
+    model: SessionModel, estimate: SessionEstimate, camera_errors: list[tuple[float, float]], limit_mm: float
+) -> str:
+    """The page: verdict, reasons with their links, registration, pairs.
 
     Args:
         model: the session's set-up.
         estimate: its result.
         camera_errors: per epoch, translation error (mm) and rotation error (rad), where the truth is known.
+        limit_mm: of the predicted error.
     """
     lines = [HEADINGS[estimate.verdict], ""]
-    lines += [f"- {reason}" for reason in estimate.reasons]
+    lines += [f"- {linked(reason, estimate)}" for reason in estimate.reasons]
     used = sum(pair.used for pair in estimate.pairs)
     lines += [
         "",
@@ -40,9 +41,10 @@ def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_erro
         f"{sum(aim.used for aim in estimate.aims)} of {len(estimate.aims)} calibration shots used, "
         f"{len(estimate.tracks)} track queries.",
         "",
-        f"Predicted error at {len(model.targets_mm)} targets, mm:",
+        f"Predicted error at {len(model.targets_mm)} targets, mm; limit of the [worst](recording://{WORST_TARGET}): "
+        f"{limit_mm:.1f}:",
         "",
-        "| camera epoch | verdict | pairs | mean | 95 % bound, mean | 95 % bound, worst target |",
+        "| camera epoch | verdict | pairs | mean | mean 95 % bound | worst 95 % bound |",
         "|---|---|---|---|---|---|",
     ]
     lines += [_epoch_row(epoch) for epoch in estimate.epochs]
@@ -55,7 +57,7 @@ def summary_markdown(model: SessionModel, estimate: SessionEstimate, camera_erro
             f"Against the truth, epoch {index}: camera off by {translation_mm:.2f} mm and "
             f"{math.degrees(rotation_rad):.2f} deg.",
         ]
-    lines += [LEGEND]
+    lines += [NOTE]
     return "\n".join(lines)
 
 
