@@ -56,7 +56,8 @@ def test_tables_files_and_plots(
     assert {"tre_mean_mm", "pair_residual_mm", "nis", "moved_mm", "beam_angle_deg"} <= quantities
     assert all(float(row["value"]) is not None for row in rows)
     written = sorted(path.name for path in plots.iterdir())
-    assert written == ["error-against-pairs.png", "held-out-pairs.png", "influence.png", "tre.png"]
+    names = ["error-against-pairs", "held-out-pairs", "influence", "predicted-against-true", "tre"]
+    assert written == [f"{name}.png" for name in names]
     assert all(path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 5000 for path in plots.iterdir())
 
 

@@ -100,7 +100,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
             found = run(cases, config, jobs=jobs or _cores(), progress=progress, conditions=conditions)
         if csv is not None:
             write_file(csv, as_csv(found), CSV_FILE)
-        written = save_plots(found, plots, plot_format) if plots is not None else []
+        written = save_plots(found, plots, plot_format, config.solve.limit_mm) if plots is not None else []
         if as_json:
             typer.echo(json.dumps(as_dict(found), indent=2))
         elif not quiet:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtri, gammaln, xlogy
@@ -16,6 +17,8 @@ from fgreg.evaluation.run import SessionEvaluation
 from fgreg.evaluation.summary import all_tre_mm, pooled_curve
 from fgreg.geometry.transforms import FloatArray
 from fgreg.output.atomic_file import FileKind, write_file
+from fgreg.viewer import palette
+from fgreg.viewer.palette import Color
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,9 +28,20 @@ FORMATS = {
     "png": FileKind("a plot of fgreg", (b"\x89PNG\r\n",), (b"tEXtSoftware\0fgreg",)),
     "svg": FileKind("a plot of fgreg", (b"<?xml",), (b"<dc:title>fgreg</dc:title>",)),
 }
-PLOTS = ("error-against-pairs", "held-out-pairs", "influence", "tre")
-BLUE, ORANGE, GREY, RED = "#2a6f97", "#d97706", "#6b7280", "#b91c1c"
+PLOTS = ("error-against-pairs", "held-out-pairs", "influence", "tre", "predicted-against-true")
 MOST_BARS = 60
+MARKERS = "osD^vPX*"
+"""Signs of sessions, which go round where there are more."""
+NAMED_SESSIONS = 6
+"""In a legend; where there are more, none is named."""
+
+
+def _hex(color: Color) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color)
+
+
+BLUE, ORANGE, RED, GREY = _hex(palette.BLUE), _hex(palette.ORANGE), _hex(palette.VERMILLION), "#6b7280"
+"""Told apart by colour-blind people; what is beyond a limit has another sign or a hatch, too."""
 
 
 def new_figure(width: float = 6.4, height: float = 4.0) -> Figure:
@@ -43,15 +57,23 @@ def new_figure(width: float = 6.4, height: float = 4.0) -> Figure:
     return Figure(figsize=(width, height), dpi=150, layout="constrained")
 
 
-def save_plots(evaluations: Sequence[SessionEvaluation], folder: Path, file_format: str = "png") -> list[Path]:
+def save_plots(evaluations: Sequence[SessionEvaluation], folder: Path, file_format: str, limit_mm: float) -> list[Path]:
     """Write the plots for which these evaluations have figures; returns the files.
+
+    ``limit_mm``: predicted 95 % error at the worst target up to which the verdict is ``ok``.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
         InputError: the folder cannot be written to, or another format than ``FORMATS``.
     """
     check_plots(folder, file_format)
-    makers = (curve_figure, held_out_figure, influence_figure, tre_figure)
+    makers: tuple[Callable[[Sequence[SessionEvaluation]], Figure | None], ...] = (
+        partial(curve_figure, limit_mm=limit_mm),
+        held_out_figure,
+        influence_figure,
+        partial(tre_figure, limit_mm=limit_mm),
+        partial(predicted_figure, limit_mm=limit_mm),
+    )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -95,7 +117,20 @@ def _dress(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def curve_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
+def _limit(axes: Axes, limit_mm: float, *, upright: bool = False) -> None:
+    """Draw the limit as a line with its name, within the picture."""
+    text = f"limit {limit_mm:.1f} mm"
+    ground = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85}
+    style: dict[str, Any] = {"fontsize": 8, "color": RED, "ha": "right", "bbox": ground}
+    if upright:
+        axes.axvline(limit_mm, color=RED, linewidth=1.4)
+        axes.text(limit_mm, 0.97, text, transform=axes.get_xaxis_transform(), rotation=90.0, va="top", **style)
+    else:
+        axes.axhline(limit_mm, color=RED, linewidth=1.4)
+        axes.text(0.99, limit_mm, text, transform=axes.get_yaxis_transform(), va="bottom", **style)
+
+
+def curve_figure(evaluations: Sequence[SessionEvaluation], limit_mm: float) -> Figure | None:
     """TRE, predicted TRE and pair residual against the number of pairs."""
     points = pooled_curve(evaluations)
     if not points:
@@ -112,7 +147,7 @@ def curve_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
             color=BLUE,
             alpha=0.15,
             linewidth=0,
-            label="true TRE, mean to 95 %",
+            label="true TRE, mean to 95 % quantile",
         )
         axes.plot(pairs, [p.tre_mm.mean for p in known if p.tre_mm], "o-", color=BLUE, label="true TRE, mean")
     expected = [(p.pairs, p.expected_mm) for p in points if p.expected_mm is not None]
@@ -120,6 +155,7 @@ def curve_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     residual = [(p.pairs, p.pair_residual_mm.mean) for p in points if p.pair_residual_mm is not None]
     if residual:
         axes.plot(*zip(*residual, strict=True), "s-", color=ORANGE, label="pair residual, mean (Eq. 12, not a TRE)")
+    _limit(axes, limit_mm)
     axes.set(xlabel="pairs used", ylabel="mm", ylim=(0, None))
     axes.set_xticks([p.pairs for p in points])
     _dress(axes)
@@ -147,9 +183,20 @@ def held_out_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     if bars:
         place = np.arange(len(held))
         upper.bar(place, residual, color=ORANGE, width=0.7)
-        lower.bar(place, nis, color=[RED if v > limit else BLUE for v in nis], width=0.7)
+        beyond = [v > limit for v in nis]
+        bars_drawn = lower.bar(place, nis, color=[RED if b else BLUE for b in beyond], width=0.7)
+        for bar, b in zip(bars_drawn, beyond, strict=True):
+            bar.set_hatch("///" if b else "")
         lower.axhline(limit, color=GREY, linestyle="--", linewidth=1)
-        lower.annotate("95 %", (1.0, limit), xycoords=("axes fraction", "data"), fontsize=8, color=GREY, va="bottom")
+        lower.annotate(
+            "95 % bound",
+            (0.99, limit),
+            xycoords=("axes fraction", "data"),
+            fontsize=8,
+            color=GREY,
+            va="bottom",
+            ha="right",
+        )
         lower.set_xticks(place, [str(pm.pm) for pm in held], fontsize=7, rotation=90 if len(held) > 25 else 0)
         upper.margins(x=0.01)
         upper.set(ylabel="pair residual, mm")
@@ -194,7 +241,7 @@ def influence_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     return figure
 
 
-def tre_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
+def tre_figure(evaluations: Sequence[SessionEvaluation], limit_mm: float) -> Figure | None:
     """Cumulative distribution of the TRE over targets and sessions."""
     errors = np.sort(all_tre_mm(evaluations))
     if errors.size == 0:
@@ -203,10 +250,55 @@ def tre_figure(evaluations: Sequence[SessionEvaluation]) -> Figure | None:
     axes = figure.subplots()
     axes.step(errors, 100 * np.arange(1, errors.size + 1) / errors.size, where="post", color=BLUE)
     p95 = float(np.quantile(errors, 0.95))
-    for value, name in ((float(errors.mean()), "mean"), (p95, "95 %")):
+    for value, name in ((float(errors.mean()), "mean"), (p95, "95 % quantile")):
         axes.axvline(value, color=GREY, linestyle="--", linewidth=1)
         axes.annotate(f"{name} {value:.2f}", (value, 3), fontsize=8, color=GREY, rotation=90, ha="right")
-    axes.set(xlabel="TRE, mm", ylabel="targets, %", xlim=(0, None), ylim=(0, 101))
+    _limit(axes, limit_mm, upright=True)
+    axes.set(xlabel="true TRE, mm", ylabel="targets, %", xlim=(0, None), ylim=(0, 101))
     _dress(axes)
     axes.set_title(f"TRE of {errors.size} targets, {len(evaluations)} session(s)", fontsize=10, loc="left")
     return figure
+
+
+def predicted_figure(evaluations: Sequence[SessionEvaluation], limit_mm: float) -> Figure | None:
+    """True error against its predicted 95 % bound, a sign per target: a cross where it is not held."""
+    found = [(e.name, *_bounds_and_errors(e)) for e in evaluations]
+    found = [(name, bound, error) for name, bound, error in found if bound.size]
+    if not found:
+        return None
+    figure = new_figure(6.4, 4.8)
+    axes = figure.subplots()
+    bounds, errors = (np.concatenate(part) for part in ([f[1] for f in found], [f[2] for f in found]))
+    end = 1.06 * max(float(bounds.max()), float(errors.max()), limit_mm)
+    axes.plot([0, end], [0, end], color=GREY, linestyle="--", linewidth=1)
+    axes.annotate("true error = 95 % bound", (0.93 * end, 0.95 * end), fontsize=8, color=GREY, ha="right", va="bottom")
+    named = len(found) <= NAMED_SESSIONS
+    for number, (name, bound, error) in enumerate(found):
+        sign, holds = MARKERS[number % len(MARKERS)], error <= bound
+        label = name.replace("$", r"\$") if named else None
+        axes.plot(bound[holds], error[holds], sign, color=BLUE, markersize=5, alpha=0.7, label=label)
+        axes.plot(bound[~holds], error[~holds], "x", color=RED, markersize=7)
+    if (beyond := int((errors > bounds).sum())) and named:
+        axes.plot([], [], "x", color=RED, label=f"error beyond its bound: {beyond}")
+    _limit(axes, limit_mm)
+    _limit(axes, limit_mm, upright=True)
+    axes.set(xlabel="predicted 95 % bound, mm", ylabel="true error, mm", xlim=(0, end), ylim=(0, end))
+    _dress(axes)
+    if named:
+        axes.legend(frameon=False, fontsize=8, loc="center left")
+    held = errors.size - beyond
+    axes.set_title(
+        f"Predicted against true error: the 95 % bound holds at {held} of {errors.size} targets",
+        fontsize=10,
+        loc="left",
+    )
+    return figure
+
+
+def _bounds_and_errors(evaluation: SessionEvaluation) -> tuple[FloatArray, FloatArray]:
+    """The predicted bounds and the true errors of a session's targets, where both are known, (n,) each."""
+    whole = evaluation.whole
+    known = [(b, e) for b, e in zip(whole.bound_mm, whole.tre_mm, strict=True) if b is not None and e is not None]
+    if not known:
+        return np.zeros(0), np.zeros(0)
+    return np.concatenate([b for b, _ in known]), np.concatenate([e for _, e in known])

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 from fgreg.evaluation.case import Case, EvaluationConfig, curve_sizes, folds_of, left_out_one_by_one, subsets_of
 from fgreg.evaluation.resolve import Resolved, resolve
-from fgreg.geometry.target_error import beam_error, tre_mm
+from fgreg.geometry.target_error import beam_error, target_bounds_mm, tre_mm
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.estimate import PredictedTre, Verdict
+from fgreg.model.estimate import EpochEstimate, PredictedTre, Verdict
 from fgreg.model.sensitivity import wrap_angle
 from fgreg.registration.influence import Influence, influences
 from fgreg.registration.solve import solve
@@ -37,7 +37,8 @@ class WholeSolve:
         trus_T_camera: (4, 4) of each epoch, None where not solved.
         epoch_pms: number of PMs of each epoch.
         predicted: TRE predicted by the posterior, per epoch.
-        tre_mm: errors (n,) at the targets, per epoch. beam_angle_rad, beam_offset_mm: of the laser line.
+        tre_mm: errors (n,) at the targets, per epoch. bound_mm: their predicted 95 % bounds (n,), per epoch.
+        beam_angle_rad, beam_offset_mm: of the laser line.
         track_error_rad, track_sigma_rad: result less truth, and its predicted sigma, per track; None where unknown.
         influence: of every PM used.
     """
@@ -48,6 +49,7 @@ class WholeSolve:
     epoch_pms: tuple[int, ...]
     predicted: tuple[PredictedTre | None, ...]
     tre_mm: tuple[FloatArray | None, ...]
+    bound_mm: tuple[FloatArray | None, ...]
     beam_angle_rad: float | None
     beam_offset_mm: float | None
     track_error_rad: tuple[float | None, ...]
@@ -148,12 +150,20 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
         epoch_pms=tuple(len(case.pms_of_epoch(epoch.index)) for epoch in solution.epochs),
         predicted=tuple(epoch.predicted_tre for epoch in solution.epochs),
         tre_mm=tuple(errors),
+        bound_mm=tuple(_bounds_mm(epoch, model.targets_mm) for epoch in solution.epochs),
         beam_angle_rad=angle,
         beam_offset_mm=offset,
         track_error_rad=tuple(track_error),
         track_sigma_rad=tuple(answer.sigma_rad for answer in solution.tracks),
         influence=() if solution.registration is None else influences(solution.registration, model.targets_mm, means),
     )
+
+
+def _bounds_mm(epoch: EpochEstimate, targets_mm: FloatArray) -> FloatArray | None:
+    """The predicted 95 % bounds (n,) of the errors at the targets; None without a registration."""
+    if epoch.trus_T_camera is None or epoch.covariance is None or epoch.predicted_tre is None:
+        return None
+    return target_bounds_mm(epoch.covariance, epoch.trus_T_camera, targets_mm, epoch.predicted_tre.worst_mm)
 
 
 def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, int, _Task]]:
