@@ -288,7 +288,7 @@ def test_the_recording_shows_the_registration_as_it_moves(short: Path, tmp_path:
     assert "No registration yet" in pages[0]
     assert any("the probe may be turned" in page or "look first" in page for page in pages[-2:])
     assert {"online/predicted_worst_mm", "online/nis", "online/pairs"} <= {origin.lstrip("/") for origin in views(rrd)}
-    assert sum(entity.startswith("/world/looks/") and entity.endswith("/arc") for entity in found) == 9
+    assert sum(entity.startswith("/world/looks/") for entity in found) == 9
 
 
 def test_without_a_screen_or_viewer_live_is_one_clear_error(tmp_path: Path) -> None:

@@ -69,9 +69,9 @@ class Recorded:
         (found,) = [row for row in self.rows[entity] if row.shot == shot]
         return found
 
-    def look(self, part: str, shot: int) -> Row:
-        """A part of what stays drawn of a look, which appears with its shot."""
-        return self.at(f"/world/looks/{shot}/{part}", shot)
+    def look(self, shot: int) -> Row:
+        """What stays drawn of a look, which appears with its shot."""
+        return self.at(f"/world/looks/{shot}", shot)
 
     def words(self, shot: int) -> list[str]:
         """The labels of the scene at a shot."""
@@ -132,9 +132,9 @@ def test_beams_end_at_their_photoacoustic_markers(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.measurements.pairs):
         shot = AIMS + i
         if i == UNUSED:
-            assert f"/world/looks/{shot}/beam" not in recorded.rows
+            assert "Arrows3D:origins" not in recorded.look(shot).values
             continue
-        for entity in (f"/world/looks/{shot}/beam", "/world/shot/beam"):
+        for entity in (f"/world/looks/{shot}", "/world/shot/beam"):
             row = recorded.at(entity, shot)
             tip = row.array("Arrows3D:origins") + row.array("Arrows3D:vectors")
             np.testing.assert_allclose(tip[0], recorded.truth.trus_p_pm_mm[pair.pm], atol=1e-4)
@@ -150,7 +150,7 @@ def test_the_beam_of_an_aim_ends_at_its_spot(recorded: Recorded) -> None:
 
 def test_arcs_pass_through_their_photoacoustic_markers(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.measurements.pairs):
-        strip = np.array(recorded.look("arc", AIMS + i).values["LineStrips3D:strips"][0])
+        strip = np.array(recorded.look(AIMS + i).values["LineStrips3D:strips"][0])
         pm = recorded.truth.trus_p_pm_mm[pair.pm]
         # The arc is drawn through 25 points: between two of them it bulges by less than 0.02 mm.
         segment = np.diff(strip, axis=0)
@@ -163,13 +163,13 @@ def test_arcs_pass_through_their_photoacoustic_markers(recorded: Recorded) -> No
 
 def test_ellipsoids_are_the_covariances(recorded: Recorded) -> None:
     for i, pair in enumerate(recorded.estimate.pairs):
-        row = recorded.look("pm_95", AIMS + i)
+        row = recorded.look(AIMS + i)
         assert pair.trus_p_pm_mm is not None
         assert pair.covariance is not None
         if pair.used:
-            centre = recorded.look("pm", AIMS + i).array("Points3D:positions")[0]
+            centre = row.array("Points3D:positions")[0]
         else:  # a cross about it
-            centre = np.mean(recorded.look("not_used", AIMS + i).values["LineStrips3D:strips"], axis=(0, 1))
+            centre = np.mean(row.values["LineStrips3D:strips"][1:], axis=(0, 1))
         np.testing.assert_allclose(centre, pair.trus_p_pm_mm, atol=1e-5)
         np.testing.assert_allclose(row.array("Ellipsoids3D:centers")[0], pair.trus_p_pm_mm, atol=1e-5)
         half, (x, y, z, w) = row.array("Ellipsoids3D:half_sizes")[0], row.array("Ellipsoids3D:quaternions")[0]
@@ -438,8 +438,8 @@ def test_an_epoch_without_a_registration_hides_its_camera_instead_of_standing_at
     # To a frame that is nowhere. A scale of 0 is a mistake to Rerun 0.41, which then draws the camera at the origin.
     assert second.values["Transform3D:parent_frame"] == ["not known"]
     assert "Transform3D:translation" not in second.values
-    assert [shot for shot in range(4) if f"/world/looks/{shot}/beam" in rows] == [0, 1]
-    assert [shot for shot in range(4) if f"/world/looks/{shot}/arc" in rows] == [0, 1, 2, 3]
+    assert [shot for shot in range(4) if "Arrows3D:origins" in rows[f"/world/looks/{shot}"][0].values] == [0, 1]
+    assert all("LineStrips3D:strips" in rows[f"/world/looks/{shot}"][0].values for shot in range(4))
 
 
 def test_what_was_not_detected_or_is_not_finite_is_left_out(tmp_path: Path) -> None:
@@ -454,8 +454,8 @@ def test_what_was_not_detected_or_is_not_finite_is_left_out(tmp_path: Path) -> N
     heard = replace(measurements, pairs=(measurements.pairs[0], measurements.pairs[2]))
     rows = record(tmp_path / "part.rrd", model, heard, replace(estimate, pairs=pairs))
     assert [row.shot for row in rows["/plots/nis/pair"] if row.shot is not None] == [2]
-    assert [shot for shot in range(3) if f"/world/looks/{shot}/arc" in rows] == [0, 2]
-    sizes = [len(rows[f"/world/looks/{shot}/pm_95"][0].values["Ellipsoids3D:half_sizes"]) for shot in (0, 2)]
+    assert [shot for shot in range(3) if f"/world/looks/{shot}" in rows] == [0, 2]
+    sizes = [len(rows[f"/world/looks/{shot}"][0].values["Ellipsoids3D:half_sizes"]) for shot in (0, 2)]
     assert sizes == [0, 1]
 
 

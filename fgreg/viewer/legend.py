@@ -44,18 +44,17 @@ SIZE = 5.5
 
 def draw(rec: shapes.Recorder) -> None:
     """Draw the legend under ``legend``, for all times."""
-    for number, (words, sign, color) in enumerate(ENTRIES):
-        middle = np.array([number % COLUMNS + 0.5, number // COLUMNS + 0.4]) * CELL
-        path = f"legend/{number}"
-        if sign == "dot":
-            rec.static(f"{path}/sign", shapes.points_2d(middle[None], color, 5.0))
-        else:
-            rec.static(f"{path}/sign", shapes.strips_2d([middle + SIZE * part for part in SIGNS[sign]], color, 1.3))
-        below = middle[None] + [[0.0, 1.6 * SIZE]]
-        rec.static(f"{path}/words", shapes.points_2d(below, palette.TEXT, 0.1, [words]))
-
-
-def bounds() -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the view of the legend shows: x and y, px."""
-    rows = -(-len(ENTRIES) // COLUMNS)
-    return (0.0, COLUMNS * CELL[0]), (0.0, rows * CELL[1])
+    middles = np.array([[n % COLUMNS + 0.5, n // COLUMNS + 0.4] for n in range(len(ENTRIES))]) * CELL
+    words = [words for words, _, _ in ENTRIES]
+    below = middles + np.array([0.0, 1.6 * SIZE])
+    rec.static("legend/words", shapes.points_2d(below, palette.TEXT, 0.1, words))
+    dots = [(middle, color) for middle, (_, sign, color) in zip(middles, ENTRIES, strict=True) if sign == "dot"]
+    places, colors = zip(*dots, strict=True)
+    rec.static("legend/dots", shapes.coloured_points_2d(np.array(places), colors, 5.0))
+    lines = [
+        (middle + SIZE * part, color)
+        for middle, (_, sign, color) in zip(middles, ENTRIES, strict=True)
+        for part in SIGNS.get(sign, [])
+    ]
+    strips, colors = zip(*lines, strict=True)
+    rec.static("legend/signs", shapes.coloured_strips_2d(strips, colors, 1.3))

@@ -186,28 +186,27 @@ class LiveDrawing:
             self._plane_is_plain = True
 
     def _pair(self, update: ViewerUpdate, pair: Pair) -> tuple[FloatArray | None, tuple[str, FloatArray] | None]:
-        strip = self._arc(pair.look, keep=update.number)
+        strip = self._arc(pair.look)
         used = update.used
-        beam = self._beam(update, pair, nearest_on(strip), keep=update.number if used else None)
+        beam = self._beam(update, pair, nearest_on(strip))
+        spot = None if beam is None else beam[1]
+        entity, parts = shapes.look(update.number, arc=strip, beam=beam if used else None, pm=spot, used=used)
+        self._rec.log(entity, *parts)
         if beam is None:
             self._rec.clear("world/shot/pm")
             return None, None
-        spot, look = beam[1], f"world/looks/{update.number}"
+        spot = beam[1]
         color = palette.PM if used else palette.UNUSED
         (self._pms if used else self._unused).append(spot)
-        if used:
-            self._rec.log(f"{look}/pm", shapes.small_points(spot[None], color, 3.5))
-        else:
-            self._rec.log(f"{look}/not_used", shapes.cross(spot, color))
         self._rec.log("world/shot/pm", shapes.point(spot, color, 5.0))
         return beam, (f"PM {pair.pm}" + ("" if used else ", not used"), spot)
 
     def _track(self, update: ViewerUpdate, query: Track) -> tuple[FloatArray | None, tuple[str, FloatArray] | None]:
         answer = update.answer
         if query.looks:
-            self._arc(query.looks[-1], keep=None)
+            self._arc(query.looks[-1])
         lambda_mm = None if answer is None else answer.lambda_mm
-        beam = self._beam(update, query, lambda _origin, _direction: lambda_mm, keep=None)
+        beam = self._beam(update, query, lambda _origin, _direction: lambda_mm)
         if beam is None:
             self._rec.clear("world/shot/pm")
         else:
@@ -217,10 +216,8 @@ class LiveDrawing:
             self._stage(self._model.stage.scan_from_device(answer.stage_rad), label)
         return beam, None if beam is None else ("predicted spot", beam[1])
 
-    def _arc(self, look: Look, *, keep: int | None) -> FloatArray:
+    def _arc(self, look: Look) -> FloatArray:
         strip = scene.arc_strip_mm(look, self._model.probe)
-        if keep is not None:
-            self._rec.log(f"world/looks/{keep}/arc", shapes.strips([strip], palette.SOUND, 1.0))
         self._rec.log("world/shot/arc", shapes.strips([strip], palette.SOUND, 3.0))
         device_deg = math.degrees(self._model.stage.device_from_scan(look.scan_rad))
         self._stage(look.scan_rad, f"image plane, stage {device_deg:.1f}°")
@@ -232,11 +229,8 @@ class LiveDrawing:
         corners = scene.plane_corners_mm(self._model.probe, self._depth_mm)
         self._plane_words = label, transform_points(trus_T_plane, corners)
 
-    def _beam(self, update: ViewerUpdate, shot: Pair | Track, reach: Reach, *, keep: int | None) -> FloatArray | None:
-        """Draw the shot's beam; returns the laser frame's origin and its end (2, 3), TRUS mm.
-
-        ``reach`` gives its length; ``keep``: the shot to keep it drawn for.
-        """
+    def _beam(self, update: ViewerUpdate, shot: Pair | Track, reach: Reach) -> FloatArray | None:
+        """Draw the shot's beam; returns the origin and its end (2, 3), TRUS mm; ``reach`` gives its length."""
         transform, laser = update.trus_T_camera, update.marker_T_laser
         if transform is None or laser is None:
             self._rec.clear("world/shot/beam")
@@ -247,8 +241,6 @@ class LiveDrawing:
             self._rec.clear("world/shot/beam")
             return None
         origin, tip = scene.laser_origin_and_tip(trus_T_laser, lambda_mm)
-        if keep is not None:
-            self._rec.log(f"world/looks/{keep}/beam", shapes.arrow(origin, tip, palette.BEAM, 0.7))
         self._rec.log("world/shot/beam", shapes.arrow(origin, tip, palette.BEAM, 2.5))
         return np.stack([origin, tip])
 

@@ -4,7 +4,7 @@ Entities, all in TRUS millimetres unless a parent's transform says otherwise:
 
 - ``world/probe``, ``world/trus``: the housing and the axes of TRUS.
 - ``world/stage``: rotated to the shot's plane; ``plane`` (with the shot's frame on it) and ``elements`` below.
-- ``world/looks/N/{arc,beam,pm,pm_95,not_used}``: those of shot N, from its time on; links in the summary select them.
+- ``world/looks/N``: arc, beam, PM and its ellipsoid of shot N, from its time on; links in the summary select it.
 - ``world/shot/{arc,beam,pm,sound}``: those of the shot at the cursor, bold; ``labels``: the words of the view.
 - ``world/camera``: ``trus_T_camera`` of the epoch; ``left`` and ``right`` are pinholes with the endoscope's images,
   ``crossed`` marks it as refused, ``marker`` is ``camera_T_marker`` of the shot with the tags' outlines and ``laser``.

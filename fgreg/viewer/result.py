@@ -152,35 +152,32 @@ class ResultDrawing:
         color = palette.PM if pair.used else palette.UNUSED
         marker = None if measured is None else measured.marker
         self._marker(marker)
-        beam = self._beam(marker, pair.lambda_mm if pair.used else None, pair.epoch, keep=shot.number)
-        plane = self._sound(shot.number, pair, None if measured is None else measured.look)
+        beam = self._beam(marker, pair.lambda_mm if pair.used else None, pair.epoch)
+        look = None if measured is None else measured.look
+        plane = self._sound(pair, look)
         spot = None
         if pair.trus_p_pm_mm is None:
             self.rec.clear("world/shot/pm")
         else:
             spot = f"PM {pair.pm}" + ("" if pair.used else ", not used"), pair.trus_p_pm_mm
             self.rec.log("world/shot/pm", shapes.point(pair.trus_p_pm_mm, color, 5.0))
-            look = f"world/looks/{shot.number}"
-            if pair.used:
-                # The point has the same size at every zoom, for ellipsoids that are too small to see.
-                self.rec.log(f"{look}/pm", shapes.small_points(pair.trus_p_pm_mm[None], color, 3.5))
-            else:
-                self.rec.log(f"{look}/not_used", shapes.cross(pair.trus_p_pm_mm, color))
-            if pair.covariance is not None:
-                one = shapes.ellipsoids(pair.trus_p_pm_mm[None], pair.covariance[None], color)
-                self.rec.log(f"{look}/pm_95", one)
+        arc = None if look is None else scene.arc_strip_mm(look, self.model.probe)
+        entity, parts = shapes.look(shot.number, arc=arc, beam=beam, pm=pair.trus_p_pm_mm, used=pair.used)
+        if pair.trus_p_pm_mm is not None and pair.covariance is not None:
+            parts.append(shapes.ellipsoids(pair.trus_p_pm_mm[None], pair.covariance[None], color))
+        if parts:
+            self.rec.log(entity, *parts)
         self._words(eye, pair.epoch, marker, spot, plane)
         self._see(shot, pair.epoch, beam, None if plane is None else plane[1])
         self._say(shot, f"pair, PM {pair.pm}", pair.used, pair.reason, pair.residual_mm)
 
-    def _sound(self, number: int, pair: PairEstimate, look: Look | None) -> tuple[str, FloatArray] | None:
+    def _sound(self, pair: PairEstimate, look: Look | None) -> tuple[str, FloatArray] | None:
         """Draw the arc, the sound path, and the image plane of a look; returns the plane's words and corners."""
         if look is None:
             self.rec.clear("world/shot/arc", "world/shot/sound")
             return None
         probe, color = self.model.probe, palette.SOUND if pair.used else palette.UNUSED
         strip = scene.arc_strip_mm(look, probe)
-        self.rec.log(f"world/looks/{number}/arc", shapes.strips([strip], color, 1.0))
         self.rec.log("world/shot/arc", shapes.strips([strip], color, 3.0))
         theta = look.scan_rad if pair.theta_rad is None else pair.theta_rad
         way = np.stack([scene.element_centre_mm(look, probe), scene.arc_point_mm(look, probe, theta)])
@@ -263,18 +260,14 @@ class ResultDrawing:
         seen = Seen(plane, beam, np.reshape(spots[True], (-1, 3)), np.reshape(spots[False], (-1, 3)))
         endoscope_view.draw(self.rec, self.model.camera.left, self._trus_T_camera(epoch), seen)
 
-    def _beam(
-        self, marker: MarkerObservation | None, lambda_mm: float | None, epoch: int, *, keep: int | None = None
-    ) -> FloatArray | None:
-        """Draw the beam; returns the laser frame's origin and the spot (2, 3). ``keep``: shot to keep it drawn for."""
+    def _beam(self, marker: MarkerObservation | None, lambda_mm: float | None, epoch: int) -> FloatArray | None:
+        """Draw the beam; returns the laser frame's origin and the spot (2, 3)."""
         trus_T_camera, laser = self._trus_T_camera(epoch), self.estimate.laser
         if marker is None or lambda_mm is None or trus_T_camera is None or laser is None:
             self.rec.clear("world/shot/beam")
             return None
         trus_T_laser = trus_T_camera @ marker.camera_T_marker @ laser.marker_T_laser
         origin, tip = scene.laser_origin_and_tip(trus_T_laser, lambda_mm)
-        if keep is not None:
-            self.rec.log(f"world/looks/{keep}/beam", shapes.arrow(origin, tip, palette.BEAM, 0.7))
         self.rec.log("world/shot/beam", shapes.arrow(origin, tip, palette.BEAM, 2.5))
         return np.stack([origin, tip])
 

@@ -19,7 +19,7 @@ from fgreg.geometry.transforms import FloatArray, inverse
 from fgreg.model.camera_model import CameraModel
 from fgreg.model.session_model import SessionModel
 from fgreg.viewer.pa_frame import PaPicture
-from fgreg.viewer.palette import AXES, CAMERA, PLANE, PROBE, REFUSED, UNUSED, Color
+from fgreg.viewer.palette import AXES, BEAM, CAMERA, PLANE, PM, PROBE, REFUSED, SOUND, UNUSED, Color
 from fgreg.viewer.scene import Label, ellipsoid_95, frustum_strips_mm, quaternion_xyzw
 
 Image8 = npt.NDArray[np.uint8]
@@ -171,10 +171,34 @@ def small_points(points_mm: FloatArray, color: Color, size: float) -> rr.Points3
     return rr.Points3D(points_mm, colors=[color], radii=[ui(size)])
 
 
-def cross(p_mm: FloatArray, color: Color, half_mm: float = 1.5) -> rr.LineStrips3D:
-    """Three short lines through a point: a shot that was not used."""
+def cross_mm(p_mm: FloatArray, half_mm: float = 1.5) -> list[FloatArray]:
+    """Three short lines (2, 3) through a point: a shot that was not used."""
     ends = half_mm * np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return strips([np.stack([p_mm - end, p_mm + end]) for end in ends], color, 1.2)
+    return [np.stack([p_mm - end, p_mm + end]) for end in ends]
+
+
+def look(
+    number: int, *, arc: FloatArray | None, beam: FloatArray | None, pm: FloatArray | None, used: bool
+) -> tuple[str, list[rr.AsComponents]]:
+    """The entity of a look and what stays drawn of it: one entity, so that a link selects all of it.
+
+    Args:
+        number: of the shot.
+        arc: (n, 3) mm. beam: (2, 3) mm. pm: (3,) mm. None where there is none.
+        used: the PM is a point, else a cross.
+    """
+    parts: list[rr.AsComponents] = []
+    lines = [] if arc is None else [arc]
+    if pm is not None and used:
+        # The point has the same size at every zoom, for ellipsoids that are too small to see.
+        parts.append(small_points(pm[None], PM, 3.5))
+    elif pm is not None:
+        lines += cross_mm(pm)
+    if lines:
+        parts.append(strips(lines, SOUND if used else UNUSED, 1.0))
+    if beam is not None:
+        parts.append(arrow(beam[0], beam[1], BEAM, 0.7))
+    return f"world/looks/{number}", parts
 
 
 def plane_mesh(corners_mm: FloatArray, picture: npt.NDArray[np.uint8] | None) -> rr.Mesh3D:
@@ -302,6 +326,11 @@ def coloured_points_2d(pixels: FloatArray, colors: Sequence[Color], size: float)
 def strips_2d(strips_px: Sequence[FloatArray], color: Color, size: float) -> rr.LineStrips2D:
     """Lines on an image."""
     return rr.LineStrips2D(strips_px, colors=[color], radii=[ui(size)])
+
+
+def coloured_strips_2d(strips_px: Sequence[FloatArray], colors: Sequence[Color], size: float) -> rr.LineStrips2D:
+    """Lines on an image, each with its colour."""
+    return rr.LineStrips2D(strips_px, colors=colors, radii=[ui(size)])
 
 
 def ruler(frame: PaPicture) -> rr.Points2D:

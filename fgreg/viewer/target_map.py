@@ -81,8 +81,3 @@ def _band() -> npt.NDArray[np.uint8]:
     limits = (np.arange(round(END * PX_PER_LIMIT)) + 0.5) / PX_PER_LIMIT
     row = np.array(palette.error_colors(limits, 1.0), dtype=np.uint8)
     return np.repeat(row[None], BAND_PX, axis=0)
-
-
-def scale_bounds() -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the view of the scale shows: x and y, px."""
-    return (-0.12 * PX_PER_LIMIT, (END + 0.08) * PX_PER_LIMIT), (-8.0 * DOT_PX, BAND_PX + 16.0)
