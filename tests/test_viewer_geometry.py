@@ -8,7 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from fgreg.geometry.transforms import as_float_array, exp_so3
+from fgreg.geometry.target_error import target_bounds_mm
+from fgreg.geometry.transforms import as_float_array, exp_so3, make_transform
 from fgreg.model.camera_model import CameraModel
 from fgreg.model.measurements import Look, Measurements
 from fgreg.viewer import scene as scene
@@ -68,6 +69,23 @@ def test_quaternions_turn_vectors_as_their_rotations_do() -> None:
         rotation = exp_so3(rng.normal(size=3) * 1.5)
         x, y, z, w = scene.quaternion_xyzw(rotation)
         np.testing.assert_allclose(gtsam.Rot3.Quaternion(w, x, y, z).matrix(), rotation, atol=1e-12)
+
+
+def test_target_bounds_are_those_of_targets_moved_by_registrations_drawn_from_the_covariance() -> None:
+    rng = np.random.default_rng(3)
+    pose = gtsam.Pose3(make_transform(exp_so3(rng.normal(size=3)), rng.normal(size=3) * 80.0))
+    covariance = random_covariance(rng, 6, 1.0) * np.outer(*2 * [np.array([1e-3] * 3 + [0.2] * 3)])
+    targets = np.array([[0.0, 0.0, 40.0], [20.0, -15.0, 30.0]])
+    camera_p = [pose.transformTo(target) for target in targets]
+    draws = rng.multivariate_normal(np.zeros(6), covariance, 8000)
+    moved = np.array([[pose.retract(xi).transformFrom(p) for p in camera_p] for xi in draws])
+    drawn = np.quantile(np.linalg.norm(moved - targets, axis=2), 0.95, axis=0)
+    worst = float(drawn.max())
+    np.testing.assert_allclose(target_bounds_mm(covariance, pose.matrix(), targets, worst), drawn, rtol=0.03)
+    # What a verdict adds counts at every target.
+    np.testing.assert_allclose(
+        target_bounds_mm(covariance, pose.matrix(), targets, worst + 2.0), drawn + 2.0, rtol=0.03
+    )
 
 
 def test_the_frustum_is_the_outline_of_the_image() -> None:

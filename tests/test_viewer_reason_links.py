@@ -57,5 +57,5 @@ def test_a_reason_of_one_epoch_leads_to_its_shots(estimate: SessionEstimate) -> 
 
 
 def test_a_session_without_shots_has_reasons_without_links() -> None:
-    empty = SessionEstimate("empty", Verdict.REFUSED, ("no pairs",), None, (), (), (), ())
+    empty = SessionEstimate("empty", Verdict.REFUSED, ("no pairs",), None, (), (), ())
     assert linked("no pairs", empty) == "no pairs"

@@ -18,7 +18,7 @@ from PIL import Image
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, as_float_array, inverse
 from fgreg.model.camera_model import CameraModel, StereoRig
-from fgreg.model.estimate import SessionEstimate, TrackEstimate, Verdict
+from fgreg.model.estimate import SessionEstimate, TargetEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import ChannelModel, MarkerModel, SessionModel, StageModel, TagModel
 from fgreg.simulation.lens import project_points
@@ -26,7 +26,7 @@ from fgreg.viewer import endoscope_view, palette, scene, shapes
 from fgreg.viewer.blueprint import WORLD_PX
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
-from tests.answers import REGISTRATION_COVARIANCE, answer_from_truth
+from tests.answers import answer_from_truth
 from tests.forward import Truth, make_measurements, make_session
 from tests.recordings import Row, read_recording, transform_of, views, views_of
 
@@ -35,7 +35,7 @@ UNUSED = 3
 TRACK_T = 100.0
 TRACK_DEVICE_DEG = -12.0
 LIMIT_MM = 3.0
-WORST_MM = 1.4
+WORST_MM = 6.4
 
 
 def make_model() -> SessionModel:
@@ -87,6 +87,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     last = measurements.pairs[-1]
     track = TrackEstimate(TRACK_T, math.radians(TRACK_DEVICE_DEG), 0.01, truth.pair_lambda_mm[-1], causal=False)
     estimate = answer_from_truth(rng, model, measurements, truth, unused=(UNUSED,), tracks=(track,))
+    places = zip(model.targets_mm, np.linspace(0.2, WORST_MM, len(model.targets_mm)), strict=True)
+    errors = tuple(
+        TargetEstimate(
+            "apex" if i == len(model.targets_mm) - 1 else str(i + 1), at, 0.5 * p95, p95, 0.8 * p95, 0.6 * p95
+        )
+        for i, (at, p95) in enumerate(places)
+    )
+    estimate = replace(estimate, epochs=tuple(replace(epoch, targets=errors) for epoch in estimate.epochs))
     path = tmp_path_factory.mktemp("recording") / "phantom.rrd"
     frame = rng.normal(size=(128, 1200))
     left = np.zeros((180, 320), dtype=np.uint8)
@@ -222,21 +230,16 @@ def test_plots_hold_the_figures_of_their_shots(recorded: Recorded) -> None:
 
 def test_targets_carry_the_bound_of_the_predicted_error_in_size_and_colour(recorded: Recorded) -> None:
     row = recorded.rows["/world/targets/bound_95"][0]
-    targets, trus_T_camera = recorded.model.targets_mm, recorded.truth.trus_T_camera[0]
+    targets = recorded.model.targets_mm
     np.testing.assert_allclose(row.array("Points3D:positions"), targets, atol=1e-5)
-    # By drawing registrations; the largest bound is the one that the epoch states.
-    draws = np.random.default_rng(3).multivariate_normal(np.zeros(6), REGISTRATION_COVARIANCE, 20_000)
-    camera_p = (np.c_[targets, np.ones(27)] @ inverse(trus_T_camera).T)[:, :3]
-    errors = np.linalg.norm(np.cross(draws[:, None, :3], camera_p[None]) + draws[:, None, 3:], axis=2)
-    bounds = np.quantile(errors, 0.95, axis=0)
-    bounds += WORST_MM - bounds.max()
-    np.testing.assert_allclose(row.array("Points3D:radii"), np.maximum(bounds, 0.6), atol=0.04)
-    within = [int(color) >> 8 for color in row.values["Points3D:colors"]]
-    # The limit is 3 mm: nothing is beyond half of it.
-    assert set(within) == {int.from_bytes(bytes(palette.ERRORS[0]), "big")}
-    assert recorded.rows["/world/targets/worst"][0].values["Points3D:labels"] == [f"worst: {WORST_MM:.2f} mm"]
+    bounds = np.array([target.p95_mm for target in recorded.estimate.epochs[0].targets])
+    np.testing.assert_allclose(row.array("Points3D:radii"), np.minimum(np.maximum(bounds, 0.6), 4.5), atol=1e-4)
+    colors = [int(color) >> 8 for color in row.values["Points3D:colors"]]
+    classes = [int.from_bytes(bytes(color), "big") for color in palette.ERRORS]
+    assert [classes.index(color) for color in colors] == [int(b > 1.5) + int(b > 3.0) + int(b > 6.0) for b in bounds]
+    assert recorded.rows["/world/targets/worst"][0].values["Points3D:labels"] == [f"worst: apex, {WORST_MM:.2f} mm"]
     dots = recorded.rows["/scale/targets"][0].array("Points2D:positions")
-    np.testing.assert_allclose(dots[:, 0], 100.0 * bounds / LIMIT_MM, atol=1.5)
+    np.testing.assert_allclose(dots[:, 0], 100.0 * bounds / LIMIT_MM, atol=1e-3)
     edges = recorded.rows["/scale/edges"][0].values["Points2D:labels"]
     assert edges == ["0 mm", "1.5", "limit 3.0 mm", "refused from 6.0 mm"]
 

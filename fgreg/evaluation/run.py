@@ -11,11 +11,13 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from fgreg.evaluation.case import Case, EvaluationConfig, curve_sizes, folds_of, left_out_one_by_one, subsets_of
 from fgreg.evaluation.resolve import Resolved, resolve
-from fgreg.geometry.target_error import beam_error, target_bounds_mm, tre_mm
+from fgreg.geometry.target_error import beam_error, tre_mm
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.estimate import EpochEstimate, PredictedTre, Verdict
+from fgreg.model.estimate import PredictedTre, Verdict
 from fgreg.model.sensitivity import wrap_angle
 from fgreg.registration.influence import Influence, influences
 from fgreg.registration.solve import solve
@@ -150,20 +152,13 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
         epoch_pms=tuple(len(case.pms_of_epoch(epoch.index)) for epoch in solution.epochs),
         predicted=tuple(epoch.predicted_tre for epoch in solution.epochs),
         tre_mm=tuple(errors),
-        bound_mm=tuple(_bounds_mm(epoch, model.targets_mm) for epoch in solution.epochs),
+        bound_mm=tuple(np.array([t.p95_mm for t in e.targets]) if e.targets else None for e in solution.epochs),
         beam_angle_rad=angle,
         beam_offset_mm=offset,
         track_error_rad=tuple(track_error),
         track_sigma_rad=tuple(answer.sigma_rad for answer in solution.tracks),
         influence=() if solution.registration is None else influences(solution.registration, model.targets_mm, means),
     )
-
-
-def _bounds_mm(epoch: EpochEstimate, targets_mm: FloatArray) -> FloatArray | None:
-    """The predicted 95 % bounds (n,) of the errors at the targets; None without a registration."""
-    if epoch.trus_T_camera is None or epoch.covariance is None or epoch.predicted_tre is None:
-        return None
-    return target_bounds_mm(epoch.covariance, epoch.trus_T_camera, targets_mm, epoch.predicted_tre.worst_mm)
 
 
 def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, int, _Task]]:

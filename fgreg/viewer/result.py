@@ -10,7 +10,6 @@ from typing import Protocol, TypeGuard
 import numpy as np
 import rerun as rr
 
-from fgreg.geometry.target_error import target_bounds_mm
 from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
 from fgreg.model.estimate import PairEstimate, SessionEstimate, TrackEstimate, Verdict
 from fgreg.model.measurements import Look, MarkerObservation, Measurements, Pair, Track
@@ -135,12 +134,12 @@ class ResultDrawing:
         self.rec.log("world/camera", shapes.transform(trus_T_camera))
         shapes.color_cameras(self.rec, self.model, self._picture_mm(), refused=self._refused(epoch))
         known = self.estimate.epochs[epoch] if epoch < len(self.estimate.epochs) else None
-        if trus_T_camera is None or known is None or known.covariance is None or known.predicted_tre is None:
+        if known is None or not known.targets:
             target_map.clear(self.rec)
         else:
-            targets, worst_mm = self.model.targets_mm, known.predicted_tre.worst_mm
-            bounds = target_bounds_mm(known.covariance, trus_T_camera, targets, worst_mm)
-            target_map.draw(self.rec, targets, bounds, self.limit_mm)
+            bounds = np.array([target.p95_mm for target in known.targets])
+            names = [target.name for target in known.targets]
+            target_map.draw(self.rec, self.model.targets_mm, bounds, self.limit_mm, names)
         if self.truth is not None and epoch < len(self.truth.trus_T_camera):
             camera = None if self.model.camera is None else self.model.camera.left
             outline = scene.frustum_strips_mm(camera, self._picture_mm() / 3.0)

@@ -44,7 +44,7 @@ def summary_markdown(
         f"Predicted error at {len(model.targets_mm)} targets, mm; limit of the [worst](recording://{WORST_TARGET}): "
         f"{limit_mm:.1f}:",
         "",
-        "| camera epoch | verdict | pairs | mean | mean 95 % bound | worst 95 % bound |",
+        "| camera epoch | verdict | pairs | mean | 95 % bound, mean | 95 % bound, worst target |",
         "|---|---|---|---|---|---|",
     ]
     lines += [_epoch_row(epoch) for epoch in estimate.epochs]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -31,12 +33,21 @@ def radii_mm(bounds: FloatArray, targets_mm: FloatArray) -> FloatArray:
     return np.asarray(np.clip(bounds, LEAST_RADIUS_MM, max(room, LEAST_RADIUS_MM)))
 
 
-def draw(rec: shapes.Recorder, targets_mm: FloatArray, bounds: FloatArray, limit_mm: float) -> None:
-    """Draw spheres under ``world/targets`` and dots under ``scale``, at the present time."""
+def draw(
+    rec: shapes.Recorder, targets_mm: FloatArray, bounds: FloatArray, limit_mm: float, names: Sequence[str] = ()
+) -> None:
+    """Draw spheres under ``world/targets`` and dots under ``scale``, at the present time.
+
+    Args:
+        rec: where.
+        targets_mm: (n, 3). bounds: (n,) 95 % bounds of the error there, mm. limit_mm: of the worst one.
+        names: of the targets; a number is none.
+    """
     colors = palette.error_colors(bounds, limit_mm)
     rec.log("world/targets/bound_95", shapes.spheres(targets_mm, radii_mm(bounds, targets_mm), colors))
     worst = int(np.argmax(bounds))
-    label = f"worst: {bounds[worst]:.2f} mm"
+    name = f"{names[worst]}, " if names and not names[worst].isdigit() else ""
+    label = f"worst: {name}{bounds[worst]:.2f} mm"
     rec.log("world/targets/worst", shapes.point(targets_mm[worst], palette.TEXT, 1.0, label))
     rec.log("scale/targets", shapes.coloured_points_2d(dots_px(bounds, limit_mm), colors, 2.6))
 
