@@ -80,7 +80,7 @@ def test_the_plane_is_at_the_stage_s_angle_and_the_goal_at_the_beam_s_predicted_
         np.testing.assert_allclose(up, [0.0, math.sin(scan_rad), math.cos(scan_rad)], atol=1e-6)
     # The model's stage counts the other way from 5 degrees: its own angles are what is written.
     assert "image plane, stage -15.0°" in rows["/world/shot/labels"][-1].values["Points3D:labels"]
-    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8°"]
+    assert rows["/world/goal/label"][-1].values["Points3D:labels"] == ["beam at -21.0° ± 0.8° (1 sigma)"]
     text = page(rows, 0)
     assert text.startswith("# OK")
     assert "## Next: go on" in text
