@@ -202,6 +202,7 @@ def test_a_recording_is_packed_with_the_viewer_that_shows_it(tmp_path: Path, mon
     (static / "widget.js").write_text("a;\n//!<INLINE-MARKER-OPEN>\nfetch(url);\n//!<INLINE-MARKER-CLOSE>\nb;")
     (static / "re_viewer_bg.wasm").write_bytes(b"\0asm")
     monkeypatch.syspath_prepend(static.parents[1])
+    monkeypatch.delitem(sys.modules, "rerun_notebook", raising=False)
     inputs = {"events.jsonl": "1" * 64}
     recording = tmp_path / "a.rrd"
     recording.write_bytes(b"RRF2 fgreg " + recording_id(inputs).encode() + b" RRF2FOOT....")

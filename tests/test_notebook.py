@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rerun.notebook import EntitySelectionItem, SelectionChangeEvent
+
+from fgreg.viewer.scene import shots_of
 
 NOTEBOOK = Path(__file__).resolve().parents[1] / "docs" / "inspect.ipynb"
 
@@ -30,10 +31,12 @@ def test_a_clicked_pm_is_left_out(pose_session: Path, monkeypatch: pytest.Monkey
 
 
 def _click(names: dict[str, Any]) -> None:
-    """What a browser sends for a click on the background, then beside PM 7."""
-    (pair,) = [pair for pair in names["report"].estimate.pairs if pair.pm == 7]
-    beside = (pair.trus_p_pm_mm + np.array([0.2, -0.3, 0.1])).tolist()
-    for path, at in (("/world/probe", [0.0, 0.0, 0.0]), ("/world/looks/pm", beside)):
+    """What a browser sends for a click on the background, then on the look at PM 7."""
+    estimate = names["report"].estimate
+    (number,) = [
+        shot.number for shot in shots_of(estimate) if shot.kind == "pair" and estimate.pairs[shot.position].pm == 7
+    ]
+    for path in ("/world/probe", f"/world/looks/{number}"):
         (on_event,) = names["viewer"]._event_callbacks
-        item = EntitySelectionItem(path, instance_id=0, view_name="World", position=at)
+        item = EntitySelectionItem(path, instance_id=0, view_name="Scene", position=[0.0, 0.0, 0.0])
         on_event(SelectionChangeEvent("fgreg", "one", None, [item]))

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
-import numpy as np
-
 from fgreg.model.estimate import SessionEstimate
+from fgreg.viewer.scene import shots_of
 
-_PMS = ("/world/looks/pm", "/world/looks/pm_95", "/world/shot/pm")
-"""Entities of the recording that are PMs; in their view positions are TRUS mm."""
+_LOOK = re.compile(r"/?world/looks/(\d+)")
+"""Entity of the recording that is the look of a shot: its PM, beam and arc."""
 
 
 def picked_pm(event: Any, estimate: SessionEstimate) -> int | None:
-    """The PM that was clicked in the 3D view of a session's recording; None where something else was.
+    """The PM whose look was clicked in a session's recording; None where something else was.
 
     Args:
-        event: what ``rerun.notebook.Viewer.on_event`` hands over. Where the selection changed it has the clicked entity
-            and the place (3,) mm in the view.
+        event: what ``rerun.notebook.Viewer.on_event`` hands over. Where the selection changed it has what was clicked.
         estimate: of the session.
     """
-    known = [(pair.pm, pair.trus_p_pm_mm) for pair in estimate.pairs if pair.trus_p_pm_mm is not None]
-    if getattr(event, "type", "") != "selection_change" or not known:
+    if getattr(event, "type", "") != "selection_change":
         return None
     for item in event.items:
-        if item.type == "entity" and item.position is not None and f"/{item.entity_path.strip('/')}" in _PMS:
-            away = [float(np.linalg.norm(trus_p_pm_mm - np.asarray(item.position))) for _, trus_p_pm_mm in known]
-            return known[int(np.argmin(away))][0]
+        if item.type == "entity" and (look := _LOOK.fullmatch(item.entity_path)):
+            positions = {shot.number: shot.position for shot in shots_of(estimate) if shot.kind == "pair"}
+            position = positions.get(int(look[1]))
+            return None if position is None else estimate.pairs[position].pm
     return None
