@@ -42,7 +42,7 @@ def check_tables(path: Path) -> None:
         try:
             with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as base:
                 computed = base.execute(_COMPUTED).fetchmany(1)
-        except sqlite3.Error:
+        except (sqlite3.Error, ValueError):  # ValueError: names that are no text
             continue  # the reader of recordings says what is wrong
         if computed:
             raise InputError(str(file), "tables that are computed", "a recording with plain tables")

@@ -72,6 +72,7 @@ class Recording:
         bound_chunks()
         check_tables(path)
         self._reader: Any = None
+        self._usual: set[str] = set()  # types whose definitions in the file were compared with ROS's own
         try:
             reader: Any = AnyReader([path], default_typestore=_common_types())
             reader.open()
@@ -137,6 +138,11 @@ class Recording:
         if recorded.kind not in self._reader.typestore.fielddefs:
             expected = "its definition in the file, or a type of ROS 2's common ones"
             raise InputError(where, f"{recorded.kind} without a definition", expected)
+        if recorded.kind not in self._usual:
+            odd = _other_field(recorded.kind, self._reader.typestore.fielddefs)
+            if odd:
+                raise InputError(where, f"{recorded.kind} defined without the usual {odd}", "ROS's own definition")
+            self._usual.add(recorded.kind)
         try:
             return self._reader.deserialize(recorded.raw, recorded.kind)
         except Exception as error:
@@ -205,6 +211,35 @@ class Recording:
         mend = {".mcap": "mcap recover", ".bag": "rosbag reindex"}.get(self.path.suffix.lower())
         hint = f"; of a recorder that was cut off, {mend} makes one" if mend else ""
         return InputError(str(self.path), f"a recording that cannot be read ({_words(error)})", f"a whole one{hint}")
+
+
+def _other_field(kind: str, own: Mapping[str, Any]) -> str:
+    """A field of ROS's definition of a type, or of a type within it, that the file's own has not; '' if it has all.
+
+    ROS 1 has further fields, and the capitals D, K, R and P. Types that are not ROS's common ones are not compared.
+    """
+    common = _common_types().fielddefs
+    waiting, seen = [kind], set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name in seen or name not in common:
+            continue
+        seen.add(name)
+        found = {field if len(field) > 1 else field.lower(): what for field, what in own.get(name, ((), ()))[1]}
+        for field, what in common[name][1]:
+            if found.get(field) != what:
+                return f"{name}.{field}"
+            waiting += [word for word in _type_words(what) if word in common]
+    return ""
+
+
+def _type_words(what: Any) -> Iterator[str]:
+    """The names within a field's description, a tree of tuples."""
+    for part in what[1] if isinstance(what[1], tuple) else (what[1],):
+        if isinstance(part, tuple):
+            yield from _type_words(part)
+        elif isinstance(part, str):
+            yield part
 
 
 @functools.cache

@@ -175,13 +175,15 @@ def packed_pose(t_s: float, numbers: Sequence[float]) -> bytes:
     return b"\0\1\0\0" + body + struct.pack("<7d", *numbers)
 
 
-def write_mcap(path: Path, topic: str, poses: Sequence[tuple[float, Sequence[float]]]) -> Path:
+def write_mcap(
+    path: Path, topic: str, poses: Sequence[tuple[float, Sequence[float]]], definition: str = POSE_STAMPED
+) -> Path:
     """An MCAP file of PoseStamped by the mcap library: (seconds, x y z qx qy qz qw)."""
     writer_module = pytest.importorskip("mcap.writer", reason="mcap is not installed")
     with path.open("wb") as file:
         writer = writer_module.Writer(file)
         writer.start(profile="ros2", library="test")
-        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", POSE_STAMPED.encode())
+        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", definition.encode())
         channel = writer.register_channel(topic, "cdr", schema)
         for i, (t_s, numbers) in enumerate(poses):
             ns = START_NS + round((t_s + 0.005) * 1e9)

@@ -299,3 +299,22 @@ def test_without_rosbags_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'fgreg\[ros\]'"):
         Recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("usual", "other", "field"),
+    [
+        ("MSG: geometry_msgs/Point\nfloat64 x", "MSG: geometry_msgs/Point\nfloat64 X2", "geometry_msgs/msg/Point.x"),
+        ("string frame_id", "string name", "std_msgs/msg/Header.frame_id"),
+        ("geometry_msgs/Point position", "geometry_msgs/Point place", "geometry_msgs/msg/Pose.position"),
+        ("float64 w", "string w", "geometry_msgs/msg/Quaternion.w"),
+    ],
+)
+def test_a_definition_that_is_not_ros_own_is_one_line(tmp_path: Path, usual: str, other: str, field: str) -> None:
+    assert bags.POSE_STAMPED.count(usual + "\n") == 1
+    definition = bags.POSE_STAMPED.replace(usual + "\n", other + "\n")
+    path = bags.write_mcap(tmp_path / "a.mcap", "/pose", [(0.0, (0, 0, 0, 0, 0, 0, 1))], definition)
+    with Recording(path) as recording:
+        (recorded,) = recording.messages(["/pose"])
+        with pytest.raises(InputError, match=f"PoseStamped defined without the usual {field}, expected ROS's own"):
+            recording.decode(recorded)
