@@ -7,7 +7,8 @@ import pytest
 from scipy.special import ndtr
 
 from fgreg.detection.corners import square_corners
-from fgreg.detection.edges import _Band, _step_model, fit_edges
+from fgreg.detection.edge_pixels import EdgePixels
+from fgreg.detection.edges import _step_model, fit_edges
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.camera_model import CameraModel
 
@@ -37,7 +38,7 @@ CORNERS = np.array([[101.3, 60.2], [261.7, 83.9], [240.4, 231.6], [88.8, 214.1]]
 def test_step_model_jacobian_against_differences() -> None:
     rng = np.random.default_rng(0)
     zeros = np.zeros((2, 50))
-    band = _Band(rng.uniform(-4, 4, (2, 50)), rng.uniform(-1, 1, (2, 50)), zeros, np.ones((2, 50), dtype=bool))
+    band = EdgePixels(rng.uniform(-4, 4, (2, 50)), rng.uniform(-1, 1, (2, 50)), zeros, *np.ones((2, 2, 50), dtype=bool))
     x = np.array([[0.3, -0.2, 0.1, 20, 3, 150, -5, 0.003, -0.03], [-0.3, 0.2, -0.3, 10, 1, 100, 5, -0.004, 0.02]])
     _, jacobian = _step_model(band, x)
     for k in range(9):
@@ -54,7 +55,7 @@ def test_step_model_is_the_blur_of_a_step_under_sloping_light() -> None:
     scene = (1 + g * v) * (b + (w - b) * np.heaviside(v, 0.5))
     d = np.array([-2.0, -0.5, 0.0, 0.7, 3.0])
     expected = [np.sum(scene * np.exp(-0.5 * ((v - e) / s) ** 2)) * (v[1] - v[0]) / (s * np.sqrt(2 * np.pi)) for e in d]
-    band = _Band(d[None], np.zeros((1, 5)), np.zeros((1, 5)), np.ones((1, 5), dtype=bool))
+    band = EdgePixels(d[None], np.zeros((1, 5)), np.zeros((1, 5)), *np.ones((2, 1, 5), dtype=bool))
     model, _ = _step_model(band, np.array([[0.0, 0.0, np.log(s), b, 0.0, w, 0.0, g, 0.0]]))
     assert model[0] == pytest.approx(expected, abs=1e-3)
 

@@ -14,7 +14,7 @@ import pytest
 
 from fgreg.cli.main import main
 from fgreg.detection.board import detect_board, find_board_corners
-from fgreg.detection.edges import Image
+from fgreg.detection.edge_pixels import Image
 from fgreg.detection.marker import view_corners
 from fgreg.detection.results import NotFound
 from fgreg.geometry.transforms import FloatArray, inverse, make_transform

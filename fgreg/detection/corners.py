@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.edges import MIN_CONTRAST, GreyImage, Image, fit_edges, segment_frames
+from fgreg.detection.edge_pixels import GreyImage, Image, segment_frames
+from fgreg.detection.edges import MIN_CONTRAST, fit_edges
 from fgreg.detection.frame_files import white_level
 from fgreg.geometry.transforms import BoolArray, FloatArray
 from fgreg.model.camera_model import CameraModel
@@ -142,7 +143,7 @@ def square_corners(
 
     usable = np.flatnonzero(np.isfinite(ideal).all(axis=(1, 2)) & (sides.min(axis=1) >= MIN_EDGE_PX))
     if not edges or usable.size == 0:
-        return _with_common(ideal, covariance, found, from_edges, sides, np.ones(n))
+        return _with_common(ideal, covariance, found, from_edges, sides, np.ones(n), np.zeros(n))
 
     start = ideal[usable].reshape(-1, 2)
     end = np.roll(ideal[usable], -1, axis=1).reshape(-1, 2)
@@ -188,7 +189,9 @@ def square_corners(
         covariance[k, 2 * c : 2 * c + 2, 2 * c : 2 * c + 2] = FALLBACK_SIGMA_PX**2 * inverse @ inverse.T
     blur2 = np.ones(n)
     blur2[usable] = np.square(fit.blur_px).reshape(-1, 4).mean(axis=1)
-    return _with_common(ideal, covariance, found, from_edges, sides, blur2)
+    by_response = np.zeros(n)
+    by_response[usable] = (fit.by_response * fit.good).reshape(-1, 4).max(axis=1)
+    return _with_common(ideal, covariance, found, from_edges, sides, blur2, by_response)
 
 
 def _with_common(
@@ -198,11 +201,16 @@ def _with_common(
     from_edges: BoolArray,
     sides_px: FloatArray,
     blur2: FloatArray,
+    by_response: FloatArray,
 ) -> SquareCorners:
-    """Add the common errors. They are larger for short edges, which average over fewer pixels."""
+    """Add the common errors. They are larger for short edges, which average over fewer pixels.
+
+    ``by_response`` (n,) px: one sigma by which all sides of a square lie outwards; its corners do sqrt(2) times that.
+    """
     from_edge = COMMON_PX * np.sqrt(COMMON_LENGTH_PX / np.maximum(sides_px.min(axis=1), 1.0))
     common = np.where(from_edges, (from_edge * np.sqrt(blur2))[:, None], COMMON_FALLBACK_PX)
     arm = ideal - ideal.mean(axis=1, keepdims=True)
     arm /= np.maximum(np.linalg.norm(arm, axis=2, keepdims=True), 1e-9)
-    outward = arm * np.where(from_edges, OUTWARD_PX * blur2[:, None], OUTWARD_FALLBACK_PX)[..., None]
+    outward_px = np.hypot(OUTWARD_PX * blur2, np.sqrt(2.0) * by_response)
+    outward = arm * np.where(from_edges, outward_px[:, None], OUTWARD_FALLBACK_PX)[..., None]
     return SquareCorners(ideal, covariance, found, from_edges, common, outward)

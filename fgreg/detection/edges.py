@@ -14,6 +14,10 @@ Symmetric blur does not bias o and m, nor does light that falls off along or acr
 is 0.005 px, the same in both views). No pixel is interpolated, so the noise is independent and the normal equations
 give the covariance.
 
+A camera whose levels are no linear function of the light moves all edges towards the dark side, by up to 0.4 s: the
+line is that of a linear camera, and ``by_response`` says how far it may be off. More is added where white is cut off,
+where odd and even lines disagree, and where the dark side is bright under a veil.
+
 Lengths are *ideal* pixels (camera.py), without lens distortion: the edges of a square are straight in them.
 """
 
@@ -22,24 +26,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr
 
+from fgreg.detection.edge_pixels import EdgePixels, GreyImage, edge_pixels, segment_frames
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray
 from fgreg.model.camera_model import CameraModel
-from fgreg.model.lens import (
-    distort_jacobian,
-    focal_px,
-    pixels_from_ideal,
-)
-
-Image = npt.NDArray[np.uint8]
-GreyImage = npt.NDArray[np.uint8] | npt.NDArray[np.float32]
-"""Grey levels from 0 to 255, with fractions where the picture has more than 8 bits."""
 
 MAX_ROWS = 112
 """Largest number of pixel rows used across an edge; longer edges are sampled evenly."""
-CURVE_NODES = 17
 SECTIONS, MIN_SECTIONS = 8, 6
 """Parts of an edge, and the number of parts in which both sides must be in the image."""
 MIN_CONTRAST = 12.0
@@ -58,6 +52,25 @@ KURTOSIS_SIGMA, MAX_KURTOSIS = 0.03, 0.08
 PARAMETERS = 9
 STEEP = 0.3
 """Pixels at which the model is at least this steep, as a share of its steepest, tell its misfit."""
+WHITE, CUT_OFF = 255.0, 254.5
+"""The highest grey level, and that from which a pixel may be brighter than it says."""
+VIDEO, VIDEO_SIGMA = 0.5, 0.08
+"""Exponent of video's response (ITU-R BT.709, sRGB) as a power of the light, and how far cameras differ from it."""
+EDGE_ERROR, COMMON_ERROR, FULL_RATIO = 0.1, (0.05, 7.0), 16.0
+"""Standard deviation of the exponent that one edge, and all edges of a picture, ask for, from blur of other shapes and
+from compression, which shows as noise: of the latter a constant, and a factor on noise over contrast. Both are for a
+light side brighter than the dark one by this ratio: they grow as its logarithm falls."""
+OVEREXPOSED, CUT_SHARE = 0.8, 0.1
+"""One sigma of where all edges are together, in blurs, and the share of an edge's pixels cut off at white from which
+that counts: neither the response nor how bright the light side is can be told."""
+COMBED = 0.1
+"""One sigma of an edge's offset and slope as a share of the distance between odd and even lines: the marker moved."""
+VEIL = 0.02
+"""One sigma of o in blurs, times the square of the dark side's level over the light side's: where the dark side is not
+dark there is a veil (smoke, glare) that may vary across the edge."""
+LEAST_EXPONENT, MOST_EXPONENT = 0.2, 1.3
+CLEARLY_LINEAR = 1e-4
+"""Odds of video's response below which it is not looked at."""
 MEDIAN_SIGMAS = 0.6745
 """Median of the size of a normally distributed residual, in standard deviations."""
 BINS, CLEAN_SHARE = 40, 0.75
@@ -76,6 +89,7 @@ class EdgeFit:
         blur_px: (n,) standard deviation s of the step.
         step: (n,) grey levels, left side of the starting segment less its right side.
         good: (n,) whether the edge passed all checks.
+        by_response: (n,) one sigma of o, px, by the camera's response: one error for all edges.
     """
 
     line: FloatArray
@@ -83,100 +97,10 @@ class EdgeFit:
     blur_px: FloatArray
     step: FloatArray
     good: BoolArray
+    by_response: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Band:
-    """p pixels for each of n edges, all (n, p): distance d, position u, grey level, and whether the pixel is used."""
-
-    d: FloatArray
-    u: FloatArray
-    grey: FloatArray
-    used: BoolArray
-
-
-def segment_frames(start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(middle, direction, normal, half length) of segments (n, 2) -> (n, 2).
-
-    The normal points to the left of the direction as drawn (y down), which is outside a tag whose corners run
-    clockwise as seen.
-    """
-    half = 0.5 * (end - start)
-    length = np.linalg.norm(half, axis=-1)
-    direction = half / length[..., None]
-    normal = np.stack([direction[..., 1], -direction[..., 0]], axis=-1)
-    return 0.5 * (start + end), direction, normal, length
-
-
-def _band(
-    camera: CameraModel,
-    image: GreyImage,
-    start: FloatArray,
-    end: FloatArray,
-    half_width: FloatArray,
-    trim: FloatArray,
-    rows: int,
-) -> _Band:
-    """Gather pixels: one row per pixel step along the edge's major axis, and across it the pixels within half_width."""
-    middle, direction, normal, half_length = segment_frames(start, end)
-    n = len(start)
-    # The ideal segment, trimmed at its ends, in distorted pixels.
-    s_nodes = np.linspace(-1.0, 1.0, CURVE_NODES) * (half_length - trim)[:, None]
-    nodes = pixels_from_ideal(camera, middle[:, None] + s_nodes[..., None] * direction[:, None])
-    chord = np.abs(nodes[:, -1] - nodes[:, 0])
-    major = (chord[:, 1] > chord[:, 0]).astype(np.intp)
-    along_nodes = np.take_along_axis(nodes, major[:, None, None], axis=2)[..., 0]
-    count = min(rows, int(chord.max()) + 1)
-    steps = np.linspace(0.0, 1.0, count)
-    along = np.rint(along_nodes[:, :1] + steps * (along_nodes[:, -1:] - along_nodes[:, :1]))
-    fresh = np.ones(along.shape, dtype=bool)
-    fresh[:, 1:] = along[:, 1:] != along[:, :-1]
-    s = np.empty(along.shape)
-    for k in range(n):
-        forward = along_nodes[k, -1] > along_nodes[k, 0]
-        order = slice(None) if forward else slice(None, None, -1)
-        s[k] = np.interp(along[k], along_nodes[k, order], s_nodes[k, order])
-    ideal = middle[:, None] + s[..., None] * direction[:, None]
-    centre = pixels_from_ideal(camera, ideal)
-    # Across: pixels along the minor axis; a slanted edge needs up to sqrt(2) more of them.
-    reach = int(np.ceil(half_width.max() * np.sqrt(2.0))) + 1
-    offsets = np.arange(-reach, reach + 1)
-    nearest = np.rint(centre)
-    # Ideal distance of a pixel to first order about its row's centre: the band is narrow.
-    f = focal_px(camera)
-    inverse_jacobian = np.linalg.inv(f[:, None] * distort_jacobian(camera, ideal / f) / f)
-    height, width = image.shape
-    parts = []
-    for k in range(n):  # one edge at a time: its arrays stay in the cache
-        minor, other = 1 - major[k], major[k]
-        across = nearest[k, :, minor, None] + offsets
-        off = across - centre[k, :, minor, None]
-        beside = (nearest[k, :, other] - centre[k, :, other])[:, None]
-        by_normal = normal[k] @ inverse_jacobian[k]
-        d = by_normal[:, minor, None] * off + by_normal[:, other, None] * beside
-        limits = (width, height)
-        inside = (across >= 0) & (across < limits[minor])
-        inside &= ((nearest[k, :, other] >= 0) & (nearest[k, :, other] < limits[other]) & fresh[k])[:, None]
-        row, column = np.nonzero(inside & (np.abs(d) <= half_width[k]))
-        by_direction = direction[k] @ inverse_jacobian[k]
-        u = by_direction[row, minor] * off[row, column] + by_direction[row, other] * beside[row, 0]
-        at = across[row, column].astype(np.intp), nearest[k, row, other].astype(np.intp)
-        iy, ix = at if minor == 1 else at[::-1]
-        parts.append((d[row, column], (s[k, row] + u) / half_length[k], image[iy, ix]))
-    return _joined(parts)
-
-
-def _joined(parts: list[tuple[FloatArray, FloatArray, GreyImage]]) -> _Band:
-    """The pixels (d, u, grey) of each edge as rows of one array, padded to the longest row."""
-    shape = len(parts), max(1, *(len(d) for d, _, _ in parts)) if parts else 1
-    band = _Band(np.zeros(shape), np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool))
-    for k, (d, u, grey) in enumerate(parts):
-        count = len(d)
-        band.d[k, :count], band.u[k, :count], band.grey[k, :count], band.used[k, :count] = d, u, grey, True
-    return band
-
-
-def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _step_model(band: EdgePixels, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Grey levels (n, p) of parameters (n, 9) = (o, m, log s, b0, b1, w0, w1, g, c), and their Jacobian (n, 9, p)."""
     u = band.u
     blur = np.exp(x[:, 2])[:, None]
@@ -209,10 +133,39 @@ def _step_model(band: _Band, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     return dark * light + step * high, jacobian
 
 
+def _seen(light: FloatArray, by_light: FloatArray, exponent: float) -> tuple[FloatArray, FloatArray]:
+    """Grey levels (n, p) of light (n, p), 255 (light / 255)^exponent; and their Jacobian (n, k, p) from the light's."""
+    if exponent == 1.0:
+        return light, by_light
+    share = np.maximum(light, 0.5) / WHITE
+    return WHITE * share**exponent, by_light * (exponent * share ** (exponent - 1.0))[:, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BandFit:
+    """Parameters (n, 9), inverse normal matrix (n, 9, 9), pixel noise sigma (n,); by the response's exponent: what one
+    Gauss-Newton step would change of it (n,), its information (n,), and the derivative of o (n,); and how far apart
+    odd and even lines have the edge (n,) px, 0 where that may be noise."""
+
+    x: FloatArray
+    inverse_normal: FloatArray
+    sigma: FloatArray
+    exponent_step: FloatArray
+    exponent_information: FloatArray
+    offset_by_exponent: FloatArray
+    between_fields: FloatArray
+
+
 def _fit_band(
-    band: _Band, start: FloatArray, iterations: int, tolerance_px: float, fall_off_sigma: float, near: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(parameters (n, 9), inverse normal matrix (n, 9, 9), pixel noise sigma (n,)), by Levenberg-Marquardt."""
+    band: EdgePixels,
+    start: FloatArray,
+    iterations: int,
+    tolerance_px: float,
+    fall_off_sigma: float,
+    near: bool,
+    exponent: float = 1.0,
+) -> _BandFit:
+    """The edges by Levenberg-Marquardt, for a camera with this response."""
     x = start.copy()
     contrast = np.maximum(np.abs(x[:, 5] - x[:, 3]), MIN_CONTRAST)
     # Priors: inverse variances about the start.
@@ -229,7 +182,7 @@ def _fit_band(
     weight = band.used.astype(np.float64)
     sigma = 0.1 * contrast
     damping = np.full(len(x), 1e-3)
-    grey, jacobian = _step_model(band, x)
+    grey, jacobian = _seen(*_step_model(band, x), exponent)
     residual = band.grey - grey
     cost = np.full(len(x), np.inf)
     for iteration in range(iterations):
@@ -253,22 +206,94 @@ def _fit_band(
         y = x + step
         y[:, 2] = np.clip(y[:, 2], np.log(0.2), np.log(2.0 * MAX_BLUR_PX))
         y[:, 8] = np.clip(y[:, 8], -MAX_KURTOSIS, MAX_KURTOSIS)
-        new_grey, new_jacobian = _step_model(band, y)
+        new_grey, new_jacobian = _seen(*_step_model(band, y), exponent)
         new_residual = band.grey - new_grey
         new_cost = np.sum(weight * new_residual**2, axis=1) / sigma**2 + np.sum(prior * (y - centre) ** 2, axis=1)
         better = new_cost <= cost
         damping = np.where(better, damping * 0.1, damping * 10.0)
         if better.all():
-            x, cost, residual, jacobian = y, new_cost, new_residual, new_jacobian
+            x, cost, residual, jacobian, grey = y, new_cost, new_residual, new_jacobian, new_grey
         else:
             x[better], cost[better] = y[better], new_cost[better]
             residual[better], jacobian[better] = new_residual[better], new_jacobian[better]
+            grey[better] = new_grey[better]
         if iteration > (0 if near else REWEIGH_AT) and np.abs(step[:, :2]).max() < tolerance_px:
             break
     sigma = _spread(residual, weight, weight)
     normal = (jacobian * (weight / sigma[:, None] ** 2)[:, None]) @ np.swapaxes(jacobian, 1, 2)
     normal[:, diagonal, diagonal] += prior + 1e-9
-    return x, np.asarray(np.linalg.inv(normal), dtype=np.float64), sigma
+    inverse_normal = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    # The exponent as one more parameter of each edge: the Schur complement of the others.
+    share = np.clip(grey / WHITE, 1e-3, 1.0)
+    by_exponent = grey * np.log(share) / exponent
+    weighed = by_exponent * weight / sigma[:, None] ** 2
+    others = np.einsum("nij,njp,np->ni", inverse_normal, jacobian, weighed)
+    left = by_exponent - np.einsum("nip,ni->np", jacobian, others)
+    information = np.sum(weighed * left, axis=1)
+    gradient = np.sum(left * weight / sigma[:, None] ** 2 * residual, axis=1)
+    step = gradient / np.maximum(information, 1e-9)
+    return _BandFit(
+        x,
+        inverse_normal,
+        sigma,
+        step,
+        information,
+        -others[:, 0],
+        _between_fields(band, residual, jacobian[:, 0], weight),
+    )
+
+
+def _between_fields(band: EdgePixels, residual: FloatArray, by_offset: FloatArray, weight: FloatArray) -> FloatArray:
+    """Distance (n,) px of an edge on odd lines from that on even ones: interlaced video of something that moved."""
+    offset, variance = [], []
+    for lines in (band.odd, ~band.odd):
+        information = np.maximum(np.sum(weight * lines * by_offset**2, axis=1), 1e-6)
+        offset.append(np.sum(weight * lines * by_offset * residual, axis=1) / information)
+        mean = np.where(lines, residual - by_offset * offset[-1][:, None], 0.0)
+        variance.append(np.sum(weight * by_offset**2 * mean**2, axis=1) / information**2)
+    apart = np.abs(offset[0] - offset[1])
+    return np.where(apart > 4.0 * np.sqrt(variance[0] + variance[1]), apart, 0.0)
+
+
+def _asked_exponent(fit: _BandFit, near: BoolArray) -> tuple[float, float]:
+    """The response's exponent that edges ask for which were fitted with 1, and its sigma."""
+    light = np.clip(fit.x[near][:, [3, 5]], 1.0, WHITE)
+    ratio = np.maximum(np.log(light[:, 1] / light[:, 0]) / np.log(FULL_RATIO), 0.02)
+    variance = 1.0 / np.maximum(fit.exponent_information[near], 1e-6) + (EDGE_ERROR / ratio) ** 2
+    asked = np.clip(1.0 + fit.exponent_step[near], LEAST_EXPONENT, MOST_EXPONENT)
+    mean, weight = float(np.median(asked)), 1.0 / variance
+    for _ in range(5):  # Huber: a spot on an edge asks for anything
+        size = np.abs(asked - mean) / np.sqrt(variance)
+        weight = np.minimum(1.0, 1.5 / np.maximum(size, 1e-9)) / variance
+        mean = float(weight @ asked / weight.sum())
+    contrast = np.maximum(light[:, 1] - light[:, 0], MIN_CONTRAST)
+    common = np.hypot(COMMON_ERROR[0], COMMON_ERROR[1] * np.median(fit.sigma[near] / contrast)) / np.median(ratio)
+    return mean, float(np.hypot(weight.sum() ** -0.5, common))
+
+
+def _by_response(band: EdgePixels, linear: _BandFit, near: BoolArray) -> FloatArray:
+    """One sigma (n,) px of o, one error for all edges, because the camera's response to light is not known.
+
+    The edges are fitted for a camera that is linear. One that has about video's response makes dark squares smaller
+    and skews the blur: that gives the odds of these two hypotheses, equal before; a second fit says how far apart
+    they are.
+    """
+    nothing = np.zeros(len(linear.x))
+    if not near.any():
+        return nothing
+    asked, sigma = _asked_exponent(linear, near)
+    spread = np.hypot(sigma, VIDEO_SIGMA)
+    log_odds = (
+        0.5 * ((asked - 1.0) / sigma) ** 2 + np.log(sigma) - 0.5 * ((asked - VIDEO) / spread) ** 2 - np.log(spread)
+    )
+    video_odds = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0))))
+    if video_odds < CLEARLY_LINEAR:
+        return nothing
+    start = linear.x.copy()
+    start[:, [3, 5]] = WHITE * (np.clip(linear.x[:, [3, 5]], 0.5, WHITE) / WHITE) ** (1.0 / VIDEO)
+    start[:, [4, 6]] = 0.0
+    video = _fit_band(band, start, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True, exponent=VIDEO)
+    return np.asarray(np.sqrt(video_odds) * np.abs(video.x[:, 0] - linear.x[:, 0]))
 
 
 def _clean_bins(weight: FloatArray, bins: IntArray) -> BoolArray:
@@ -292,7 +317,7 @@ def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> Fl
     return np.asarray(np.maximum(np.sqrt(np.sum(weight * residual**2, axis=1) / dof), 0.3))
 
 
-def _sections_seen(band: _Band, x: FloatArray, reach: FloatArray, margin_px: FloatArray) -> IntArray:
+def _sections_seen(band: EdgePixels, x: FloatArray, reach: FloatArray, margin_px: FloatArray) -> IntArray:
     """Number (n,) of sections of |u| < reach (n,) with pixels beyond ``margin_px`` (n,) on both sides."""
     e = band.d - x[:, :1] - x[:, 1:2] * band.u
     section = np.floor((band.u / reach[:, None] + 1.0) * (SECTIONS / 2)).astype(np.intp)
@@ -306,7 +331,7 @@ def _sections_seen(band: _Band, x: FloatArray, reach: FloatArray, margin_px: Flo
     return np.asarray((seen == 3).sum(axis=1))
 
 
-def _first_guess(band: _Band, half_width: FloatArray, blur_px: FloatArray) -> FloatArray:
+def _first_guess(band: EdgePixels, half_width: FloatArray, blur_px: FloatArray) -> FloatArray:
     """Levels from the outer thirds of the band, no offset, a wide blur."""
     x = np.zeros((len(band.d), PARAMETERS))
     x[:, 2] = np.log(blur_px)
@@ -324,9 +349,9 @@ def _locate(
     """First pass: (parameters (n, 9), whether an edge is near (n,), light less dark level about the start (n,))."""
     half_width = np.clip(0.55 * cell_px, 2.0, widest_px)
     trim = np.clip(0.12 * np.linalg.norm(end - start, axis=1), 2.0, 12.0)
-    band = _band(camera, image, start, end, half_width, trim, 40)
+    band = edge_pixels(camera, image, start, end, half_width, trim, 40)
     guess = _first_guess(band, half_width, np.clip(0.35 * half_width, 0.8, 0.3 * widest_px))
-    x, _, _ = _fit_band(band, guess, 10, 0.02, FALL_OFF_SIGMA, near=False)
+    x = _fit_band(band, guess, 10, 0.02, FALL_OFF_SIGMA, near=False).x
     near = (np.abs(x[:, 0]) + np.abs(x[:, 1]) < half_width) & (x[:, 5] - x[:, 3] > MIN_CONTRAST)
     near &= np.exp(x[:, 2]) < MAX_BLUR_PX
     return np.where(near[:, None], x, guess), near, guess[:, 5] - guess[:, 3]
@@ -362,12 +387,16 @@ def fit_edges(
     # Not so wide that the next cell's blur reaches in.
     half_width2 = np.clip(3.0 * blur + 1.5, 2.0, np.clip(cell_px - 3.5 * blur, 2.0, 14.0))
     trim2 = np.clip(3.0 * blur + 1.0, 2.0, 0.25 * length)
-    band = _band(camera, image, start2, end2, half_width2, trim2, MAX_ROWS)
+    band = edge_pixels(camera, image, start2, end2, half_width2, trim2, MAX_ROWS)
     # Opposite edges look opposite ways: what their g have in common is a misfit of the blur, not light.
     x[:, 7] = 0.5 * (x[:, 7] - x[:, 7].reshape(-1, 2, 2)[:, ::-1].ravel())
     x[:, [0, 1, 8]] = 0.0
     x[:, 2] = np.log(np.clip(blur, 0.4, MAX_BLUR_PX))
-    x, inverse_normal, sigma = _fit_band(band, x, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True)
+    fit = _fit_band(band, x, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True)
+    by_response = _by_response(band, fit, near)
+    cut = np.sum(band.used & (band.grey >= CUT_OFF), axis=1) > CUT_SHARE * np.sum(band.used, axis=1)
+    by_response = np.hypot(by_response, OVEREXPOSED * cut * np.exp(fit.x[:, 2]))
+    x, inverse_normal, sigma = fit.x, fit.inverse_normal, fit.sigma
 
     # Back to the starting segments' frame: they differ by the small rotation of the first pass.
     middle, direction, _, half_length = segment_frames(start, end)
@@ -380,7 +409,7 @@ def fit_edges(
     line = np.stack([height[:, 0] - slope * place[:, 0], slope], axis=1)
 
     blur = np.exp(x[:, 2])
-    contrast = x[:, 5] - x[:, 3]
+    contrast = np.minimum(x[:, 5], WHITE) - x[:, 3]
     sections = _sections_seen(band, x, 1.0 - 2.0 * trim2 / length, np.minimum(blur, 0.4 * half_width2))
     good = (
         near
@@ -389,5 +418,6 @@ def fit_edges(
         & (sections >= MIN_SECTIONS)
         & (np.abs(x[:, 0]) + np.abs(x[:, 1]) < 1.5)
     )
-    covariance = inverse_normal[:, :2, :2]
-    return EdgeFit(line=line, covariance=covariance, blur_px=blur, step=step, good=good)
+    covariance = inverse_normal[:, :2, :2] + np.square(COMBED * fit.between_fields)[:, None, None] * np.eye(2)
+    covariance[:, 0, 0] += np.square(VEIL * blur * np.clip(x[:, 3] / np.maximum(x[:, 5], 1.0), 0.0, 1.0) ** 2)
+    return EdgeFit(line=line, covariance=covariance, blur_px=blur, step=step, good=good, by_response=by_response)

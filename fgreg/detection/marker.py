@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fgreg.detection.body_pose import VIEW_NAMES, choose_pose, without_strays
 from fgreg.detection.corners import eight_bit, grey, square_corners
-from fgreg.detection.edges import GreyImage, Image
+from fgreg.detection.edge_pixels import GreyImage, Image
 from fgreg.detection.pose_least_squares import CornerSet, join
 from fgreg.detection.results import MarkerFit, NotFound
 from fgreg.detection.spoilt_tags import find_spoilt_tags

@@ -13,7 +13,8 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from fgreg.detection.edges import MIN_CONTRAST, Image
+from fgreg.detection.edge_pixels import Image
+from fgreg.detection.edges import MIN_CONTRAST
 from fgreg.detection.tags import FoundTag, dictionary_named, halved
 from fgreg.geometry.transforms import BoolArray, FloatArray
 

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.detection.edges import Image
+from fgreg.detection.edge_pixels import Image
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import BoolArray, FloatArray
 
