@@ -55,7 +55,7 @@ def nees(fits: list[tuple[FloatArray, MarkerFit]]) -> FloatArray:
         Disturbances(motion_px=8.0, motion_rad=1.9),
         Disturbances(noise_gain=4.0),
         Disturbances(jpeg_quality=50),
-        Disturbances(interlace_px=2.0, motion_rad=0.4),
+        Disturbances(field_hz=50.0, hand_mm_s=20.0),
         Disturbances(smoke=0.5),
     ],
     ids=["defocus-2", "defocus-4", "motion-3", "motion-8", "noise", "jpeg", "interlaced", "smoke"],

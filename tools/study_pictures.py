@@ -48,7 +48,7 @@ ROWS: dict[str, Disturbances] = {
     "drops 2": Disturbances(drops=2),
     "noise x 4": Disturbances(noise_gain=4.0),
     "MJPEG 50": Disturbances(jpeg_quality=50),
-    "interlaced 2 px": Disturbances(interlace_px=2.0),
+    "interlaced 20 mm/s": Disturbances(field_hz=50.0, hand_mm_s=20.0),
     "wet and moving": Disturbances(motion_px=3.0, specks=2, blood=2, noise_gain=2.0, jpeg_quality=80),
 }
 LARGE_NEES = 5.0

@@ -325,6 +325,8 @@ def check(
             sys.stderr.write(f"fgreg: warning: {warning}\n")
         if not found.problems:
             typer.echo(f"{session}: no problems" + (f", {len(warnings)} warnings" if warnings else ""))
+            if found.markers:
+                typer.echo(found.markers)
     if found.problems:
         raise typer.Exit(EXIT_BAD_INPUT)
 
@@ -372,6 +374,15 @@ def simulate(
         list[str] | None,
         typer.Option("--declare", metavar="KEY=VALUE", help="What session.yaml has instead: probe.radius_mm=0.01."),
     ] = None,
+    disturb: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--disturb",
+            metavar="NAME=VALUE",
+            help="What spoils the pictures, each shot drawing its own: smoke=0.3, blood=2, drops=1, specular=1, "
+            "hand_mm_s=10, field_hz=50, deinterlace=1, jpeg_quality=60 (docs/simulate.md has all). Repeatable.",
+        ),
+    ] = None,
     camera: Annotated[bool, typer.Option("--camera", help="Poses, of a session that has camera and board.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing session.")] = False,
     list_presets: Annotated[bool, typer.Option("--list", help="List the presets and end.")] = False,
@@ -386,6 +397,7 @@ def simulate(
     from fgreg.output.session_folder import check_folder
     from fgreg.simulation.config import Sweep
     from fgreg.simulation.deviations import with_deviations
+    from fgreg.simulation.disturbances import with_values
     from fgreg.simulation.presets import PRESETS
     from fgreg.simulation.simulate import simulate as run
     from fgreg.simulation.write import write_session
@@ -418,6 +430,14 @@ def simulate(
         raise InputError("--off", str(error), "a name among these") from error
     declared = {key: _number("--declare", value) for key, value in _named_values("--declare", declare)}
     config = replace(config, declared=declared, camera_declared=camera)
+    if spoils := {name: _number("--disturb", value) for name, value in _named_values("--disturb", disturb)}:
+        if not config.frames:
+            raise InputError("--disturb", f"preset {preset}, which has no pictures", "a preset with raw frames")
+        try:
+            disturbances = with_values(config.disturbances, {"drawn": 1.0, **spoils})
+        except ValueError as error:
+            raise InputError("--disturb", str(error), "a name and a value among these") from error
+        config = replace(config, disturbances=disturbances)
     warn_of_leftovers(out)
     check_folder(out, overwrite=overwrite)
     with _progress(quiet) as progress:
@@ -428,6 +448,11 @@ def simulate(
         write_session(simulated, out, overwrite, lambda done, total: progress("rendering", done, total))
     if not quiet:
         typer.echo(f"{out}: {config.aims} aims, {config.pairs} PMs, {len(simulated.frames)} frames, seed {seed}")
+        if config.frames:
+            typer.echo(
+                f"What to expect of it: 'fgreg check {out}' says how many shots can be used and why others cannot,"
+            )
+            typer.echo(f"'fgreg solve {out}' the verdict, 'fgreg evaluate {out}' the true error.")
 
 
 add_commands(app, _progress)

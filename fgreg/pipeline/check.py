@@ -7,7 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fgreg.detection.events_to_measurements import extract_measurements
+import numpy as np
+
+from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
+from fgreg.detection.results import MarkerFit, marker_covariance
 from fgreg.errors import InputError
 from fgreg.output.leftovers import leftovers
 from fgreg.session.event_writer import type_of
@@ -40,11 +43,13 @@ class SessionCheck:
     Attributes:
         problems: for which a solve ends with one line. warnings: sentences.
         unused: shots that a solve leaves out, by the numbers and the frames alone.
+        markers: how many markers were found in the frames, and how well; empty where no frame was looked at.
     """
 
     problems: tuple[InputError, ...]
     warnings: tuple[str, ...]
     unused: tuple[UnusedShot, ...] = ()
+    markers: str = ""
 
 
 def check(
@@ -71,7 +76,20 @@ def check(
         UnusedShot(session.events[index].line, type_of(session.events[index]), reason)
         for index, reason in sorted(extracted.unused.items())
     )
-    return SessionCheck((), tuple(warnings), unused)
+    return SessionCheck((), tuple(warnings), unused, _about_markers(extracted))
+
+
+def _about_markers(extracted: ExtractedMeasurements) -> str:
+    """The yield of the pictures in a sentence."""
+    fits = [fit for fit in extracted.markers.values() if isinstance(fit, MarkerFit)]
+    if not extracted.markers:
+        return ""
+    text = f"markers: found in {len(fits)} of {len(extracted.markers)} shots with pictures"
+    if not fits:
+        return text
+    variances = [np.diag(marker_covariance(fit, extracted.marker_noise)) for fit in fits]
+    turn, shift = np.median([[np.sqrt(v[:3].sum()), np.sqrt(v[3:].sum())] for v in variances], axis=0)
+    return f"{text}; median 1 sigma {np.degrees(turn):.3f} deg, {shift:.3f} mm"
 
 
 def _about_result(folder: Path) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.camera_model import CameraModel, StereoRig
 from fgreg.model.session_model import SESSION, SessionModel
 from fgreg.simulation.config import SimulationConfig
 
@@ -47,7 +48,7 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
         name=config.name,
         probe=replace(config.probe, sensitivity=sensitivity, channels=channels, image=image),
         stage=config.stage,
-        camera=(config.declared_camera or config.camera) if config.has_camera else None,
+        camera=_recorded_camera(config) if config.has_camera else None,
         marker=config.marker if config.has_camera else None,
         board=config.board if config.has_camera else None,
         noise=config.declared_noise or config.noise,
@@ -65,6 +66,20 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
             place = place[name]
         place[last] = value
     return document
+
+
+def _recorded_camera(config: SimulationConfig) -> StereoRig:
+    """The session's camera: of single fields where these are recorded, whose line v is line 2 v of the frame."""
+    rig = config.declared_camera or config.camera
+    if not (config.frames and config.disturbances.deinterlace):
+        return rig
+
+    def halved(camera: CameraModel) -> CameraModel:
+        width, height = camera.image_size
+        matrix = as_float_array(np.diag([1.0, 0.5, 1.0]) @ camera.matrix)
+        return replace(camera, image_size=(width, (height + 1) // 2), matrix=matrix)
+
+    return replace(rig, left=halved(rig.left), right=None if rig.right is None else halved(rig.right))
 
 
 def _rounded(value: Any) -> Any:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.geometry.transforms import FloatArray, make_transform, transform_points
+from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform, transform_points
 from fgreg.model.camera_model import CameraModel
 from fgreg.simulation.acoustics import (
     Hearing,
@@ -19,15 +19,20 @@ from fgreg.simulation.acoustics import (
 )
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.disturbances import Disturbances, SpoiltView
+from fgreg.simulation.highlights import Wetness
 from fgreg.simulation.lens import project_points
 from fgreg.simulation.misreading import true_board, true_marker, true_rig, view_shift_mm
-from fgreg.simulation.render import UInt8Image, render_frame
+from fgreg.simulation.render import Exposure, UInt8Image, render_frame
 from fgreg.simulation.surfaces import Background, BoardSurface, PatchSurface, Surface, TagSurface
 
 ProbeFrame = npt.NDArray[np.int16] | npt.NDArray[np.uint8] | npt.NDArray[np.float32]
 
 DRAPE_MM = 45.0
 """Distance of the drape behind the calibration board."""
+MOMENTS = 5
+"""Number of places of a moving hand in one exposure."""
+LEVER_MM = 100.0
+"""The hand turns about points at this distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +57,7 @@ class ShotPicture:
     camera_T_trus: FloatArray | None = None
 
     def render(self, config: SimulationConfig, right: bool) -> UInt8Image:
-        """The image of the left or the right camera, (h, w) 8-bit.
+        """The image of the left or the right camera, (h, w) or (h, w, 3) 8-bit; deinterlaced, of half the height.
 
         Raises:
             ValueError: there is no right camera.
@@ -68,46 +73,95 @@ class ShotPicture:
     def _render(
         self, config: SimulationConfig, camera: CameraModel, camera_T_left: FloatArray, stream: int
     ) -> UInt8Image:
+        what = config.disturbances.of_shot(self.noise_seed)
         camera_T_marker = self.camera_T_marker.copy()
         camera_T_marker[:3, 3] += view_shift_mm(config, camera_T_marker)
-        surfaces: list[Surface] = [
+        held: list[Surface] = [
             TagSurface(config.marker.dictionary, tag.id, tag.size_mm, camera_T_marker @ tag.marker_T_tag)
             for tag in true_marker(config).tags
         ]
         # The bare fibre about the laser frame's origin. It is behind the marker's printed face: never over it.
         fibre = transform_points(self.camera_T_laser, np.array([[0.0, 0.0, -4.0], [0.0, 0.0, 8.0]]))
-        surfaces.append(_strip(fibre[0], fibre[1], 0.9, 0.7, depth_bias_mm=25.0))
+        held.append(_strip(fibre[0], fibre[1], 0.9, 0.7, depth_bias_mm=25.0))
+        surfaces: list[Surface] = []
         if self.camera_T_board is not None:
             surfaces.append(BoardSurface(true_board(config), self.camera_T_board))
             away = make_transform(np.eye(3), np.array([0.0, 0.0, DRAPE_MM]))
             background = Background(self.camera_T_board @ away, 0.1, 0.3, self.scene_seed)
         else:
             assert self.camera_T_trus is not None
-            background, clutter = _tissue(config, self.camera_T_trus, self.scene_seed)
-            surfaces += clutter
+            background, surfaces = _tissue(config, self.camera_T_trus, self.scene_seed)
             half = np.array([0.5, 0.0, 0.0])
             surfaces.append(_strip(self.camera_p_spot_mm - half, self.camera_p_spot_mm + half, 1.0, 1.1))
+        wet = None
+        if what.specular > 0.0:
+            wet = Wetness(what.specular, transform_points(camera_T_left, _light_at_tip(config)), self.scene_seed)
         return render_frame(
             camera,
             [surface.seen_from(camera_T_left) for surface in surfaces],
             np.random.default_rng((*self.noise_seed, stream)),
             config.optics,
             background.seen_from(camera_T_left),
-            self._spoilt(config, camera, camera_T_left, stream),
+            held=[surface.seen_from(camera_T_left) for surface in held],
+            exposures=[
+                self._exposure(config, what, camera, camera_T_left, stream, after_s, lines)
+                for after_s, lines in _fields(what)
+            ],
+            disturbances=what,
+            wet=wet,
         )
 
-    def _spoilt(
-        self, config: SimulationConfig, camera: CameraModel, camera_T_left: FloatArray, stream: int
-    ) -> SpoiltView | None:
-        if config.disturbances == Disturbances():
-            return None
+    def _exposure(
+        self,
+        config: SimulationConfig,
+        what: Disturbances,
+        camera: CameraModel,
+        camera_T_left: FloatArray,
+        stream: int,
+        after_s: float,
+        lines: slice,
+    ) -> Exposure:
+        """The exposure of ``lines`` whose middle is ``after_s`` after the time at which the marker is where it is."""
+        if what == Disturbances():
+            return Exposure()
+        moves: tuple[FloatArray, ...] = ()
+        if what.hand_mm_s > 0.0:
+            half_s = 0.5e-3 * what.shutter_ms
+            times = after_s + half_s * (2.0 * (np.arange(MOMENTS) + 0.5) / MOMENTS - 1.0)
+            moves = tuple(self._moved(what.hand_mm_s, time) for time in times)
         tag, optics = config.marker.tags[0], config.optics
-        camera_p = transform_points(camera_T_left @ self.camera_T_marker, tag.marker_p_corners_mm)
+        middle = self._moved(what.hand_mm_s, after_s) @ self.camera_T_marker
+        camera_p = transform_points(camera_T_left @ middle, tag.marker_p_corners_mm)
         corners = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]], dtype=np.float32)
         image_from_tag = cv2.getPerspectiveTransform(corners, project_points(camera, camera_p).astype(np.float32))
-        nearness = optics.reference_mm / float(np.linalg.norm(camera_p.mean(axis=0)))
-        white = optics.white_level * nearness**optics.distance_exponent
-        return SpoiltView(config.disturbances, np.asarray(image_from_tag), stream == 1, self.noise_seed, white)
+        distance = float(np.linalg.norm(camera_p.mean(axis=0)))
+        white = optics.white_level * (optics.reference_mm / distance) ** optics.distance_exponent
+        spoilt = SpoiltView(what, np.asarray(image_from_tag), stream == 1, self.noise_seed, white, distance)
+        return Exposure(tuple(camera_T_left @ move @ inverse(camera_T_left) for move in moves), spoilt, lines)
+
+    def _moved(self, speed_mm_s: float, after_s: float) -> FloatArray:
+        """(4, 4) motion of what the hand holds, left camera frame, up to ``after_s``."""
+        rng = np.random.default_rng((*self.noise_seed, 74))
+        along, about = (axis / np.linalg.norm(axis) for axis in rng.standard_normal((2, 3)))
+        rotation = exp_so3(after_s * speed_mm_s / LEVER_MM * about)
+        centre = self.camera_T_marker[:3, 3]
+        return make_transform(rotation, centre + after_s * speed_mm_s * along - rotation @ centre)
+
+
+def _fields(what: Disturbances) -> list[tuple[float, slice]]:
+    """Of each field its time, from that of the marker's pose, and its lines."""
+    if not what.field_hz:
+        return [(0.0, slice(None))]
+    if what.deinterlace:
+        return [(0.0, slice(0, None, 2))]
+    half_s = 0.5 / what.field_hz
+    return [(-half_s, slice(0, None, 2)), (half_s, slice(1, None, 2))]
+
+
+def _light_at_tip(config: SimulationConfig) -> FloatArray:
+    """(3,) the scope's light, left camera frame: midway between the lenses."""
+    right_T_left = config.camera.right_T_left
+    return np.zeros(3) if right_T_left is None else np.asarray(0.5 * inverse(right_T_left)[:3, 3])
 
 
 def _tissue(config: SimulationConfig, camera_T_trus: FloatArray, seed: int) -> tuple[Background, list[Surface]]:
@@ -124,7 +178,7 @@ def _tissue(config: SimulationConfig, camera_T_trus: FloatArray, seed: int) -> t
         at = np.array([*rng.uniform(20.0, 55.0, 2) * rng.choice([-1.0, 1.0], 2), 0.5])
         plane_T_patch = make_transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), at)
         clutter.append(PatchSurface(camera_T_plane @ plane_T_patch, width, length, albedo))
-    return Background(camera_T_plane, 0.2, 0.4, seed), clutter
+    return Background(camera_T_plane, 0.2, 0.4, seed, blood_mm=0.03, slope=0.3), clutter
 
 
 def _strip(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from fgreg.model.session_model import BoardModel, ChannelModel, CharucoModel, ImageModel, NoiseModel
 from fgreg.simulation.config import SimulationConfig, Sweep, default_probe, default_rig
+from fgreg.simulation.disturbances import Disturbances
 
 _CHANNELS = ChannelModel(sampling_mhz=40.0, t0_us=13.0, pulse_delay_us=0.4)
 
@@ -48,8 +49,30 @@ RAW_SMALL = replace(
 )
 """Raw frames, few and small."""
 
+THEATRE = replace(
+    PHANTOM,
+    name="theatre",
+    optics=replace(PHANTOM.optics, colour=True, white_level=200.0),
+    disturbances=Disturbances(
+        drawn=True,
+        smoke=0.2,
+        blood=1,
+        drops=0.5,
+        specular=1.0,
+        specks=1,
+        hand_mm_s=5.0,
+        shutter_ms=8.0,
+        field_hz=50.0,
+        video_curve=True,
+        jpeg_quality=80,
+    ),
+)
+"""The phantom's shots as a theatre shows them: in colour, with smoke, blood, drops, wet tissue, a hand that is not
+quite still, interlaced video and MJPEG."""
+
 PRESETS: dict[str, SimulationConfig] = {
     "phantom": PHANTOM,
+    "theatre": THEATRE,
     "paper": PAPER,
     "first-hit": FIRST_HIT,
     "one-way": replace(FIRST_HIT, name="one-way", sweep=Sweep.ONE_WAY),

@@ -1,4 +1,4 @@
-"""Camera images of flat printed things: perspective, distortion, blur, fall-off of light and sensor noise.
+"""Camera images of flat printed things: perspective, distortion, blur, fall-off of light, motion and sensor noise.
 
 Each sheet is ray cast. Rays through the corners of the pixels are intersected with the sheet; a pixel whose four
 corners see one colour has that colour, all others are integrated over 64 samples of a low-discrepancy pattern that is
@@ -17,7 +17,9 @@ import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.camera_model import CameraModel
-from fgreg.simulation.disturbances import SpoiltView
+from fgreg.simulation.blood import transmission
+from fgreg.simulation.disturbances import Disturbances, SpoiltView, compressed, video_levels
+from fgreg.simulation.highlights import Wetness, highlights
 from fgreg.simulation.lens import project_points, undistorted_rays
 from fgreg.simulation.surfaces import Background, Sheet, Surface
 from fgreg.simulation.textures import BLACK, WHITE, Float32Array
@@ -39,6 +41,7 @@ class Optics:
         vignetting: share of the light lost in the corners of the image.
         read_noise, shot_noise: sensor noise of variance ``read_noise**2 + shot_noise * level`` (grey levels).
         samples: per pixel that sees an edge.
+        colour: pictures are blue, green and red: of tissue as the blood in it has it, all else is grey.
     """
 
     blur_px: float = 0.8
@@ -49,6 +52,23 @@ class Optics:
     read_noise: float = 0.6
     shot_noise: float = 0.005
     samples: int = 64
+    colour: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """A time in which light falls on some lines of the sensor.
+
+    Attributes:
+        moves: (4, 4) each, motion of what is held in a hand, in this camera's frame, at times that are even in it; none
+            where it is still.
+        spoilt: what spoils the light.
+        lines: rows of the image.
+    """
+
+    moves: tuple[FloatArray, ...] = ()
+    spoilt: SpoiltView | None = None
+    lines: slice = field(default_factory=lambda: slice(None))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +82,12 @@ class _Rays:
     columns_from_coarse: Float32Array
     vignette: FloatArray = field(repr=False)
 
+    def centres(self, rows: tuple[int, int], columns: tuple[int, int]) -> tuple[Float32Array, Float32Array]:
+        """x and y of rays through the middle of a block's pixels."""
+        block = slice(rows[0], rows[1] + 1), slice(columns[0], columns[1] + 1)
+        x, y = self.corner_x[block], self.corner_y[block]
+        return tuple(0.25 * (c[:-1, :-1] + c[1:, :-1] + c[:-1, 1:] + c[1:, 1:]) for c in (x, y))  # type: ignore[return-value]
+
 
 def render_frame(
     camera: CameraModel,
@@ -69,9 +95,13 @@ def render_frame(
     rng: np.random.Generator,
     optics: Optics | None = None,
     background: Background | None = None,
-    spoilt: SpoiltView | None = None,
+    *,
+    held: Sequence[Surface] = (),
+    exposures: Sequence[Exposure] = (Exposure(),),
+    disturbances: Disturbances | None = None,
+    wet: Wetness | None = None,
 ) -> UInt8Image:
-    """One 8-bit grey image, (h, w).
+    """One 8-bit image, (h, w) grey or (h, w, 3) blue, green and red.
 
     Args:
         camera: the lens and image size.
@@ -79,29 +109,92 @@ def render_frame(
         rng: for the sensor noise.
         optics: light, lens and sensor.
         background: behind all surfaces; black where absent.
-        spoilt: what spoils this picture.
+        held: surfaces held in a hand, which moves; while it does they are before all others.
+        exposures: all lines belong to one of them.
+        disturbances: of sensor and video.
+        wet: where absent nothing mirrors.
     """
-    optics = optics or Optics()
+    optics, disturbances = optics or Optics(), disturbances or Disturbances()
     rays = _rays(camera.image_size, camera.matrix.tobytes(), camera.distortion.tobytes(), camera.fisheye)
     width, height = camera.image_size
-    image = np.zeros((height, width), dtype=np.float32)
+    moving = any(exposure.moves for exposure in exposures)
+    canvas = _Canvas.blank(height, width, 3 if optics.colour else 1)
     if background is not None:
-        image += _spread(_background_radiance(background, rays, optics), rays, (0, height), (0, width))
-    sheets = [surface.sheet() for surface in surfaces]
-    sheets.sort(key=_distance, reverse=True)
-    for sheet in sheets:
-        _paint(image, sheet, camera, rays, optics)
-    if spoilt is not None:
-        image = spoilt.light(image)
-    image = _blurred(image, optics.blur_px)
-    if spoilt is not None:
-        image = spoilt.recorded(image)
-    sigma = np.sqrt(np.maximum(image, 0.0) * np.float32(optics.shot_noise) + np.float32(optics.read_noise**2))
-    if spoilt is not None:
-        sigma *= np.float32(spoilt.what.noise_gain)
-    image += sigma * rng.standard_normal(image.shape, dtype=np.float32)
-    picture = np.asarray(np.clip(np.rint(image), 0.0, 255.0).astype(np.uint8))
-    return picture if spoilt is None else spoilt.compressed(picture)
+        _paint_background(canvas, background, rays, optics, wet)
+    _paint_all(canvas, [*surfaces, *(() if moving else held)], camera, rays, optics, wet)
+    planes = [np.empty((height, width), dtype=np.float32) for _ in canvas.planes]
+    for exposure in exposures:
+        seen = [canvas] if not moving else [canvas.copy() for _ in exposure.moves]
+        for one, move in zip(seen, exposure.moves, strict=False):
+            _paint_all(one, [surface.seen_from(move) for surface in held], camera, rays, optics, wet)
+        light = [
+            np.asarray(sum(parts) / np.float32(len(seen))) for parts in zip(*(s.planes for s in seen), strict=True)
+        ]
+        if exposure.spoilt is not None:
+            light = exposure.spoilt.light(light, seen[len(seen) // 2].distance_mm)
+        for plane, part in zip(planes, light, strict=True):
+            plane[exposure.lines] = _blurred(part, optics.blur_px)[exposure.lines]
+    recorded = planes if not disturbances.deinterlace else [plane[::2] for plane in planes]
+    picture = np.stack([_sensed(plane, rng, optics, disturbances) for plane in recorded], axis=-1)
+    return compressed(picture if optics.colour else np.ascontiguousarray(picture[..., 0]), disturbances)
+
+
+def _sensed(light: Float32Array, rng: np.random.Generator, optics: Optics, what: Disturbances) -> UInt8Image:
+    """What the sensor makes of light (h, w), in 8 bits."""
+    level = light if what.exposure == 1.0 else light * np.float32(what.exposure)
+    sigma = np.sqrt(np.maximum(level, 0.0) * np.float32(optics.shot_noise) + np.float32(optics.read_noise**2))
+    level = level + np.float32(what.noise_gain) * sigma * rng.standard_normal(level.shape, dtype=np.float32)
+    if what.video_curve:
+        level = video_levels(level)
+    return np.asarray(np.clip(np.rint(level), 0.0, 255.0).astype(np.uint8))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Canvas:
+    """Light, (h, w) each plane, and the distance (h, w) mm of what is seen."""
+
+    planes: list[Float32Array]
+    distance_mm: Float32Array
+
+    @staticmethod
+    def blank(height: int, width: int, colours: int) -> _Canvas:
+        empty = [np.zeros((height, width), dtype=np.float32) for _ in range(colours + 1)]
+        return _Canvas(empty[1:], empty[0])
+
+    def copy(self) -> _Canvas:
+        return _Canvas([plane.copy() for plane in self.planes], self.distance_mm.copy())
+
+
+def _paint_background(
+    canvas: _Canvas, background: Background, rays: _Rays, optics: Optics, wet: Wetness | None
+) -> None:
+    height, width = canvas.distance_mm.shape
+    level, distance, plane_p = _background(background, rays, optics)
+    radiance = level * background.albedo_at(plane_p[..., 0], plane_p[..., 1])
+    whole = (0, height), (0, width)
+    canvas.distance_mm[:] = _spread(distance, rays, *whole)
+    tissue = optics.colour and background.blood_mm > 0.0
+    films = transmission(background.film_mm_at(plane_p[..., 0], plane_p[..., 1]), 3) if tissue else None
+    for number, plane in enumerate(canvas.planes):
+        plane += _spread(radiance if films is None else background.pale * radiance * films[number], rays, *whole)
+    if wet is not None and background.slope > 0.0:
+        x, y = rays.centres(*whole)
+        shine = highlights(background.camera_T_background, x, y, background.slope, wet) * _spread(level, rays, *whole)
+        for plane in canvas.planes:
+            plane += shine
+
+
+def _paint_all(
+    canvas: _Canvas,
+    surfaces: Sequence[Surface],
+    camera: CameraModel,
+    rays: _Rays,
+    optics: Optics,
+    wet: Wetness | None,
+) -> None:
+    """Draws surfaces over what is there, in place, the farthest first."""
+    for sheet in sorted((surface.sheet() for surface in surfaces), key=_distance, reverse=True):
+        _paint(canvas, sheet, camera, rays, optics, wet)
 
 
 @lru_cache(maxsize=8)
@@ -145,7 +238,7 @@ def _spread(coarse: FloatArray, rays: _Rays, rows: tuple[int, int], columns: tup
 
 
 def _light(camera_T_surface: FloatArray, rays: _Rays, optics: Optics) -> tuple[FloatArray, FloatArray]:
-    """Grey level of white on the plane for each coarse ray, and the distance along the ray (in units of z = 1)."""
+    """Grey level of white on the plane for each coarse ray, and the depth there."""
     normal = camera_T_surface[:3, 2]
     offset = float(normal @ camera_T_surface[:3, 3])
     along = rays.coarse @ normal * (1.0 if offset >= 0 else -1.0)
@@ -162,12 +255,13 @@ def _light(camera_T_surface: FloatArray, rays: _Rays, optics: Optics) -> tuple[F
     return level, depth
 
 
-def _background_radiance(background: Background, rays: _Rays, optics: Optics) -> FloatArray:
+def _background(background: Background, rays: _Rays, optics: Optics) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """For each coarse ray: level of white, distance, and the point (..., 3) of the background's plane."""
     level, depth = _light(background.camera_T_background, rays, optics)
+    camera_p = rays.coarse * np.minimum(depth, 1e4)[..., None]
     camera_R_plane = background.camera_T_background[:3, :3]
-    camera_p = rays.coarse * np.minimum(depth, 1e4)[..., None] - background.camera_T_background[:3, 3]
-    plane_p = camera_p @ camera_R_plane
-    return level * background.albedo_at(plane_p[..., 0], plane_p[..., 1])
+    plane_p = (camera_p - background.camera_T_background[:3, 3]) @ camera_R_plane
+    return level, np.linalg.norm(camera_p, axis=-1), plane_p
 
 
 def _outline_in_camera(sheet: Sheet) -> FloatArray:
@@ -211,7 +305,9 @@ def _sample_offsets(samples: int) -> Float32Array:
     return np.column_stack([(index + 0.5) / samples, reversed_bits]).astype(np.float32)
 
 
-def _paint(image: Float32Array, sheet: Sheet, camera: CameraModel, rays: _Rays, optics: Optics) -> None:
+def _paint(
+    canvas: _Canvas, sheet: Sheet, camera: CameraModel, rays: _Rays, optics: Optics, wet: Wetness | None
+) -> None:
     """Draws one sheet over what is there, in place."""
     region = _region(sheet, camera, rays)
     if region is None:
@@ -236,11 +332,19 @@ def _paint(image: Float32Array, sheet: Sheet, camera: CameraModel, rays: _Rays, 
         colour[rows, columns], cover[rows, columns] = _integrate(
             sheet, albedo, u, v, rows, columns, (row0, column0), optics.samples
         )
-    level, _ = _light(sheet.camera_T_surface, rays, optics)
-    colour *= _spread(level, rays, (row0, row1), (column0, column1))
-    block = image[row0:row1, column0:column1]
-    block *= 1.0 - cover
-    block += colour
+    level, depth = _light(sheet.camera_T_surface, rays, optics)
+    white = _spread(level, rays, (row0, row1), (column0, column1))
+    colour *= white
+    if wet is not None and sheet.slope > 0.0:
+        at = rays.centres((row0, row1), (column0, column1))
+        colour += cover * white * highlights(sheet.camera_T_surface, *at, sheet.slope, wet)
+    for plane in canvas.planes:
+        block = plane[row0:row1, column0:column1]
+        block *= 1.0 - cover
+        block += colour
+    away = depth * np.linalg.norm(rays.coarse, axis=-1)
+    block = canvas.distance_mm[row0:row1, column0:column1]
+    np.copyto(block, _spread(away, rays, (row0, row1), (column0, column1)), where=cover > 0.5)
 
 
 def _texture_coordinates(sheet: Sheet, x: Float32Array, y: Float32Array) -> tuple[Float32Array, Float32Array]:

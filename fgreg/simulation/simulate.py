@@ -38,6 +38,7 @@ from fgreg.simulation import sweeps
 from fgreg.simulation.array import map_by_declared
 from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.deviations import named
+from fgreg.simulation.disturbances import Disturbances
 from fgreg.simulation.documents import degrees, round_array, rows, session_document
 from fgreg.simulation.misreading import marker_poses_read, points_read, spots_read
 from fgreg.simulation.pictures import LookPicture, ShotPicture
@@ -114,6 +115,7 @@ class _Recorder:
         self.events: list[Document] = []
         self.frames: dict[str, Callable[[], Frame]] = {}
         self.true_markers: dict[int, FloatArray] = {}
+        self.spoilt: dict[str, Disturbances] = {}
         self.time_s = 0.0
 
     def record(self) -> SimulatedSession:
@@ -193,6 +195,8 @@ class _Recorder:
             "x_outlier_pms": [int(i) for i in np.flatnonzero(outlier)],
             "x_lambda_mm": rows(pms.lambda_mm),
         }
+        if config.frames and config.disturbances != Disturbances():
+            truth["x_disturbances"] = {shot: what.named() for shot, what in self.spoilt.items()}
         if config.deviations:
             truth["x_deviations"] = {name: round(value, 9) for name, value in named(config.deviations).items()}
         return truth
@@ -347,6 +351,7 @@ class _Recorder:
             camera_T_board,
             camera_T_trus,
         )
+        self.spoilt[name] = self.config.disturbances.of_shot(picture.noise_seed)
         frames = {side: Path(f"frames/{name}-{side}.png") for side in ("left", "right")}
         if self.config.camera.right is None:
             del frames["right"]

@@ -11,10 +11,16 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import BoardModel
 from fgreg.simulation.textures import CellTexture, board_texture, plain_texture, tag_texture
 
+FILM_SLOPE = 0.12
+"""Standard deviation of the slopes of a film of liquid on something flat."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A textured plane: ``texture_from_surface`` (2, 3) maps (x, y, 1) mm to texture (u, v) mm."""
+    """A textured plane: ``texture_from_surface`` (2, 3) maps (x, y, 1) mm to texture (u, v) mm.
+
+    ``slope``: of the liquid on it where the scene is wet, 0 where it stays dry.
+    """
 
     camera_T_surface: FloatArray
     texture: CellTexture
@@ -23,6 +29,7 @@ class Sheet:
     faces_camera: bool
     outline_mm: FloatArray
     depth_bias_mm: float = 0.0
+    slope: float = 0.0
 
 
 class Surface(Protocol):
@@ -70,6 +77,7 @@ class TagSurface:
             (0.0, self.black, self.white),
             front,
             np.array([[-half, -half], [half, -half], [half, half], [-half, half]]),
+            slope=FILM_SLOPE,
         )
 
     def seen_from(self, other_T_camera: FloatArray) -> TagSurface:
@@ -126,6 +134,7 @@ class PatchSurface:
             True,
             np.array([[-w, -h], [w, -h], [w, h], [-w, h]]),
             self.depth_bias_mm,
+            FILM_SLOPE,
         )
 
     def seen_from(self, other_T_camera: FloatArray) -> PatchSurface:
@@ -140,12 +149,18 @@ class Background:
         camera_T_background: (4, 4).
         albedo: mean; contrast: relative amplitude of the mottling.
         seed: of the pattern.
+        blood_mm: mean thickness of the blood in it, which gives tissue its colour; 0: grey.
+        pale: what is left of the albedo is larger by this factor in colour pictures of tissue.
+        slope: standard deviation of its surface's slopes; 0: it stays dry.
     """
 
     camera_T_background: FloatArray
     albedo: float = 0.22
     contrast: float = 0.35
     seed: int = 0
+    blood_mm: float = 0.0
+    pale: float = 1.4
+    slope: float = 0.0
 
     def seen_from(self, other_T_camera: FloatArray) -> Background:
         """The same background expressed in another camera's frame."""
@@ -165,3 +180,13 @@ class Background:
                 -((x_mm - cx) ** 2 + (y_mm - cy) ** 2) / (2.0 * rng.uniform(4.0, 9.0) ** 2)
             )
         return np.asarray(self.albedo * np.clip(1.0 + self.contrast * 1.6 * value, 0.05, 2.0))
+
+    def film_mm_at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Thickness of the blood at points of the plane: lognormal, in waves of 6 to 60 mm."""
+        rng = np.random.default_rng((self.seed, 5))
+        value, waves = np.zeros(np.shape(x_mm)), 14
+        for _ in range(waves):
+            turn, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+            wave = 2.0 * np.pi / np.exp(rng.uniform(np.log(6.0), np.log(60.0)))
+            value += np.cos(wave * (np.cos(turn) * x_mm + np.sin(turn) * y_mm) + phase) * np.sqrt(2.0 / waves)
+        return np.asarray(self.blood_mm * np.exp(0.35 * value))
