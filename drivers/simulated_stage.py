@@ -34,6 +34,7 @@ class Misbehaviour:
         frozen: repeats the last status.
         speed_factor: ratio of the actual to the ordered speed.
         reversed: turns the wrong way.
+        says_it_stands: its moving flag never comes on.
     """
 
     deaf: bool = False
@@ -41,6 +42,7 @@ class Misbehaviour:
     frozen: bool = False
     speed_factor: float = 1.0
     reversed: bool = False
+    says_it_stands: bool = False
 
 
 class SimulatedStage:
@@ -107,7 +109,7 @@ class SimulatedStage:
             Stamp(self._at, self._at),
             self.model.scan_from_device(self.device_rad + self._offset),
             self.model.direction * self.velocity_rad_s,
-            moving,
+            moving and not self.wrong.says_it_stands,
             self._homing,
             self._homed,
         )

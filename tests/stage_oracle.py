@@ -13,6 +13,8 @@ from typing import Any
 LIMITS_DEG, SWEEP_DEG = (-60.0, 40.0), (-35.0, 30.0)  # plane angles
 SPEED_DEG_S = {"home": 8.0, "search": 12.0, "track": 10.0}
 TOLERANCE_DEG = 0.5
+REST_S = 1.5
+"""By then a stopped stage stands; none of these speeds needs longer."""
 
 
 @dataclass
@@ -54,9 +56,30 @@ class Oracle:
         status = self._newest("status", self._since("clock jump"))
         return status if status is not None and now - status["at"] <= 0.3 + 1e-9 else None
 
+    def _strayed(self) -> int:
+        """Index after the last status in which a stage that should stand, and says so, is not where it stood; 0: none.
+
+        Where it stood: in an earlier status of the same rest, read after its brakes' time, with the same zero. Compared
+        only until the first such move, which a status after the reset may begin anew.
+        """
+        strayed, stood, rest_s = 0, None, -math.inf
+        previous_s: float | None = None
+        for i, (now, what, details) in enumerate(self.history):
+            if what.startswith("drive") or what in ("rest", "clock jump"):
+                stood, previous_s, rest_s = None, None, now
+            elif what == "status" and (details["moving"] or (stood is not None and stood["homed"] != details["homed"])):
+                stood, previous_s = None, None
+            elif what == "status":
+                if stood is not None and abs(details["angle"] - stood["angle"]) > 2.0 * TOLERANCE_DEG + 1e-6:
+                    strayed, stood = i + 1, details
+                elif stood is None and previous_s is not None and previous_s > rest_s + REST_S + 1e-6:
+                    stood = details
+                previous_s = now
+        return strayed
+
     def drive_is_legal(self, now: float, kind: str, target: float | None, speed: float, sent: float, sigma: Any) -> str:
         """Why not; empty where it is legal."""
-        trouble = self._since("clock jump", "emergency", "fault")
+        trouble = max(self._since("clock jump", "emergency", "fault"), self._strayed())
         if trouble and self._newest("reset", trouble) is None:
             return "no reset since the trouble"
         begin = self._since("clock jump", "emergency", "fault", "stop", "silence", "reset")

@@ -444,6 +444,73 @@ def test_stage_that_is_turned_by_its_own_knob_is_stopped() -> None:
     assert _halts(room.run(0.1))[0] == "the stage moves without a command"
 
 
+def test_stage_that_says_it_stands_and_goes_on_is_latched_stopped_again_and_not_reset_before_it_stands() -> None:
+    room = _room()
+    room.stage.wrong.says_it_stands = True
+    room.go(MotionKind.SEARCH, 30.0, speed_deg_s=5.0)
+    room.run(0.2)
+    room.stage.wrong.deaf = True
+    stopped = room.now
+    room.do(room.gate.handle(Stop(room.now, False, "test"), room.now))
+    while room.gate.latched is None:
+        room.run(0.02)
+        assert room.now - stopped < LIMITS.standing_s() + 0.3  # 1 deg at 5 deg/s, and two statuses
+    assert "the stage says that it stands, and turned by 1." in room.gate.latched
+    assert len(_halts(room.run(1.0))) >= 3  # again at each further degree
+    assert "still moves" in _refusal(room.gate.handle(Reset(room.now, "nurse"), room.now))
+    room.stage.wrong.deaf = False
+    room.do(room.gate.fault("test", room.now))
+    room.run(LIMITS.standing_s() + 0.5)
+    assert room.gate.handle(Reset(room.now, "nurse"), room.now) == []
+    assert room.run(2.0) == []
+
+
+@pytest.mark.parametrize("after", ["start", "arrival", "stop"])
+def test_stage_that_creeps_away_while_it_says_it_stands_is_latched(after: str) -> None:
+    room = _room()
+    if after != "start":
+        room.go(MotionKind.SEARCH, 2.0)
+        room.run(0.4 if after == "stop" else 1.5)
+        room.do(room.gate.handle(Stop(room.now, False, "test"), room.now))
+        room.run(0.1 if after == "arrival" else 2.0)
+    room.stage.wrong.says_it_stands = True
+    stood = math.degrees(room.stage.device_rad)
+    room.stage.move_to(LIMITS.stage.scan_from_device(math.radians(stood + 30.0)), math.radians(0.5))
+    while room.gate.latched is None:
+        room.do(room.gate.handle(Stop(room.now, False, "again"), room.now))  # a stop gives it no time to move
+        room.stage.move_to(LIMITS.stage.scan_from_device(math.radians(stood + 30.0)), math.radians(0.5))
+        room.run(0.02)
+        assert math.degrees(room.stage.device_rad) < stood + 1.1
+    assert "turned by 1.0 deg" in room.gate.latched
+
+
+@settings(max_examples=60, derandomize=True, deadline=None)
+@given(st.integers(0, 14), st.floats(10.0, 20.0), st.floats(20.0, 400.0), st.integers(5, 80))
+def test_brakes_of_a_stage_that_says_it_stands_are_no_straying_however_late_its_statuses_come(
+    lateness: int, speed: float, acceleration: float, ticks: int
+) -> None:
+    """A status is stamped when it arrives; its angle was read up to 0.3 s before, after the last one had arrived."""
+    room = _room(limits=replace(LIMITS, track_speed_rad_s=math.radians(20.0)))
+    room.stage._acceleration = math.radians(acceleration)
+    room.go(MotionKind.TRACK, -50.0, speed_deg_s=speed)
+    room.run(0.02 * ticks)
+    for _ in range(40):  # the first of them is of a motion
+        read = [replace(room.stage.status(), moving=False)]
+        room.hearing = False
+        room.do(room.gate.handle(Stop(room.now, False, "test"), room.now))
+        room.run(0.02 * (lateness + 1))
+        late = replace(read[0], stamp=Stamp(room.now, room.now))
+        room.do(room.gate.tick(room.now, late))
+    assert room.gate.latched is None
+
+
+def test_stage_whose_zero_is_lost_at_rest_is_not_taken_for_one_that_turned() -> None:
+    room = _room()
+    room.stage._offset, room.stage._homed = math.radians(20.0), False  # its power was off
+    assert room.run(1.0) == []
+    assert "not homed" in _refusal(room.go(MotionKind.SEARCH, 0.0))
+
+
 def test_stage_that_stops_by_itself_ends_the_request() -> None:
     room = _room()
     room.go(MotionKind.SEARCH, 30.0)

@@ -49,7 +49,7 @@ AGES: Table = {"late": 0.21, "later": 3.0, "ahead": -0.1}
 FAULTS = [
     *("not homed", "another request", "stopped", "emergency", "clock back", "clock ahead", "clock back, old beats"),
     *("fault", "requested again", "heartbeat gap", "silent", "old beat after", "beat again", "home with target"),
-    *("twice", "0.3 s", "unwatched", "unheard"),
+    *("twice", "0.3 s", "unwatched", "unheard", "turned by hand"),
     *(*STANDS_BADLY, *TARGETS_BADLY, *MARKERS, *VERDICTS, *BAD_SPEEDS, *SIGMAS, *AGES),
 ]
 DISTURBANCES = [
@@ -99,6 +99,8 @@ class GateMachine(RuleBasedStateMachine):
                     self.oracle.note(self.now, f"drive {action.kind}")
                     self.driving = action
                 case Halt() | Arrived():
+                    if self.driving is not None:
+                        self.oracle.note(self.now, "rest")
                     self.driving = None
                 case _:
                     pass
@@ -114,7 +116,8 @@ class GateMachine(RuleBasedStateMachine):
             self._take(self.gate.tick(self.now, None))
             return
         status = self._status()
-        self.oracle.note(self.now, "status", at=self.now, angle=self.angle, homed=status.homed)
+        details = {"at": self.now, "angle": self.angle, "homed": status.homed, "moving": status.moving}
+        self.oracle.note(self.now, "status", **details)
         self._take(self.gate.tick(self.now, status))
         if self.driving is not None and self.driving.kind is MotionKind.HOME and abs(self.angle) < 1e-9:
             self.homed = True
@@ -182,6 +185,9 @@ class GateMachine(RuleBasedStateMachine):
         self.silent, self.runaway, self.homed, self.angle = False, 1.0, homed, at
         self._send(Stop(self.now, False, "test"))
         self.oracle.note(self.now, "stop")
+        for _ in range(6):  # until a stage that was turned by somebody has stood for long enough
+            self.now += 0.4
+            self._tick()
         self.reset()
         self.request(kind)
 
@@ -199,6 +205,8 @@ class GateMachine(RuleBasedStateMachine):
             self.stop(False)
         if "emergency" in faults:
             self.stop(True)
+        if "turned by hand" in faults:
+            self.somebody_turns_the_stage(self.angle + 1.5)
         if "clock back" in faults:
             self.clock_jumps(-0.01)
             self._live()
@@ -245,6 +253,7 @@ class GateMachine(RuleBasedStateMachine):
         """One thing goes wrong while a motion is under way."""
         self._recover(kind, -20.0)
         self.command(kind, None if kind is MotionKind.HOME else to, 5.0, 0.5, 0.0)
+        assert self.driving is not None
         for _ in range(before):
             self._live()
             self.motion_under_way_is_legal()
@@ -335,7 +344,16 @@ def test_good_command_gets_out_and_one_fault_or_two_let_no_illegal_one_out(kind:
     machine = _machine()
     machine.nearly_good_command(kind, 0.0, 20.0, set())
     assert machine.driving is not None
-    troubles = ["emergency", "fault", "clock back", "clock ahead", "clock back, old beats", "stopped", "heartbeat gap"]
+    troubles = [
+        "emergency",
+        "fault",
+        "turned by hand",
+        "clock back",
+        "clock ahead",
+        "clock back, old beats",
+        "stopped",
+        "heartbeat gap",
+    ]
     pairs = [{trouble, more} for trouble in troubles for more in ("requested again", "beat again")]
     pairs += [{"unwatched", "beat again"}, {"silent", "0.3 s"}, {"marker old", "old beat after"}]
     for faults in [*({fault} for fault in FAULTS), *pairs]:

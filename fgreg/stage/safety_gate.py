@@ -65,6 +65,8 @@ class Gate:
         self._halted_s: float | None = None
         self._braking: _Motion | None = None
         self._seen_moving = False
+        self._stands_rad: float | None = None  # where it came to rest; None while it turns or brakes
+        self._strayed_s = -math.inf  # when it last left that angle, by its positions
 
     @property
     def moving(self) -> MotionKind | None:
@@ -124,10 +126,10 @@ class Gate:
         return [Halt(reason, latched=self.latched is not None)]
 
     def _come_to_rest(self) -> None:
+        """A stage that stands already has no way left to brake: a stop gives it no time to move."""
         if self._motion is not None:
-            self._braking = self._motion
+            self._braking, self._halted_s, self._stands_rad = self._motion, self._now, None
         self._motion = None
-        self._halted_s = self._now
 
     def _latch(self, reason: str) -> list[Action]:
         if self.latched is None:
@@ -150,7 +152,8 @@ class Gate:
             reason = f"the clock jumped by {now - last:.3f} s: the watchdog did not run"
         else:
             return []
-        self._beat = self._status = self._arrived_before_s = None
+        self._beat = self._status = self._arrived_before_s = self._stands_rad = None
+        self._halted_s, self._strayed_s = self._now, -math.inf
         return self._latch(reason)
 
     def _alive(self, now: float) -> bool:
@@ -187,6 +190,8 @@ class Gate:
             reason = "the stage is silent"
         elif reason is None and status is not None and (status.moving or status.fault):
             reason = status.fault or "the stage still moves"
+        elif reason is None and now - self._strayed_s <= self.limits.standing_s():
+            reason = "the stage still moves"
         if reason is not None:
             return [Refusal(f"reset refused: {reason}")]
         self.latched = None
@@ -206,7 +211,7 @@ class Gate:
             low, high = min(low, target), max(high, target)
         deadline = now + 1.5 * travel / command.speed_rad_s + limits.slack_s
         until = now + MAX_CALL_S + carried / limits.deceleration_rad_s2
-        self._seen_moving = False
+        self._seen_moving, self._stands_rad = False, None
         self._motion = _Motion(command, now, here, low, high, deadline, carried, until)
         if command.kind is MotionKind.HOME:
             self._request = None  # one request, one homing
@@ -316,26 +321,38 @@ class Gate:
         if before is not None and status.stamp.host_s > before.stamp.host_s:
             self._arrived_before_s = before.stamp.host_s
         if self._motion is None:
-            return self._at_rest(status, now)
+            return self._at_rest(before, status, now)
         reason = self._misbehaves(self._motion, before, read_after_s, status, now)
         if reason is not None:
             return self._latch(reason)
         return self._ended(self._motion, status)
 
-    def _at_rest(self, status: StageStatus, now: float) -> list[Action]:
-        """Check a stage that should be at rest, or be braking."""
-        if not (status.moving or status.homing):
+    def _at_rest(self, before: StageStatus | None, status: StageStatus, now: float) -> list[Action]:
+        """Check a stage that should be at rest, or be braking.
+
+        Its own moving flag is believed where it says that it moves. Where it says that it stands, its positions count:
+        from one to another lie at most two tolerances, one for each.
+        """
+        limits, here = self.limits, status.scan_rad
+        if status.moving or status.homing:
+            self._stands_rad = None
+            if status.homed and not limits.inside(here, limits.tolerance_rad):
+                return self._latch(f"the stage is at {math.degrees(here):.1f} deg, outside its limits")
+            braking = self._halted_s is not None and now - self._halted_s <= limits.standing_s()
+            return [] if braking else self._latch("the stage moves without a command")
+        if before is not None and before.homed != status.homed:
+            self._stands_rad = None  # its zero was set or lost: the angle jumps, the stage does not
+        if self._stands_rad is None:
+            # Until the angle was surely read after the brakes' time, it may be one on the way.
+            read_after_s = -math.inf if self._arrived_before_s is None else self._arrived_before_s
+            if self._halted_s is None or read_after_s >= self._halted_s + limits.standing_s():
+                self._stands_rad = here
             return []
-        if status.homed and not self.limits.inside(status.scan_rad, self.limits.tolerance_rad):
-            return self._latch(f"the stage is at {math.degrees(status.scan_rad):.1f} deg, outside its limits")
-        braking = self._halted_s is not None and now - self._halted_s <= self.limits.standing_s()
-        if braking:
+        strayed = abs(here - self._stands_rad)
+        if strayed <= 2.0 * limits.tolerance_rad:
             return []
-        halted = self._halted_s
-        actions = self._latch("the stage moves without a command")
-        if halted is not None:
-            self._halted_s = halted  # not braking: the stop is repeated at every status until it is at rest
-        return actions
+        self._stands_rad, self._strayed_s = here, now
+        return self._latch(f"the stage says that it stands, and turned by {math.degrees(strayed):.1f} deg")
 
     def _misbehaves(
         self,
@@ -392,7 +409,7 @@ class Gate:
             arrived = abs(here - motion.command.scan_rad) <= limits.tolerance_rad
         if arrived:
             self._come_to_rest()
-            self._braking = None
+            self._braking, self._stands_rad = None, here
             return [Arrived(motion.command.number)]
         if took > limits.stop_s:
             return self._halt(f"the stage stopped by itself at {math.degrees(here):.1f} deg")
