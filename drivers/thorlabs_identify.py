@@ -65,7 +65,10 @@ def identify(port: str) -> CubeIdentity:
                     if answer not in told:  # other replies would be mixed with repeated ones
                         line.write(question)
             time.sleep(0.002)
-            told |= {message.id: message.data for message in parser.feed(line.read(4096))}
+            for message in parser.feed(line.read(4096)):
+                if message.id in (thorlabs_apt.ERROR, thorlabs_apt.ERROR_WITH_NOTES):
+                    raise StageError(f"stage at {port} reports an error: {thorlabs_apt.read_error(message)}")
+                told[thorlabs_apt.GET_STATUS if message.is_status else message.id] = message.data
     except OSError as error:
         raise StageLost(f"stage at {port} is gone: {error}") from error
     finally:

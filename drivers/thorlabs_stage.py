@@ -2,7 +2,8 @@
 
 :meth:`ThorlabsStage.status` queries the cube at every call; only opening waits for a reply. Cubes sometimes leave a
 query unanswered: it is repeated, and the stage counts as lost only after ``LOST_S`` without any reply. The cube
-controls the speed, so its setting is read back after every order.
+controls the speed, so its setting is read back after every order. An error that the cube reports is raised once, by the
+next :meth:`ThorlabsStage.status`, and is a fault in the statuses of the next ``LOST_S``.
 
 Before homing, the angle counts from its value at power-on.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fgreg.drivers import thorlabs_apt
@@ -67,6 +69,8 @@ class ThorlabsStage:
         self._velocity = 0.0
         self._told: int | None = None
         self._fault = ""
+        self._errors: dict[str, float] = {}  # with the time each last came
+        self._unraised: list[str] = []
         self._port = open_port(port)
         try:
             self._start()
@@ -98,7 +102,12 @@ class ThorlabsStage:
         self._write(thorlabs_apt.short(thorlabs_apt.MOVE_STOP, thorlabs_apt.CHANNEL, thorlabs_apt.STOP_AT_ONCE))
 
     def status(self) -> StageStatus:
-        """The newest status with its time of arrival; asks the cube for a newer one."""
+        """The newest status with its time of arrival; asks the cube for a newer one.
+
+        Raises:
+            StageError: the cube reports an error; the next call returns the status again.
+            StageLost: it is gone, or silent.
+        """
         self._read()
         now = time.monotonic()
         if now - self._received_s > LOST_S:
@@ -106,6 +115,7 @@ class ThorlabsStage:
         if now - self._asked_s > ASK_AGAIN_S or self._received_s >= self._asked_s:
             self._asked_s = now
             self._write(thorlabs_apt.short(thorlabs_apt.REQ_STATUS, thorlabs_apt.CHANNEL))
+        self._raise_error()
         return self._as_status()
 
     def close(self) -> None:
@@ -142,6 +152,7 @@ class ThorlabsStage:
                 self._write(thorlabs_apt.short(question, parameter))
             time.sleep(0.002)
             self._read()
+            self._raise_error()
 
     def _write(self, data: bytes) -> None:
         self._check()
@@ -162,12 +173,19 @@ class ThorlabsStage:
     def _take(self, message: thorlabs_apt.AptMessage) -> None:
         now = time.monotonic()
         match message.id:
-            case thorlabs_apt.GET_STATUS | thorlabs_apt.MOVE_COMPLETED | thorlabs_apt.STOPPED if message.data:
+            case _ if message.is_status:
                 status = thorlabs_apt.read_status(message.data)
-                if self._status is not None and (status.bits ^ self._status.bits) & thorlabs_apt.HOMED_BIT:
-                    self._before, self._velocity = None, 0.0  # the zero was set: the position jumps, the stage does not
+                self._take_bits(status.bits)
                 self._follow(now, status.position)
                 self._status, self._received_s = status, now
+            case thorlabs_apt.GET_STATUS_BITS:  # without a position: no newer status
+                self._take_bits(thorlabs_apt.read_status_bits(message.data))
+            case thorlabs_apt.ERROR | thorlabs_apt.ERROR_WITH_NOTES:
+                error = f"{self._name} reports an error: {thorlabs_apt.read_error(message)}"
+                self._errors = {text: at for text, at in self._errors.items() if now - at <= LOST_S}
+                if error not in self._errors:  # one that is repeated is one
+                    self._unraised.append(error)
+                self._errors[error] = now
             case thorlabs_apt.GET_HOME:
                 self._home = thorlabs_apt.read_home(message.data)
             case thorlabs_apt.GET_INFO:
@@ -182,6 +200,17 @@ class ThorlabsStage:
                     self._fault = ""
             case _:
                 pass
+
+    def _take_bits(self, bits: int) -> None:
+        if self._status is None:
+            return
+        if (bits ^ self._status.bits) & thorlabs_apt.HOMED_BIT:
+            self._before, self._velocity = None, 0.0  # the zero was set: the position jumps, the stage does not
+        self._status = replace(self._status, bits=bits)
+
+    def _raise_error(self) -> None:
+        if self._unraised:
+            raise StageError(self._unraised.pop(0))
 
     def _follow(self, now: float, position: int) -> None:
         """Velocity from the positions, since the cube's own velocity differs between models.
@@ -203,7 +232,8 @@ class ThorlabsStage:
         if self._status is None:
             raise StageError(f"{self._name} has told no status yet")
         bits = self._status.bits
-        fault = self._fault
+        recent = (error for error, at in self._errors.items() if time.monotonic() - at <= LOST_S)
+        fault = self._fault or next(recent, "")
         if bits & thorlabs_apt.MOTION_ERROR_BIT:
             fault = f"{self._name} reports a motion error: is something in its way?"
         elif bits & thorlabs_apt.OVERLOAD_BIT:

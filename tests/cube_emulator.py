@@ -43,6 +43,9 @@ class CubeEmulator:
         drop: share of replies that get lost, every n-th: 0 none, 2 every second, 1 all.
         garbage: bytes sent before every reply.
         deaf_to_velocity: whether set velocities are ignored.
+        behind: bytes sent right behind the next reply, once.
+        status_id: of the reply to a request for a status; ``status_more``: bytes at its end, of a second channel.
+        claims_rest: its moving bits never come on.
     """
 
     def __init__(self, device_deg: float = 0.0, model: bytes = b"KDC101\0\0") -> None:
@@ -50,6 +53,7 @@ class CubeEmulator:
         self.orders: list[tuple[str, float]] = []
         self.complaints: list[str] = []
         self.drop, self.garbage, self.deaf_to_velocity, self.extra_bits = 0, b"", False, 0
+        self.behind, self.status_id, self.status_more, self.claims_rest = b"", 0x0491, b"", False
         self.speed_deg_s, self.home_speed_deg_s, self.enabled, self.homed = 25.0, 10.0, False, False
         self._offset = -device_deg
         self._target: float | None = None
@@ -167,15 +171,15 @@ class CubeEmulator:
             self._target, self._homing = None, False
             self._reply(_pack(0x0466, 0x01, 0x50, data=self._status_data()))
         elif message_id == 0x0490:
-            self._reply(_pack(0x0491, 0x01, 0x50, data=self._status_data()))
+            self._reply(_pack(self.status_id, 0x01, 0x50, data=self._status_data()))
 
     def _status_data(self) -> bytes:
         bits = self.extra_bits | (0x400 if self.homed else 0) | (0x80000000 if self.enabled else 0)
-        if self._target is not None:
+        if self._target is not None and not self.claims_rest:
             bits |= 0x10 if self._target > self.device_deg else 0x20
             bits |= 0x200 if self._homing else 0
         position = round((self.device_deg + self._offset) * COUNTS_PER_DEG)
-        return struct.pack("<HlhHL", 1, position, 0, 0, bits)
+        return struct.pack("<HlhHL", 1, position, 0, 0, bits) + self.status_more
 
     def _reply(self, message: bytes) -> None:
         unpacker = Unpacker(on_error="raise")
@@ -184,4 +188,5 @@ class CubeEmulator:
         self._replies += 1
         if self.drop and self._replies % self.drop == 0:
             return
-        os.write(self._master, self.garbage + message)
+        behind, self.behind = self.behind, b""
+        os.write(self._master, self.garbage + message + behind)

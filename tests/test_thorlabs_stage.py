@@ -6,17 +6,20 @@ import builtins
 import math
 import os
 import signal
+import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 import pytest
 import thorlabs_apt_protocol as library
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thorlabs_apt_protocol.unpacker import Unpacker
 
 from fgreg.drivers import thorlabs_apt
+from fgreg.drivers.thorlabs_identify import identify
 from fgreg.drivers.thorlabs_stage import LOST_S, ThorlabsStage, open_stage
 from fgreg.errors import MissingExtraError
 from fgreg.model.session_model import StageModel
@@ -188,6 +191,70 @@ def test_cube_complaints_become_faults() -> None:
             _until(stage, lambda status: not status.fault)
         cube.enabled = False
         assert "switched off" in _until(stage, lambda status: bool(status.fault)).fault
+
+
+SHORT_ERROR = b"\x80\x00\x00\x00\x01\x50"
+LONG_ERROR = b"\x81\x00\x44\x00\x81\x50" + struct.pack("<HH64s", 0x0453, 7, b"Motor overload")
+POSITION = b"\x12\x04\x06\x00\x81\x50" + struct.pack("<Hi", 1, 99)
+NOT_KNOWN_HERE = b"\x12\x02\x01\x01\x01\x50"  # MOD_GET_CHANENABLESTATE
+
+
+def _bits(bits: int) -> bytes:
+    return b"\x2a\x04\x06\x00\x81\x50" + struct.pack("<HI", 1, bits)
+
+
+def test_messages_behind_a_status_are_those_of_the_library_and_never_cost_it() -> None:
+    for behind in (SHORT_ERROR, LONG_ERROR, POSITION, _bits(0x80000400), NOT_KNOWN_HERE):
+        unpacker = Unpacker(on_error="raise")
+        unpacker.feed(behind)
+        assert len(list(unpacker)) == 1
+        status = b"\x91\x04\x0e\x00\x81\x50\x01\x00" + bytes([10, 11, 12, 0, 14, 15, 16, 17, 0, 4, 0, 128])
+        for at_once in (True, False):
+            parser = thorlabs_apt.AptParser()
+            parts = [status + behind] if at_once else [bytes([byte]) for byte in status + behind]
+            found = [message for part in parts for message in parser.feed(part)]
+            assert [message.data for message in found if message.is_status] == [status[6:]]
+            assert len(found) == (1 if behind is NOT_KNOWN_HERE else 2)
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [(SHORT_ERROR, "an error: without a code"), (LONG_ERROR, "an error: code 7, Motor overload, about message 0x0453")],
+)
+def test_error_of_the_cube_is_raised_once_and_a_fault_while_it_is_repeated(error: bytes, says: str) -> None:
+    with _opened() as (cube, stage):
+        cube.device_deg = 3.0
+        cube.behind = error
+        with pytest.raises(StageError, match=says):
+            _until(stage, lambda _: False)
+        status = stage.status()  # its position came right before the error
+        assert math.degrees(status.scan_rad) == pytest.approx(10.0 - 3.0, abs=1e-3)
+        assert says in status.fault
+        cube.behind = error
+        _until(stage, lambda _: not cube.behind)
+        assert says in stage.status().fault
+
+
+def test_bits_without_a_position_are_taken_but_are_no_newer_status() -> None:
+    with _opened() as (cube, stage):
+        _until(stage, lambda status: not status.fault)
+        cube.drop, before = 1, stage.status()
+        os.write(cube._master, _bits(0x80004400) + POSITION)
+        status = _until(stage, lambda status: bool(status.fault))
+        assert "motion error" in status.fault
+        assert status.homed
+        assert (status.stamp, status.scan_rad) == (before.stamp, before.scan_rad)
+
+
+@pytest.mark.parametrize(("status_id", "more"), [(0x0491, 14), (0x0481, 0), (0x0481, 14)])
+def test_statuses_of_newer_controllers_are_read(status_id: int, more: int) -> None:
+    with _emulated(device_deg=4.0) as cube:
+        cube.status_id, cube.status_more = status_id, bytes(more)
+        assert identify(cube.port).model == "KDC101"
+        with closing(open_stage(MODEL, port=cube.port)) as stage:
+            stage.move_to(math.radians(8.0), math.radians(20.0))
+            status = _until(stage, lambda status: _rested(status) and abs(math.degrees(status.scan_rad) - 8.0) < 0.01)
+            assert not status.fault
 
 
 def test_cube_that_keeps_its_old_speed_is_a_fault() -> None:
