@@ -10,6 +10,7 @@ Before homing, the angle counts from its value at power-on.
 
 from __future__ import annotations
 
+import errno
 import math
 import time
 from collections.abc import Callable
@@ -298,7 +299,7 @@ def _velocity(speed_rad_s: float) -> int:
 
 
 def open_port(port: str) -> serial.Serial:
-    """Open a cube's serial line for exclusive use. Raises StageLost, MissingExtraError."""
+    """Open a cube's serial line for exclusive use. Raises StageLost (another program has it), MissingExtraError."""
     try:
         import serial
     except ImportError as error:
@@ -306,4 +307,6 @@ def open_port(port: str) -> serial.Serial:
     try:
         return serial.Serial(port, 115200, rtscts=True, timeout=0, write_timeout=_WRITE_S, exclusive=True)
     except (OSError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno in (errno.EAGAIN, errno.EBUSY):
+            raise StageLost(f"stage at {port} is in use by another program: close that one") from error
         raise StageLost(f"stage at {port} cannot be opened: {error}") from error
