@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import warn_of_leftovers
+from fgreg.cli.options import warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -157,7 +156,7 @@ def add_calibrate_camera(app: typer.Typer, progress_bar: ProgressBar) -> None:
         with progress_bar(quiet or as_json) as progress:
             report = calibrate_camera(chosen, board, out, model=model, scale_sigma=scale_sigma, progress=progress)
         for sentence in report.conditions:
-            sys.stderr.write(f"fgreg: warning: {sentence}\n")
+            warn(sentence)
         if as_json:
             typer.echo(json.dumps(report_dict(report), indent=2))
         elif not quiet:

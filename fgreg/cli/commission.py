@@ -1,7 +1,6 @@
 """The command ``fgreg commission``."""
 
 import json
-import sys
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import warn_of_leftovers
+from fgreg.cli.options import warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,10 +82,10 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
 
 def _warn(sessions: "Iterable[CommissionedSession]", of_rig: Iterable[str]) -> None:
     for warning in of_rig:
-        sys.stderr.write(f"fgreg: warning: {warning}\n")
+        warn(warning)
     for session in sessions:
         for warning in session.warnings:
-            sys.stderr.write(f"fgreg: warning: {session.folder}: {warning}\n")
+            warn(f"{session.folder}: {warning}")
 
 
 def print_report(report: "CommissionReport") -> None:

@@ -2,7 +2,6 @@
 
 import os
 import shlex
-import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgreg.cli.options import refuse_given, warn_of_leftovers
+from fgreg.cli.options import refuse_given, warn, warn_of_leftovers
 from fgreg.errors import InputError
 from fgreg.schema.limits import RECORDING_MEMORY, memory_at_most
 
@@ -146,7 +145,7 @@ def _export(result: Path, out: Path, epoch: int | None, force: bool, overwrite: 
     try:
         changed = stale(result, estimate)
     except InputError as error:
-        sys.stderr.write(f"fgreg: warning: whether the result is stale cannot be told: {error}\n")
+        warn(f"whether the result is stale cannot be told: {error}")
     registration = registration_of(estimate, result, epoch=epoch, force=force, stale=changed)
     write_file(out, writer(registration), kind)
     marked = ", REFUSED and marked as such" if registration.refused else ""
@@ -184,7 +183,7 @@ def _import(
         found = read_calibration(calibration, unit=unit, rectified=rectified, image_size=_size(size))
         rig = found.rig
         for warning in found.warnings:
-            sys.stderr.write(f"fgreg: warning: {warning}\n")
+            warn(warning)
     else:
         alone = {"--rectified": rectified or None, "--calibration-unit": unit, "--calibration-size": size}
         refuse_given(alone, "it alone", "it with --calibration")
@@ -199,9 +198,9 @@ def _import(
             progress=lambda done, total: progress("checking events and frames", done, total),
         )
     for warning in [*written.left_out[:MOST_SAID], *written.warnings]:
-        sys.stderr.write(f"fgreg: warning: {warning}\n")
+        warn(warning)
     if (more := len(written.left_out) - MOST_SAID) > 0:
-        sys.stderr.write(f"fgreg: warning: {more} more reasons why data were left out\n")
+        warn(f"{more} more reasons why data were left out")
     if not quiet:
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(written.events.items()))
         typer.echo(f"{out}: {counts}; {written.frames} frames; next: fgreg solve {shlex.quote(str(out))}")

@@ -1,12 +1,13 @@
 """The command ``fgreg devices``."""
 
 import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from fgreg.cli.options import warn
 
 if TYPE_CHECKING:
     from fgreg.live.device_check import DeviceReport
@@ -40,7 +41,7 @@ def add_devices(app: typer.Typer) -> None:
 
         read = None if config is None else read_config(config)
         for warning in () if read is None else read.warnings:
-            sys.stderr.write(f"fgreg: warning: {warning}\n")
+            warn(warning)
         show = _Shown(as_json)
         show.section("extras", device_check.extras())
         show.section("video devices", device_check.video(0 if read is not None else device_check.LISTEN_S))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgreg.cli.options import refuse_stale, warn_of_leftovers
+from fgreg.cli.options import refuse_stale, warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]
     session = read_session(folder)
     known = read_ground_truth(folder)
     for warning in session.warnings:
-        sys.stderr.write(f"fgreg: warning: {warning}\n")
+        warn(warning)
     step = f"looking at frames of {session.model.name}"
     extracted = extract_measurements(
         session.events, session.model, progress=lambda done, total: progress(step, done, total)

@@ -1,5 +1,6 @@
 """The commands ``fgreg exclude`` and ``fgreg include``."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,4 +86,4 @@ def _record(session: Path, pm: str, aim: str, reason: str, by: str, *, include: 
         typer.echo(f"{session}: no shot is left out by hand")
     for shot in left:
         typer.echo(f"{session}: {shot.name} at {shot.t:.1f} s: {clean(shot.text)}")
-    typer.echo(f"Now solve it again: fgreg solve {session}")
+    typer.echo(f"Now solve it again: fgreg solve {shlex.quote(str(session))}")

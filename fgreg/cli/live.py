@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import LimitOption, solve_config, warn_of_leftovers
+from fgreg.cli.options import LimitOption, solve_config, warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> "t
 
     found = read_config(path)
     for warning in found.warnings:
-        sys.stderr.write(f"fgreg: warning: {warning}\n")
+        warn(warning)
     return found.live_setup(stack, (lambda _line: None) if silent else typer.echo, seen=seen), found.solve
 
 

@@ -12,6 +12,7 @@ import gc
 import json
 import math
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -30,7 +31,7 @@ from fgreg.cli.evaluate import add_commands
 from fgreg.cli.exclude import add_exclude, shot_names
 from fgreg.cli.html_report import add_report
 from fgreg.cli.live import add_live
-from fgreg.cli.options import EstimateOption, LimitOption, progress_columns, solve_config, warn_of_leftovers
+from fgreg.cli.options import EstimateOption, LimitOption, progress_columns, solve_config, warn, warn_of_leftovers
 from fgreg.cli.print import add_print
 from fgreg.cli.replay import add_replay
 from fgreg.cli.schema import add_schema
@@ -256,7 +257,7 @@ def _show(report: "SolveReport", as_json: bool) -> None:
         typer.echo(json.dumps(summary_dict(report.session.model, report.estimate, extras), indent=2))
     else:
         for warning in report.session.warnings:
-            sys.stderr.write(f"fgreg: warning: {warning}\n")
+            warn(warning)
         print_summary(report.session.model, report.estimate, extras)
 
 
@@ -322,7 +323,7 @@ def check(
             sys.stderr.write(f"fgreg: error: {' '.join(str(problem).split())}\n")
         warnings = [*found.warnings, *(shot.text for shot in found.unused)]
         for warning in warnings:
-            sys.stderr.write(f"fgreg: warning: {warning}\n")
+            warn(warning)
         if not found.problems:
             typer.echo(f"{session}: no problems" + (f", {len(warnings)} warnings" if warnings else ""))
             if found.markers:
@@ -449,10 +450,11 @@ def simulate(
     if not quiet:
         typer.echo(f"{out}: {config.aims} aims, {config.pairs} PMs, {len(simulated.frames)} frames, seed {seed}")
         if config.frames:
-            typer.echo(
-                f"What to expect of it: 'fgreg check {out}' says how many shots can be used and why others cannot,"
-            )
-            typer.echo(f"'fgreg solve {out}' the verdict, 'fgreg evaluate {out}' the true error.")
+            name = shlex.quote(str(out))
+            typer.echo("What to expect of it:")
+            typer.echo(f"  fgreg check {name}     how many shots can be used, and why others cannot")
+            typer.echo(f"  fgreg solve {name}     the verdict")
+            typer.echo(f"  fgreg evaluate {name}  the true error")
 
 
 add_commands(app, _progress)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgreg.errors import InputError
+from fgreg.errors import InputError, one_line
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn
@@ -95,9 +95,14 @@ def refuse_given(options: Mapping[str, object], found: str, expected: str) -> No
             raise InputError(name, found, expected)
 
 
+def warn(text: str) -> None:
+    """Write a warning as one line on standard error, with control characters escaped: files and devices name things."""
+    sys.stderr.write(f"fgreg: warning: {one_line(text)}\n")
+
+
 def warn_of_leftovers(*paths: Path | None) -> None:
     """Name on standard error what interrupted runs left beside these outputs, and how to take it back."""
     from fgreg.output.leftovers import leftovers
 
     for text in dict.fromkeys(text for path in paths if path is not None for text in leftovers(path)):
-        sys.stderr.write(f"fgreg: warning: {text}\n")
+        warn(text)

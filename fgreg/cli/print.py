@@ -1,13 +1,12 @@
 """The command ``fgreg print``."""
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fgreg.cli.options import refuse_given, warn_of_leftovers
+from fgreg.cli.options import refuse_given, warn, warn_of_leftovers
 from fgreg.errors import InputError
 from fgreg.printing.paper import Paper
 
@@ -126,7 +125,7 @@ def add_print(app: typer.Typer) -> None:
         data, pages = pdf_of(sheet)
         write_file(out, data, PRINT_FILE)
         for doubt in doubts:
-            sys.stderr.write(f"fgreg: warning: {doubt}\n")
+            warn(doubt)
         if not quiet:
             size = f"{pages} page{'s' if pages > 1 else ''} of {'A4' if paper is Paper.A4 else 'Letter'}"
             typer.echo(f"# {out}: {size}; print at 100 %, measure both bars of 100 mm. In session.yaml:")

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import LimitOption, OnlineEstimateOption, progress_columns, solve_config, warn_of_leftovers
+from fgreg.cli.options import LimitOption, OnlineEstimateOption, progress_columns, solve_config, warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ def add_replay(app: typer.Typer, make_extras: MakeExtras) -> None:
             typer.echo(json.dumps(summary_dict(solved.session.model, solved.estimate, extras), indent=2))
         elif not quiet:
             for warning in solved.session.warnings:
-                sys.stderr.write(f"fgreg: warning: {warning}\n")
+                warn(warning)
             typer.echo()
             print_summary(solved.session.model, solved.estimate, extras)
         if solved.estimate.verdict is Verdict.REFUSED:

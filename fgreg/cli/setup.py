@@ -1,7 +1,6 @@
 """The command ``fgreg setup``."""
 
 import json
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import warn_of_leftovers
+from fgreg.cli.options import warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -146,7 +145,7 @@ def _read_config(path: Path) -> "SetupConfig":
 
         live = read_config(path)
         for warning in live.warnings:
-            sys.stderr.write(f"fgreg: warning: {warning}\n")
+            warn(warning)
         return SetupConfig(path.name, live.model, live.settings.hearing_threshold, live.latencies)
     problems: list[InputError] = []
     setup = read_setup(data, str(path), path.resolve().parent.name or SETUP_FILE, problems, path.resolve().parent)
@@ -154,7 +153,7 @@ def _read_config(path: Path) -> "SetupConfig":
         raise problems[0]
     assert setup.model is not None
     for warning in setup.warnings:
-        sys.stderr.write(f"fgreg: warning: {warning}\n")
+        warn(warning)
     return SetupConfig(path.name, setup.model)
 
 
