@@ -75,7 +75,7 @@ def test_a_verdict_without_contrary_evidence_is_never_ok(pose_session: Path) -> 
     assert estimate.verdict is not Verdict.OK
     (said,) = [reason for reason in estimate.reasons if "by hand" in reason]
     assert said.startswith("8 of 32 shots were left out by hand (PM 12 to 19)")
-    assert "no test has seen them" in said
+    assert "no test has seen what is left out" in said
 
 
 def test_a_replay_leaves_out_from_the_event_on(pose_session: Path, tmp_path: Path) -> None:
@@ -140,6 +140,16 @@ def test_the_commands_record_who_and_why_and_delete_nothing(pose_session: Path) 
         (3, None, "A. N."),
     ]
     assert sum(isinstance(event, TrackEvent) for event in read_session(pose_session).events) == 4
+
+
+def test_what_an_event_says_cannot_steer_the_terminal(pose_session: Path, tmp_path: Path) -> None:
+    spaced = pose_session.rename(tmp_path / "a session")
+    run = CliRunner()
+    said = run.invoke(app, ["exclude", str(spaced), "--pm", "3", "--by", "A\x1b[2J\u202e"])
+    assert f"fgreg solve '{spaced}'" in said.output
+    checked = run.invoke(app, ["check", str(spaced)])
+    assert r"left out by hand (A\x1b[2J\u202e)" in checked.output
+    assert all(line.isprintable() for line in (said.output + checked.output).splitlines())
 
 
 def test_a_registration_without_shots_is_verified_as_it_is(pose_session: Path, tmp_path: Path) -> None:

@@ -249,7 +249,7 @@ def _shown_text(shift_mm: float, turn_rad: float) -> str:
         return "some shifts or turns would not show, however large"
     return (
         f"a shift of {shift_mm:.1f} mm or a turn of {math.degrees(turn_rad):.1f} deg about the middle of the targets "
-        f"would show ({POWER:.0%})"
+        f"would show ({100 * POWER:.0f} % of the time)"
     )
 
 

@@ -281,8 +281,9 @@ def register(
         solvable = [len(measurements.epochs) - 1]
     if not solvable:
         counts = [len({p.pm for p in measurements.pairs if p.epoch == k}) for k in range(len(measurements.epochs))]
+        there = " and ".join(map(str, counts))
         raise EstimationError(
-            f"no camera epoch has the 3 photoacoustic markers that a first solution needs (found {counts}); "
+            f"no camera epoch has the 3 photoacoustic markers that a first solution needs (found {there}); "
             "take at least 6 pairs without moving the camera"
         )
     choices = {k: choose_minimum(search, model, config) for k, search in enumerate(searches) if search.minima}

@@ -193,8 +193,8 @@ def left_out(kept: BoolArray, nis: FloatArray, what: str, sure: int) -> list[Con
         Condition(
             Verdict.REFUSED if refuse else Verdict.WARNING,
             f"{out} of {len(kept)} {what} do not fit the others and are left out (nis {nis[~kept].min():.0f} to "
-            f"{nis[~kept].max():.0f}, at most {WARN_LEFT_OUT:.0%} accepted): look at what was detected there, check "
-            f"noise, probe and marker in session.yaml, and take {out} {what} again",
+            f"{nis[~kept].max():.0f}, at most {100 * WARN_LEFT_OUT:.0f} % accepted): look at what was detected there, "
+            f"check noise, probe and marker in session.yaml, and take {out} {what} again",
         )
     ]
 
@@ -218,8 +218,8 @@ def by_hand(excluded: Sequence[ExcludedShot], used: int) -> list[Condition]:
     count = len(excluded)
     text = (
         f"{count} of {count + used} shots {'was' if count == 1 else 'were'} left out by hand ({'; '.join(names)}): no "
-        "test has seen them, and the predicted error holds only if they were left out for a cause seen when they were "
-        "taken, not for how they fit; solve with them too and compare, or have check points"
+        "test has seen what is left out, and the predicted error holds only if that was for a cause seen at the shot, "
+        "not for how it fits; solve with all shots too and compare, or have check points"
     )
     return [Condition(Verdict.WARNING, text)]
 
@@ -427,12 +427,12 @@ def accuracy(
         advice = f"most of it is systematic ({largest}): measure these{also}"
     elif causes is not None and causes.beam > DOMINANT and causes.beam >= causes.edge:
         advice = (
-            f"{causes.beam:.0%} of its variance is the beam's: take more aims, at short and long distances, and roll "
-            "the fibre about its beam during calibration"
+            f"{100 * causes.beam:.0f} % of its variance is the beam's: take more aims, at short and long distances, "
+            "and roll the fibre about its beam during calibration"
         )
     elif causes is not None and causes.edge > DOMINANT:
         what = "measure the window's half width" if both_sides else "take looks from both sides at each PM"
-        advice = f"{causes.edge:.0%} of its variance is the window edge's: {what}"
+        advice = f"{100 * causes.edge:.0f} % of its variance is the window edge's: {what}"
     return [
         Condition(
             Verdict.REFUSED if far else Verdict.WARNING,
