@@ -20,7 +20,7 @@ from fgreg.html_report.contents import Source, contents
 from fgreg.html_report.render import render
 from fgreg.html_report.viewer_3d import viewer_of
 from fgreg.html_report.words import ANSWER, PERMITS
-from fgreg.model.estimate import SessionEstimate, SettingsUsed, TargetEstimate, Verdict
+from fgreg.model.estimate import AimEstimate, SessionEstimate, SettingsUsed, TargetEstimate, Verdict
 from fgreg.pipeline.html_report import ReportRequest, report_session
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.session.result_file import read_result
@@ -147,6 +147,22 @@ def test_the_verdict_says_whether_the_probe_may_be_turned(verdict: Verdict) -> N
     assert ("not to be used" in text) == (verdict is Verdict.REFUSED)
     assert "take 3 more" in text
     assert "no tissue surface is known yet" in text
+
+
+def test_it_says_of_which_camera_epoch_its_figures_are_and_numbers_the_aims() -> None:
+    source = a_source(Verdict.WARNING)
+    (epoch,) = source.estimate.epochs
+    moved = replace(epoch, index=1, start_s=50.0, verdict=Verdict.OK)
+    aims = (AimEstimate(2.5, used=True), AimEstimate(7.5, used=False, reason="left out by hand"))
+    said = []
+    for epochs in ((epoch,), (epoch, moved)):
+        estimate = replace(source.estimate, epochs=epochs, aims=aims)
+        said.append(" ".join(" ".join(Page(render(contents(replace(source, estimate=estimate)))).texts).split()))
+    assert "camera epoch 1" not in said[0]
+    assert "in camera epoch 1, 95 % bound" in said[1]
+    assert "All of camera epoch 1, the last one" in said[1]
+    assert "Yes" not in said[1]  # an epoch's own verdict does not answer whether the probe may be turned
+    assert "1 7.5 \u2013 \u2013 \u2013 not used left out by hand" in said[1]
 
 
 def test_without_a_registration_it_says_so() -> None:

@@ -236,7 +236,7 @@ def _epoch(
                 at_worst += f"; against what the scanner shows {_number(tre.seen.worst_mm, 2)} mm"
         grid.add_row("    at worst", at_worst)
         if tre.systematic is not None and largest:
-            grid.add_row("    causes", f"{largest} (1 sigma each, at the worst target)")
+            grid.add_row("    causes", f"{largest} (1 sigma each at the worst target)")
     mean, worst = _entry(truth.tre_mean_mm, epoch.index), _entry(truth.tre_worst_mm, epoch.index)
     if mean is not None or worst is not None:
         grid.add_row("  true TRE", f"mean {_number(mean, 2)}, worst {_number(worst, 2)} mm (against the ground truth)")

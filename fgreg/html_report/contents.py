@@ -105,6 +105,7 @@ def _verdict(source: Source) -> Row:
     answered = sum(track.stage_rad is not None for track in estimate.tracks)
     compared = sum(check.error_mm is not None for check in estimate.checks)
     at = "" if worst is None or len(source.model.targets) == 0 else f" ({worst.name})"
+    of_epoch = f" in camera epoch {epoch.index}" if epoch is not None and len(estimate.epochs) > 1 else ""
     return {
         "kind": estimate.verdict.value,
         "answer": words.ANSWER[estimate.verdict],
@@ -116,7 +117,8 @@ def _verdict(source: Source) -> Row:
         "figures": [
             (
                 f"{number(None if tre is None else tre.worst_mm)} mm",
-                f"predicted error at the worst target{at}, 95 % bound; the limit is {source.settings.limit_mm:g} mm",
+                f"predicted error at the worst target{at}{of_epoch}, 95 % bound; "
+                f"the limit is {source.settings.limit_mm:g} mm",
             ),
             (_of(used, len(estimate.pairs)), "looks used"),
             (_of(answered, len(estimate.tracks)), "tracking queries answered"),
@@ -156,6 +158,7 @@ def _targets(source: Source) -> Row:
         summary = [(name, number(p.mean_mm), number(p.p95_mm), number(p.worst_mm)) for name, p in rows_of]
     return {
         "named": bool(source.model.targets),
+        "epoch": epoch.index if epoch is not None and len(source.estimate.epochs) > 1 else None,
         "limit": f"{limit:g}",
         "maps": target_map.target_maps(targets, limit, source.model.probe),
         "key": target_map.error_key(),
@@ -320,6 +323,7 @@ def _calibration(source: Source) -> Row:
         "beam": beam,
         "aims": [
             {
+                "number": place,
                 "t": number(aim.t, 1),
                 "used": aim.used,
                 "lambda": number(aim.lambda_mm, 1),
@@ -327,7 +331,7 @@ def _calibration(source: Source) -> Row:
                 "nis": number(aim.nis, 1),
                 "reason": aim.reason,
             }
-            for aim in aims
+            for place, aim in enumerate(aims)
         ],
         "used": sum(aim.used for aim in aims),
         "constants": constants,
@@ -357,7 +361,6 @@ def _moves(source: Source) -> Row:
                 "pairs": epoch.pairs,
                 "worst": number(worst),
                 "kind": epoch.verdict.value,
-                "answer": words.ANSWER[epoch.verdict],
             }
         )
     count = len(rows) - 1

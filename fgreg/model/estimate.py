@@ -109,7 +109,7 @@ class SystematicEstimate:
     sigma: Annotated[float, Key("its standard deviation", _NOT_NEGATIVE_FINE)]
     observed: Annotated[float, Key("share of the prior variance that was removed", Number(0.0, 1.0, decimals=4))]
     score: Annotated[float, Key("standard normal where the declared value and its deviation are right", _SIZE)]
-    worst_target_mm: Annotated[float, Key("RMS error at the worst target that is due to it", _NOT_NEGATIVE)]
+    worst_target_mm: Annotated[float, Key("1 sigma of the error at the worst target that is due to it", _NOT_NEGATIVE)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
