@@ -43,6 +43,9 @@ def test_a_reason_leads_to_the_shots_that_it_names(estimate: SessionEstimate) ->
         ("the residuals of 2 of 12 shots are larger, (nis 23 to 24)", ["world/looks/7", "world/looks/8"]),
         ("the predicted error at the worst target is 4.0 mm", ["world/targets/worst"]),
         ("no shot is named here", ["world/looks/4", "world/looks/11"]),
+        (f"the check at {at:.1f} s is off by 9.5 mm sideways: locate it again", []),
+        ("the checks are off by 9.4 mm sideways, 1.2 mm expected at most", []),
+        ("the mean error at the checks is 9.4 mm, at most 9.9 mm (95 % bound)", []),
     ):
         assert targets(reason, estimate) == expected, reason
     assert f"shot 2 (aim, {at:.1f} s)" in linked(f"the aim at {at:.1f} s does not fit", estimate)

@@ -237,7 +237,7 @@ def test_targets_carry_the_bound_of_the_predicted_error_in_size_and_colour(recor
     colors = [int(color) >> 8 for color in row.values["Points3D:colors"]]
     classes = [int.from_bytes(bytes(color), "big") for color in palette.ERRORS]
     assert [classes.index(color) for color in colors] == [int(b > 1.5) + int(b > 3.0) + int(b > 6.0) for b in bounds]
-    assert recorded.rows["/world/targets/worst"][0].values["Points3D:labels"] == [f"worst: apex, {WORST_MM:.2f} mm"]
+    assert recorded.rows["/world/targets/worst"][0].values["Points3D:labels"] == [f"worst: {WORST_MM:.2f} mm\napex"]
     dots = recorded.rows["/scale/targets"][0].array("Points2D:positions")
     np.testing.assert_allclose(dots[:, 0], 100.0 * bounds / LIMIT_MM, atol=1e-3)
     edges = recorded.rows["/scale/edges"][0].values["Points2D:labels"]

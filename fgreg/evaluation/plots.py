@@ -117,17 +117,21 @@ def _dress(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def _limit(axes: Axes, limit_mm: float, *, upright: bool = False) -> None:
-    """Draw the limit as a line with its name, within the picture."""
+def _limit(axes: Axes, limit_mm: float, *, upright: bool = False, other_end: bool = False) -> None:
+    """Draw the limit as a line with its name, within the picture: at its upper or right end, or at the other one."""
     text = f"limit {limit_mm:.1f} mm"
     ground = {"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85}
     style: dict[str, Any] = {"fontsize": 8, "color": RED, "ha": "right", "bbox": ground}
     if upright:
         axes.axvline(limit_mm, color=RED, linewidth=1.4)
-        axes.text(limit_mm, 0.97, text, transform=axes.get_xaxis_transform(), rotation=90.0, va="top", **style)
+        end, va = (0.03, "bottom") if other_end else (0.97, "top")
+        axes.text(limit_mm, end, text, transform=axes.get_xaxis_transform(), rotation=90.0, va=va, **style)
     else:
         axes.axhline(limit_mm, color=RED, linewidth=1.4)
-        axes.text(0.99, limit_mm, text, transform=axes.get_yaxis_transform(), va="bottom", **style)
+        style["ha"] = "left" if other_end else "right"
+        axes.text(
+            0.01 if other_end else 0.99, limit_mm, text, transform=axes.get_yaxis_transform(), va="bottom", **style
+        )
 
 
 def curve_figure(evaluations: Sequence[SessionEvaluation], limit_mm: float) -> Figure | None:
@@ -270,8 +274,7 @@ def predicted_figure(evaluations: Sequence[SessionEvaluation], limit_mm: float) 
     axes = figure.subplots()
     bounds, errors = (np.concatenate(part) for part in ([f[1] for f in found], [f[2] for f in found]))
     end = 1.06 * max(float(bounds.max()), float(errors.max()), limit_mm)
-    axes.plot([0, end], [0, end], color=GREY, linestyle="--", linewidth=1)
-    axes.annotate("true error = 95 % bound", (0.93 * end, 0.95 * end), fontsize=8, color=GREY, ha="right", va="bottom")
+    axes.plot([0, end], [0, end], color=GREY, linestyle="--", linewidth=1, label="true error = 95 % bound")
     named = len(found) <= NAMED_SESSIONS
     for number, (name, bound, error) in enumerate(found):
         sign, holds = MARKERS[number % len(MARKERS)], error <= bound
@@ -280,12 +283,11 @@ def predicted_figure(evaluations: Sequence[SessionEvaluation], limit_mm: float) 
         axes.plot(bound[~holds], error[~holds], "x", color=RED, markersize=7)
     if (beyond := int((errors > bounds).sum())) and named:
         axes.plot([], [], "x", color=RED, label=f"error beyond its bound: {beyond}")
-    _limit(axes, limit_mm)
-    _limit(axes, limit_mm, upright=True)
+    _limit(axes, limit_mm, other_end=True)
+    _limit(axes, limit_mm, upright=True, other_end=True)
     axes.set(xlabel="predicted 95 % bound, mm", ylabel="true error, mm", xlim=(0, end), ylim=(0, end))
     _dress(axes)
-    if named:
-        axes.legend(frameon=False, fontsize=8, loc="center left")
+    axes.legend(frameon=False, fontsize=8, loc="center left")
     held = errors.size - beyond
     axes.set_title(
         f"Predicted against true error: the 95 % bound holds at {held} of {errors.size} targets",

@@ -1,7 +1,8 @@
 """Links from a reason of the verdict to what it is about: shots with their times, or the worst target.
 
 A reason is a sentence, which names its shots by PM, by time, by being left out, or by their NIS. One that names none is
-about all looks of its camera epoch. A viewer can go to an entity by a link, not to a time: the link's words have that.
+about all looks of its camera epoch; one about check points has no link, since they are no shots. A viewer can go to an
+entity by a link, not to a time: the link's words have that.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ _EPOCH = re.compile(r"^epoch (\d+): ")
 _PM = re.compile(r"\bPM (\d+)(?: to (\d+)|((?:, \d+)+))?")
 _AT = re.compile(r"\bat (\d+(?:\.\d+)?) s\b")
 _LEFT_OUT = re.compile(r"\b(aims?|pairs?)\b.*?(?:are left out|could not be used)")
+_CHECKS = re.compile(r"\bthe checks? (?:at|is|are|to)\b|\bat the checks?\b")
 _NIS = re.compile(r"\bnis (\d+(?:\.\d+)?)(?: to (\d+(?:\.\d+)?))?")
 
 
@@ -83,6 +85,8 @@ def _about(reason: str, shots: list[_Facts]) -> tuple[list[_Facts], bool]:
     if epoch := _EPOCH.match(reason):
         shots = [s for s in shots if s.epoch == int(epoch[1])]
         reason = reason[epoch.end() :]
+    if _CHECKS.search(reason):
+        return [], True
     times = [float(found[1]) for found in _AT.finditer(reason)]
     if at := [s for s in shots if any(abs(s.shot.t - t) <= 0.051 for t in times)]:
         return at, True

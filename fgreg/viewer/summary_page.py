@@ -39,7 +39,7 @@ def summary_markdown(
         "",
         f"Session **{estimate.session}**: {used} of {len(estimate.pairs)} looks used, "
         f"{sum(aim.used for aim in estimate.aims)} of {len(estimate.aims)} calibration shots used, "
-        f"{len(estimate.tracks)} track queries.",
+        f"{len(estimate.tracks)} tracking queries.",
         "",
         f"Predicted error at {len(model.targets_mm)} targets, mm; limit of the [worst](recording://{WORST_TARGET}): "
         f"{limit_mm:.1f}:",

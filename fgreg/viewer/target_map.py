@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from fgreg.errors import one_line
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import SessionModel
 from fgreg.viewer import palette, shapes
@@ -17,6 +18,8 @@ LEAST_RADIUS_MM = 0.6
 """Of a sphere, so that it is seen."""
 MARGIN = 0.78
 """Part of the view that the targets fill; beside it is room for the label of the worst one."""
+LONGEST_NAME = 18
+"""Characters of a target's name that fit into the margin, under its sphere."""
 END = 3.0
 """Right end of the scale, in limits; larger errors are drawn there."""
 PX_PER_LIMIT = 100
@@ -46,8 +49,8 @@ def draw(
     colors = palette.error_colors(bounds, limit_mm)
     rec.log("world/targets/bound_95", shapes.spheres(targets_mm, radii_mm(bounds, targets_mm), colors))
     worst = int(np.argmax(bounds))
-    name = f"{names[worst]}, " if names and not names[worst].isdigit() else ""
-    label = f"worst: {name}{bounds[worst]:.2f} mm"
+    name = f"\n{one_line(names[worst], LONGEST_NAME)}" if names and not names[worst].isdigit() else ""
+    label = f"worst: {bounds[worst]:.2f} mm{name}"
     rec.log("world/targets/worst", shapes.point(targets_mm[worst], palette.TEXT, 1.0, label))
     rec.log("scale/targets", shapes.coloured_points_2d(dots_px(bounds, limit_mm), colors, 2.6))
 
