@@ -164,6 +164,8 @@ def test_a_registration_without_shots_is_verified_as_it_is(pose_session: Path, t
     found = fgreg.verify(pose_session, tmp_path / "new.jsonl", limit)
     assert [shot.pm for shot in found.verification.shots] == [16, 17, 19]
     assert [(shot.pm, shot.reason) for shot in found.unused] == [(18, "left out by hand: bumped")]
+    said = CliRunner().invoke(app, ["verify", str(pose_session), str(tmp_path / "new.jsonl"), "--limit-mm", "10"])
+    assert "the registration's own verdict is warning: look first" in " ".join(said.output.split())
 
 
 WRONG = {

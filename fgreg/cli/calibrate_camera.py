@@ -98,7 +98,7 @@ def add_calibrate_camera(app: typer.Typer, progress_bar: ProgressBar) -> None:
         ] = None,
         most_views: Annotated[int, typer.Option("--most-views", help="Of more, those least alike are used.")] = 60,
         scale_sigma: Annotated[
-            float, typer.Option("--scale-sigma", help="How well the board's size is known, relative.")
+            float, typer.Option("--scale-sigma", help="1 sigma of the board's size, relative.")
         ] = 0.002,
         limit_mm: Annotated[
             float, typer.Option("--limit-mm", help="With --check: error of located points (RMS) that matters.")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from fgreg.pipeline.exclude import ShotNames
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
-PmOption = Annotated[str, typer.Option("--pm", metavar="N,N", help="All looks at these PMs.")]
+PmOption = Annotated[str, typer.Option("--pm", metavar="N,N", help="All looks at these PMs up to now.")]
 AimOption = Annotated[
     str, typer.Option("--aim", metavar="N,N", help="These aims, by their place among the session's aims, from 0.")
 ]

@@ -76,6 +76,7 @@ def report_dict(report: "VerifyReport") -> dict[str, Any]:
 
     return {
         "session": report.session,
+        "registration": report.registered.value,
         "new": str(report.new),
         "verdict": found.validity.value,
         "reason": found.reason,
@@ -97,13 +98,18 @@ def _print(report: "VerifyReport") -> None:
     from rich.text import Text
 
     from fgreg.camera_moves.validity import Validity
-    from fgreg.cli.report import bullet, clean, print_plain
+    from fgreg.cli.report import MEANINGS, bullet, clean, print_plain
+    from fgreg.model.estimate import Verdict
 
     styles = {Validity.VALID: "bold green", Validity.CANNOT_TELL: "bold yellow"}
     found = report.verification
     word = Text(f" {found.validity.value.upper()} ", style=f"{styles.get(found.validity, 'bold red')} reverse")
     parts: list[RenderableType] = [Text.assemble(word, " ", (clean(report.session), "bold"))]
     parts.append(bullet(found.reason))
+    if report.registered is not Verdict.OK:
+        parts.append(
+            bullet(f"the registration's own verdict is {report.registered.value}: {MEANINGS[report.registered]}")
+        )
     for shot in found.shots:
         left = "" if shot.used else ", left out"
         parts.append(

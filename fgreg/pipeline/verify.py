@@ -53,12 +53,14 @@ class VerifyReport:
 
     Attributes:
         session: name of the registered session. new: as given.
+        registered: verdict of the registration itself, which new shots do not change.
         verification: verdict, odds and shots.
         unused: new pairs in whose frames marker or PM was not found.
         elapsed_s: time of it all.
     """
 
     session: str
+    registered: Verdict
     new: Path
     verification: Verification
     unused: tuple[UnusedShot, ...]
@@ -109,7 +111,7 @@ def verify_session(
         found = Verification(Validity.MOVED, text, np.inf, 0.0, ())
     else:
         found = verify(pairs, snapshot, epoch, session.model, config)
-    return VerifyReport(session.model.name, new, found, unused, time.perf_counter() - start)
+    return VerifyReport(session.model.name, result.verdict, new, found, unused, time.perf_counter() - start)
 
 
 def _new_events(new: Path, session: Session) -> tuple[tuple[Event, ...], SessionModel]:
