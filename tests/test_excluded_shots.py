@@ -17,6 +17,7 @@ from fgreg.model.events import AimEvent, PairEvent, TrackEvent
 from fgreg.model.excluded_shots import excluded_shots
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.live_session import LiveSession
+from fgreg.pipeline.exclude import ShotNames, without_shots
 from fgreg.pipeline.replay import ReplayRequest, replay_session
 from fgreg.session.result_file import read_result
 from fgreg.session.session_reader import read_session
@@ -217,3 +218,17 @@ def test_a_pm_that_is_looked_at_again_counts_again(pose_session: Path) -> None:
     _append(pose_session, {"type": "exclude", "pm": 5}, {**look, "t": 1e4})
     (left,) = excluded_shots(read_session(pose_session).events).values()
     assert (left.pm, left.t, left.text) == (5, look["t"], "left out by hand")
+
+
+def test_what_is_left_out_twice_keeps_its_reason(pose_session: Path) -> None:
+    why = {"type": "exclude", "pm": 5, "reason": "bumped", "by": "A. N."}
+    _append(pose_session, why, {"type": "exclude", "pm": 5})
+    twice = without_shots(read_session(pose_session), ShotNames((5, 6), (2,)), ("--without-pm", "--without-aim"))
+    assert [(shot.pm, shot.aim, shot.reason, shot.by) for shot in excluded_shots(twice.events).values()] == [
+        (None, 2, "option --without-aim", ""),
+        (5, None, "bumped", "A. N."),
+        (6, None, "option --without-pm", ""),
+    ]
+    _append(pose_session, {**why, "reason": "blood on the tag"})
+    (left,) = excluded_shots(read_session(pose_session).events).values()
+    assert left.reason == "blood on the tag"

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fgreg.model.estimate import ExcludedShot
-from fgreg.model.events import AimEvent, Event, ExcludeEvent, HandChoice, PairEvent, refused_lines
+from fgreg.model.events import AimEvent, Event, ExcludeEvent, HandChoice, IncludeEvent, PairEvent, refused_lines
 
 
 def excluded_shots(events: Sequence[Event]) -> dict[int, ExcludedShot]:
     """The aims and looks that are left out after these events, by their lines, in the order of lines.
 
-    A choice is of shots before it: a PM that is looked at again counts again.
+    A choice is of shots before it: a PM that is looked at again counts again. One that says neither why nor who takes
+    nothing from an earlier one that does.
     """
     shots: dict[int, tuple[AimEvent | PairEvent, int]] = {}
     looks: dict[int, list[int]] = {}
@@ -26,10 +27,12 @@ def excluded_shots(events: Sequence[Event]) -> dict[int, ExcludedShot]:
             looks.setdefault(event.pm, []).append(event.line)
         elif isinstance(event, HandChoice) and event.line not in refused:
             for line in [event.shot_line] if event.pm is None else looks.get(event.pm, []):
-                if line is not None and isinstance(event, ExcludeEvent):
-                    out[line] = event
-                elif line is not None:
+                if line is None:
+                    continue
+                if isinstance(event, IncludeEvent):
                     out.pop(line, None)
+                elif event.reason or event.by or line not in out:
+                    out[line] = event
     return {line: _excluded(*shots[line], out[line]) for line in sorted(out.keys() & shots.keys())}
 
 

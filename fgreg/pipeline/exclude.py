@@ -27,16 +27,24 @@ class ShotNames:
 def without_shots(session: Session, names: ShotNames, options: tuple[str, str]) -> Session:
     """The session as if it ended with ``exclude`` events for these shots; its files stay as they are.
 
+    Shots that its own events leave out keep the reason of those.
+
     ``options``: those that named PMs and aims, for messages and reasons.
 
     Raises:
         InputError: a PM or an aim that is not there.
     """
-    chosen = _chosen(session.events, names, options)
+    out = excluded_shots(session.events)
+    lines = [
+        (event.line, option)
+        for pm, of_line, option in _chosen(session.events, names, options)
+        for event in session.events
+        if event.line not in out and (event.line == of_line or (isinstance(event, PairEvent) and event.pm == pm))
+    ]
     t, line = (session.events[-1].t, session.events[-1].line) if session.events else (0.0, 0)
     events = [
-        ExcludeEvent(t, line + number, pm, of_line, f"option {option}")
-        for number, (pm, of_line, option) in enumerate(chosen, 1)
+        ExcludeEvent(t, line + number, shot_line=of_line, reason=f"option {option}")
+        for number, (of_line, option) in enumerate(lines, 1)
     ]
     return replace(session, events=(*session.events, *events)) if events else session
 
