@@ -323,7 +323,7 @@ class Workflow:
         self._next_pm += 1
         self._pms += 1
         turn, sigma = math.degrees(found.scan_rad), math.degrees(found.sigma_rad)
-        text = f"PM detected at {turn:.1f} +- {sigma:.1f} deg after {found.positions} positions"
+        text = f"PM detected at {turn:.1f} +- {sigma:.1f} deg (1 sigma) after {found.positions} positions"
         if self._settings.both_sides:
             text += ("", ", with a look from one side only", ", with looks from both sides")[len(search.first_hits)]
         out.append(Tell(f"{text}: go on to the next spot", done=True))
