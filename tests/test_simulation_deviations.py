@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fgreg.cli.main import app
+from fgreg.errors import InputError
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray, as_float_array, exp_so3, inverse, log_so3, make_transform
 from fgreg.model.camera_dependence import nominal_pose_gain
@@ -530,10 +531,13 @@ def test_command_line_takes_what_is_off(tmp_path: Path) -> None:
     run = CliRunner().invoke
     options = ["--preset", "first-hit", "--aims", "2", "--pairs", "2", "--sweep", "two-sided"]
     options += ["--off", "radius_mm=1", "--off", "water_mm=10", "--declare", "probe.radius_mm=0.01", "--camera"]
+    options += ["--declare", "stage.direction=-1", "--declare", "probe.flip=true"]
     result = run(app, ["simulate", str(tmp_path / "s"), *options])
     assert result.exit_code == 0, result.output
     session = read_session(tmp_path / "s")
     assert session.model.probe.radius_mm == 0.01
+    assert session.model.stage.direction == -1
+    assert session.model.probe.flip
     assert session.model.camera is not None
     assert "x_deviations" in (tmp_path / "s" / "ground_truth.yaml").read_text()
     expected = simulate(
@@ -548,6 +552,11 @@ def test_command_line_takes_what_is_off(tmp_path: Path) -> None:
         f'"range_mm": {next(e for e in expected.events if e["type"] == "pair")["trus"]["range_mm"]}'
         in (tmp_path / "s" / "events.jsonl").read_text()
     )
-    for bad in (["--off", "radius_m=1"], ["--off", "radius_mm"], ["--off", "radius_mm=wide"], ["--sweep", "up"]):
-        assert run(app, ["simulate", str(tmp_path / "t"), *bad]).exit_code != 0
+    bad_options = [["--off", "radius_m=1"], ["--off", "radius_mm"], ["--off", "radius_mm=wide"], ["--sweep", "up"]]
+    bad_declared = ("probes.radius_mm=1", "probe.radius_mm.x=1", "probe.radius_mm=wide", "probe.radius_mm=[")
+    bad_options += [["--declare", declared] for declared in bad_declared]
+    for bad in bad_options:
+        result = run(app, ["simulate", str(tmp_path / "t"), "--preset", "first-hit", *bad])
+        assert isinstance(result.exception, InputError | SystemExit), bad
+        assert result.exit_code != 0
         assert not (tmp_path / "t").exists()

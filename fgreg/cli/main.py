@@ -373,7 +373,7 @@ def simulate(
     ] = None,
     declare: Annotated[
         list[str] | None,
-        typer.Option("--declare", metavar="KEY=VALUE", help="What session.yaml has instead: probe.radius_mm=0.01."),
+        typer.Option("--declare", metavar="KEY=VALUE", help="What session.yaml has instead: probe.flip=true."),
     ] = None,
     disturb: Annotated[
         list[str] | None,
@@ -396,6 +396,9 @@ def simulate(
     from dataclasses import replace
 
     from fgreg.output.session_folder import check_folder
+    from fgreg.schema.yaml_writer import yaml_text
+    from fgreg.session.setup_reader import read_setup
+    from fgreg.session.yaml_loader import parse_yaml
     from fgreg.simulation.config import Sweep
     from fgreg.simulation.deviations import with_deviations
     from fgreg.simulation.disturbances import with_values
@@ -429,7 +432,10 @@ def simulate(
         config = with_deviations(config, values)
     except ValueError as error:
         raise InputError("--off", str(error), "a name among these") from error
-    declared = {key: _number("--declare", value) for key, value in _named_values("--declare", declare)}
+    declared = {
+        key: parse_yaml(f"value: {value}", f"--declare {key}")["value"]
+        for key, value in _named_values("--declare", declare)
+    }
     config = replace(config, declared=declared, camera_declared=camera)
     if spoils := {name: _number("--disturb", value) for name, value in _named_values("--disturb", disturb)}:
         if not config.frames:
@@ -446,6 +452,11 @@ def simulate(
             simulated = run(config, seed)
         except ValueError as error:
             raise InputError("the simulation", str(error), "a session that can be realised") from error
+        if declared:
+            problems: list[InputError] = []
+            read_setup(parse_yaml(yaml_text(simulated.session), "session.yaml"), "session.yaml", out.name, problems)
+            if problems:
+                raise InputError("--declare", f"a session.yaml with a fault: {problems[0]}", "one that can be read")
         write_session(simulated, out, overwrite, lambda done, total: progress("rendering", done, total))
     if not quiet:
         typer.echo(f"{out}: {config.aims} aims, {config.pairs} PMs, {len(simulated.frames)} frames, seed {seed}")

@@ -34,7 +34,11 @@ def degrees(angle_rad: float) -> float:
 
 
 def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray | None = None) -> dict[str, Any]:
-    """The content of ``session.yaml``; devices that recorded nothing (cameras without frames) are left out."""
+    """The content of ``session.yaml``; devices that recorded nothing (cameras without frames) are left out.
+
+    Raises:
+        ValueError: a key of ``config.declared`` lies in no section.
+    """
     sensitivity = config.probe.sensitivity
     if config.amplitudes:
         # Measured at the middle depth, as a user would: turn the stage across a source and record the amplitudes.
@@ -63,6 +67,8 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
         *within, last = key.split(".")
         place = document
         for name in within:
+            if not isinstance(place.get(name), dict):
+                raise ValueError(f"{key}, but {name} is no part of this session.yaml")
             place = place[name]
         place[last] = value
     return document
