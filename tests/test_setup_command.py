@@ -116,7 +116,8 @@ def test_a_recording_that_cannot_be_used_is_one_line(
 def test_a_session_says_what_it_contradicts(pose_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, text, _ = run(capsys, pose_session)
     assert status == 0
-    assert "bears out what is declared" in text
+    assert "contradicts nothing that is declared (verdict " in text
+    assert "no session shows stage.zero_deg" in text
     setup = pose_session / "session.yaml"
     setup.write_text(setup.read_text(encoding="utf-8").replace("direction: 1", "direction: -1"), encoding="utf-8")
     status, text, _ = run(capsys, pose_session, "--json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,6 +71,18 @@ def test_statements_and_measurements_that_do_not_fit_are_refused() -> None:
     wrong = looks(1, 30.0, 40.0, 5.0, TargetLine(0.0, 2, 1, of=0, apart_mm=20.0, depth_mm=28.0))
     with pytest.raises(EstimationError, match="sigmas off what is heard"):
         still_targets([looks(0, -30.0, 40.0, 0.0), wrong], [Medium(1.0, 1e-4)], DECLARED)
+    # Which wire is which: the depth of the first, and the distances of the others from it, exchanged.
+    first = looks(0, -30.0, 40.0, 0.0, TargetLine(0.0, 1, 0, depth_mm=28.0))
+    apart = [TargetLine(0.0, 2, n, of=0, apart_mm=2.0 * 40.0 * math.sin(t * DEG)) for n, t in ((1, 25.0), (2, 30.0))]
+    right = [first, looks(1, 20.0, 40.0, 0.0, apart[0]), looks(2, 30.0, 40.0, 0.0, apart[1])]
+    radius = by_name(still_targets(right, [Medium(1.0, 1e-4)], DECLARED))["probe.radius_mm"]
+    assert radius.value == pytest.approx(12.0, abs=0.1)
+    exchanged = [first, looks(1, 20.0, 40.0, 0.0, apart[1]), looks(2, 30.0, 40.0, 0.0, apart[0])]
+    with pytest.raises(EstimationError, match="look which target is which"):
+        still_targets(exchanged, [Medium(1.0, 1e-4)], DECLARED)
+    # Without distances the radius is hardly seen, and that is not presented as a radius that agrees.
+    noisy = replace(first, range_mm=first.range_mm + 0.2 * (-1.0) ** np.arange(13))
+    assert not by_name(still_targets([noisy], [Medium(1.0, 1e-4)], DECLARED))["probe.radius_mm"].seen
     near = looks(1, -29.9, 40.0, 0.0, TargetLine(0.0, 2, 1, of=0, towards=("+y",)))
     with pytest.raises(EstimationError, match="move it farther"):
         still_targets([looks(0, -30.0, 40.0, 0.0), near], [Medium(1.0, 1e-4)], DECLARED)
@@ -101,6 +114,15 @@ def test_window_latency_and_threshold_of_a_sweep() -> None:
     assert found["settings.hearing_threshold"].value == pytest.approx(20.0, rel=0.02)  # half of 40 at the edges
 
 
+def test_times_and_angles_in_other_units_are_refused() -> None:
+    right = sweep(0.0, 0.0)
+    slow = replace(right, pulse_s=1e3 * right.pulse_s, stage_s=1e3 * right.stage_s)
+    with pytest.raises(EstimationError, match="give t in s"):
+        window_of([slow], DECLARED)
+    with pytest.raises(EstimationError, match="scan_deg in degrees"):
+        window_of([replace(right, stage_rad=DEG * right.stage_rad)], DECLARED)
+
+
 def movement(turn: FloatArray, delay_s: float) -> Movement:
     """The tip, 50 mm before the marker's origin, at x = 12 sin(2 t) along the camera's y; the marker turns about it."""
     t = np.arange(0.0, 12.0, 0.033)
@@ -114,10 +136,14 @@ def movement(turn: FloatArray, delay_s: float) -> Movement:
 
 
 def test_latency_of_the_camera_by_a_fibre_that_moves_and_turns() -> None:
-    found = camera_latency([movement(np.array([0.1, 0.05, 0.1]), 0.07)])
+    found = camera_latency([movement(np.array([0.1, 0.05, 0.1]), 0.07)], DECLARED.noise)
     assert found.value == pytest.approx(0.07, abs=5e-4)
     moved = movement(np.zeros(3), 0.0)
     poses = moved.camera_T_marker[np.random.default_rng(1).permutation(len(moved.camera_T_marker))]
     other = Movement("moved", moved.pulse_s, moved.x_mm, moved.marker_s, poses)
     with pytest.raises(EstimationError, match="does not explain"):
-        camera_latency([other])
+        camera_latency([other], DECLARED.noise)
+    # The hand does nearly the same some seconds later: roughly explained is not enough.
+    roughly = replace(moved, x_mm=moved.x_mm + 2.0 * np.sin(0.7 * moved.pulse_s))
+    with pytest.raises(EstimationError, match="by one clock"):
+        camera_latency([roughly], DECLARED.noise)

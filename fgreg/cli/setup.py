@@ -21,6 +21,9 @@ EXIT_CONTRADICTED = 1
 SHOWN_SCORE = 2.0
 """Score from which a constant of a session is listed."""
 
+NOT_SHOWN = """no session shows stage.zero_deg, direction and flip where both are wrong, flip where looks have x_mm, or
+  a constant that it sees less well than declared: for these, record targets that stand still"""
+
 RECORDINGS = """Take these recordings, each a file of JSON lines (t: arrival at the host, s, one clock):
 1. Still targets: two or three wires along the probe's axis in water, or the fibre's tip held
    still at two or three places. At each, turn the stage in steps of 1 deg past it, always from
@@ -66,7 +69,8 @@ Of each value: 1 sigma, how it was found, and what is declared. agrees: within 3
 both; not seen: these recordings say nothing of it, and how to show it.
 \b
 A session is solved, and its result is not written. A constant that it contradicts has a
-score beyond 3.5; signs are found by the mirrored hypothesis.
+score beyond 3.5; signs are found by the mirrored hypothesis. That it contradicts nothing
+does not make it right: zero, both signs wrong together, and what few pairs show badly pass.
 \b
 Exit status 0 done, 1 a session contradicts what is declared, 2 bad input.
 """
@@ -192,10 +196,11 @@ def name_of(one: "Compared") -> str:
 
 
 def _print_session(one: "SessionFindings") -> None:
-    says = "contradicts what is declared" if one.contradicts else "bears out what is declared"
-    typer.echo(f"{one.folder}: {says} (verdict {one.verdict.value})")
+    typer.echo(f"{one.folder}: {one.says} (verdict {one.verdict.value})")
     for text in one.contradicts:
         typer.echo(f"  - {text}")
+    if not one.contradicts:
+        typer.echo(f"  {NOT_SHOWN}")
     doubtful = sorted((c for c in one.constants if abs(c.score) >= SHOWN_SCORE), key=lambda c: -abs(c.score))
     if doubtful:
         typer.echo("  score beyond 2: " + ", ".join(f"{c.name} {c.score:+.1f} ({_value(c)})" for c in doubtful))
@@ -232,6 +237,7 @@ def _document(
             {
                 "session": str(one.folder),
                 "verdict": one.verdict.value,
+                "says": one.says,
                 "contradicts": list(one.contradicts),
                 "other_reasons": list(one.reasons),
                 "constants": [

@@ -77,7 +77,7 @@ class SessionFindings:
     """What an ordinary session says of the declared constants.
 
     Attributes:
-        constants: of its result: score and value of each. contradicts: sentences, none where it bears them out.
+        constants: of its result: score and value of each. contradicts: sentences.
         reasons: the other ones of its verdict.
     """
 
@@ -86,6 +86,13 @@ class SessionFindings:
     constants: tuple[SystematicEstimate, ...]
     contradicts: tuple[str, ...]
     reasons: tuple[str, ...]
+
+    @property
+    def says(self) -> str:
+        """What it says of them, in words. A refused session that contradicts nothing could not have."""
+        if self.contradicts:
+            return "contradicts what is declared"
+        return "cannot tell" if self.verdict is Verdict.REFUSED else "contradicts nothing that is declared"
 
 
 def is_session(path: Path) -> bool:
@@ -110,7 +117,11 @@ def find_constants(recordings: Sequence[Path], config: SetupConfig) -> list[Comp
     with_names: list[tuple[Sequence[tuple[Path, tuple[SetupLine, ...]]], Callable[[], list[Found]], str]] = [
         (still, lambda: still_targets(*_still(still, declared), declared), "a target heard from one side to the other"),
         (sweeps, lambda: window_of([_sweep(*one, declared) for one in sweeps], declared), "a sweep past a PM"),
-        (moving, lambda: [camera_latency([_movement(*one) for one in moving])], "a fibre moved along the probe"),
+        (
+            moving,
+            lambda: [camera_latency([_movement(*one) for one in moving], declared.noise)],
+            "a fibre moved along the probe",
+        ),
     ]
     for given, estimate, expected in with_names:
         if not given:

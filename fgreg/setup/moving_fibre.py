@@ -20,6 +20,7 @@ import numpy as np
 
 from fgreg.errors import EstimationError
 from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.model.session_model import NoiseModel
 from fgreg.setup.constants import Found
 from fgreg.setup.optimum import optimum
 
@@ -42,6 +43,8 @@ WORST_S = 0.03
 """Standard deviation from which a delay is not determined."""
 LEAST_EXPLAINED = 0.5
 """Share of the variance of x that the marker has to explain: else it is not the fibre's marker."""
+MISFIT = 2.5
+"""Of the noise of x: beyond it the clocks are apart. What the hand does again some seconds later fits roughly, too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,13 +58,13 @@ class Movement:
     camera_T_marker: FloatArray
 
 
-def camera_latency(movements: Sequence[Movement]) -> Found:
-    """How much later than the pulses the camera's pictures come.
+def camera_latency(movements: Sequence[Movement], noise: NoiseModel) -> Found:
+    """How much later than the pulses the camera's pictures come; ``noise`` as declared.
 
     Raises:
         EstimationError: a recording cannot be used, with its name.
     """
-    delays, sigmas = zip(*(_delay(one) for one in movements), strict=True)
+    delays, sigmas = zip(*(_delay(one, noise) for one in movements), strict=True)
     weight = np.array([1.0 / sigma**2 for sigma in sigmas])
     value = float(weight @ delays / weight.sum())
     pulses = sum(one.pulse_s.size for one in movements)
@@ -69,7 +72,7 @@ def camera_latency(movements: Sequence[Movement]) -> Found:
     return Found("camera_less_pulse_latency_s", value, float(1.0 / math.sqrt(weight.sum())), "s", how)
 
 
-def _delay(one: Movement) -> tuple[float, float]:
+def _delay(one: Movement, noise: NoiseModel) -> tuple[float, float]:
     order = np.argsort(one.marker_s, kind="stable")
     times, poses = one.marker_s[order], one.camera_T_marker[order]
     if times.size < LEAST_PULSES:
@@ -100,6 +103,12 @@ def _delay(one: Movement) -> tuple[float, float]:
         return np.concatenate([(predicted(p) - x)[kept] / sigma, p[1:13] / PRIOR])
 
     found = optimum(residuals, start, SCALE).widened()
+    # Smoothing leaves less than a third of the marker's noise.
+    expected = math.hypot(noise.lateral_mm, float(np.max(noise.marker_translation_mm)) / 3.0, LEAST_SIGMA_MM)
+    misfit_mm = math.sqrt(float(np.mean((predicted(found.value) - x) ** 2)))
+    if misfit_mm > MISFIT * expected:
+        text = f"the PM is {misfit_mm:.1f} mm RMS from where the marker says, {expected:.1f} by the declared noise"
+        raise EstimationError(f"{one.name}: {text}: give t of both in s, by one clock")
     if abs(found.value[0]) > 0.9 * WIDEST_S:
         raise EstimationError(f"{one.name}: a delay beyond {WIDEST_S:g} s, or a movement that repeats itself too fast")
     blocks = np.arange(t.size) * BLOCKS // t.size

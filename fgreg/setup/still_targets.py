@@ -5,11 +5,12 @@ range at device angle u is
 
     (1 + s) r = hypot(rho cos(phi - u) - R', rho sin(phi - u)) - o,        R' = R + x tilt
 
-R the radius, o the range offset, s the error of the medium's sound speed. Its amplitude falls off as
+R the radius, o the range offset, s the error of the medium's sound speed. At phi it is loudest: the top of
 
-    log a = log a0 - k (phi - u)^2.
+    log a = log a0 - k (phi - u)^2,
 
-Measured besides, where that was done: the depth rho - R', and the distance between two targets.
+which shares no other parameter and is fitted first. Measured besides, where that was done: the depth rho - R',
+and the distance between two targets.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.errors import EstimationError
-from fgreg.geometry.transforms import FloatArray, IntArray
+from fgreg.geometry.transforms import FloatArray
 from fgreg.model.setup_recording import TargetLine
 from fgreg.setup.constants import Declared, Found
 from fgreg.setup.optimum import Optimum, optimum
@@ -39,7 +40,11 @@ OFFSET_SIGMA_MM = 5.0
 LEAST_DOF = 8
 """Residuals from which their scatter is the noise, and not what is declared."""
 MISFIT_Z = 5.0
-"""Beyond this many of its sigmas a measured depth or distance is wrong."""
+"""Beyond this many of its sigmas a measured depth, distance or loudest angle is wrong."""
+MISFIT = 3.0
+"""Times the noise of ranges: beyond it the ranges contradict what was measured."""
+SEEN = 0.5
+"""Largest share of the declared radius that the sigma of a radius may be: its weak prior alone says 1."""
 FAR = 3.0
 """A radius that many times the declared one, or that small, is none."""
 _R, _O, _TILT = range(3)
@@ -71,17 +76,15 @@ class Medium:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Target:
-    """A target's looks with what is fitted first: start values, and standard deviations of the looks."""
+    """A target's looks: true ranges, mean x, the device angle at which the plane points at it (mm, rad, 1 sigma)."""
 
     looks: TargetLooks
     range_mm: FloatArray
     x_mm: float
-    bell: FloatArray
-    """(3,) of log amplitude: maximum, angle, k; empty without amplitudes."""
-    louder: IntArray
-    """Looks that have an amplitude."""
+    angle_rad: float
+    angle_sigma_rad: float
     first: int
-    """Index of its first parameter: rho, phi, and of a bell log a0 and k."""
+    """Index of its first parameter: rho, then phi."""
 
 
 def still_targets(targets: Sequence[TargetLooks], media: Sequence[Medium], declared: Declared) -> list[Found]:
@@ -91,8 +94,8 @@ def still_targets(targets: Sequence[TargetLooks], media: Sequence[Medium], decla
         EstimationError: they show nothing.
     """
     ready = _ready(targets, media)
-    sigma_range, sigma_log = _noise(ready, declared)
-    count = ready[-1].first + 2 + 2 * (ready[-1].bell.size > 0)
+    sigma_range = _range_sigma(ready, declared)
+    count = ready[-1].first + 2
     depths = any(fact.depth_mm is not None for one in ready for fact in one.looks.facts)
     offset_sigma = OFFSET_SIGMA_MM if depths else declared.range_offset_sigma_mm
     start, scale = np.zeros(count), np.ones(count)
@@ -100,12 +103,8 @@ def still_targets(targets: Sequence[TargetLooks], media: Sequence[Medium], decla
     scale[[_O, _TILT]] = 0.1, declared.tilt_sigma_rad
     scale[3 : 3 + len(media)] = [medium.sigma for medium in media]
     for one in ready:
-        nearest, angle = float(one.range_mm.min()), _start_angle(one)
-        start[one.first : one.first + 2] = declared.radius_mm + nearest, angle
+        start[one.first : one.first + 2] = declared.radius_mm + float(one.range_mm.min()), one.angle_rad
         scale[one.first + 1] = math.radians(0.1)
-        if one.bell.size:
-            start[one.first + 2 : one.first + 4] = one.bell[0], one.bell[2]
-            scale[one.first + 3] = one.bell[2]
     by_number = {(one.looks.medium, one.looks.number): one for one in ready}
 
     def residuals(p: FloatArray) -> FloatArray:
@@ -121,81 +120,98 @@ def still_targets(targets: Sequence[TargetLooks], media: Sequence[Medium], decla
             p[3 : 3 + len(media)] / [medium.sigma for medium in media],
         ]
         for one in ready:
-            rho, phi = p[one.first : one.first + 2]
-            away = phi - one.looks.device_rad
-            face = p[_R] + one.x_mm * p[_TILT]
-            distance = np.hypot(rho * np.cos(away) - face, rho * np.sin(away))
-            parts.append((distance - p[_O] - (1.0 + p[3 + one.looks.medium]) * one.range_mm) / sigma_range)
-            if one.bell.size:
-                log, k = p[one.first + 2 : one.first + 4]
-                bell = log - k * away[one.louder] ** 2
-                parts.append((np.log(one.looks.amplitude[one.louder]) - bell) / sigma_log)
-            else:
-                parts.append(np.array([(phi - _start_angle(one)) / _middle_sigma(one)]))
+            parts.append(_ranges_off_mm(p, one) / sigma_range)
             parts.extend(_measured(p, one, by_number, declared))
         return np.concatenate(parts)
 
     found = optimum(residuals, start, scale).widened()
-    _check(found, ready, by_number, declared)
-    return [*_constants(found, ready), *_signs(found, ready, by_number, declared)]
+    _check(found, ready, by_number, declared, sigma_range)
+    return [*_constants(found, ready, declared), *_signs(found, ready, by_number, declared)]
 
 
 def _ready(targets: Sequence[TargetLooks], media: Sequence[Medium]) -> list[_Target]:
-    ready, first = [], 3 + len(media)
+    bells: list[_Bell | None] = []
     for one in targets:
         angles = len(np.unique(np.round(one.device_rad, 5)))
         if angles < LEAST_LOOKS:
             raise EstimationError(
                 f"target {one.number} was heard at {angles} stage angles: {LEAST_LOOKS} or more needed"
             )
-        louder = np.flatnonzero(np.nan_to_num(one.amplitude) > 0.0)
-        bell = np.zeros(0)
-        if len(np.unique(np.round(one.device_rad[louder], 5))) >= BELL_LOOKS:
-            middle = float(one.device_rad[louder].mean())
-            a, b, c = np.polyfit(one.device_rad[louder] - middle, np.log(one.amplitude[louder]), 2)
-            if a >= 0.0 or not (np.ptp(one.device_rad[louder]) > abs(b / a)):
-                text = f"target {one.number} has amplitudes that do not fall off to both sides: turn the stage past it"
-                raise EstimationError(text)
-            bell = np.array([c - b * b / (4.0 * a), middle - b / (2.0 * a), -a])
-        ready.append(_Target(one, media[one.medium].ratio * one.range_mm, float(one.x_mm.mean()), bell, louder, first))
-        first += 4 if bell.size else 2
+        bells.append(_bell(one))
+    fitted = [bell for bell in bells if bell is not None]
+    dof = sum(bell.degrees_of_freedom for bell in fitted)
+    noise = max(math.sqrt(sum(bell.squares for bell in fitted) / max(dof, 1)), LEAST_AMPLITUDE_SIGMA)
+    ready = []
+    for number, (one, bell) in enumerate(zip(targets, bells, strict=True)):
+        # Without amplitudes: the middle of where it was heard. Each end is anywhere within a step.
+        angle, sigma = 0.5 * float(one.device_rad.min() + one.device_rad.max()), _step_rad(one) / math.sqrt(6.0)
+        if bell is not None:
+            angle, sigma = bell.angle_rad, noise * bell.sigma_rad
+        ranges = media[one.medium].ratio * one.range_mm
+        ready.append(_Target(one, ranges, float(one.x_mm.mean()), angle, sigma, 3 + len(media) + 2 * number))
     return ready
 
 
-def _start_angle(one: _Target) -> float:
-    """The device angle of a target: of the loudest look, or the middle of where it was heard."""
-    return float(one.bell[1]) if one.bell.size else 0.5 * float(one.looks.device_rad.min() + one.looks.device_rad.max())
+@dataclass(frozen=True, slots=True)
+class _Bell:
+    """Loudest angle (rad), its sigma at a noise of 1 of the log amplitudes, and the squares that the fit leaves."""
+
+    angle_rad: float
+    sigma_rad: float
+    squares: float
+    degrees_of_freedom: int
 
 
-def _middle_sigma(one: _Target) -> float:
-    """Of the middle of the angles at which a target was heard: each end is anywhere within a step."""
-    angles = np.unique(np.round(one.looks.device_rad, 5))
-    return max(float(np.median(np.diff(angles))), math.radians(0.05)) / math.sqrt(6.0)
+def _bell(one: TargetLooks) -> _Bell | None:
+    """The parabola log a = a u^2 + b u + c, whose top is at -b / 2a; None with too few amplitudes."""
+    louder = np.flatnonzero(np.nan_to_num(one.amplitude) > 0.0)
+    if len(np.unique(np.round(one.device_rad[louder], 5))) < BELL_LOOKS:
+        return None
+    middle = float(one.device_rad[louder].mean())
+    u, log = one.device_rad[louder] - middle, np.log(one.amplitude[louder])
+    powers = np.vander(u, 3)
+    fit = np.linalg.lstsq(powers, log, rcond=None)[0]
+    a, b, _ = fit
+    if a >= 0.0 or not (np.ptp(u) > abs(b / a)):
+        raise EstimationError(
+            f"target {one.number} has amplitudes that do not fall off to both sides: turn the stage past it"
+        )
+    g = np.linalg.pinv(powers).T @ [0.5 * b / a**2, -0.5 / a, 0.0]
+    left = log - powers @ fit
+    return _Bell(middle - 0.5 * b / a, float(np.linalg.norm(g)), float(left @ left), u.size - 3)
 
 
-def _noise(ready: Sequence[_Target], declared: Declared) -> tuple[float, float]:
-    """Standard deviations of ranges and of log amplitudes, by their scatter about parabolas."""
-    ranges, logs, dof, log_dof = 0.0, 0.0, 0, 0
+def _step_rad(one: TargetLooks) -> float:
+    angles = np.unique(np.round(one.device_rad, 5))
+    return max(float(np.median(np.diff(angles))), math.radians(0.05))
+
+
+def _range_sigma(ready: Sequence[_Target], declared: Declared) -> float:
+    """Standard deviation of ranges, mm, by their scatter about parabolas."""
+    ranges, dof = 0.0, 0
     for one in ready:
         u = one.looks.device_rad - one.looks.device_rad.mean()
         if u.size > 3:
             ranges += float(np.sum((one.range_mm - np.polyval(np.polyfit(u, one.range_mm, 2), u)) ** 2))
             dof += u.size - 3
-        if one.bell.size:
-            log = np.log(one.looks.amplitude[one.louder])
-            log -= one.bell[0] - one.bell[2] * (one.looks.device_rad[one.louder] - one.bell[1]) ** 2
-            logs, log_dof = logs + float(log @ log), log_dof + log.size - 3
-    sigma = max(math.sqrt(ranges / dof), 1e-3) if dof >= LEAST_DOF else max(declared.noise.range_mm, 1e-3)
-    return sigma, max(math.sqrt(logs / max(log_dof, 1)), LEAST_AMPLITUDE_SIGMA)
+    return max(math.sqrt(ranges / dof) if dof >= LEAST_DOF else declared.noise.range_mm, 1e-3)
+
+
+def _ranges_off_mm(p: FloatArray, one: _Target) -> FloatArray:
+    rho, phi = p[one.first : one.first + 2]
+    away = phi - one.looks.device_rad
+    face = p[_R] + one.x_mm * p[_TILT]
+    distance = np.hypot(rho * np.cos(away) - face, rho * np.sin(away))
+    return np.asarray(distance - p[_O] - (1.0 + p[3 + one.looks.medium]) * one.range_mm)
 
 
 def _measured(
     p: FloatArray, one: _Target, targets: Mapping[tuple[int, int], _Target], declared: Declared
 ) -> list[FloatArray]:
-    """Residuals of what was measured of a target besides."""
-    parts = []
+    """Residuals of a target's loudest angle, and of what was measured of it besides."""
+    rho, phi = p[one.first : one.first + 2]
+    parts = [np.array([(phi - one.angle_rad) / one.angle_sigma_rad])]
     for fact in one.looks.facts:
-        rho, phi = p[one.first : one.first + 2]
         if fact.depth_mm is not None:
             parts.append(np.array([(rho - p[_R] - one.x_mm * p[_TILT] - fact.depth_mm) / fact.depth_sigma_mm]))
         if fact.apart_mm is not None:
@@ -210,14 +226,23 @@ def _measured(
 
 
 def _check(
-    found: Optimum, ready: Sequence[_Target], targets: Mapping[tuple[int, int], _Target], declared: Declared
+    found: Optimum,
+    ready: Sequence[_Target],
+    targets: Mapping[tuple[int, int], _Target],
+    declared: Declared,
+    sigma_range: float,
 ) -> None:
     """Raises EstimationError where what was measured besides does not fit."""
+    limit = MISFIT * max(sigma_range, declared.noise.range_mm)
     for one in ready:
         apart = [float(abs(part[0])) for part in _measured(found.value, one, targets, declared)]
         if max(apart, default=0.0) > MISFIT_Z:
             text = f"the depth or distance of target {one.looks.number} is {max(apart):.0f} sigmas off what is heard"
-            raise EstimationError(f"{text}: measure it again")
+            raise EstimationError(f"{text}: measure it again, and look which target is which")
+        off = float(np.sqrt(np.mean(_ranges_off_mm(found.value, one) ** 2)))
+        if off > limit:
+            text = f"depths and distances do not fit the ranges of target {one.looks.number}, by {off:.1f} mm RMS"
+            raise EstimationError(f"{text}: measure again, and look which target is which")
     radius = float(found.value[_R])
     if not declared.radius_mm / FAR < radius < declared.radius_mm * FAR:
         raise EstimationError(f"these give a radius of {radius:.1f} mm: look at the depths and distances measured")
@@ -230,7 +255,7 @@ def _other(one: _Target, fact: TargetLine, targets: Mapping[tuple[int, int], _Ta
     return other
 
 
-def _constants(found: Optimum, ready: Sequence[_Target]) -> list[Found]:
+def _constants(found: Optimum, ready: Sequence[_Target], declared: Declared) -> list[Found]:
     sigma = np.sqrt(np.diag(found.covariance))
     facts = [fact for one in ready for fact in one.looks.facts]
     by = [f"the range of {len(ready)} still target{'s' * (len(ready) > 1)} against the stage angle"]
@@ -240,8 +265,10 @@ def _constants(found: Optimum, ready: Sequence[_Target]) -> list[Found]:
         by.append(f"{depths} measured depth{'s' * (depths > 1)}")
     how = ", ".join(by)
     needs = "" if depths else "; nothing shows it: measure the depth of a target (depth_mm)"
+    radius_seen = float(sigma[_R]) < SEEN * declared.radius_mm
+    between = "" if radius_seen else "; these hardly show it: measure the distance of two targets (apart_mm)"
     return [
-        Found("probe.radius_mm", float(found.value[_R]), float(sigma[_R]), "mm", how),
+        Found("probe.radius_mm", float(found.value[_R]), float(sigma[_R]), "mm", how + between, seen=radius_seen),
         Found("range_offset_mm", float(found.value[_O]), float(sigma[_O]), "mm", how + needs, seen=depths > 0),
     ]
 

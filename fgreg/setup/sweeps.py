@@ -39,6 +39,10 @@ DELAY_SIGMA_S, BACKLASH_SIGMA_RAD = 1.0, math.radians(2.0)
 """Weak priors."""
 SOFT_RAD = math.radians(0.2)
 """Of an edge, without amplitudes."""
+SLOWEST_RAD_S = math.radians(0.05)
+"""No stage is swept more slowly: times are in another unit."""
+NARROWEST_RAD = math.radians(0.2)
+"""No window has a smaller half width: angles are in another unit."""
 DISAGREE = 10.0
 """Chi square per degree of freedom from which the passes are not of one still PM."""
 
@@ -93,6 +97,9 @@ def window_of(sweeps: Sequence[Sweep], declared: Declared) -> list[Found]:
         fitted.append(_Fitted(sweep, passes, first, bell))
         first += 5 if bell else 2
     speeds = [one.speed for of in fitted for one in of.passes]
+    if min(speeds) < SLOWEST_RAD_S:
+        slow = f"{fitted[0].sweep.name}: the stage turns at {math.degrees(min(speeds)):.2g} deg/s"
+        raise EstimationError(f"{slow}: give t in s, scan_deg in degrees")
     told = max(speeds) >= SPEEDS * min(speeds)
     backlash_sigma = BACKLASH_SIGMA_RAD if told else declared.backlash_sigma_rad
     start, scale = _start(fitted, first)
@@ -278,6 +285,9 @@ def _results(found: Optimum, fitted: Sequence[_Fitted], told: bool) -> list[Foun
         heard = np.concatenate([one.heard for one in of.passes])
         depth = float(np.median(of.sweep.range_mm[heard]))
         half = 0.5 * float(p[of.first + 1] - p[of.first])
+        if half < NARROWEST_RAD:
+            narrow = f"{of.sweep.name}: a window of half width {math.degrees(half):.2g} deg"
+            raise EstimationError(f"{narrow}: give scan_deg in degrees")
         g = np.zeros(p.size)
         g[of.first : of.first + 2] = -0.5, 0.5
         text = f"{len(of.passes)} passes of {of.sweep.name}, where the PM begins and ends to be heard"
