@@ -25,7 +25,7 @@ VIEWS = 10
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders left and right of rendered views, and both.avi with the views side by side."""
+    """Folders left and right of rendered views, odd with them paired wrongly, both.avi with the views side by side."""
     folder = tmp_path_factory.mktemp("pictures")
     rng = np.random.default_rng(3)
     video = cv2.VideoWriter(str(folder / "both.avi"), cv2.VideoWriter.fourcc(*"FFV1"), 5.0, (1280, 360))
@@ -39,6 +39,9 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
             frames.append(render_frame(camera, [board], rng, Optics(), far.seen_from(camera_T_left)))
             (folder / side).mkdir(exist_ok=True)
             cv2.imwrite(str(folder / side / f"{i:03d}.png"), frames[-1])
+            (folder / "odd" / side).mkdir(parents=True, exist_ok=True)  # each right picture beside the left one before
+            number = (i + 1) % VIEWS if side == "right" else i
+            (folder / "odd" / side / f"{number:03d}.png").write_bytes((folder / side / f"{i:03d}.png").read_bytes())
         video.write(cv2.cvtColor(np.hstack(frames), cv2.COLOR_GRAY2BGR))
     video.release()
     return folder
@@ -84,6 +87,10 @@ def test_pictures_become_the_camera_of_a_session(
     assert status == 0
     assert text.startswith("HOLDS")
     assert f"{VIEWS} views" in text
+    # Exchanged pictures fit as well, but the cameras are on the wrong sides.
+    status, _, error = run(capsys, pictures / "right", pictures / "left", *OPTIONS, "--out", tmp_path / "other.yaml")
+    assert status == 0
+    assert "were left and right pictures exchanged?" in error
     # A calibration whose principal point is off is told.
     wrong = tmp_path / "wrong.yaml"
     document = yaml.safe_load(out.read_text(encoding="utf-8"))
@@ -117,6 +124,7 @@ def test_a_video_with_both_views_gives_the_same(
         ([".", "--columns", "9", "--rows", "7", "--square-mm", "9", "--out", "x.yaml"], "--columns: found 9 x 7"),
         ([".", "--out", "x.yaml"], "--setup: found nothing"),
         ([".", *OPTIONS[:-1], "DICT_6X6_100", "--out", "x.yaml"], "the board in 0 of 10 pictures"),
+        (["odd", *OPTIONS, "--out", "x.yaml"], "left and right pictures of one moment"),
         ([".", *OPTIONS, "--out", "left/000.png"], "a file that is not a camera calibration"),
     ],
 )

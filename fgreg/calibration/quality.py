@@ -168,6 +168,10 @@ def conditions(
             f"two halves of the views differ by more than their sigmas say (p {both.p:.1g}); all sigmas are "
             f"multiplied by {both.factor:.1f}: is the board flat and the focus fixed? Other lens models: --model"
         )
+    pose = bundle.rig.right_T_left
+    if pose is not None and pose[0, 3] > 0.5 * float(np.linalg.norm(pose[:3, 3])):
+        beside = f"the right camera is {pose[0, 3]:.1f} mm to the left of the left one"
+        out.append(f"{beside}: were left and right pictures exchanged?")
     strays = float((~bundle.used).mean())
     if strays > 0.05:
         out.append(

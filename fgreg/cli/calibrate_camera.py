@@ -110,6 +110,7 @@ def add_calibrate_camera(app: typer.Typer, progress_bar: ProgressBar) -> None:
         from fgreg.convert.camera_file import read_board, read_camera
         from fgreg.drivers.endoscope import Layout
         from fgreg.drivers.stereo_recording import sources
+        from fgreg.model.plausible import implausible
         from fgreg.pipeline.calibrate_camera import Pictures, calibrate_camera, check_camera
 
         if (out is None) == (check is None):
@@ -141,6 +142,8 @@ def add_calibrate_camera(app: typer.Typer, progress_bar: ProgressBar) -> None:
             raise InputError(
                 "--setup", "nothing", "a session.yaml with the board, or --columns, --rows and --square-mm"
             )
+        for doubt in implausible(board):
+            warn(doubt)
         chosen = Pictures(left, right, Layout(where), most_views)
         if camera is not None:
             with progress_bar(quiet or as_json) as progress:

@@ -37,6 +37,10 @@ from fgreg.version import __version__
 LENSES = {"pinhole5": (5, False), "pinhole8": (8, False), "fisheye": (4, True)}
 """Lens models by name: number of coefficients, and whether it is a fisheye one."""
 MIN_VIEWS = 3
+WORST_PX = 3.0
+"""Residual (1 sigma of a corner) from which these are not views of one board by one pair of cameras: good: 0.1."""
+MOST_STRAYS = 0.3
+"""Share of corners left out from which they are not, either."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (name of the step, items done, total items)."""
@@ -140,6 +144,11 @@ def calibrate_camera(
         raise InputError(
             str(pictures.left), f"views that no {model} lens explains ({error})", "views of this board"
         ) from None
+    strays = float((~bundle.used).mean())
+    if bundle.sigma_px > WORST_PX or strays > MOST_STRAYS:
+        found = f"views that fit to {bundle.sigma_px:.2g} px only, {100 * strays:.0f} % of the corners left out"
+        expected = "left and right pictures of one moment, of one board and one focus"
+        raise InputError(str(pictures.left), found, expected)
     covariance = bundle.covariance * (1.0 if both is None else both.factor**2)
     systematic = systematic_sigmas(bundle.rig, covariance, scale_sigma)
     sides = range(len(parameters.cameras(bundle.rig)))
