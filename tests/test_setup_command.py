@@ -16,6 +16,8 @@ from fgreg.simulation.config import default_probe, default_stage
 from study_setup import SIGNS, DrawnRig, draw_rig, write_recordings
 from tests import live_configs
 
+NOTES = {"by": "A. N.", "rows": [[1.0, 2.0], [3.0, 4.0]]}
+
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DrawnRig]:
@@ -25,7 +27,8 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DrawnRig]:
     rig = draw_rig(rng)
     write_recordings(folder, rig.rig, rng)
     model = SessionModel("rig", default_probe(ChannelModel(40.0)), default_stage())
-    (folder / "session.yaml").write_text(yaml_text(SESSION.write(model)), encoding="utf-8")
+    text = yaml_text(SESSION.write(model)) + f"x_notes: {NOTES}\n"
+    (folder / "session.yaml").write_text(text, encoding="utf-8")
     return folder, rig
 
 
@@ -64,7 +67,9 @@ def test_recordings_become_a_session_yaml(here: DrawnRig, tmp_path: Path, capsys
     assert document["stage"]["direction"] == found["stage.direction"]
     assert document["probe"]["sensitivity"]["depth_mm"] == pytest.approx([25.0, 38.0], abs=1.5)
     assert document["systematic"]["radius_mm"] == pytest.approx(0.14, abs=0.03)
-    lines = [line for line in out.read_text(encoding="utf-8").splitlines() if ": " in line]
+    assert document["x_notes"] == NOTES
+    written = out.read_text(encoding="utf-8").replace(yaml_text({"x_notes": NOTES}), "")
+    lines = [line for line in written.splitlines() if ": " in line]
     assert all("#" in line for line in lines if "format:" not in line)
     assert any(line.startswith("#   hearing_threshold:") for line in lines)
     before = out.read_bytes()

@@ -1,7 +1,7 @@
 """The command ``fgreg setup``."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -141,7 +141,7 @@ def _read_config(path: Path) -> "SetupConfig":
     from fgreg.pipeline.setup import SetupConfig
     from fgreg.session.session_reader import SETUP_FILE
     from fgreg.session.setup_reader import read_setup
-    from fgreg.session.yaml_loader import load_yaml
+    from fgreg.session.yaml_loader import load_yaml, parse_yaml
 
     data = load_yaml(path, str(path))
     if str(data.get("format", "")).startswith("fgreg-live"):
@@ -150,7 +150,8 @@ def _read_config(path: Path) -> "SetupConfig":
         live = read_config(path)
         for warning in live.warnings:
             warn(warning)
-        return SetupConfig(path.name, live.model, live.settings.hearing_threshold, live.latencies)
+        own = _own(parse_yaml(live.setup, SETUP_FILE))
+        return SetupConfig(path.name, live.model, live.settings.hearing_threshold, live.latencies, own)
     problems: list[InputError] = []
     setup = read_setup(data, str(path), path.resolve().parent.name or SETUP_FILE, problems, path.resolve().parent)
     if problems:
@@ -158,7 +159,12 @@ def _read_config(path: Path) -> "SetupConfig":
     assert setup.model is not None
     for warning in setup.warnings:
         warn(warning)
-    return SetupConfig(path.name, setup.model)
+    return SetupConfig(path.name, setup.model, own=_own(data))
+
+
+def _own(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The user's own keys of a session.yaml."""
+    return {key: value for key, value in data.items() if key.startswith("x_")}
 
 
 def _print(

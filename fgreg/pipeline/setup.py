@@ -8,9 +8,10 @@ contradicts.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,13 +42,15 @@ DIFFERS_Z = 3.0
 class SetupConfig:
     """What is declared, and the name of the file that declares it.
 
-    ``hearing_threshold`` and ``latencies`` are those of a CONFIG.yaml of ``fgreg live``; None: a session.yaml.
+    ``hearing_threshold`` and ``latencies`` are those of a CONFIG.yaml of ``fgreg live``; None: a session.yaml. ``own``:
+    the user's own top keys of the set-up (``x_...``), a calibration's among them.
     """
 
     label: str
     model: SessionModel
     hearing_threshold: float | None = None
     latencies: Latencies | None = None
+    own: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

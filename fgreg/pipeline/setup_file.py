@@ -70,6 +70,7 @@ def setup_yaml(config: SetupConfig, found: Sequence[Compared]) -> str:
     if rig is not None:
         lines.append(f"# rig: {rig.name} is left out: its values count from the former ones. Commission again.")
     lines += _commented(yaml_text(document, _FLOW).splitlines(), comments, helps, config.label)
+    lines += yaml_text(config.own, _FLOW).splitlines()
     settings = [*_settings(found)]
     if settings:
         lines += ["", "# Of the CONFIG.yaml of fgreg live, under settings:", *(f"#   {line}" for line in settings)]
