@@ -15,6 +15,9 @@ import yaml
 import fgreg
 from fgreg.cli import evaluate
 from fgreg.cli.main import main
+from fgreg.errors import InputError
+from fgreg.session.setup_reader import read_setup
+from fgreg.session.yaml_loader import parse_yaml
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "docs" / "guide"
@@ -40,6 +43,20 @@ def commands() -> list[tuple[str, list[str]]]:
                 if name == "fgreg":
                     found.append((page.name, [words[0], "--help"] if needs else words))
     return found
+
+
+def test_the_session_yaml_to_begin_with_is_one() -> None:
+    """Alone, and with what fgreg print and calibrate-camera add below it."""
+    page = (GUIDE / "set-up.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    printed = "board: {columns: 9, rows: 6, square_mm: 10.0}\nmarker:\n  dictionary: DICT_4X4_50\n"
+    printed += "  tags:\n    - id: 0\n      size_mm: 12.0\n"
+    for text in (block, block + printed):
+        problems: list[InputError] = []
+        setup = read_setup(parse_yaml(text, "session.yaml"), "session.yaml", "mine", problems)
+        assert not problems
+        assert not setup.warnings
+        assert setup.model is not None
 
 
 def test_every_command_of_the_guide_runs(
