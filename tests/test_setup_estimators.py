@@ -83,6 +83,9 @@ def test_statements_and_measurements_that_do_not_fit_are_refused() -> None:
     # Without distances the radius is hardly seen, and that is not presented as a radius that agrees.
     noisy = replace(first, range_mm=first.range_mm + 0.2 * (-1.0) ** np.arange(13))
     assert not by_name(still_targets([noisy], [Medium(1.0, 1e-4)], DECLARED))["probe.radius_mm"].seen
+    moved = replace(first, x_mm=np.where(np.arange(13) < 6, 0.0, 3.0))
+    with pytest.raises(EstimationError, match="the x of target 0 scatters by"):
+        still_targets([moved], [Medium(1.0, 1e-4)], DECLARED)
     near = looks(1, -29.9, 40.0, 0.0, TargetLine(0.0, 2, 1, of=0, towards=("+y",)))
     with pytest.raises(EstimationError, match="move it farther"):
         still_targets([looks(0, -30.0, 40.0, 0.0), near], [Medium(1.0, 1e-4)], DECLARED)

@@ -25,10 +25,11 @@ NOT_SHOWN = """no session shows stage.zero_deg, direction and flip where both ar
   a constant that it sees less well than declared: for these, record targets that stand still"""
 
 RECORDINGS = """Take these recordings, each a file of JSON lines (t: arrival at the host, s, one clock):
-1. Still targets: two or three wires along the probe's axis in water, or the fibre's tip held
-   still at two or three places. At each, turn the stage in steps of 1 deg past it, always from
-   the same side; a few pulses at each stop. Measure the depth of one from the element faces, and
-   the distance between two: these show range offset and radius.
+1. Still targets: two or three beads or knots in water (no wires along the axis: these have no x),
+   or the fibre's tip held still at two or three places, 20 to 60 deg apart. At each, turn the
+   stage in steps of 1 deg past it, always from the same side; a few pulses at each stop. Measure
+   the depth of one from the element faces, and the distance between two: these show range offset
+   and radius.
      {"type": "medium", "t": 0, "sound_speed_m_s": 1482}
      {"type": "target", "t": 0, "target": 0, "depth_mm": 25.1}
      {"type": "target", "t": 0, "target": 1, "from": 0, "apart_mm": 41.2, "towards": ["+y", "+x"]}

@@ -45,6 +45,8 @@ MISFIT = 3.0
 """Times the noise of ranges: beyond it the ranges contradict what was measured."""
 SEEN = 0.5
 """Largest share of the declared radius that the sigma of a radius may be: its weak prior alone says 1."""
+MOST_LOOKS, NORMAL = 0.8, 1.2816
+"""Share of a target's looks that has to lie together (others may be stray), and within how many sigmas it then does."""
 FAR = 3.0
 """A radius that many times the declared one, or that small, is none."""
 _R, _O, _TILT = range(3)
@@ -93,7 +95,7 @@ def still_targets(targets: Sequence[TargetLooks], media: Sequence[Medium], decla
     Raises:
         EstimationError: they show nothing.
     """
-    ready = _ready(targets, media)
+    ready = _ready(targets, media, declared)
     sigma_range = _range_sigma(ready, declared)
     count = ready[-1].first + 2
     depths = any(fact.depth_mm is not None for one in ready for fact in one.looks.facts)
@@ -129,9 +131,10 @@ def still_targets(targets: Sequence[TargetLooks], media: Sequence[Medium], decla
     return [*_constants(found, ready, declared), *_signs(found, ready, by_number, declared)]
 
 
-def _ready(targets: Sequence[TargetLooks], media: Sequence[Medium]) -> list[_Target]:
+def _ready(targets: Sequence[TargetLooks], media: Sequence[Medium], declared: Declared) -> list[_Target]:
     bells: list[_Bell | None] = []
     for one in targets:
+        _check_still(one, declared)
         angles = len(np.unique(np.round(one.device_rad, 5)))
         if angles < LEAST_LOOKS:
             raise EstimationError(
@@ -150,6 +153,20 @@ def _ready(targets: Sequence[TargetLooks], media: Sequence[Medium]) -> list[_Tar
         ranges = media[one.medium].ratio * one.range_mm
         ready.append(_Target(one, ranges, float(one.x_mm.mean()), angle, sigma, 3 + len(media) + 2 * number))
     return ready
+
+
+def _check_still(one: TargetLooks, declared: Declared) -> None:
+    """Raises EstimationError where x, or the range beside a parabola, scatters too much; a few stray looks may."""
+    u = one.device_rad - one.device_rad.mean()
+    ranges = one.range_mm - np.polyval(np.polyfit(u, one.range_mm, min(2, len(np.unique(u)) - 1)), u)
+    for name, off, sigma in (
+        ("x", one.x_mm, declared.noise.lateral_mm),
+        ("range", ranges, declared.noise.range_mm),
+    ):
+        spread = float(np.quantile(np.abs(off - np.median(off)), MOST_LOOKS)) / NORMAL
+        if spread > MISFIT * sigma:
+            text = f"the {name} of target {one.number} scatters by {spread:.1f} mm, {sigma:g} by the declared noise"
+            raise EstimationError(f"{text}: it moved, or other things were heard")
 
 
 @dataclass(frozen=True, slots=True)
