@@ -2,7 +2,7 @@
 
 Rigs are drawn: signs, radius, range offset, window, latencies, backlash, threshold; and with the standard deviations of
 a careful lab what no recording shows: tilts, array offset, window centre, sound speed of the water. Each has the
-recordings that docs/setup.md asks for: three wires in water, two sweeps past a PM, a fibre that is moved. The forward
+recordings that docs/setup.md asks for: three points in water, two sweeps past a PM, a fibre that is moved. The forward
 model shares no code with the estimator.
 
     python tools/study_setup.py --rigs 20
@@ -90,7 +90,7 @@ def point(rig: TrueRig, x_mm: float, angle_deg: float, depth_mm: float) -> Float
 
 
 def wires(rig: TrueRig, rng: np.random.Generator) -> list[StillTarget]:
-    """Three wires: the depth of the first measured, the distance of each other from it, and where it lies from it."""
+    """Three points: the depth of the first measured, the distance of each other from it, and where it lies from it."""
     places = [point(rig, -4.0, -25.0, 25.0), point(rig, 3.0, 20.0, 30.0), point(rig, 4.0, 35.0, 22.0)]
     places = [place + rng.uniform(-1.0, 1.0, 3) for place in places]
     face = rig.array().radius_mm + float(np.tan(rig.deviations[Constant.TILT_IN_PLANE])) * places[0][0]
