@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Any, cast
 
 from fgreg.drivers import options
 from fgreg.drivers.base import DriverContext
-from fgreg.errors import InputError, MissingExtraError, one_line
-from fgreg.schema.kinds import JsonSchema, Kind, Text
-from fgreg.schema.problems import FieldError, Problem, nearest, shown
+from fgreg.errors import MissingExtraError
+from fgreg.model.session_model import StageModel
 from fgreg.schema.record import Record, record
 
 
@@ -92,6 +91,18 @@ class DriverEntry:
         """The device; not for stages, which the watchdog opens. Raises what its driver raises."""
         self.require()
         return load(self.factory)(context, chosen)
+
+    def for_watchdog(self, context: DriverContext, chosen: Any) -> tuple[str, dict[str, Any]]:
+        """Of a stage: the factory that the watchdog loads, and the factory's options as JSON holds them."""
+        if self.room and context.room:
+            return f"fgreg.drivers.{self.factory}", {"path": os.fspath(context.room)}
+        own = {key: value for key, value in asdict(chosen).items() if key != "limits"}
+        return f"fgreg.drivers.{self.factory}", own
+
+    def described(self, context: DriverContext, chosen: Any, _stage: StageModel) -> str | None:
+        """What a device says of itself that must not be opened only for a check; None for all others. Raises what
+        its driver raises."""
+        return None if self.ask is None else str(load(self.ask)(context, chosen))
 
 
 def installed(extra: str) -> bool:
@@ -243,53 +254,3 @@ ENTRIES: tuple[DriverEntry, ...] = (
 def drivers_of(role: Role) -> Mapping[str, DriverEntry]:
     """By name."""
     return {entry.name: entry for entry in ENTRIES if entry.role is role}
-
-
-@dataclass(frozen=True, slots=True)
-class DriverChoice(Kind):
-    """A mapping that names one of a role's drivers, with its options: the entry and the options, both checked."""
-
-    role: Role
-
-    def read(self, value: object, folder: Path | None = None, /) -> tuple[DriverEntry, Any]:
-        """Raises FieldError, MissingExtraError."""
-        entries = drivers_of(self.role)
-        if not isinstance(value, Mapping):
-            raise FieldError.of(shown(value), self.expected)
-        if "driver" not in value:
-            for key in value:
-                if nearest(key, ["driver"]):
-                    raise FieldError.of("an unknown key", "a known one (did you mean driver?)", key)
-            raise FieldError.of("nothing", f"one of {', '.join(entries)}", "driver")
-        try:
-            entry = entries[Text(allowed=tuple(entries)).read(value["driver"])]
-        except FieldError as error:
-            raise FieldError(error.below("driver")) from None
-        entry.require()
-        others = {name for other in entries.values() for name in other.record.names} - {*entry.record.names}
-        names = ", ".join(name for name in entry.record.names if name not in ("driver", "limits"))
-        takes = f"one of {entry.name}'s: {names}" if names else f"{entry.name} alone"
-        problems = [Problem((key,), "a key of another driver", takes) for key in value if key in others]
-        own = {key: entry for key, entry in value.items() if key not in others} if problems else value
-        try:
-            chosen = entry.record.read(own, folder)
-            if not problems:
-                entry.checked(chosen)
-        except FieldError as error:
-            problems += error.problems
-        except ValueError as error:
-            found = f"values that do not fit together ({one_line(str(error), 200)})"
-            problems.append(Problem((), found, "values that do"))
-        except InputError as error:
-            problems.append(Problem((), f"{error.found} ({error.where})", error.expected))
-        if problems:
-            raise FieldError(problems)
-        return entry, chosen
-
-    @property
-    def expected(self) -> str:
-        names = dict.fromkeys(name for entry in drivers_of(self.role).values() for name in entry.record.names)
-        return f"a mapping with {', '.join(names)}"
-
-    def json_schema(self, definitions: dict[str, JsonSchema], /) -> JsonSchema:
-        return {"oneOf": [entry.record.json_schema(definitions) for entry in drivers_of(self.role).values()]}

@@ -198,7 +198,7 @@ class _Feed(Generic[Item]):
             try:
                 while not self._end.is_set():
                     self._take(*receive(connection))
-            except WireClosed as error:
+            except (WireClosed, KeyError, TypeError, ValueError) as error:
                 if self._steady() and not self._end.is_set():
                     with self._lock:
                         self._lost = f"{self.name} is gone ({error})"

@@ -27,9 +27,9 @@ def add_devices(app: typer.Typer) -> None:
     ) -> None:
         """List the devices and whether they answer. No stage moves.
 
-        Without CONFIG: libraries, video devices, Thorlabs cubes. With CONFIG, each of its devices is opened for at most
-        2 s: its data, their rate, their clock, and whether they agree with session.yaml. Exit status 1
-        where one of them does not answer.
+        Without CONFIG: libraries, drivers of other packages, video devices, Thorlabs cubes. With CONFIG, each of its
+        devices is opened for at most 2 s: its data, their rate, their clock, and whether they agree with session.yaml.
+        Exit status 1 where one of them does not answer.
 
         \b
           fgreg live --example-config > room.yaml  a CONFIG with every key to choose
@@ -44,6 +44,8 @@ def add_devices(app: typer.Typer) -> None:
             warn(warning)
         show = _Shown(as_json)
         show.section("extras", device_check.extras())
+        folder = None if config is None else config.parent
+        show.section("drivers of other packages", device_check.other_drivers(folder), "other_drivers")
         show.section("video devices", device_check.video(0 if read is not None else device_check.LISTEN_S))
         if read is None:
             show.section("Thorlabs cubes", device_check.cubes())

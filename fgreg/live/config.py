@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -130,12 +129,11 @@ class LiveConfig:
         chosen = self.devices.get(Role.STAGE)
         if chosen is None:
             return None
-        own = {key: value for key, value in asdict(chosen[0].options).items() if key != "limits"}
-        options = {"path": os.fspath(context.room)} if chosen[0].entry.room and context.room else own
+        driver, options = chosen[0].entry.for_watchdog(context, chosen[0].options)
         limits = dict(self.stage_limits)
-        if (acceleration := own.get("acceleration_deg_s2")) is not None:
+        if (acceleration := getattr(chosen[0].options, "acceleration_deg_s2", None)) is not None:
             limits["deceleration_rad_s2"] = math.radians(acceleration)  # the driver brakes with this acceleration
-        return StageSetup(f"fgreg.drivers.{chosen[0].entry.factory}", options, limits)
+        return StageSetup(driver, options, limits)
 
 
 _ONE_EACH = (Role.CAMERA, Role.PHOTOACOUSTIC, Role.MOTION, Role.BMODE)

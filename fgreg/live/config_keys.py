@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from fgreg.drivers.registry import DriverChoice, DriverEntry, Role, drivers_of
+from fgreg.drivers.choice import DriverChoice
+from fgreg.drivers.registry import DriverEntry, Role, drivers_of
 from fgreg.live.scope_holder import HolderSettings
 from fgreg.live.workflow import WorkflowSettings
 from fgreg.model.solve_config import SolveConfig

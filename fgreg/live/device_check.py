@@ -7,15 +7,18 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from fgreg.drivers import plugins
 from fgreg.drivers.base import BmodeFrame, DeviceLost, DriverContext, PaFrame, StereoFrame
-from fgreg.drivers.options import Connection, EndoscopeOptions
-from fgreg.drivers.registry import EXTRAS, Role, distribution, installed, load
+from fgreg.drivers.options import EndoscopeOptions
+from fgreg.drivers.registry import EXTRAS, Role, distribution, drivers_of, installed
 from fgreg.errors import FgregError, MissingExtraError, one_line
 from fgreg.live.config import Chosen, LiveConfig
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Stamp
+from fgreg.schema.problems import FieldError
 
 LISTEN_S = 2.0
 ENOUGH, ENOUGH_S = 20, 1.0
@@ -56,6 +59,20 @@ def extras() -> Iterator[DeviceReport]:
         except importlib.metadata.PackageNotFoundError:
             version = "of unknown version"
         yield DeviceReport("extra", "", extra, True, f"{package} {version} ({purpose})")
+
+
+def other_drivers(folder: Path | None = None) -> Iterator[DeviceReport]:
+    """The drivers that other packages bring, each with its keys in CONFIG.yaml; ``folder`` is that file's."""
+    for role in Role:
+        for name, found in plugins.installed(role, folder).items():
+            usable = False
+            try:
+                keys = [key for key in found.driver(folder).record.names if key != "driver"]
+                usable = name not in drivers_of(role)
+                why = f"keys {', '.join(keys) or 'none'}" if usable else "fgreg has one of this name, so name its class"
+            except FieldError as error:
+                why = f"found {error.problems[0].found}"
+            yield DeviceReport("driver", "", f"{role}.{name}", usable, f"{found.place} of {found.package}; {why}")
 
 
 def video(listen_s: float = LISTEN_S) -> Iterator[DeviceReport]:
@@ -115,15 +132,13 @@ def _asked(
 ) -> tuple[str, _Reply]:
     name = _name(chosen)
     try:
-        if chosen.entry.ask is not None:
-            return name, _Reply(True, load(chosen.entry.ask)(context, chosen.options))
+        if (said := chosen.entry.described(context, chosen.options, model.stage)) is not None:
+            return name, _Reply(True, said)
         device = chosen.open(context)
         try:
             name = device.name
             if role in (Role.SINKS, Role.OPERATOR):
-                return name, _connected(
-                    device, isinstance(chosen.options, Connection) and chosen.options.listen, listen_s
-                )
+                return name, _connected(device, bool(getattr(chosen.options, "listen", False)), listen_s)
             return name, _listened(device, model, listen_s)
         finally:
             device.close()

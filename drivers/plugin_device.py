@@ -1,0 +1,99 @@
+"""A device whose driver is of another package: whatever its driver raises is a loss of this device, never a crash."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from fgreg.drivers.base import (
+    BmodeFrame,
+    CommandKind,
+    DeviceLost,
+    MotionSample,
+    OperatorCommand,
+    PaFrame,
+    Registration,
+    StereoFrame,
+)
+from fgreg.drivers.registry import Role
+from fgreg.errors import FgregError, one_line
+
+ITEMS: Mapping[Role, type] = {
+    Role.CAMERA: StereoFrame,
+    Role.PHOTOACOUSTIC: PaFrame,
+    Role.MOTION: MotionSample,
+    Role.BMODE: BmodeFrame,
+    Role.OPERATOR: OperatorCommand,
+}
+"""What ``poll`` gives, by role."""
+
+T = TypeVar("T")
+
+
+class PluginDevice:
+    """Fits the protocol of its role (fgreg.drivers.base), whatever its driver does."""
+
+    def __init__(self, role: Role, driver: str, device: Any) -> None:
+        self._role, self._driver, self._device = role, driver, device
+        self._untold: DeviceLost | None = None
+
+    @property
+    def name(self) -> str:
+        """Name shown to the user."""
+        try:
+            return one_line(str(self._device.name), 80)
+        except Exception:
+            return self._driver
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device says so."""
+        try:
+            return bool(self._device.connected)
+        except Exception:
+            return False
+
+    @property
+    def dropped(self) -> int:
+        """As the device counts; 0 where it does not."""
+        try:
+            return int(self._device.dropped)
+        except Exception:
+            return 0
+
+    def poll(self) -> list[Any]:
+        """Items since the last call. Raises DeviceLost, FgregError."""
+        if self._untold is not None:
+            untold, self._untold = self._untold, None
+            raise untold
+        items = self._called(lambda: list(self._device.poll()))
+        wrong = next((item for item in items if not isinstance(item, ITEMS[self._role])), None)
+        if wrong is not None:
+            raise DeviceLost(f"{self._driver}: gave a {type(wrong).__name__}, expected {ITEMS[self._role].__name__}")
+        return items
+
+    def send(self, registration: Registration) -> None:
+        """Send the registration. Raises DeviceLost, FgregError."""
+        self._called(lambda: self._device.send(registration))
+
+    def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
+        """Show a message; an error is reported by the next ``poll``."""
+        try:
+            self._called(lambda: self._device.tell(text, done=done, wants=wants))
+        except FgregError as error:
+            self._untold = error if isinstance(error, DeviceLost) else DeviceLost(str(error))
+
+    def close(self) -> None:
+        """Release the device."""
+        with contextlib.suppress(Exception):
+            self._device.close()
+
+    def _called(self, call: Callable[[], T]) -> T:
+        try:
+            return call()
+        except FgregError:
+            raise
+        except Exception as error:
+            why = one_line(f"{type(error).__name__}: {error}", 200)
+            raise DeviceLost(f"{self._driver}: an error of its driver: {why}") from error
