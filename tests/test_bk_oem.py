@@ -149,19 +149,6 @@ def test_a_message_without_end_ends_the_connection_not_the_driver(
     assert len(fetch(source)) == 1
 
 
-def test_a_scanner_that_is_switched_off_and_on_is_lost_once_and_found_again(
-    scanner: Scanner, source: BkOemScanner
-) -> None:
-    for number in range(3):
-        wait_for(lambda: scanner.grabbing)
-        scanner.send(grabbed(picture(scanner)))
-        assert fetch(source)[0].index == number
-        scanner.send_raw(frame(grabbed(picture(scanner)))[:15])
-        scanner.hang_up()
-        with pytest.raises(DeviceLost, match=r"BK scanner: .*hung up in the middle of a message"):
-            wait_for(source.poll)
-
-
 def test_a_frozen_picture_is_a_silent_scanner(scanner: Scanner) -> None:
     driver = BkOemScanner(Endpoint("127.0.0.1", scanner.port), silent_s=0.2)
     try:

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fgreg.drivers import tcp_link
 from fgreg.drivers.base import (
     BmodeSource,
     DeviceLost,
@@ -31,7 +30,7 @@ from fgreg.errors import InputError
 from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.model.time_sync import Stamp
 from tests.igtl_bytes import Told, image_body, message, read_matrix, read_messages, transform_body
-from tests.network_peers import collect, hung_up, serve, wait_for
+from tests.network_peers import collect, serve, wait_for
 
 pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
 
@@ -85,43 +84,6 @@ def test_rows_may_be_the_senders_columns_and_volumes_are_left_out(scanner: tuple
             assert frame.index == 1
             assert frame.stamp.device_s == frame.stamp.host_s  # the sender gave no time
             assert (source.rejected, source.last_rejection) == (1, "US: not a single slice")
-    finally:
-        source.close()
-
-
-def test_hostile_senders_do_not_end_the_source(
-    scanner: tuple[socket.socket, Endpoint], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tcp_link, "RETRY_S", 0.02)
-    server, endpoint = scanner
-    source = IgtlPhotoacoustic(endpoint, "Image_Probe", silent_s=None)
-    hostile: list[tuple[bytes, bool]] = [
-        (struct.pack(">H12s20sIIQQ", 1, b"IMAGE", b"Image_Probe", 0, 0, 1 << 62, 0), False),
-        (b"SSH-2.0-OpenSSH_9.2\r\n" * 4, False),
-        (np.random.default_rng(3).bytes(5000), False),
-        (image(0)[:40], True),
-        (image(0)[:-7], True),
-        (message("IMAGE", "Image_Probe", image_body(np.zeros((1, 4, 6), np.int16)), checksum=5), True),
-    ]
-    try:
-        for number, (data, goes_on) in enumerate(hostile):
-            peer, _ = server.accept()
-            with peer:
-                peer.sendall(data)
-                if not goes_on:
-                    assert hung_up(peer)
-            with pytest.raises(DeviceLost, match=r"photoacoustic source: 127\.0\.0\.1:\d+: "):
-                wait_for(source.poll)
-            assert source.poll() == []
-            assert not source.connected
-            peer, _ = server.accept()
-            with peer:
-                peer.sendall(image(number))
-                (frame,) = collect(source.poll, 1)
-                assert int(frame.data[0, 0]) == number
-                assert source.connected
-            with pytest.raises(DeviceLost):
-                wait_for(source.poll)
     finally:
         source.close()
 
@@ -307,23 +269,6 @@ def test_reasons_of_any_length_and_script_go_out_as_ascii(
     assert status.content[30:].startswith(b"\\u03c3 = 3\\xb0\n; xxx")
     assert len(status.content) < 10_000
     assert json.loads(verdict.content[4:])["reasons"][0] == "σ = 3°\n"
-
-
-def test_the_receiver_leaving_is_said_once_and_the_next_one_gets_the_newest() -> None:
-    sink = IgtlTransformSink(Endpoint.listening(0))
-    try:
-        sink.send(ok())
-        with socket.create_connection(("127.0.0.1", sink.endpoint.port)):
-            wait_for(lambda: sink.connected)
-        wait_for(lambda: not sink.connected)
-        with pytest.raises(DeviceLost, match="transform sink: "):
-            sink.send(ok())
-        sink.send(refused())
-        with socket.create_connection(("127.0.0.1", sink.endpoint.port)) as peer:
-            peer.settimeout(2.0)
-            assert {m.kind for m in read_messages(peer.recv(1 << 16))} == {"STATUS", "STRING"}
-    finally:
-        sink.close()
 
 
 def test_names_and_versions_are_checked_before_anything_is_opened() -> None:

@@ -277,18 +277,6 @@ def test_a_peer_gets_messages_and_replies(switch: tuple[IgtlOperator, socket.soc
     assert operator.rejected == 1
 
 
-def test_a_switch_that_is_unplugged_is_lost_once_and_back(switch: tuple[IgtlOperator, socket.socket]) -> None:
-    operator, peer = switch
-    wait_for(lambda: operator.connected)
-    peer.close()
-    with pytest.raises(DeviceLost, match="operator"):
-        wait_for(lambda: operator.poll() or None)
-    assert operator.poll() == []
-    with socket.create_connection(("127.0.0.1", operator.endpoint.port), timeout=5.0) as again:
-        again.sendall(words("home"))
-        assert collect(operator.poll, 1) == [OperatorCommand(CommandKind.HOME)]
-
-
 def test_several_operators_are_one_and_a_loss_delays_no_stop(
     typed: Typed, switch: tuple[IgtlOperator, socket.socket]
 ) -> None:

@@ -1,0 +1,1 @@
+"""What drivers are tested with, ours and those of other packages."""
