@@ -232,3 +232,23 @@ def test_what_is_left_out_twice_keeps_its_reason(pose_session: Path) -> None:
     _append(pose_session, {**why, "reason": "blood on the tag"})
     (left,) = excluded_shots(read_session(pose_session).events).values()
     assert left.reason == "blood on the tag"
+
+
+def test_a_recorded_shot_or_check_that_was_refused_leaves_no_ok(pose_session: Path) -> None:
+    assert fgreg.solve(pose_session, FAST).estimate.verdict is Verdict.OK
+    lines = _lines(pose_session)
+    (first, *_) = [number for number, event in enumerate(lines, 1) if event["type"] == "pair"]
+    check = {"type": "check", "t": 1e4, "camera_p_mm": [0.0, 0.0, 150.0], "trus_p_mm": [0.0, 0.0, 60.0]}
+    refusals = [
+        {"type": "refused", "event": {"type": kind, "line": line}, "reason": "a crash"}
+        for kind, line in (("pair", first), ("check", len(lines) + 1))
+    ]
+    _append(pose_session, check, *refusals)
+    solved = fgreg.solve(pose_session, FAST).estimate
+    assert solved.verdict is Verdict.WARNING
+    said = "`refused` events take out recorded shots, checks or camera moves (2; the first: a crash)"
+    assert [reason for reason in solved.reasons if reason.startswith(said)]
+    with LiveSession.open(pose_session, config=FAST) as live:
+        assert live.estimate is not None
+        assert live.estimate.verdict is Verdict.WARNING
+        assert any(reason.startswith(said) for reason in live.estimate.reasons)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import math
 import shutil
 import sys
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -20,7 +22,7 @@ from fgreg.html_report.contents import Source, contents
 from fgreg.html_report.render import render
 from fgreg.html_report.viewer_3d import viewer_of
 from fgreg.html_report.words import ANSWER, PERMITS
-from fgreg.model.estimate import AimEstimate, SessionEstimate, SettingsUsed, TargetEstimate, Verdict
+from fgreg.model.estimate import AimEstimate, SessionEstimate, SettingsUsed, TargetEstimate, TrackEstimate, Verdict
 from fgreg.pipeline.html_report import ReportRequest, report_session
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.session.result_file import read_result
@@ -233,3 +235,16 @@ def test_a_recording_is_packed_with_the_viewer_that_shows_it(tmp_path: Path, mon
     assert html.count(viewer.assembly) == 1
     with pytest.raises(Exception, match="a recording of other files, expected that of this session"):
         viewer_of(recording, {"events.jsonl": "2" * 64})
+
+
+def test_an_angle_that_is_known_too_badly_is_not_to_be_turned_to_without_a_look() -> None:
+    source = a_source(Verdict.OK)
+    sharp = TrackEstimate(9.0, math.radians(10.0), math.radians(0.5), 20.0, causal=False)
+    loose = TrackEstimate(10.0, math.radians(10.0), math.radians(2.1), 20.0, causal=False)
+    assert np.linalg.norm(source.model.targets_mm[:, 1:], axis=1).max() > 40.0  # 2.1 deg are 3 mm and more there
+    found = contents(replace(source, estimate=replace(source.estimate, tracks=(sharp, loose))))
+    assert [row["answer"] for row in found["tracks"]["rows"]] == ["Yes", "Look first"]
+    assert found["verdict"]["answer"] == "Look first"
+    assert found["verdict"]["reasons"][-1].startswith("the newest angle: its 95 % bound is ")
+    found = contents(replace(source, estimate=replace(source.estimate, tracks=(loose, sharp))))
+    assert found["verdict"]["answer"] == "Yes"

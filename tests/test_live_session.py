@@ -130,7 +130,10 @@ def test_an_event_that_the_engine_refuses_is_recorded_as_refused_and_never_taken
         live._engine.refuse_t = {pairs[9].t}
         with pytest.raises(EventRefused, match="indeterminate"):
             live.add(pairs[9])
-        assert live.estimate is before
+        assert before is not None
+        assert live.estimate is not None
+        assert live.estimate.trus_T_camera is before.trus_T_camera
+        assert "(1; the first: an indeterminate system): no test has seen them" in live.estimate.reasons[0]
         live.add(pairs[10])
         after = live.estimate
     recorded = read_session(folder)

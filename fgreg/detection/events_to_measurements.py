@@ -41,6 +41,7 @@ from fgreg.model.events import (
     looks_of,
     needs_frames,
     needs_marker_frames,
+    refused_evidence,
     refused_lines,
 )
 from fgreg.model.excluded_shots import excluded_shots
@@ -98,6 +99,7 @@ class ExtractedMeasurements:
     epoch_of: tuple[int, ...]
     checks: Mapping[int, Check] = field(default_factory=dict)
     excluded: tuple[ExcludedShot, ...] = ()
+    refused: tuple[str, ...] = ()
     set_aside: Mapping[int, Aim | Pair] = field(default_factory=dict)
 
 
@@ -162,6 +164,7 @@ def extract_measurements(
         epoch_of=epoch_of,
         checks=builder.checks,
         excluded=tuple(by_hand.values()),
+        refused=refused_evidence(events),
         set_aside=set_aside,
     )
 

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 from fgreg.geometry.transforms import log_so3
 from fgreg.html_report import figures, target_map, words
 from fgreg.html_report.words import degrees, number, percent, vector
-from fgreg.model.estimate import EpochEstimate, PairEstimate, SessionEstimate, SettingsUsed, Verdict
+from fgreg.model.estimate import EpochEstimate, PairEstimate, SessionEstimate, SettingsUsed, TrackEstimate, Verdict
 from fgreg.model.events import CameraMovedEvent, Event, NoteEvent, PairEvent, RefusedEvent, StageEvent
 from fgreg.model.session_model import SessionModel
 from fgreg.model.systematic import TEXTS, largest_causes
@@ -101,19 +101,22 @@ def _verdict(source: Source) -> Row:
         if newest.stage_rad is not None:
             question = f"Turn the probe by this angle, to {degrees(newest.stage_rad)} deg?"
             angle = f"It answers the newest query, at {newest.t:.1f} s; 1 sigma is {degrees(newest.sigma_rad)} deg."
+    verdict, loose = _answer_verdict(newest, source) if newest is not None else (estimate.verdict, "")
+    if newest is None or newest.stage_rad is None:
+        verdict = estimate.verdict
     used = sum(pair.used for pair in estimate.pairs)
     answered = sum(track.stage_rad is not None for track in estimate.tracks)
     compared = sum(check.error_mm is not None for check in estimate.checks)
     at = "" if worst is None or len(source.model.targets) == 0 else f" ({worst.name})"
     of_epoch = f" in camera epoch {epoch.index}" if epoch is not None and len(estimate.epochs) > 1 else ""
     return {
-        "kind": estimate.verdict.value,
-        "answer": words.ANSWER[estimate.verdict],
-        "sign": words.SIGNS[estimate.verdict],
+        "kind": verdict.value,
+        "answer": words.ANSWER[verdict],
+        "sign": words.SIGNS[verdict],
         "question": question,
-        "permits": words.PERMITS[estimate.verdict],
+        "permits": words.PERMITS[verdict],
         "angle": angle,
-        "reasons": list(estimate.reasons),
+        "reasons": [*estimate.reasons, *([f"the newest angle: {loose}"] if loose else [])],
         "figures": [
             (
                 f"{number(None if tre is None else tre.worst_mm)} mm",
@@ -207,8 +210,26 @@ def _registration(source: Source) -> Row:
     }
 
 
+def _answer_verdict(track: TrackEstimate, source: Source) -> tuple[Verdict, str]:
+    """Whether the probe may be turned by one answer, and why not where the registration itself is good enough.
+
+    An answer has an error of its own, from its marker and its beam: at the target farthest from the probe's axis, its
+    95 % bound has to be within the limit as well.
+    """
+    verdict = source.estimate.verdict
+    if track.stage_rad is None or track.sigma_rad is None:
+        return Verdict.REFUSED, ""
+    farthest_mm = float(np.linalg.norm(source.model.targets_mm[:, 1:], axis=1).max())
+    bound_mm = figures.SIGMA_95 * track.sigma_rad * farthest_mm
+    if verdict is not Verdict.OK or bound_mm <= source.settings.limit_mm:
+        return verdict, ""
+    text = f"its 95 % bound is {bound_mm:.1f} mm at the target farthest from the probe's axis, the limit "
+    return Verdict.WARNING, f"{text}{source.settings.limit_mm:g} mm; see the marker better, or take more aims"
+
+
 def _tracks(source: Source) -> Row:
     tracks = source.estimate.tracks
+    judged = [_answer_verdict(track, source) for track in tracks]
     rows = [
         {
             "t": number(track.t, 1),
@@ -217,11 +238,12 @@ def _tracks(source: Source) -> Row:
             "bound": degrees(None if track.sigma_rad is None else figures.SIGMA_95 * track.sigma_rad, 2),
             "lambda": number(track.lambda_mm, 1),
             "from": "what was known then" if track.causal else "the whole session",
-            "answer": words.ANSWER[Verdict.REFUSED if track.stage_rad is None else source.estimate.verdict],
-            "kind": (Verdict.REFUSED if track.stage_rad is None else source.estimate.verdict).value,
+            "answer": words.ANSWER[verdict],
+            "kind": verdict.value,
             "reason": track.reason,
+            "loose": loose,
         }
-        for track in tracks
+        for track, (verdict, loose) in zip(tracks, judged, strict=True)
     ]
     return {"rows": rows, "picture": figures.track_picture(tracks, source.model.stage)}
 

@@ -4,7 +4,7 @@
 those of the *device*, in degrees, as in the file; measurements.py has the numbers that the estimator uses.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -371,6 +371,9 @@ EVENTS = Tagged(
 Shot = AimEvent | PairEvent | TrackEvent
 """Events with a marker."""
 
+EVIDENCE = AimEvent | PairEvent | CheckEvent | CameraMovedEvent
+"""Events that tests of a registration rest on."""
+
 
 def looks_of(event: Event) -> tuple[TrusRecord, ...]:
     """The looks of an event."""
@@ -394,6 +397,12 @@ def needs_frames(event: Event, *, redetect: bool) -> bool:
     if isinstance(event, Shot) and (needs_board(event) or needs_marker_frames(event.marker, redetect=redetect)):
         return True
     return any(look.needs_frame for look in looks_of(event))
+
+
+def refused_evidence(events: Sequence[Event]) -> tuple[str, ...]:
+    """Why each recorded aim, look, check or camera move was refused that does not count for that reason."""
+    refused = refused_lines(events)
+    return tuple(refused[event.line] for event in events if event.line in refused and isinstance(event, EVIDENCE))
 
 
 def refused_lines(events: Iterable[Event]) -> dict[int, str]:

@@ -18,6 +18,7 @@ from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.estimate import ExcludedShot, TrackEstimate
 from fgreg.model.events import (
+    EVIDENCE,
     AimEvent,
     CameraMovedEvent,
     CheckEvent,
@@ -28,6 +29,7 @@ from fgreg.model.events import (
     RefusedEvent,
     StageEvent,
     TrackEvent,
+    refused_evidence,
     refused_lines,
 )
 from fgreg.model.excluded_shots import excluded_shots
@@ -40,7 +42,7 @@ from fgreg.online.engine_process import GONE, EngineGone
 from fgreg.online.estimate import OnlineEstimate, with_conditions
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent
 from fgreg.registration.checks import CHECKS_REFUSE
-from fgreg.registration.verdict import by_hand
+from fgreg.registration.verdict import by_hand, refused_shots
 from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
 from fgreg.tracking.snapshot import Snapshot
@@ -156,6 +158,7 @@ class LiveSession:
         self._engine, self._feed = engine, EpochFeed(engine, self._checks)
         self._closures = 0  # loop closures that are recorded
         self._excluded: tuple[ExcludedShot, ...] = ()  # left out by hand
+        self._refused: list[str] = []  # why recorded shots, checks and moves were refused
         self._shots = 0  # aims and pairs in the estimate
         self._extractor = MeasurementExtractor(self.journal.model)
 
@@ -167,7 +170,8 @@ class LiveSession:
     def _with_all(self, estimate: OnlineEstimate | None) -> OnlineEstimate | None:
         """The engine's estimate with the checks, and with what was left out by hand."""
         checked = self._checks.applied(estimate)
-        return None if checked is None else with_conditions(checked, by_hand(self._excluded, self._shots))
+        left_out = by_hand(self._excluded, self._shots) + refused_shots(self._refused)
+        return None if checked is None else with_conditions(checked, left_out)
 
     @classmethod
     def open(
@@ -233,7 +237,7 @@ class LiveSession:
     def _take_up(self, events: Sequence[Event]) -> None:
         """Take in recorded events, with one estimate at the end."""
         refused, excluded = refused_lines(events), excluded_shots(events)
-        self._excluded = tuple(excluded.values())
+        self._excluded, self._refused = tuple(excluded.values()), list(refused_evidence(events))
         with self._engine.restoring():
             for event in events:
                 if event.line not in refused and event.line not in excluded:
@@ -429,6 +433,8 @@ class LiveSession:
 
     def _refuse(self, event: Event, line: int | None, reason: str) -> None:
         """Note a refusal, with the event's line if it is on disk, else with the event itself as far as possible."""
+        if line is not None and isinstance(event, EVIDENCE):
+            self._refused.append(reason)
         t = self.journal.last_t
         if t is None:  # the time of a refused event may be any number
             t = min(0.0, event.t) if math.isfinite(event.t) and event.t > -EARLIEST_S else 0.0

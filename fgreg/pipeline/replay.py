@@ -45,7 +45,7 @@ from fgreg.pipeline.solve import (
     solve_extracted,
 )
 from fgreg.registration.checks import CHECKS_REFUSE
-from fgreg.registration.verdict import by_hand
+from fgreg.registration.verdict import Condition, by_hand, refused_shots
 from fgreg.schema.limits import REPLAYED_PAIRS
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import write_result
@@ -216,8 +216,10 @@ class _Player:
     def estimate(self) -> OnlineEstimate | None:
         """After the last event, with the checks of its epoch and what is left out by hand; None before the first."""
         checked = self._checks.applied(self._estimate)
-        out = tuple(self._excluded.values())
-        return None if checked is None else with_conditions(checked, by_hand(out, self._shots))
+        return None if checked is None else with_conditions(checked, self._left_out())
+
+    def _left_out(self) -> list[Condition]:
+        return by_hand(tuple(self._excluded.values()), self._shots) + refused_shots(self._extracted.refused)
 
     def settle(self) -> OnlineEstimate | None:
         """The engine's estimate after a full solve; None where it has taken in nothing."""

@@ -41,7 +41,7 @@ from fgreg.registration.influence import influences
 from fgreg.registration.move_doubt import TELLING
 from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import Solution, solve
-from fgreg.registration.verdict import Condition, by_hand
+from fgreg.registration.verdict import Condition, by_hand, refused_shots
 from fgreg.session.ground_truth import GroundTruth
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.result_file import RESULT_FILE, RESULT_KIND, write_result
@@ -232,13 +232,13 @@ def move_conditions(found: EpochsFound, split: Measurements) -> list[Condition]:
 
 
 def hand_conditions(extracted: ExtractedMeasurements) -> list[Condition]:
-    """Conditions of the verdict from shots that were left out by hand."""
+    """Conditions of the verdict from shots that were left out by hand, and from refused events."""
     shots = extracted.measurements
-    return by_hand(extracted.excluded, len(shots.aims) + len(shots.pairs))
+    return by_hand(extracted.excluded, len(shots.aims) + len(shots.pairs)) + refused_shots(extracted.refused)
 
 
 def detection_conditions(extracted: ExtractedMeasurements) -> list[Condition]:
-    """Conditions of the verdict from before the solve: shots left out by hand, unusable calibration shots."""
+    """Conditions of the verdict from before the solve: shots left out or refused, unusable calibration shots."""
     found = hand_conditions(extracted)
     lost_aims, used = extracted.unused_aims, len(extracted.measurements.aims)
     if lost_aims and len(lost_aims) >= TOO_FEW_AIMS * (used + len(lost_aims)):

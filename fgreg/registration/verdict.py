@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import bdtrc, chdtrc, chdtri
 
+from fgreg.errors import one_line
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, hat, inverse, transform_points
 from fgreg.graph.split_points import ALARM
@@ -220,6 +221,21 @@ def by_hand(excluded: Sequence[ExcludedShot], used: int) -> list[Condition]:
         f"{count} of {count + used} shots {'was' if count == 1 else 'were'} left out by hand ({'; '.join(names)}): no "
         "test has seen what is left out, and the predicted error holds only if that was for a cause seen at the shot, "
         "not for how it fits; solve with all shots too and compare, or have check points"
+    )
+    return [Condition(Verdict.WARNING, text)]
+
+
+def refused_shots(reasons: Sequence[str]) -> list[Condition]:
+    """Recorded aims, looks, checks or camera moves that ``refused`` events take out: evidence that no test has seen.
+
+    Args:
+        reasons: why each was refused.
+    """
+    if not reasons:
+        return []
+    text = (
+        f"`refused` events take out recorded shots, checks or camera moves ({len(reasons)}; the first: "
+        f"{one_line(reasons[0], 100)}): no test has seen them; take them again"
     )
     return [Condition(Verdict.WARNING, text)]
 
