@@ -46,7 +46,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 
 def test_recordings_become_a_session_yaml(here: DrawnRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "session.yaml"
-    files = ["wires.jsonl", "sweep-1.jsonl", "sweep-2.jsonl", "moved.jsonl"]
+    files = ["points.jsonl", "sweep-1.jsonl", "sweep-2.jsonl", "moved.jsonl"]
     status, text, _ = run(capsys, "session.yaml", *files, "--out", out, "--json")
     assert status == 0
     constants = json.loads(text)["constants"]
@@ -73,10 +73,10 @@ def test_recordings_become_a_session_yaml(here: DrawnRig, tmp_path: Path, capsys
     assert all("#" in line for line in lines if "format:" not in line)
     assert any(line.startswith("#   hearing_threshold:") for line in lines)
     before = out.read_bytes()
-    status, _, error = run(capsys, "session.yaml", "wires.jsonl", "--out", out)
+    status, _, error = run(capsys, "session.yaml", "points.jsonl", "--out", out)
     assert (status, error) == (2, f"fgreg: error: {out}: found a file, expected a new name, or --force\n")
     assert out.read_bytes() == before
-    status, text, _ = run(capsys, "session.yaml", "wires.jsonl", "--out", out, "--force")
+    status, text, _ = run(capsys, "session.yaml", "points.jsonl", "--out", out, "--force")
     assert status == 0
     assert "probe.radius_mm" in text
     assert yaml.safe_load(out.read_text(encoding="utf-8"))["probe"]["sensitivity"]["depth_mm"] == [20.0, 30.0, 45.0]
@@ -94,7 +94,7 @@ def test_without_recordings_it_says_what_to_record(here: DrawnRig, capsys: pytes
     [
         ({"a.jsonl": ("sweep-1.jsonl", 0, 3)}, "in none of which anything was heard"),
         ({"a.jsonl": ("sweep-1.jsonl", 0, 300)}, "in one sense only: turn the stage past it both ways"),
-        ({"a.jsonl": ("wires.jsonl", 0, 40)}, "target: found 1, which no pulse heard"),
+        ({"a.jsonl": ("points.jsonl", 0, 40)}, "target: found 1, which no pulse heard"),
         ({"a.jsonl": ("moved.jsonl", 0, 100)}, "pulses with the PM heard"),
         ({"a.jsonl": ("session.yaml", 0, 3)}, "line 1: found bad JSON"),
         ({}, "a.jsonl: found nothing"),

@@ -107,7 +107,7 @@ def write_recordings(folder: Path, rig: TrueRig, rng: np.random.Generator) -> li
     """The recordings of a rig as files."""
     water = WATER_M_S + 3.0 * float(rng.standard_normal())
     recordings = {
-        "wires": still_recording(rig, wires(rig, rng), rng, medium_m_s=water, declared_m_s=WATER_M_S),
+        "points": still_recording(rig, wires(rig, rng), rng, medium_m_s=water, declared_m_s=WATER_M_S),
         "sweep-1": sweep_recording(rig, point(rig, 2.0, 5.0, 25.0), SPEEDS, rng),
         "sweep-2": sweep_recording(rig, point(rig, -3.0, -10.0, 38.0), SPEEDS, rng),
         "moved": moving_recording(rig, point(rig, 0.0, 0.0, 30.0), rng),

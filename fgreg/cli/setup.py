@@ -45,7 +45,7 @@ RECORDINGS = """Take these recordings, each a file of JSON lines (t: arrival at 
    more for 20 s, turned as little as can be.
      {"type": "marker", "t": 0.03, "camera_T_marker": [[...], [...], [...], [0, 0, 0, 1]]}
      {"type": "pulse", "t": 0.1, "x_mm": 2.0, "range_mm": 25.3}
-Then: fgreg setup CONFIG.yaml wires.jsonl sweep.jsonl moved.jsonl --out session.yaml"""
+Then: fgreg setup CONFIG.yaml points.jsonl sweep.jsonl moved.jsonl --out session.yaml"""
 
 _HELP = """Find signs and constants of probe and stage from a few recordings, or what a session contradicts.
 
@@ -53,7 +53,7 @@ _HELP = """Find signs and constants of probe and stage from a few recordings, or
 Say what to record:
   fgreg setup session.yaml
 From recordings, told apart by what they contain; all of one kind count together:
-  fgreg setup session.yaml wires.jsonl sweep-near.jsonl sweep-deep.jsonl moved.jsonl
+  fgreg setup session.yaml points.jsonl sweep-near.jsonl sweep-deep.jsonl moved.jsonl
   ... --out new/session.yaml     session.yaml with what was found, every line commented
 Of an ordinary session: which declared constants and signs it contradicts.
   fgreg setup my-session/
