@@ -180,6 +180,8 @@ WRONG = {
     "--pm: found 99, expected a PM of the session": ["exclude", "--pm", "3,99"],
     "--pm: found 3, expected a PM that is left out: none": ["include", "--pm", "3"],
     "--pm and --aim: found nothing": ["exclude"],
+    "--without-pm: found nothing, expected numbers with commas": ["solve", "--without-pm", ""],
+    "--aim: found 1,,2, expected numbers with commas": ["exclude", "--aim", "1,,2"],
 }
 
 
@@ -252,3 +254,19 @@ def test_a_recorded_shot_or_check_that_was_refused_leaves_no_ok(pose_session: Pa
         assert live.estimate is not None
         assert live.estimate.verdict is Verdict.WARNING
         assert any(reason.startswith(said) for reason in live.estimate.reasons)
+
+
+def test_a_torn_last_line_is_told_and_kept_when_a_shot_is_left_out(
+    pose_session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (pose_session / "events.jsonl").open("a") as file:
+        file.write('{"t": 1e4, "type": "pa')
+    monkeypatch.setattr("sys.argv", ["fgreg", "exclude", str(pose_session), "--pm", "3"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    said = capsys.readouterr()
+    assert (ended.value.code, "the last line was cut short; its 22 bytes are kept in events.jsonl.cut" in said.err) == (
+        0,
+        True,
+    )
+    assert "PM 3 at " in said.out

@@ -6,34 +6,36 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgreg.cli.options import warn
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
     from fgreg.pipeline.exclude import ShotNames
 
 SessionArgument = Annotated[Path, typer.Argument(metavar="SESSION", help="Folder of the session.")]
-PmOption = Annotated[str, typer.Option("--pm", metavar="N,N", help="All looks at these PMs up to now.")]
+PmOption = Annotated[str | None, typer.Option("--pm", metavar="N,N", help="All looks at these PMs up to now.")]
 AimOption = Annotated[
-    str, typer.Option("--aim", metavar="N,N", help="These aims, by their place among the session's aims, from 0.")
+    str | None,
+    typer.Option("--aim", metavar="N,N", help="These aims, by their place among the session's aims, from 0."),
 ]
 ReasonOption = Annotated[str, typer.Option("--reason", metavar="TEXT", help="Why; it is recorded.")]
 ByOption = Annotated[str, typer.Option("--by", metavar="NAME", help="Who decides it; it is recorded.")]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="No text.")]
 
 
-def shot_names(pms: str, aims: str, options: tuple[str, str]) -> "ShotNames":
+def shot_names(pms: str | None, aims: str | None, options: tuple[str, str]) -> "ShotNames":
     """Shots as options name them. Raises InputError."""
     from fgreg.pipeline.exclude import ShotNames
 
     return ShotNames(_numbers(options[0], pms), _numbers(options[1], aims))
 
 
-def _numbers(option: str, text: str) -> tuple[int, ...]:
-    """The numbers of ``3,7``; none of an empty text."""
-    parts = [part.strip() for part in text.split(",")] if text.strip() else []
+def _numbers(option: str, text: str | None) -> tuple[int, ...]:
+    """The numbers of ``3,7``; none where the option is not given."""
+    parts = [] if text is None else [part.strip() for part in text.split(",")]
     for part in parts:
         if not (part.isascii() and part.isdigit() and len(part) < 10):
-            raise InputError(option, text, "numbers with commas between, such as 3,7")
+            raise InputError(option, text or "nothing", "numbers with commas between, such as 3,7")
     return tuple(int(part) for part in parts)
 
 
@@ -43,8 +45,8 @@ def add_exclude(app: typer.Typer) -> None:
     @app.command()
     def exclude(
         session: SessionArgument,
-        pm: PmOption = "",
-        aim: AimOption = "",
+        pm: PmOption = None,
+        aim: AimOption = None,
         reason: ReasonOption = "",
         by: ByOption = "",
         quiet: QuietOption = False,
@@ -62,8 +64,8 @@ def add_exclude(app: typer.Typer) -> None:
     @app.command()
     def include(
         session: SessionArgument,
-        pm: PmOption = "",
-        aim: AimOption = "",
+        pm: PmOption = None,
+        aim: AimOption = None,
         reason: ReasonOption = "",
         by: ByOption = "",
         quiet: QuietOption = False,
@@ -72,14 +74,16 @@ def add_exclude(app: typer.Typer) -> None:
         _record(session, pm, aim, reason, by, include=True, quiet=quiet)
 
 
-def _record(session: Path, pm: str, aim: str, reason: str, by: str, *, include: bool, quiet: bool) -> None:
+def _record(
+    session: Path, pm: str | None, aim: str | None, reason: str, by: str, *, include: bool, quiet: bool
+) -> None:
     from fgreg.cli.report import clean
     from fgreg.pipeline.exclude import record_choice
 
     names = shot_names(pm, aim, ("--pm", "--aim"))
     if not names.pms and not names.aims:
         raise InputError("--pm and --aim", "nothing", "the PMs or aims that are meant, such as --pm 3,7")
-    left = record_choice(session, names, reason=reason, by=by, include=include)
+    left = record_choice(session, names, reason=reason, by=by, include=include, warn=warn)
     if quiet:
         return
     if not left:

@@ -220,11 +220,11 @@ def solve(
         typer.Option("--detect-moves/--no-detect-moves", help="Find unreported camera moves, by the pairs."),
     ] = True,
     without_pm: Annotated[
-        str, typer.Option("--without-pm", metavar="N,N", help="Leave out these PMs, in this solve only.")
-    ] = "",
+        str | None, typer.Option("--without-pm", metavar="N,N", help="Leave out these PMs, in this solve only.")
+    ] = None,
     without_aim: Annotated[
-        str, typer.Option("--without-aim", metavar="N,N", help="Leave out these aims, counted from 0.")
-    ] = "",
+        str | None, typer.Option("--without-aim", metavar="N,N", help="Leave out these aims, counted from 0.")
+    ] = None,
     as_json: JsonOption = False,
     quiet: QuietOption = False,
 ) -> None:

@@ -140,7 +140,7 @@ def _spread_cells(figures: Spread | None, decimals: int = 2) -> list[str]:
 
 
 def _against_truth(evaluations: Sequence[SessionEvaluation]) -> Table:
-    table = _table(("what", ""), ("n", ""), ("mean", ""), ("std", ""), ("95 % below", ""), ("worst", ""))
+    table = _table(("what", ""), ("n", ""), ("mean", ""), ("std", ""), ("95 % quantile", ""), ("worst", ""))
 
     def row(what: str, figures: Spread | None, decimals: int = 2) -> None:
         if figures is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,9 +60,17 @@ def without_lines(session: Session, excluded: Sequence[ExcludedShot]) -> Session
 
 
 def record_choice(
-    folder: Path, names: ShotNames, *, reason: str = "", by: str = "", include: bool = False
+    folder: Path,
+    names: ShotNames,
+    *,
+    reason: str = "",
+    by: str = "",
+    include: bool = False,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> tuple[ExcludedShot, ...]:
     """Append ``exclude`` events for these shots to a session, or ``include`` events; returns all that it leaves out.
+
+    ``warn``: told what was wrong with the file, such as a last line that was cut short.
 
     Raises:
         InputError: a PM or an aim that is not there, or (``include``) not left out; nothing is recorded.
@@ -70,6 +78,8 @@ def record_choice(
     """
     read_session(folder)  # a session without events gets no file
     with Journal.open(folder) as journal:
+        for text in journal.warnings:
+            warn(text)
         events = list(journal.take_recorded())
         out = excluded_shots(events).values()
         if include:

@@ -79,6 +79,8 @@ from fgreg.tracking.snapshot import Snapshot, make_snapshot
 
 GRAPH_PAIRS = 200
 """Largest number of pairs for which the explicit graph is solved as well; its optimum has to agree."""
+MIN_COMPARED = 6
+"""Smallest number of PMs for which they are compared."""
 AGREEMENT_SIGMA = 0.05
 """Largest distance between the two optima, in units of the estimate's own standard deviations."""
 
@@ -250,7 +252,8 @@ def _common_conditions(
     found.extend(understated_noise(deviant, np.concatenate([nis.pm, nis.aim])))
     if found and verdict_of(found) is Verdict.REFUSED:
         return found  # inconsistent data cannot test whether the two forms of the graph agree
-    if len(pairs) <= GRAPH_PAIRS and problem.anchor is None:  # the explicit graph has no prior of finished epochs
+    # The explicit graph has no prior of finished epochs; few pairs are too flat an optimum to compare by one step.
+    if len(pairs) <= GRAPH_PAIRS and problem.anchor is None and len(problem.pms) >= MIN_COMPARED:
         found.extend(_agreement(registration))
     return found
 
