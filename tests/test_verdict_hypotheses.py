@@ -96,7 +96,7 @@ def test_a_beam_that_dominates_the_error_is_to_be_calibrated_with_roll() -> None
     tre = PredictedTre(mean_mm=2.0, p95_mm=3.0, worst_mm=4.0)
     text = accuracy(tre, SolveConfig(), Causes(beam=0.7, edge=0.1))[0].text
     assert "roll the fibre about its beam during calibration" in text
-    assert "70%" in text
+    assert "70 %" in text
     assert "more pairs" in accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.1))[0].text
     assert "both sides at each PM" in accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6))[0].text
     known = accuracy(tre, SolveConfig(), Causes(beam=0.2, edge=0.6), both_sides=True)[0].text
