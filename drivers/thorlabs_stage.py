@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import errno
 import math
+import os
+import select
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -158,7 +160,7 @@ class ThorlabsStage:
     def _write(self, data: bytes) -> None:
         self._check()
         try:
-            self._port.write(data)
+            write_all(self._port.fileno(), data)
         except OSError as error:  # SerialException and its timeout are OSErrors
             raise self._give_up(f"takes nothing in: {error}") from error
 
@@ -296,6 +298,22 @@ def find_ports() -> list[str]:
 
 def _velocity(speed_rad_s: float) -> int:
     return max(1, math.floor(speed_rad_s * VELOCITY_PER_RAD_S))
+
+
+def write_all(fd: int, data: bytes) -> None:
+    """Write to a line that does not block.
+
+    pyserial's own timeout also runs out where this process was not scheduled, though all is written.
+
+    Raises:
+        OSError: it takes nothing in for :data:`_WRITE_S`, or is gone.
+    """
+    while data:
+        try:
+            data = data[os.write(fd, data) :]
+        except BlockingIOError:
+            if not select.select([], [fd], [], _WRITE_S)[1]:
+                raise OSError(f"not for {1e3 * _WRITE_S:.0f} ms") from None
 
 
 def open_port(port: str) -> serial.Serial:

@@ -20,7 +20,7 @@ from thorlabs_apt_protocol.unpacker import Unpacker
 
 from fgreg.drivers import thorlabs_apt
 from fgreg.drivers.thorlabs_identify import identify
-from fgreg.drivers.thorlabs_stage import LOST_S, ThorlabsStage, open_stage
+from fgreg.drivers.thorlabs_stage import LOST_S, ThorlabsStage, open_stage, write_all
 from fgreg.errors import MissingExtraError
 from fgreg.model.session_model import StageModel
 from fgreg.stage.client import Report, StageLink, StageRecord
@@ -358,3 +358,22 @@ def test_orders_are_packed_as_the_library_packs_them() -> None:
     assert thorlabs_apt.set_home(thorlabs_apt.HomeSettings(2, 1, 9, -5)) == library.mot_set_homeparams(
         **to, chan_ident=1, home_dir=2, limit_switch=1, home_velocity=9, offset_distance=-5
     )
+
+
+def test_a_line_that_takes_nothing_in_is_an_error_and_a_pause_of_this_process_is_none() -> None:
+    reader, writer = os.pipe()
+    try:
+        os.set_blocking(writer, False)
+        began = time.monotonic()
+        with pytest.raises(OSError, match="not for 50 ms"):
+            write_all(writer, b"a" * 200_000)
+        assert 0.05 <= time.monotonic() - began < 5.0
+        os.set_blocking(reader, False)
+        with pytest.raises(BlockingIOError):
+            while True:
+                os.read(reader, 65536)
+        write_all(writer, b"whole")
+        assert os.read(reader, 100).endswith(b"whole")
+    finally:
+        os.close(reader)
+        os.close(writer)
