@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 import math
 import os
 import signal
@@ -369,9 +370,9 @@ def test_a_line_that_takes_nothing_in_is_an_error_and_a_pause_of_this_process_is
             write_all(writer, b"a" * 200_000)
         assert 0.05 <= time.monotonic() - began < 5.0
         os.set_blocking(reader, False)
-        with pytest.raises(BlockingIOError):
-            while True:
-                os.read(reader, 65536)
+        with contextlib.suppress(BlockingIOError):
+            while os.read(reader, 65536):
+                pass
         write_all(writer, b"whole")
         assert os.read(reader, 100).endswith(b"whole")
     finally:
