@@ -36,7 +36,7 @@ class PluginDevice:
 
     def __init__(self, role: Role, driver: str, device: Any) -> None:
         self._role, self._driver, self._device = role, driver, device
-        self._untold: DeviceLost | None = None
+        self._unreported: DeviceLost | None = None
 
     @property
     def name(self) -> str:
@@ -64,9 +64,9 @@ class PluginDevice:
 
     def poll(self) -> list[Any]:
         """Items since the last call. Raises DeviceLost, FgregError."""
-        if self._untold is not None:
-            untold, self._untold = self._untold, None
-            raise untold
+        if self._unreported is not None:
+            unreported, self._unreported = self._unreported, None
+            raise unreported
         items = self._called(lambda: list(self._device.poll()))
         wrong = next((item for item in items if not isinstance(item, ITEMS[self._role])), None)
         if wrong is not None:
@@ -82,7 +82,7 @@ class PluginDevice:
         try:
             self._called(lambda: self._device.tell(text, done=done, wants=wants))
         except FgregError as error:
-            self._untold = error if isinstance(error, DeviceLost) else DeviceLost(str(error))
+            self._unreported = error if isinstance(error, DeviceLost) else DeviceLost(str(error))
 
     def close(self) -> None:
         """Release the device."""

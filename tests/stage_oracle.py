@@ -60,7 +60,7 @@ class Oracle:
         """Index after the last status in which a stage that should stand, and says so, is not where it stood; 0: none.
 
         Where it stood: in an earlier status of the same rest, read after its brakes' time, with the same zero. Compared
-        only until the first such move, which a status after the reset may begin anew.
+        only until the first such move, which a status after the reset may begin again.
         """
         strayed, stood, rest_s = 0, None, -math.inf
         previous_s: float | None = None

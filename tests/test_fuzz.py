@@ -6,15 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from fuzz import main, make_input
+from fuzz import main, make_input, read
 from fuzz_inputs import Form
 from fuzz_targets import TARGETS
 
 
 @pytest.mark.parametrize("name", list(TARGETS))
 def test_what_the_fuzzers_change_is_valid(name: str, tmp_path: Path) -> None:
-    for data in TARGETS[name].valid():
-        TARGETS[name].read(data, tmp_path)
+    inputs = TARGETS[name].valid()
+    assert inputs
+    for data in inputs:
+        assert read(TARGETS[name], data, tmp_path)
 
 
 def test_inputs_are_the_same_for_the_same_seed_and_differ_otherwise() -> None:

@@ -127,6 +127,7 @@ def config(folder: Path, **roles: Any) -> Path:
 def test_the_drivers_of_the_page_pass_their_own_test(monkeypatch: pytest.MonkeyPatch) -> None:
     module = importlib.import_module("test_fgreg_acme")
     monkeypatch.setattr(kit, "QUIET_S", 0.02)
+    assert {name for name in vars(module) if name.startswith("test_")} == {"test_camera", "test_pulses"}
     module.test_camera()
     module.test_pulses()
 

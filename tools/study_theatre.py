@@ -33,7 +33,7 @@ import numpy as np
 
 from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.detection.results import BoardFit, MarkerFit, marker_covariance
-from fgreg.geometry.transforms import FloatArray, inverse, log_so3, transform_points
+from fgreg.geometry.transforms import inverse, transform_points
 from fgreg.model.estimate import Verdict
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.solve import solve
@@ -42,6 +42,7 @@ from fgreg.session.session_reader import read_session
 from fgreg.simulation.disturbances import Disturbances
 from fgreg.simulation.presets import THEATRE
 from fgreg.simulation.simulate import simulate
+from study_pictures import pose_error
 
 ROWS: dict[str, Disturbances] = {
     "clean": Disturbances(),
@@ -69,12 +70,6 @@ ROWS: dict[str, Disturbances] = {
     "theatre": THEATRE.disturbances,
 }
 LARGE_NEES = 5.0
-
-
-def pose_error(true: FloatArray, found: FloatArray) -> FloatArray:
-    """(6,) right tangent (first order in the translation)."""
-    error = inverse(true) @ found
-    return np.concatenate([log_so3(error[:3, :3]), error[:3, 3]])
 
 
 def session_figures(what: Disturbances, seed: int) -> dict[str, Any]:
