@@ -22,11 +22,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +45,7 @@ from paper_sessions import (
     timing,
     tracking,
 )
+from study_pool import Pool, add_pool_options, pool_of
 
 PUBLISHED_CALIBRATION = {5: 2.12, 10: 1.71, 20: 1.39, 30: 1.30, 40: 1.18}
 PUBLISHED_DEVIATION = {0: 1.51, 5: 1.62, 10: 1.96, 15: 1.98, 20: 2.21}
@@ -89,24 +88,16 @@ def ratio_to_bound(rows: Sequence[Row], which: str = "tre") -> tuple[float, floa
 class Runner:
     """Runs jobs over all cores and gathers rows by key, in the order of the seeds."""
 
-    def __init__(self, args: argparse.Namespace) -> None:
-        self.args = args
+    def __init__(self, args: argparse.Namespace, pool: Pool) -> None:
+        self.args, self.pool = args, pool
 
     def run(self, title: str, jobs: Sequence[Job]) -> dict[Any, list[Row]]:
         out: dict[Any, list[Row]] = {}
-        if self.args.jobs == 1:
-            results: Any = map(run_job, jobs)
-            pool = None
-        else:
-            pool = ProcessPoolExecutor(self.args.jobs, multiprocessing.get_context("spawn"))
-            results = pool.map(run_job, jobs)
-        for done, rows in enumerate(results, 1):
+        for done, rows in enumerate(self.pool.map(run_job, jobs), 1):
             for key, row in rows.items():
                 out.setdefault(key, []).append(row)
             print(f"\r{title}: {done} of {len(jobs)}   ", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
-        if pool is not None:
-            pool.shutdown()
         return out
 
     def seeds(self, count: int) -> range:
@@ -342,17 +333,18 @@ def main() -> None:
     parser.add_argument("--guess-deg", type=float, default=5.0, help="rotation of (a)'s first guess from the truth")
     parser.add_argument("--guess-mm", type=float, default=5.0, help="shift of (a)'s first guess from the truth")
     parser.add_argument("--seed", type=int, default=1, help="of the first session of each row; the others follow")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    add_pool_options(parser)
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there as well")
     parser.add_argument("--json", action="store_true", help="print one JSON document instead of Markdown")
     args = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    runner = Runner(args)
     tables: list[Table] = []
-    for name in args.only:
-        tables.append(TABLES[name](runner))
-        if not args.json:
-            print(as_markdown(tables[-1]), flush=True)
+    with pool_of(args) as pool:
+        runner = Runner(args, pool)
+        for name in args.only:
+            tables.append(TABLES[name](runner))
+            if not args.json:
+                print(as_markdown(tables[-1]), flush=True)
     if args.json:
         print(json.dumps([{"title": t, "columns": h, "rows": b} for t, h, b in tables], indent=2))
     if args.markdown is not None:

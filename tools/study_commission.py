@@ -21,7 +21,6 @@ import argparse
 import tempfile
 import warnings
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.deviations import deviations_of
 from fgreg.simulation.simulate import SimulatedSession, simulate
 from fgreg.simulation.write import write_session
+from study_pool import add_pool_options, pool_of
 from study_systematics import outcome
 from systematic_cells import NOISES, Cell, configuration
 
@@ -198,11 +198,11 @@ def main() -> None:
     parser.add_argument("--checks", type=int, default=0, help="check points of each session, used as data")
     parser.add_argument("--poses", action="store_true", help="sessions without camera, marker and board sections")
     parser.add_argument("--first", type=int, default=0, help="seed of the first rig")
-    parser.add_argument("--jobs", type=int, default=1)
+    add_pool_options(parser)
     args = parser.parse_args()
     seeds = range(args.first, args.first + args.rigs)
     jobs = [Job(seed, args.sessions, args.noise, args.pairs, args.checks, args.poses) for seed in seeds]
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         show(list(pool.map(run, jobs)))
 
 

@@ -29,9 +29,8 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from itertools import repeat
+from functools import partial
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -45,6 +44,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.posterior import pose_tangent, target_errors, weighted_quantile
 from fgreg.registration.posterior_mean import PosteriorMean, posterior_mean
 from fgreg.registration.register import register
+from study_pool import add_pool_options, pool_of
 
 sys.path.insert(0, os.fspath(__import__("pathlib").Path(__file__).resolve().parent.parent))
 from tests.forward import make_measurements, make_session
@@ -203,15 +203,15 @@ def main() -> None:
     parser.add_argument("--kind", choices=["window", "first-hit", "both"], default="both")
     parser.add_argument("--gaussian", action="store_true", help="each cell with Gaussian windows as well")
     parser.add_argument("--marker-noise", type=float, default=1.0, help="scale of the marker's noise, stated and real")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_pool_options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON document at the end")
     args = parser.parse_args()
     results = []
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         for cell in cells(args):
             outcomes: list[Outcome] = []
             seeds = range(args.seed, args.seed + args.sessions)
-            for done, outcome in enumerate(pool.map(run, repeat(cell), seeds, chunksize=4), 1):
+            for done, outcome in enumerate(pool.map(partial(run, cell), seeds), 1):
                 outcomes.extend([] if outcome is None else [outcome])
                 print(f"\r{cell.name}: {done} of {args.sessions}", end="", file=sys.stderr, flush=True)
             print(file=sys.stderr)

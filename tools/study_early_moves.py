@@ -15,9 +15,7 @@ beyond 1.5 times the predicted 95 % (three sigma), or beyond the limit where the
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -30,6 +28,7 @@ from fgreg.model.estimate import Verdict
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from move_streams import CONFIG, bump_of, shift_of, two_epochs
+from study_pool import add_pool_options, pool_of
 
 AFTER = 20
 LOOKED_AT = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
@@ -109,12 +108,12 @@ def main() -> None:
     parser.add_argument("--sweep", choices=["first-hit", "window", "both"], default="both")
     parser.add_argument("--seeds", type=int, default=20, help="sessions of each kind and number of PMs before")
     parser.add_argument("--each", action="store_true", help="a table for each number of PMs before")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    add_pool_options(parser)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     before = [int(word) for word in args.before.split(",")]
     sweeps = {"first-hit": (True,), "window": (False,), "both": (True, False)}[args.sweep]
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         for kind, looks, first_hit in product(args.moves.split(","), map(int, args.looks.split(",")), sweeps):
             one = partial(course, kind=kind, first_hit=first_hit, looks=looks)
             name = f"{kind}, {looks} looks a PM, {'first-hit' if first_hit else 'window only'}"

@@ -20,7 +20,6 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,6 +37,7 @@ from fgreg.registration.posterior_mean import PosteriorMean, posterior_mean
 from fgreg.registration.register import register
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import make_snapshot
+from study_pool import Pool, add_pool_options, pool_of
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from tests.forward import Truth, make_measurements, make_session
@@ -167,7 +167,7 @@ def speed(pairs: int, seed: int) -> Row:
     return out
 
 
-def collect(part: Callable[[int], Row], seeds: Iterable[int], pool: ProcessPoolExecutor) -> dict[str, FloatArray]:
+def collect(part: Callable[[int], Row], seeds: Iterable[int], pool: Pool) -> dict[str, FloatArray]:
     rows: Row = {}
     for done, row in enumerate(pool.map(part, seeds), 1):
         for key, values in row.items():
@@ -187,13 +187,13 @@ def main() -> None:
     parser.add_argument("--sessions", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="number of the first session")
     parser.add_argument("--pairs", type=int, nargs="+", default=[10, 25])
-    parser.add_argument("--jobs", type=int, default=1)
+    add_pool_options(parser)
     args = parser.parse_args()
     known = {"looks": looks, "tracking": tracking, "speed": speed}
     if not set(args.parts) <= set(known):
         parser.error("parts are looks, tracking, speed")
     seeds = range(args.seed, args.seed + args.sessions)
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         for part in args.parts:
             for pairs in args.pairs:
                 got = collect(partial(known[part], pairs), seeds, pool)

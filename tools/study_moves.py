@@ -16,10 +16,8 @@ Results up to then are printed every tenth of a row.
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -39,6 +37,7 @@ from fgreg.registration.register import pack_session
 from move_streams import CONFIG, shift_of, two_epochs
 from pm_selection import select_pms
 from study_outliers import KINDS, spoil
+from study_pool import add_pool_options, pool_of
 from tests.forward import Truth, make_measurements
 
 STEADY = 15
@@ -208,7 +207,7 @@ def main() -> None:
     parser.add_argument("--shifts", type=int, default=500, help="shifts of each row")
     parser.add_argument("--clean-pairs", type=int, default=40000, help="steady pairs of each kind")
     parser.add_argument("--stream", type=int, default=108, help="pairs of each steady stream; the first 8 register it")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    add_pool_options(parser)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
     what, rows = set(args.what.split(",")), args.rows.split(",")
@@ -219,21 +218,21 @@ def main() -> None:
     per_stream = args.stream - START
     seeds = [1000000 * args.seed + s for s in range(-(-args.clean_pairs // per_stream))]
     sweeps = {"first-hit": (True,), "window": (False,), "both": (True, False)}[args.sweep]
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         if "shifts" in what:
             for name, mm, degrees, first_hit, targets in (ROWS[row] for row in rows):
                 one_ideal = partial(ideal_clean_scores, pairs=per_stream, first_hit=first_hit, mm=mm, degrees=degrees)
-                ideal = list(pool.map(one_ideal, seeds[: max(len(seeds) // 4, 1)], chunksize=4))
+                ideal = list(pool.map(one_ideal, seeds[: max(len(seeds) // 4, 1)]))
                 threshold = threshold_at(ideal, RATE)
                 one_shift = partial(shifted, first_hit=first_hit, mm=mm, degrees=degrees)
-                shifts = pool.map(one_shift, [7000000 * args.seed + s for s in range(args.shifts)], chunksize=4)
+                shifts = pool.map(one_shift, [7000000 * args.seed + s for s in range(args.shifts)])
                 for found in tenths(shifts, args.shifts):
                     report_shifts(name, found, threshold, targets)
         for part, share in (("clean", 0.0), ("outliers", 0.2)):
             for first_hit in sweeps if part in what else ():
                 one = partial(false_alarms, pairs=args.stream, first_hit=first_hit, outliers=share)
                 name = f"{100 * share:.0f} % outliers, {'first-hit' if first_hit else 'window only'}"
-                report_alarms(pool.map(one, seeds, chunksize=4), len(seeds), per_stream, name, target=not share)
+                report_alarms(pool.map(one, seeds), len(seeds), per_stream, name, target=not share)
 
 
 if __name__ == "__main__":

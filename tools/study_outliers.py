@@ -20,7 +20,6 @@ import argparse
 import json
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -38,6 +37,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register
+from study_pool import add_pool_options, pool_of
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parent.parent))
 from tests.forward import Truth, make_measurements
@@ -182,7 +182,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=("all", *KINDS), default="all")
     parser.add_argument("--window", action="store_true", help="no first hits: only the window is known")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
+    add_pool_options(parser)
     parser.add_argument(
         "--verbose", action="store_true", help="a line for each session that outliers made worse by 30 %%"
     )
@@ -192,7 +192,7 @@ def main() -> None:
     seeds = range(args.seed, args.seed + args.sessions)
     for share in args.share:
         figures = Figures()
-        with ProcessPoolExecutor(args.jobs) as pool:
+        with pool_of(args) as pool:
             for seed, found in zip(seeds, pool.map(partial(one, share=share, args=args), seeds), strict=True):
                 figures.add(found)
                 here, there = found.with_mm[0], found.without_mm[0]

@@ -49,7 +49,6 @@ import sys
 import tempfile
 import time
 import warnings
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -64,6 +63,7 @@ from fgreg.simulation.array import map_by_declared
 from fgreg.simulation.config import SimulationConfig
 from fgreg.simulation.simulate import SimulatedSession, simulate
 from fgreg.simulation.write import write_session
+from study_pool import add_pool_options, pool_of
 from systematic_cells import LIMIT_MM, RAW, ROWS, TABLE, WITHIN, Cell, all_cells, configuration, parsed
 
 CHI2_6 = 12.592
@@ -339,7 +339,7 @@ def main() -> None:
     parser.add_argument("--cells", nargs="+", default=["table"], help="names, patterns with *, or `table`")
     parser.add_argument("--list", action="store_true", help="print the names of all cells and end")
     parser.add_argument("--systematic-none", action="store_true", help="sessions that say `systematic: none`")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_pool_options(parser)
     parser.add_argument(
         "--out", type=Path, help="each session's outcome, one JSON line each; those there are not repeated"
     )
@@ -358,13 +358,12 @@ def main() -> None:
     done = earlier(args.out)
     seeds = range(args.seed, args.seed + args.sessions)
     documents = []
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         for cell in cells:
             begin = time.perf_counter()
             missing = [seed for seed in seeds if (cell.name, seed) not in done]
-            running = [pool.submit(run, (cell, seed, systematic)) for seed in missing]
-            for count, future in enumerate(as_completed(running), 1):
-                one = future.result()
+            tasks = [(cell, seed, systematic) for seed in missing]
+            for count, one in enumerate(pool.map(run, tasks), 1):
                 done[one.cell, one.seed] = one
                 if args.out is not None:
                     with args.out.open("a") as out:

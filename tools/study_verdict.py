@@ -31,7 +31,6 @@ import math
 import sys
 import tempfile
 from collections import Counter, defaultdict
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -63,6 +62,7 @@ from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import FIRST_HIT
 from fgreg.simulation.simulate import simulate
 from fgreg.simulation.write import write_session
+from study_pool import add_pool_options, pool_of
 
 BAD = (
     "few pairs",
@@ -247,7 +247,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0, help="of the first session; the others follow")
-    parser.add_argument("--jobs", type=int, default=1)
+    add_pool_options(parser)
     parser.add_argument("--limit-mm", type=float, default=3.0)
     parser.add_argument("--kind", choices=("clean", *BAD), help="this kind only")
     parser.add_argument("--reasons", action="store_true", help="print how often each condition was met, by kind")
@@ -263,8 +263,8 @@ def main() -> None:
         for seed in seeds
     ]
     outcomes = []
-    with ProcessPoolExecutor(args.jobs) as pool:
-        for outcome in pool.map(run, jobs, chunksize=4):
+    with pool_of(args) as pool:
+        for outcome in pool.map(run, jobs):
             outcomes.append(outcome)
             print(f"\r{len(outcomes)} of {len(jobs)}", end="", file=sys.stderr)
     print(file=sys.stderr)

@@ -25,8 +25,8 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +42,7 @@ from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.presets import FIRST_HIT
 from fgreg.simulation.simulate import SimulatedSession, simulate
 from fgreg.simulation.write import write_session
+from study_pool import add_pool_options, pool_of
 
 NOISES = {
     "frames": (NoiseModel((0.001, 0.001, 0.002), (5e-5, 5e-5, 5e-5), 0.0, (0.3, 0.3, 0.1), 0.26, 0.17), 15),
@@ -164,15 +165,15 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", choices=["verify", "checks"], default=["verify", "checks"])
     parser.add_argument("--sessions", type=int, default=400, help="per cell")
     parser.add_argument("--seed", type=int, default=0, help="number of the first session")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    add_pool_options(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON document at the end")
     args = parser.parse_args()
     results: dict[str, dict[str, tuple[float, float]]] = {}
-    with ProcessPoolExecutor(args.jobs) as pool:
+    with pool_of(args) as pool:
         for cell in cells(args.studies):
             total: Counts = {}
             seeds = range(args.seed, args.seed + args.sessions)
-            for done, counts in enumerate(pool.map(run, [cell] * args.sessions, seeds, chunksize=4), 1):
+            for done, counts in enumerate(pool.map(partial(run, cell), seeds), 1):
                 for name, count in counts.items():
                     total[name] = total.get(name, 0) + int(count)
                 if done % 20 == 0:

@@ -3,12 +3,13 @@
 import json
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fgreg.cli.options import warn, warn_of_leftovers
+from fgreg.cli.options import ExecutorOption, JobsOption, processes, warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
             typer.Option("--check", metavar="RIG", help="Compare the sessions with this rig; nothing is written."),
         ] = None,
         checks: Annotated[bool, typer.Option("--checks", help="Use the check points of the sessions as data.")] = False,
+        jobs: JobsOption = None,
+        executor: ExecutorOption = "local",
         as_json: Annotated[bool, typer.Option("--json", help="Print one JSON document instead of text.")] = False,
         quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, and no summary.")] = False,
     ) -> None:
@@ -45,18 +48,23 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
         With --check: pass, note or alarm for each session, as on a control chart. Exit status 1 where there is an
         alarm, or where a session to compare is refused.
         """
+        from fgreg.cli.executors import open_executor
         from fgreg.model.plausible import implausible_rig
-        from fgreg.pipeline.commission import check_session_against, commission_sessions
+        from fgreg.pipeline.commission import STEP, check_session_against, commission_sessions
         from fgreg.registration.commissioning import ChartVerdict
         from fgreg.session.rig_file import read_rig
+        from fgreg.workers.tasks import run_tasks
 
+        workers = processes(jobs)
         if (out is None) == (check is None):
             found = "nothing" if out is None else "both"
             raise InputError("--out, --check", found, "one of the two")
         if out is not None:
             warn_of_leftovers(out)
-            with progress_bar(quiet or as_json) as progress:
-                report = commission_sessions(sessions, out, use_checks=checks, progress=progress)
+            with progress_bar(quiet or as_json) as progress, open_executor(executor) as where:
+                report = commission_sessions(
+                    sessions, out, use_checks=checks, jobs=workers, executor=where, progress=progress
+                )
             _warn(report.sessions, implausible_rig(report.rig, str(out)))
             if as_json:
                 typer.echo(json.dumps(report_dict(report), indent=2))
@@ -67,8 +75,10 @@ def add_commission(app: typer.Typer, progress_bar: ProgressBar) -> None:
             return
         assert check is not None
         rig = read_rig(check)
-        with progress_bar(quiet or as_json) as progress:
-            compared = [check_session_against(rig, folder, use_checks=checks, progress=progress) for folder in sessions]
+        compare = partial(check_session_against, rig, use_checks=checks)
+        with progress_bar(quiet or as_json) as progress, open_executor(executor) as where:
+            step = partial(progress, STEP)
+            compared = list(run_tasks(compare, sessions, jobs=workers, executor=where, progress=step))
         _warn(compared, implausible_rig(rig, str(check)))
         names = list(rig.names)
         if as_json:

@@ -1,7 +1,6 @@
 """The commands ``fgreg evaluate`` and ``fgreg advise``."""
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgreg.cli.options import refuse_stale, warn, warn_of_leftovers
+from fgreg.cli.options import ExecutorOption, JobsOption, processes, refuse_stale, warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,7 +39,8 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
             str | None, typer.Option("--sizes", metavar="N,N,...", help="Numbers of pairs, such as 4,6,10.")
         ] = None,
         seed: Annotated[int, typer.Option("--seed", help="Of folds and subsets; same seed, same figures.")] = 1,
-        jobs: Annotated[int | None, typer.Option("--jobs", "-j", help="Processes. Default: one per core.")] = None,
+        jobs: JobsOption = None,
+        executor: ExecutorOption = "local",
         csv: Annotated[
             Path | None, typer.Option("--csv", metavar="FILE", help="Also write all figures, one a line.")
         ] = None,
@@ -61,6 +61,7 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         TRE. A session whose result.yaml was made from other files is refused: solve it again. Exit status 1 where a
         verdict is refused.
         """
+        from fgreg.cli.executors import open_executor
         from fgreg.evaluation.case import EvaluationConfig
         from fgreg.evaluation.export import CSV_FILE, as_csv, as_dict
         from fgreg.evaluation.plots import FORMATS, check_plots, plot_files, save_plots
@@ -72,10 +73,9 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         for option, value, least in (("--folds", folds, 0), ("--subsets", subsets, 0), ("--seed", seed, 0)):
             if value < least:
                 raise InputError(option, str(value), f"a number >= {least}")
+        workers = processes(jobs)
         if folds == 1:
             raise InputError("--folds", "1", "0 or at least 2")
-        if jobs is not None and jobs < 1:
-            raise InputError("--jobs", str(jobs), "a number >= 1")
         if plot_format not in FORMATS:
             raise InputError("--plot-format", plot_format, "one of " + ", ".join(FORMATS))
         if plots is not None:
@@ -97,7 +97,8 @@ def add_commands(app: typer.Typer, progress_bar: ProgressBar) -> None:
         with progress_bar(quiet or as_json) as progress:
             read = [read_case(folder, progress) for folder in sessions]
             cases, conditions = named_apart([case for case, _ in read], sessions), [found for _, found in read]
-            found = run(cases, config, jobs=jobs or _cores(), progress=progress, conditions=conditions)
+            with open_executor(executor) as where:
+                found = run(cases, config, jobs=workers, executor=where, progress=progress, conditions=conditions)
         if csv is not None:
             write_file(csv, as_csv(found), CSV_FILE)
         written = save_plots(found, plots, plot_format, config.solve.limit_mm) if plots is not None else []
@@ -164,11 +165,6 @@ def _sizes(text: str | None) -> tuple[int, ...] | None:
     if min(sizes) < 3:
         raise InputError("--sizes", text, "numbers of pairs of at least 3")
     return sizes
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def named_apart(cases: "list[Case]", folders: list[Path]) -> "list[Case]":

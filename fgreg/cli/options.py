@@ -1,5 +1,6 @@
 """Options that several commands share, and their settings."""
 
+import os
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
@@ -30,12 +31,33 @@ EstimateOption = Annotated[
         "comma between.",
     ),
 ]
+JobsOption = Annotated[int | None, typer.Option("--jobs", "-j", help="Processes. Default: one per core.")]
+ExecutorOption = Annotated[
+    str,
+    typer.Option(
+        "--executor",
+        metavar="WHERE",
+        help="Where the solves run: local (this machine), dask:ADDRESS (a running Dask cluster), "
+        "slurm[:KEY=VALUE,...] (by submitit) or submitit-local. Same seeds give the same figures on each.",
+    ),
+]
 OnlineEstimateOption = Annotated[
     str,
     typer.Option(
         "--estimate", metavar="NAMES", help="Estimate this too, with the value in session.yaml as prior: sound_speed."
     ),
 ]
+
+
+def processes(jobs: int | None) -> int:
+    """Number of processes: that of ``--jobs``, or the cores that this process may use.
+
+    Raises:
+        InputError: less than 1.
+    """
+    if jobs is not None and jobs < 1:
+        raise InputError("--jobs", str(jobs), "a number >= 1")
+    return jobs or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 def solve_config(

@@ -1,15 +1,14 @@
-"""Evaluate sessions: all solves, over all cores, in a fixed order.
+"""Evaluate sessions: all solves, on any executor, in a fixed order.
 
-The results do not depend on the number of processes: tasks are listed first, with subsets drawn by seed, and results
+The results do not depend on where they are computed: tasks are listed first, with subsets drawn by seed, and results
 are returned in that order.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -22,8 +21,7 @@ from fgreg.model.sensitivity import wrap_angle
 from fgreg.registration.influence import Influence, influences
 from fgreg.registration.solve import solve
 from fgreg.registration.verdict import Condition
-from fgreg.workers.parent import end_with_parent
-from fgreg.workers.threads import one_thread_each
+from fgreg.workers.tasks import Executor, run_tasks
 
 Progress = Callable[[str, int, int], None]
 """Called with (name of the step, items done, total items)."""
@@ -85,42 +83,20 @@ class SessionEvaluation:
     curve_epoch: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Task:
     """One solve from the PMs ``kept``, or from all measurements where None; ``held``: PMs to predict."""
 
-    case: int
+    case: Case
+    conditions: Sequence[Condition]
     kept: tuple[int, ...] | None
     held: tuple[int, ...] = ()
 
 
-@dataclass(slots=True, eq=False)
-class _Work:
-    """Shared input of the tasks, set once when a worker process starts."""
-
-    cases: Sequence[Case] = ()
-    conditions: Sequence[Sequence[Condition]] = ()
-    config: EvaluationConfig = field(default_factory=EvaluationConfig)
-
-
-_work = _Work()
-
-
-def _load(cases: Sequence[Case], conditions: Sequence[Sequence[Condition]], config: EvaluationConfig) -> None:
-    _work.cases, _work.conditions, _work.config = cases, conditions, config
-
-
-def _begin(cases: Sequence[Case], conditions: Sequence[Sequence[Condition]], config: EvaluationConfig) -> None:
-    """Start of a worker process."""
-    end_with_parent()
-    _load(cases, conditions, config)
-
-
-def _run(task: _Task) -> WholeSolve | Resolved:
-    case = _work.cases[task.case]
+def _run(task: _Task, config: EvaluationConfig) -> WholeSolve | Resolved:
     if task.kept is None:
-        return solve_whole(case, _work.config, _work.conditions[task.case] if _work.conditions else ())
-    return resolve(case, task.kept, _work.config, task.held)
+        return solve_whole(task.case, config, task.conditions)
+    return resolve(task.case, task.kept, config, task.held)
 
 
 def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condition] = ()) -> WholeSolve:
@@ -161,13 +137,13 @@ def solve_whole(case: Case, config: EvaluationConfig, conditions: Sequence[Condi
     )
 
 
-def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, int, _Task]]:
+def _tasks(case: Case, config: EvaluationConfig, conditions: Sequence[Condition]) -> list[tuple[str, int, _Task]]:
     """(kind, size, task) of all solves for one case, in order."""
     pms = case.pms
-    out: list[tuple[str, int, _Task]] = [("whole", 0, _Task(index, None))]
+    out: list[tuple[str, int, _Task]] = [("whole", 0, _Task(case, conditions, None))]
 
     def without(held: tuple[int, ...]) -> _Task:
-        return _Task(index, tuple(pm for pm in pms if pm not in held), held)
+        return _Task(case, conditions, tuple(pm for pm in pms if pm not in held), held)
 
     if config.leave_one_out and len(pms) > 3:
         out += [("one", 0, without(held)) for held in left_out_one_by_one(case, config.most_left_out)]
@@ -177,7 +153,8 @@ def _tasks(index: int, case: Case, config: EvaluationConfig) -> list[tuple[str, 
         mine = case.pms_of_epoch(case.largest_epoch)
         for size in curve_sizes(len(mine), config):
             for kept in subsets_of(mine, size, config.subsets, config.seed):
-                out.append(("curve", size, _Task(index, kept, tuple(pm for pm in mine if pm not in kept))))
+                others = tuple(pm for pm in mine if pm not in kept)
+                out.append(("curve", size, _Task(case, conditions, kept, others)))
     return out
 
 
@@ -186,6 +163,7 @@ def evaluate(
     config: EvaluationConfig | None = None,
     *,
     jobs: int = 1,
+    executor: Executor | None = None,
     progress: Progress | None = None,
     conditions: Sequence[Sequence[Condition]] = (),
 ) -> tuple[SessionEvaluation, ...]:
@@ -194,18 +172,16 @@ def evaluate(
     Args:
         cases: the sessions.
         config: what to compute.
-        jobs: number of processes; 1 uses this one. More require an importable main script (guard its main).
-        progress: called after each solve.
+        jobs, executor: where the solves run, see `fgreg.workers.tasks.run_tasks`.
+        progress: called as solves are done.
         conditions: conditions of each case's verdict from its detection.
     """
     config = config or EvaluationConfig()
-    listed = [_tasks(index, case, config) for index, case in enumerate(cases)]
+    given = conditions or [()] * len(cases)
+    listed = [_tasks(case, config, mine) for case, mine in zip(cases, given, strict=True)]
     tasks = [task for of_case in listed for _, _, task in of_case]
-    results: list[WholeSolve | Resolved] = []
-    for result in _results(tasks, cases, conditions, config, jobs):
-        results.append(result)
-        if progress is not None:
-            progress(STEP, len(results), len(tasks))
+    step = None if progress is None else partial(progress, STEP)
+    results = list(run_tasks(partial(_run, config=config), tasks, jobs=jobs, executor=executor, progress=step))
     out = []
     place = 0
     for case, of_case in zip(cases, listed, strict=True):
@@ -230,29 +206,3 @@ def _gather(case: Case, results: list[tuple[tuple[str, int, _Task], WholeSolve |
         ),
         curve_epoch=case.largest_epoch,
     )
-
-
-def _results(
-    tasks: Sequence[_Task],
-    cases: Sequence[Case],
-    conditions: Sequence[Sequence[Condition]],
-    config: EvaluationConfig,
-    jobs: int,
-) -> Iterator[WholeSolve | Resolved]:
-    """Results in the order of the tasks."""
-    jobs = min(jobs, len(tasks))
-    if jobs <= 1:
-        _load(cases, conditions, config)
-        try:
-            yield from map(_run, tasks)
-        finally:
-            _load((), (), EvaluationConfig())
-        return
-    # spawn: a fork would inherit the threads of the linear algebra libraries in an undefined state.
-    context = multiprocessing.get_context("spawn")
-    with one_thread_each(), ProcessPoolExecutor(jobs, context, _begin, (cases, conditions, config)) as pool:
-        try:
-            yield from pool.map(_run, tasks, chunksize=max(1, min(8, len(tasks) // (4 * jobs))))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise

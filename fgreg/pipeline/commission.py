@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,12 @@ from fgreg.registration.solve import solve
 from fgreg.session.input_hashes import read_with_hashes
 from fgreg.session.rig_file import RIG_FILE, not_made_from, same_rig, section_hashes, write_rig
 from fgreg.session.session_reader import EVENTS_FILE, SETUP_FILE, Session, read_session
+from fgreg.workers.tasks import Executor, run_tasks
 
 TOGETHER = 0.5
 """Correlation from which a constant is named that the sessions do not tell apart from another one."""
 
+STEP = "solving sessions"
 Progress = Callable[[str, int, int], None]
 """Called with (name of the step, items done, total items)."""
 
@@ -114,13 +117,20 @@ class _Solved:
 
 
 def commission_sessions(
-    folders: Sequence[Path], out: Path, *, use_checks: bool = False, progress: Progress | None = None
+    folders: Sequence[Path],
+    out: Path,
+    *,
+    use_checks: bool = False,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> CommissionReport:
     """Commission a rig from sessions, and write it to ``out``. A rig that sessions take up already is not used.
 
     Args:
         folders: of the sessions; one that is refused is left out.
         use_checks: check points are data.
+        jobs, executor: where each session is solved first, see `fgreg.workers.tasks.run_tasks`.
 
     Raises:
         InputError: a session is not valid, given twice, has another probe, camera, marker or other priors than the
@@ -130,10 +140,9 @@ def commission_sessions(
     read = [read_with_hashes(folder) for folder in folders]
     sessions, hashes = [session for session, _ in read], [found for _, found in read]
     _check_alike(sessions, hashes)
-    solved = [
-        _solved(session, replace(session.model, rig=None), use_checks, _step(progress, i, len(sessions)))
-        for i, session in enumerate(sessions)
-    ]
+    bare = [replace(session, model=replace(session.model, rig=None)) for session in sessions]
+    step = None if progress is None else partial(progress, STEP)
+    solved = list(run_tasks(partial(_solved, use_checks=use_checks), bare, jobs=jobs, executor=executor, progress=step))
     used = [i for i, one in enumerate(solved) if one.registration is not None]
     if not used:
         first = solved[0]
@@ -169,9 +178,7 @@ def commission_sessions(
     )
 
 
-def check_session_against(
-    rig: CommissionedRig, folder: Path, *, use_checks: bool = False, progress: Progress | None = None
-) -> CommissionedSession:
+def check_session_against(rig: CommissionedRig, folder: Path, *, use_checks: bool = False) -> CommissionedSession:
     """Compare a session with a rig; without a chart, with the reason, where the session is refused.
 
     Raises:
@@ -181,7 +188,7 @@ def check_session_against(
     same_rig(session.model, rig.sessions, str(folder / SETUP_FILE))
     not_made_from(rig, folder / EVENTS_FILE, f"{folder}: --check")
     # With the priors from before the commissioning the session speaks for itself.
-    solved = _solved(session, replace(session.model, rig=rig.widened()), use_checks, _step(progress, 0, 1))
+    solved = _solved(replace(session, model=replace(session.model, rig=rig.widened())), use_checks)
     if solved.registration is None:
         return _outcome(solved, None)
     evidence = session_evidence(solved.registration, rig.constants, solved.checks)
@@ -209,15 +216,11 @@ def _prior_sigmas(model: SessionModel) -> np.ndarray[tuple[int, ...], np.dtype[n
     return np.asarray(replace(model, rig=None).constant_sigmas)
 
 
-def _step(progress: Progress | None, place: int, total: int) -> Callable[[], None]:
-    return (lambda: None) if progress is None else (lambda: progress("solving sessions", place + 1, total))
-
-
-def _solved(session: Session, model: SessionModel, use_checks: bool, done: Callable[[], None]) -> _Solved:
+def _solved(session: Session, use_checks: bool) -> _Solved:
+    model = session.model
     extracted = extract_measurements(session.events, model)
     config = SolveConfig()
     solution = solve(extracted.measurements, (), model, config, detection_conditions(extracted))
-    done()
     checks = tuple(extracted.checks.values()) if use_checks else ()
     estimate = with_checks(
         solution.as_session(session.model.name),

@@ -1,0 +1,160 @@
+"""Independent tasks on any executor: one process, the cores of this machine, or a cluster.
+
+An executor is what has `submit(function, *arguments)`, whose answer has `done()` and `result()`: each
+`concurrent.futures.Executor` (Dask's by `Client.get_executor()`), and submitit's for SLURM. Results come in the order
+of the tasks, so that the same seeds give the same numbers wherever they are computed.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from typing import Any, Protocol, TypeVar
+
+from fgreg.workers.parent import end_with_parent
+from fgreg.workers.threads import one_thread_each
+
+TaskT = TypeVar("TaskT")
+ResultT = TypeVar("ResultT")
+POLL_S = 0.02
+TRIES = 3
+"""A part of the tasks whose worker was lost this often is the cause itself."""
+PARTS_PER_JOB = 4
+MOST_PER_PART = 8
+"""Tasks sent to a worker at once, on this machine: few, so that progress is seen."""
+
+
+class Handle(Protocol):
+    """A submitted call."""
+
+    def done(self) -> bool: ...
+
+    def result(self) -> Any: ...
+
+
+class Executor(Protocol):
+    """Where calls run: `concurrent.futures.Executor`, or submitit's."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Handle: ...
+
+
+class _LocalPool:
+    """The cores of this machine. A pool that lost a worker takes nothing more, so that another one follows it."""
+
+    def __init__(self, jobs: int) -> None:
+        self._jobs = jobs
+        self._pool: ProcessPoolExecutor | None = None
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Handle:
+        from multiprocessing import get_context
+
+        with one_thread_each():
+            if self._pool is not None:
+                try:
+                    return self._pool.submit(fn, *args)
+                except BrokenExecutor:
+                    self._pool.shutdown(wait=False)
+            # spawn: a fork would inherit the threads of the linear algebra libraries in an undefined state.
+            self._pool = ProcessPoolExecutor(self._jobs, get_context("spawn"), end_with_parent)
+            return self._pool.submit(fn, *args)
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def run_tasks(
+    function: Callable[[TaskT], ResultT],
+    tasks: Sequence[TaskT],
+    *,
+    jobs: int = 1,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[ResultT]:
+    """Results of ``function`` for each task, in the order of the tasks.
+
+    Args:
+        function: importable by its name, or a partial of such a function; the same task gives the same result.
+        tasks: what can be pickled.
+        jobs: processes. 1 without an executor: this process. More require an importable main script (guard its main).
+        executor: where to run; this machine where None.
+        progress: called with (tasks done, all) as they are done, in any order.
+
+    Raises:
+        BrokenExecutor: the worker of the same tasks was lost ``TRIES`` times.
+        Exception: what the function raised, with the worker's traceback as a note.
+    """
+    jobs = max(min(jobs, len(tasks)), 1)
+    if executor is None and jobs == 1:
+        for count, task in enumerate(tasks, 1):
+            found = function(task)
+            if progress is not None:
+                progress(count, len(tasks))
+            yield found
+        return
+    size = -(-len(tasks) // (PARTS_PER_JOB * jobs))
+    if executor is None:
+        size = min(size, MOST_PER_PART)
+    parts = [tasks[at : at + size] for at in range(0, len(tasks), size)]
+    pool = _LocalPool(jobs) if executor is None else None
+    where: Executor = executor if executor is not None else pool  # type: ignore[assignment]
+    running: dict[int, Handle] = {}
+    try:
+        for index, part in enumerate(parts):
+            running[index] = where.submit(_run_part, function, part)
+        yield from _in_order(function, parts, running, where, progress)
+    finally:
+        for handle in running.values():
+            getattr(handle, "cancel", lambda: None)()
+        if pool is not None:
+            pool.close()
+
+
+def _in_order(
+    function: Callable[[TaskT], ResultT],
+    parts: Sequence[Sequence[TaskT]],
+    running: dict[int, Handle],
+    where: Executor,
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[ResultT]:
+    """Results of the parts in their order; removes what is done from ``running``."""
+    ready: dict[int, list[ResultT]] = {}
+    lost = [0] * len(parts)
+    total, done, following = sum(map(len, parts)), 0, 0
+    while following < len(parts):
+        for index, handle in list(running.items()):
+            if not handle.done():
+                continue
+            del running[index]
+            try:
+                found, error = handle.result()
+            except Exception as loss:  # the function's own exceptions come as a value
+                lost[index] += 1
+                if lost[index] == TRIES:
+                    raise BrokenExecutor(f"a worker was lost {TRIES} times at the same tasks: {loss}") from loss
+                running[index] = where.submit(_run_part, function, parts[index])
+                continue
+            if error is not None:
+                raise error
+            ready[index] = found
+            done += len(found)
+            if progress is not None:
+                progress(done, total)
+        if following in ready:
+            yield from ready.pop(following)
+            following += 1
+        else:
+            time.sleep(POLL_S)
+
+
+def _run_part(
+    function: Callable[[TaskT], ResultT], part: Sequence[TaskT]
+) -> tuple[list[ResultT] | None, Exception | None]:
+    """Results, or the exception: what else comes back from a worker means that it was lost."""
+    try:
+        return [function(task) for task in part], None
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        return None, error
