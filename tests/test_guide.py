@@ -16,7 +16,6 @@ import pytest
 import yaml
 
 import fgreg
-from fgreg.cli import options
 from fgreg.cli.main import main
 from fgreg.errors import InputError
 from fgreg.model.session_model import SESSION, ChannelModel, SessionModel
@@ -118,7 +117,7 @@ def test_every_command_of_the_guide_runs(
     ]
     (session / "events.jsonl").write_text("".join(line for pm, line in lines if pm < 10))
     Path("new-shots.jsonl").write_text("".join(line for pm, line in lines if pm >= 16))
-    monkeypatch.setattr(options.os, "sched_getaffinity", lambda _: {0}, raising=False)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
     folders = {"": session.parent}
     for needs, make in MADE.items():
         folders[needs] = session.parent / "made" / needs
