@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-JOBS ?= 2
+# Many tests wait for devices and processes: one more than the two cores of the smallest machine.
+JOBS ?= 3
 
 .PHONY: help demo test check docs clean
 

@@ -45,7 +45,7 @@ def _ran(before: int) -> tuple[SessionModel, Measurements, tuple[Truth, Truth], 
     return model, measurements, truths, engine
 
 
-@pytest.mark.parametrize("before", [2, 4, 6])
+@pytest.mark.parametrize("before", [2, 6])
 def test_a_move_after_few_pms_is_found_and_they_become_an_epoch_of_their_own(before: int) -> None:
     model, measurements, truths, engine = _ran(before)
     assert engine.moves
