@@ -157,6 +157,9 @@ class CommandKind(StrEnum):
     FOLLOW = "follow"
     MOVED = "moved"
     CHECK = "check"
+    VERIFY = "verify"
+    EXCLUDE = "exclude"
+    INCLUDE = "include"
     STOP = "stop"
     RESET = "reset"
 
@@ -168,20 +171,40 @@ class OperatorCommand:
     ``home`` the stage; ``aim``: the beam is on this ``corner`` [column, row] of the board; ``register``: no more aims;
     ``search``, ``follow``: the stage may turn to search for PMs, or to follow the beam; ``next``: leave this spot;
     ``moved``: the camera has moved; ``check``: a point that both devices show now, at ``point`` (u, v in the left frame
-    and u, v in the right one, px; x and range in the image plane, mm); ``stop`` the stage at once; ``reset``: the
-    latched stage has been inspected, and motions may be requested again.
+    and u, v in the right one, px; x and range in the image plane, mm); ``verify`` the registration with new PMs, which
+    are not added to it; ``exclude``, ``include``: the looks at ``pm`` do not count, or count again; ``stop`` the stage
+    at once; ``reset``: the latched stage has been inspected, and motions may be requested again.
+
+    ``said_s``: host time at which it was said, or arrived. ``peer``: who said it; empty if unknown.
     """
 
     kind: CommandKind
     corner: tuple[int, int] | None = None
     point: tuple[float, float, float, float, float, float] | None = None
+    pm: int | None = None
+    said_s: float = field(default_factory=host_now, compare=False)
+    peer: str = field(default="", compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedWord:
+    """A command that was understood and is not obeyed: ``word``, who said it, and why not."""
+
+    word: CommandKind
+    peer: str
+    reason: str
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        return f"{self.word} from {self.peer or 'the operator'} is refused: {self.reason}"
 
 
 class Operator(Device, Protocol):
     """Source of the operator's commands: a keyboard, a foot switch, a simulated surgeon."""
 
-    def poll(self) -> Sequence[OperatorCommand]:
-        """Commands since the last call. Raises DeviceLost."""
+    def poll(self) -> Sequence[OperatorCommand | RefusedWord]:
+        """Commands since the last call, and those that the driver refuses. Raises DeviceLost."""
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         """Show a message. ``done``: the current spot is finished; ``wants``: the command that is asked for."""
@@ -228,6 +251,7 @@ class DriverContext:
 
     Attributes:
         say: shows one line to the operator.
+        typing: shows what has been typed of a line at the terminal; None where the terminal does that itself.
         corners: columns and rows of the board's inner corners.
         rectified: fgreg.drivers.rectification.Rectification of the endoscope's pictures, or None.
         room: socket of the simulated room, or None.
@@ -239,3 +263,4 @@ class DriverContext:
     rectified: Any = None
     room: Path | None = None
     paces: dict[tuple[Path, float], Any] = field(default_factory=dict)
+    typing: Callable[[str], None] | None = None

@@ -10,19 +10,20 @@ import os
 import select
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand
+from fgreg.drivers.base import CommandKind, DeviceLost, OperatorCommand, RefusedWord
+from fgreg.drivers.line_editor import LineEditor
 from fgreg.drivers.operator_words import asked, understand
+from fgreg.drivers.word_queue import WordQueue
 from fgreg.schema.limits import TYPED_LINE_BYTES
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext, Operator
     from fgreg.drivers.options import NoOptions
 
-MOST_WAITING = 64
 BACKGROUND_S = 0.5
 """Time between checks for the foreground. A background program that reads from its terminal would be suspended."""
 
@@ -36,16 +37,21 @@ class KeyboardOperator:
         say: shows one line; also called from this driver's thread.
         fd: file descriptor to read from. Default: standard input.
         corners: columns and rows of the board's inner corners; aims at others are rejected with a message.
+        typing: shows what has been typed of a line, where the terminal neither shows nor edits it; called from this
+            driver's thread, once at the start.
     """
 
     def __init__(
-        self, say: Callable[[str], None], fd: int | None = None, corners: tuple[int, int] | None = None
+        self,
+        say: Callable[[str], None],
+        fd: int | None = None,
+        corners: tuple[int, int] | None = None,
+        typing: Callable[[str], None] | None = None,
     ) -> None:
-        self._say, self._corners = say, corners
+        self._say, self._corners, self._typing = say, corners, typing
         self._fd = standard_input() if fd is None else fd
-        self._waiting: deque[OperatorCommand] = deque()
-        self._lock = threading.Lock()
-        self._dropped, self._open = 0, self._fd is not None
+        self._editor = None if typing is None or self._fd is None or not os.isatty(self._fd) else LineEditor()
+        self._queue, self._open = WordQueue(), self._fd is not None
         self._wake, self._woken = os.pipe()  # ends, in this order: read, write
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="keyboard", daemon=True)
@@ -64,14 +70,11 @@ class KeyboardOperator:
     @property
     def dropped(self) -> int:
         """Number of commands dropped because they were not fetched in time."""
-        return self._dropped
+        return self._queue.dropped
 
-    def poll(self) -> list[OperatorCommand]:
+    def poll(self) -> list[OperatorCommand | RefusedWord]:
         """Commands since the last call."""
-        with self._lock:
-            commands = list(self._waiting)
-            self._waiting.clear()
-        return commands
+        return self._queue.take()
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """Show a message as one line."""
@@ -79,10 +82,9 @@ class KeyboardOperator:
 
     def close(self) -> None:
         """End the thread; the input stays open."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
+        if self._closed:
+            return
+        self._closed = True
         os.write(self._woken, b"\0")
         self._thread.join(2.0)
         for end in (self._wake, self._woken):
@@ -90,9 +92,16 @@ class KeyboardOperator:
 
     def _run(self) -> None:
         held, too_long = b"", False
+        if self._typing is not None:
+            self._typing("")
         while self._open and not self._closed:
             data = self._read()
             if data is None:
+                continue
+            if self._editor is not None and self._typing is not None and data:
+                for line in self._editor.feed(data):
+                    self._take(line, len(line) > TYPED_LINE_BYTES)
+                self._typing(self._editor.text)
                 continue
             *lines, held = (held + data).split(b"\n")
             if not data:
@@ -110,11 +119,11 @@ class KeyboardOperator:
         if fd is None:
             return b""
         try:
-            if not _in_foreground(fd):
+            if not in_foreground(fd):
                 select.select([self._wake], [], [], BACKGROUND_S)
                 return None
             ready, _, _ = select.select([fd, self._wake], [], [], BACKGROUND_S)
-            return os.read(fd, 4096) if fd in ready and _in_foreground(fd) else None
+            return os.read(fd, 4096) if fd in ready and in_foreground(fd) else None
         except (OSError, ValueError):  # the terminal hung up, or the file was closed
             return b""
 
@@ -126,13 +135,7 @@ class KeyboardOperator:
         if isinstance(command, str):
             self._say(command)
             return
-        with self._lock:
-            self._waiting.append(command)
-            while len(self._waiting) > MOST_WAITING:
-                # Drop the oldest command, but never a stop.
-                old = next((c for c in self._waiting if c.kind is not CommandKind.STOP), self._waiting[0])
-                self._waiting.remove(old)
-                self._dropped += 1
+        self._queue.put(replace(command, peer=self.name))
 
 
 def standard_input() -> int | None:
@@ -143,7 +146,7 @@ def standard_input() -> int | None:
         return None
 
 
-def _in_foreground(fd: int) -> bool:
+def in_foreground(fd: int) -> bool:
     """Whether reading is allowed now: not if another job has the terminal."""
     try:
         return not os.isatty(fd) or os.tcgetpgrp(fd) == os.getpgrp()
@@ -153,7 +156,7 @@ def _in_foreground(fd: int) -> bool:
 
 def open_keyboard(context: DriverContext, _options: NoOptions) -> Operator:
     """The operator at the terminal."""
-    return KeyboardOperator(context.say, corners=context.corners)
+    return KeyboardOperator(context.say, corners=context.corners, typing=context.typing)
 
 
 def ask_keyboard(_context: DriverContext, _options: NoOptions) -> str:

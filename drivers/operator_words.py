@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
-from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.drivers.base import CommandKind, OperatorCommand, RefusedWord
 from fgreg.errors import one_line
 
 LETTERS = {
@@ -16,22 +17,47 @@ LETTERS = {
     "n": CommandKind.NEXT,
     "m": CommandKind.MOVED,
     "c": CommandKind.CHECK,
+    "v": CommandKind.VERIFY,
+    "e": CommandKind.EXCLUDE,
+    "i": CommandKind.INCLUDE,
     "x": CommandKind.STOP,
 }
 """One-letter commands. ``s`` is search; an empty line and ``x`` stop. ``reset`` has no letter: a typing error must not
 release a stage that has latched."""
 
-EXPECTED = (
-    "home (h), aim COLUMN ROW (a), register (r), search (s), follow (f), next (n), moved (m), "
-    "check U V U V X RANGE (c), stop (x, or an empty line), reset"
-)
+AFTER = {
+    CommandKind.AIM: "COLUMN ROW",
+    CommandKind.CHECK: "U V U V X RANGE",
+    CommandKind.EXCLUDE: "PM",
+    CommandKind.INCLUDE: "PM",
+}
+"""What follows a word."""
+
+
+def spelt(kind: CommandKind) -> str:
+    """A word as it is said, with its letter: ``search (s)``, ``aim COLUMN ROW (a)``."""
+    letter = next((letter for letter, said in LETTERS.items() if said is kind), "")
+    after = f" {AFTER[kind]}" if kind in AFTER else ""
+    if kind is CommandKind.STOP:
+        letter += ", or an empty line"
+    return f"{kind}{after}" + (f" ({letter})" if letter else "")
+
+
+EXPECTED = ", ".join(spelt(kind) for kind in CommandKind)
+MOTIONS = frozenset({CommandKind.HOME, CommandKind.SEARCH, CommandKind.FOLLOW, CommandKind.RESET})
+"""Words after which the stage may move. A stop cancels those before it; a peer of the network needs a key for them."""
+MOST_AGE_S = 0.5
+"""A word that is older has no effect, as an order to the stage that is older. A stop has no limit."""
 LARGEST_CORNER = 199
 """Largest corner index of a board in session.yaml."""
 
 _WORDS: dict[str, CommandKind] = {**{said.value: said for said in CommandKind}, **LETTERS}
 _NUMBER = re.compile(r"[0-9]{1,3}")
 _DECIMAL = re.compile(r"-?[0-9]{1,4}(\.[0-9]{1,6})?")
+_PM = re.compile(r"[0-9]{1,9}")
 _STOP = re.compile(r"\bstop\b")
+_EFFECT = {CommandKind.EXCLUDE: "no longer count", CommandKind.INCLUDE: "count again"}
+CANCELLED = "a stop came after it: say it again"
 
 
 def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCommand | str:
@@ -53,6 +79,8 @@ def understand(line: str, corners: tuple[int, int] | None = None) -> OperatorCom
         return _aim(words[1:], corners)
     if said is CommandKind.CHECK:
         return _check(words[1:])
+    if said in (CommandKind.EXCLUDE, CommandKind.INCLUDE):
+        return _choice(said, words[1:])
     if len(words) > 1:
         return f"{one_line(repr(line.strip()), 40)} is not understood; {said} takes nothing after it"
     return OperatorCommand(said)
@@ -79,9 +107,38 @@ def _check(words: list[str]) -> OperatorCommand | str:
     return OperatorCommand(CommandKind.CHECK, point=(u, v, right_u, right_v, x_mm, range_mm))
 
 
+def _choice(said: CommandKind, words: list[str]) -> OperatorCommand | str:
+    if len(words) != 1 or not _PM.fullmatch(words[0]):
+        return f"it is said as {said} PM: the number of a PM whose looks {_EFFECT[said]}"
+    return OperatorCommand(said, pm=int(words[0]))
+
+
 def asked(text: str, wants: CommandKind | None) -> str:
     """A message to the operator as one line, with the command that is asked for."""
-    if wants is None:
-        return one_line(text)
-    letter = next((f" ({letter})" for letter, said in LETTERS.items() if said is wants), "")
-    return f"{one_line(text)}: say {wants}{letter}"
+    return one_line(text) if wants is None else f"{one_line(text)}: say {spelt(wants)}"
+
+
+def in_force(
+    said: Sequence[OperatorCommand | RefusedWord], now_s: float
+) -> tuple[list[OperatorCommand], list[RefusedWord]]:
+    """The words that count now, with a stop first, and those that are refused.
+
+    Refused are words older than :data:`MOST_AGE_S`, and those that let the stage move if a stop came after them.
+    """
+    commands = [word for word in said if isinstance(word, OperatorCommand)]
+    refused = [word for word in said if isinstance(word, RefusedWord)]
+    stops = [command for command in commands if command.kind is CommandKind.STOP]
+    stopped_s = max((stop.said_s for stop in stops), default=float("-inf"))
+    kept = stops[-1:]
+    for command in commands:
+        if command.kind is CommandKind.STOP:
+            continue
+        age_s = now_s - command.said_s
+        if command.kind in MOTIONS and command.said_s < stopped_s:
+            refused.append(RefusedWord(command.kind, command.peer, CANCELLED))
+        elif age_s > MOST_AGE_S:
+            why = f"it is {age_s:.1f} s old, and {MOST_AGE_S:g} s is the limit: say it again"
+            refused.append(RefusedWord(command.kind, command.peer, why))
+        else:
+            kept.append(command)
+    return kept, refused

@@ -3,31 +3,64 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand
-from fgreg.drivers.igtl import IgtlReceiver, endpoint
-from fgreg.drivers.igtl_messages import Text, check_name, pack_text
-from fgreg.drivers.operator_words import asked, understand
-from fgreg.drivers.tcp_link import Endpoint
+from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand, RefusedWord
+from fgreg.drivers.igtl import endpoint
+from fgreg.drivers.igtl_messages import Message, MessageDecoder, Text, check_name, pack_text, require_pyigtl
+from fgreg.drivers.operator_words import asked
+from fgreg.drivers.peer_words import PeerWords
+from fgreg.drivers.tcp_device import LinkedDevice
+from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
+from fgreg.drivers.word_queue import WordQueue
 
 if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext
     from fgreg.drivers.options import IgtlOperatorOptions
 
 
-class IgtlOperator(IgtlReceiver):
+PIECE_BYTES = 2048
+"""Bytes that are decoded before their words are handed over."""
+
+
+class _WordDecoder(MessageDecoder):
+    """Hands over each message of a connection in the link's thread, before any queue."""
+
+    def __init__(
+        self,
+        rejections: Rejections,
+        wanted: frozenset[tuple[str, str]],
+        counts: Counter[tuple[str, str]],
+        take: Callable[[Message], None],
+    ) -> None:
+        super().__init__(rejections, wanted, counts)
+        self._take = take
+
+    def feed(self, data: bytes, host_s: float) -> list[Message]:
+        """As of the base. Raises StreamBroken."""
+        messages = []
+        for begin in range(0, len(data), PIECE_BYTES):  # a stop does not wait for the rest of a burst
+            found = super().feed(data[begin : begin + PIECE_BYTES], host_s)
+            for message in found:
+                self._take(message)
+            messages += found
+        return messages
+
+
+class IgtlOperator(LinkedDevice[Message]):
     """An Operator whose commands are STRING messages of a device: a foot switch, a button in 3D Slicer.
 
-    Messages to the operator, and replies to commands that are not understood, go back as STRING messages; for a slow
-    receiver only the newest is kept.
+    Messages to the operator, and replies to commands that are not understood or refused, go back as STRING messages;
+    for a slow receiver only the newest is kept. Words go past the link's queue into one in which a stop has a place of
+    its own.
 
     Args:
         endpoint: the sender, or where it connects.
         device: name of the device that sends commands.
         answers: name of the device for messages to the operator.
-        corners: columns and rows of the board's inner corners; aims at others are rejected with a message.
+        words: what it may say.
     """
 
     _role = "operator"
@@ -37,28 +70,46 @@ class IgtlOperator(IgtlReceiver):
         endpoint: Endpoint,
         device: str = "Operator",
         answers: str = "OperatorTold",
-        corners: tuple[int, int] | None = None,
+        words: PeerWords | None = None,
     ) -> None:
-        self._answers, self._corners = check_name(answers), corners
-        super().__init__(endpoint, [("STRING", check_name(device))])
+        require_pyigtl()
+        wanted, counts = frozenset([("STRING", check_name(device))]), Counter[tuple[str, str]]()
+        self._answers, self._words, self._queue = check_name(answers), words or PeerWords(), WordQueue()
 
-    def poll(self) -> list[OperatorCommand]:  # type: ignore[override]
-        """Commands since the last call. Raises DeviceLost."""
-        commands = []
-        for message in self._messages():
-            if not isinstance(message.content, Text):
-                continue
-            command = understand(message.content.text, self._corners)
-            if isinstance(command, str):
-                self._leave_out(message, command)
-                self._offer(command)
-            else:
-                commands.append(command)
-        return commands
+        def decoder(rejections: Rejections) -> _WordDecoder:
+            return _WordDecoder(rejections, wanted, counts, self._take)
+
+        super().__init__(TcpLink(endpoint, decoder))
+
+    @property
+    def dropped(self) -> int:
+        """Number of words dropped because they were not fetched in time."""
+        return self._queue.dropped
+
+    def poll(self) -> list[OperatorCommand | RefusedWord]:
+        """Words since the last call. Raises DeviceLost, after the words that came before the loss."""
+        words = self._queue.take()
+        self._link.poll()  # the same messages: the queue has their words
+        if not words:
+            self._raise_loss()
+        return words
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """Send a message."""
         self._offer(asked(text, wants))
+
+    def _take(self, message: Message) -> None:
+        """A message, in the link's thread."""
+        if not isinstance(message.content, Text):
+            return
+        word = self._words.take(message.content.text, message.device, message.host_s, time.time())
+        if isinstance(word, str):
+            self._link.rejections.add(f"{message.device}: {word}")
+            self._offer(word)
+            return
+        if isinstance(word, RefusedWord):
+            self._offer(word.text)
+        self._queue.put(word)
 
     def _offer(self, text: str) -> None:
         self._link.offer(pack_text(self._answers, text, time.time(), {}, 2))
@@ -70,7 +121,7 @@ class Operators:
     def __init__(self, operators: Sequence[Operator]) -> None:
         self._operators = tuple(operators)
         self._losses: list[DeviceLost] = []
-        self._held: list[OperatorCommand] = []
+        self._held: list[OperatorCommand | RefusedWord] = []
 
     @property
     def name(self) -> str:
@@ -87,7 +138,7 @@ class Operators:
         """Number of commands that were not fetched in time."""
         return sum(operator.dropped for operator in self._operators)
 
-    def poll(self) -> list[OperatorCommand]:
+    def poll(self) -> list[OperatorCommand | RefusedWord]:
         """Commands of all operators since the last call; none is dropped when a loss is raised.
 
         Raises:
@@ -117,5 +168,6 @@ class Operators:
 
 
 def open_operator(context: DriverContext, options: IgtlOperatorOptions) -> Operator:
-    """Texts over OpenIGTLink."""
-    return IgtlOperator(endpoint(options), options.device, options.answers, context.corners)
+    """Texts over OpenIGTLink. Raises InputError for a key that cannot be used."""
+    words = PeerWords.of(options.words, options.key, context.corners)
+    return IgtlOperator(endpoint(options), options.device, options.answers, words)

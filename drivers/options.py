@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+from fgreg.drivers.base import CommandKind
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.files import ExistingPath, exists
-from fgreg.schema.kinds import Integer, JsonSchema, Kind, Number, Text
+from fgreg.schema.kinds import Integer, JsonSchema, Kind, ListOf, Number, Text
 from fgreg.schema.matrices import Transform
 from fgreg.schema.problems import FieldError, shown
 from fgreg.schema.record import Key
@@ -275,3 +276,16 @@ class IgtlOperatorOptions(Connection):
 
     device: Annotated[str, _named("of its commands")] = "Operator"
     answers: Annotated[str, _named("of messages to it")] = "OperatorTold"
+    words: Annotated[
+        tuple[str, ...] | None,
+        Key(
+            "what it may say beside stop; home, search, follow and reset need a key",
+            ListOf(Text("a word", allowed=tuple(CommandKind))),
+            null=True,
+            example="[next, moved]",
+        ),
+    ] = None
+    key: Annotated[
+        Path | None,
+        Key("file with the key that its words are signed with", ExistingPath(), null=True, example="operator.key"),
+    ] = None

@@ -13,6 +13,7 @@ from fgreg.drivers.base import (
     MotionSample,
     OperatorCommand,
     PaFrame,
+    RefusedWord,
     Registration,
     StereoFrame,
 )
@@ -29,6 +30,11 @@ ITEMS: Mapping[Role, type] = {
 """What ``poll`` gives, by role."""
 
 T = TypeVar("T")
+
+
+def is_item(role: Role, item: object) -> bool:
+    """Whether ``poll`` may give this; an operator's may also give words that its driver refuses."""
+    return isinstance(item, ITEMS[role]) or (role is Role.OPERATOR and isinstance(item, RefusedWord))
 
 
 class PluginDevice:
@@ -68,7 +74,7 @@ class PluginDevice:
             unreported, self._unreported = self._unreported, None
             raise unreported
         items = self._called(lambda: list(self._device.poll()))
-        wrong = next((item for item in items if not isinstance(item, ITEMS[self._role])), None)
+        wrong = next((item for item in items if not is_item(self._role, item)), None)
         if wrong is not None:
             raise DeviceLost(f"{self._driver}: gave a {type(wrong).__name__}, expected {ITEMS[self._role].__name__}")
         return items

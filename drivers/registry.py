@@ -238,6 +238,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         options.IgtlOperatorOptions,
         "operators:open_operator",
         extra="igtl",
+        check="peer_words:check_operator",
     ),
     DriverEntry(
         Role.OPERATOR,

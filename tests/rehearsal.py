@@ -95,6 +95,10 @@ class Rehearsal:
         while self.now_s < end:
             self._frame()
 
+    def say(self, kind: CommandKind) -> None:
+        """A word of the operator."""
+        self._said.append(OperatorCommand(kind))
+
     def _frame(self) -> None:
         self.now_s += self.frame_s
         room, now = self.room, self.now_s

@@ -145,7 +145,7 @@ IGTL: dict[str, tuple[Callable[[Endpoint], Any], Callable[[int], bytes], list[by
     ),
     "operator": (
         lambda endpoint: IgtlOperator(endpoint, "Device"),
-        lambda _number: message("STRING", "Device", struct.pack(">HH", 3, 4) + b"home"),
+        lambda _number: message("STRING", "Device", struct.pack(">HH", 3, 4) + b"next"),
         [message("STRING", "Device", struct.pack(">HH", 3, 90) + b"ho"), message("STRING", "Device", b"\xff" * 9)],
     ),
 }

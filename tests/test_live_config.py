@@ -434,6 +434,21 @@ def test_a_port_that_is_taken_is_one_line_and_leaves_nothing_open(tmp_path: Path
         socket.create_server(("127.0.0.1", first)).close()
 
 
+def test_two_operators_have_two_keys(tmp_path: Path) -> None:
+    pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
+    key, data = tmp_path / "a.key", live_configs.config()
+    key.write_text(bytes(range(48)).hex())
+    data["operator"] = [{"driver": "igtl", "port": port, "key": "a.key"} for port in (18946, 18947)]
+    key.chmod(0o644)
+    assert "operator[0] (line" in (error := error_of(live_configs.write(tmp_path, data)))
+    assert "a key that others can read (mode 644)" in error
+    key.chmod(0o600)
+    assert "operator[1]" in (error := error_of(live_configs.write(tmp_path, data)))
+    assert "the key a.key again, expected another key than live.yaml: operator[0]" in error
+    data["operator"] = {"driver": "igtl", "words": ["next", "home"]}
+    assert "found home without a key, expected a key beside it" in error_of(live_configs.write(tmp_path, data))
+
+
 def test_listening_beyond_this_machine_gives_a_warning(tmp_path: Path) -> None:
     data = live_configs.config()
     data["sinks"][0]["host"] = "0.0.0.0"

@@ -6,10 +6,15 @@ import math
 
 import pytest
 
+from fgreg.camera_moves.validity import Validity
 from fgreg.drivers.base import CommandKind
-from fgreg.live.actions import Ask, Follow, Halt, Sweep, TakePairs
-from fgreg.live.workflow import Stage, Workflow, WorkflowSettings
+from fgreg.live.actions import Ask, Follow, Halt, Sweep, TakePairs, TakeVerify
+from fgreg.live.merge_looks import one_spot
+from fgreg.live.shots import pair_events
+from fgreg.live.verification import compared
+from fgreg.live.workflow import VERIFY_PMS, Stage, Workflow, WorkflowSettings
 from fgreg.model.estimate import Verdict
+from fgreg.model.solve_config import SolveConfig
 from fgreg.simulation.room import Room, room_config
 from fgreg.stage.limits import MotionKind
 from tests.rehearsal import Rehearsal
@@ -163,6 +168,22 @@ def test_a_marker_lost_during_a_search_ends_it() -> None:
     assert not any(isinstance(a, TakePairs) for _, a in session.actions)
 
 
+def test_a_verification_searches_new_pms_and_adds_nothing(whole: Rehearsal) -> None:
+    known, before = whole.engine.estimate.pairs, len(whole.actions)
+    whole.say(CommandKind.VERIFY)
+    taken: list[TakeVerify] = []
+    end_s = whole.now_s + 90.0
+    while len(taken) < VERIFY_PMS and whole.now_s < end_s:
+        whole.run(0.5)
+        taken = [a for _, a in whole.actions[before:] if isinstance(a, TakeVerify)]
+    assert [(a.number, a.count) for a in taken] == [(i, VERIFY_PMS) for i in range(VERIFY_PMS)]
+    last = whole.actions.index(next(entry for entry in whole.actions if entry[1] is taken[-1]))
+    assert not any(isinstance(a, TakePairs | Follow) for _, a in whole.actions[before:last])
+    looks = [event for a in taken for event in pair_events(a.number, one_spot(a.looks), 0.0, whole.model.stage)]
+    found = compared(looks, whole.engine.snapshot(), whole.model, SolveConfig())
+    assert found.validity is Validity.VALID, (found.reason, known)
+
+
 def test_after_a_reported_move_it_halts_and_searches_again(whole: Rehearsal) -> None:
     # last of the tests that use the session: it changes it
     from fgreg.online.events import CameraMoved
@@ -187,7 +208,7 @@ def test_an_epoch_that_stays_refused_is_reported_with_what_helps() -> None:
     )
     while session.now_s < 200.0 and sum(isinstance(a, TakePairs) for _, a in session.actions) < 5:
         session.run(1.0)
-    messages = [tell.text for _, tell in session.messages if "say so (moved)" in tell.text]
+    messages = [tell.text for _, tell in session.messages if "the camera was moved, say moved (m)" in tell.text]
     assert [text.split()[0] for text in messages] == ["2", "4"]
     assert all("the beam has no start" in text for text in messages)
 

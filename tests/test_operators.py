@@ -16,16 +16,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand
-from fgreg.drivers.keyboard import MOST_WAITING, KeyboardOperator
-from fgreg.drivers.operator_words import EXPECTED, LETTERS, asked, understand
+from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand, RefusedWord, host_now
+from fgreg.drivers.keyboard import KeyboardOperator
+from fgreg.drivers.operator_words import AFTER, EXPECTED, LETTERS, MOST_AGE_S, asked, in_force, understand
 from fgreg.drivers.operators import IgtlOperator, Operators
+from fgreg.drivers.peer_words import PeerWords
 from fgreg.drivers.tcp_link import Endpoint
+from fgreg.drivers.word_keys import sign
+from fgreg.drivers.word_queue import MOST_WAITING, WordQueue
 from fgreg.schema.limits import TYPED_LINE_BYTES
 from tests.igtl_bytes import message, read_messages
 from tests.network_peers import collect, wait_for
 
-OTHERWISE = (CommandKind.AIM, CommandKind.CHECK, CommandKind.RESET)
+OTHERWISE = (*AFTER, CommandKind.RESET)
+KEY = b"an operator's key of 32 bytes or more"
 
 
 @pytest.mark.parametrize("said", [said for said in CommandKind if said not in OTHERWISE])
@@ -55,6 +59,11 @@ def test_a_check_names_its_pixels_and_its_place_in_the_plane(line: str) -> None:
     assert understand(line) == OperatorCommand(CommandKind.CHECK, point=point)
 
 
+@pytest.mark.parametrize(("line", "kind"), [("exclude 3", CommandKind.EXCLUDE), ("I 12", CommandKind.INCLUDE)])
+def test_a_choice_names_its_pm(line: str, kind: CommandKind) -> None:
+    assert understand(line) == OperatorCommand(kind, pm=int(line.split()[1]))
+
+
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
@@ -67,6 +76,10 @@ def test_a_check_names_its_pixels_and_its_place_in_the_plane(line: str) -> None:
         ("aim 3 6", "columns 0 to 8, rows 0 to 5"),
         ("check 1 2 3 4 5", "check U V U V X RANGE"),
         ("c 1 2 3 4 5 x", "check U V U V X RANGE"),
+        ("exclude", "exclude PM"),
+        ("include 1 2", "include PM"),
+        ("exclude PM", "exclude PM"),
+        ("verify now", "verify takes nothing after it"),
         ("serch", EXPECTED),
         ("search the left side", "search takes nothing after it"),
         ("\x1b[A", "'\\x1b[a]'"[:6]),
@@ -88,7 +101,7 @@ def test_a_stop_need_not_be_spelt(line: str) -> None:
 @given(line=st.text(max_size=60))
 def test_any_line_is_a_command_or_a_printable_answer(line: str) -> None:
     found = understand(line, (9, 6))
-    assert isinstance(found, OperatorCommand) or (found.isprintable() and len(found) < 250)
+    assert isinstance(found, OperatorCommand) or (found.isprintable() and len(found) < 300)
 
 
 class Typed:
@@ -126,7 +139,7 @@ def test_lines_come_as_commands_in_order_however_they_are_cut(typed: Typed) -> N
         typed.type(piece)
         time.sleep(0.01)
     said = [
-        OperatorCommand(CommandKind.HOME),
+        RefusedWord(CommandKind.HOME, "keyboard", "a stop came after it: say it again"),
         OperatorCommand(CommandKind.AIM, (3, 2)),
         OperatorCommand(CommandKind.REGISTER),
         OperatorCommand(CommandKind.STOP),
@@ -163,9 +176,9 @@ def test_a_line_without_end_is_bounded_and_what_follows_it_works(typed: Typed) -
 
 def test_commands_not_fetched_are_dropped_oldest_first_but_never_a_stop(typed: Typed) -> None:
     typed.type(b"stop\n" + b"next\n" * (MOST_WAITING + 10) + b"home\n")
-    wait_for(lambda: typed.operator.dropped == 12)
+    wait_for(lambda: typed.operator.dropped == 11)
     commands = typed.operator.poll()
-    assert len(commands) == MOST_WAITING
+    assert len(commands) == MOST_WAITING + 1
     assert (commands[0], commands[-1]) == (OperatorCommand(CommandKind.STOP), OperatorCommand(CommandKind.HOME))
 
 
@@ -232,7 +245,7 @@ def test_in_the_background_the_program_is_not_stopped_by_its_terminal(tmp_path: 
 @pytest.fixture
 def switch() -> Iterator[tuple[IgtlOperator, socket.socket]]:
     pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
-    operator = IgtlOperator(Endpoint.listening(0), "FootSwitch", corners=(9, 6))
+    operator = IgtlOperator(Endpoint.listening(0), "FootSwitch", words=PeerWords(corners=(9, 6), key=KEY))
     peer = socket.create_connection(("127.0.0.1", operator.endpoint.port), timeout=5.0)
     try:
         with peer:
@@ -246,6 +259,10 @@ def words(text: str, device: str = "FootSwitch") -> bytes:
     return message("STRING", device, (3).to_bytes(2, "big") + len(data).to_bytes(2, "big") + data)
 
 
+def signed(word: str) -> bytes:
+    return words(sign(word, KEY, time.time_ns(), time.time()))
+
+
 def received(peer: socket.socket) -> str:
     data = b""
     while len(data) < 58 or len(data) < 58 + int.from_bytes(data[42:50], "big"):
@@ -257,9 +274,10 @@ def received(peer: socket.socket) -> str:
 
 def test_texts_of_a_device_are_commands_and_others_are_not(switch: tuple[IgtlOperator, socket.socket]) -> None:
     operator, peer = switch
-    peer.sendall(words("search") + words("stop", "Someone") + words("aim 1 5") + words("stop"))
-    found = collect(operator.poll, 3)
-    assert found == [
+    peer.sendall(signed("search") + words("stop", "Someone") + signed("aim 1 5"))
+    found = collect(operator.poll, 2)
+    peer.sendall(words("stop"))
+    assert found + collect(operator.poll, 1) == [
         OperatorCommand(CommandKind.SEARCH),
         OperatorCommand(CommandKind.AIM, (1, 5)),
         OperatorCommand(CommandKind.STOP),
@@ -284,17 +302,61 @@ def test_several_operators_are_one_and_a_loss_delays_no_stop(
     both: Operator = Operators([typed.operator, foot])
     wait_for(lambda: both.connected)
     typed.type(b"home\n")
-    peer.sendall(words("search"))
-    assert {command.kind for command in collect(both.poll, 2)} == {CommandKind.HOME, CommandKind.SEARCH}
+    peer.sendall(signed("search"))
+    found = collect(both.poll, 2)
+    said = {word.kind: word.peer for word in found if isinstance(word, OperatorCommand)}
+    assert said.keys() == {CommandKind.HOME, CommandKind.SEARCH}
+    assert said[CommandKind.HOME] == "keyboard" != said[CommandKind.SEARCH] != ""
     both.tell("registered")
     assert received(peer) == "registered"
     assert typed.messages == ["registered"]
     peer.close()
     wait_for(lambda: not foot.connected)
     typed.type(b"\n")
-    wait_for(lambda: typed.operator._waiting)
+    wait_for(lambda: typed.operator._queue._words)
     assert both.poll() == [OperatorCommand(CommandKind.STOP)]
     with pytest.raises(DeviceLost, match="operator"):
         both.poll()
     assert both.poll() == []
     assert not both.connected
+
+
+@pytest.mark.parametrize("before", [b"", b"next"])
+def test_a_stop_with_400_words_after_it_in_one_burst_is_the_first_word(
+    switch: tuple[IgtlOperator, socket.socket], before: bytes
+) -> None:
+    operator, peer = switch
+    wait_for(lambda: operator.connected)
+    counter = time.time_ns()
+    many = b"".join(words(sign("moved", KEY, counter + i, time.time())) for i in range(400))
+    early = words(sign("search", KEY, counter - 1, time.time())) if before else b""
+    peer.sendall(early + words("stop") + many)
+    wait_for(lambda: operator.dropped >= 400 - MOST_WAITING)
+    found, refused = in_force(operator.poll(), host_now())
+    assert not refused
+    assert found[0] == OperatorCommand(CommandKind.STOP)
+    assert len(found) == 1 + MOST_WAITING
+    assert {command.kind for command in found[1:]} == {CommandKind.MOVED}
+    assert operator.connected
+
+
+def test_a_stop_cancels_the_motions_asked_for_before_it_and_nothing_else() -> None:
+    queue = WordQueue()
+    for kind in (CommandKind.SEARCH, CommandKind.MOVED, CommandKind.STOP, CommandKind.STOP, CommandKind.FOLLOW):
+        queue.put(OperatorCommand(kind, said_s=100.0))
+    kept, refused = in_force(queue.take(), 100.1)
+    assert [command.kind for command in kept] == [CommandKind.STOP, CommandKind.MOVED, CommandKind.FOLLOW]
+    assert [word.text for word in refused] == [
+        "search from the operator is refused: a stop came after it: say it again"
+    ]
+    # Of another operator: what was said before the stop is cancelled in whatever order the two are asked.
+    words = [OperatorCommand(CommandKind.STOP, said_s=100.0), OperatorCommand(CommandKind.HOME, said_s=99.9)]
+    assert in_force(words, 100.1)[0] == words[:1]
+
+
+@pytest.mark.parametrize("kind", CommandKind)
+def test_a_word_older_than_half_a_second_is_refused_but_a_stop_is_not(kind: CommandKind) -> None:
+    late = OperatorCommand(kind, said_s=host_now() - 1.01 * MOST_AGE_S, peer="foot switch")
+    kept, refused = in_force([late], host_now())
+    assert len(kept) == (kind is CommandKind.STOP)
+    assert ["foot switch" in word.text and "0.5 s old" in word.text for word in refused] == [True] * (1 - len(kept))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.geometry.transforms import FloatArray
@@ -107,9 +107,13 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """Pass the operator's request for a kind of motion on to the stage; a request for homing also starts it."""
+    """Pass the operator's request for a kind of motion on to the stage; a request for homing also starts it.
+
+    ``by``: who asked for it; empty if unknown.
+    """
 
     kind: MotionKind
+    by: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +161,24 @@ class TakeCheck:
     scan_rad: float
 
 
+@dataclass(frozen=True, slots=True)
+class TakeChoice:
+    """Record that the looks at a PM do not count any more, or (``include``) count again."""
+
+    pm: int
+    include: bool
+    by: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TakeVerify:
+    """Compare the registration with these pulses as looks at a new PM, the ``number``-th of ``count`` from 0."""
+
+    number: int
+    count: int
+    looks: tuple[LocatedPulse, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TakePairs:
     """Record these pulses as looks at one PM."""
@@ -178,11 +200,15 @@ class Tell:
         text: the message.
         done: whether the current spot is finished, so that the fibre may move on.
         wants: the command that the operator is asked for.
+        answer: whether it only answers a command; what to do next stays as it was.
     """
 
     text: str
     done: bool = False
     wants: CommandKind | None = None
+    answer: bool = False
 
 
-Action = Ask | Sweep | Follow | Halt | Release | TakeAim | TakeCheck | TakePairs | TakeMove | Tell
+Action = (
+    Ask | Sweep | Follow | Halt | Release | TakeAim | TakeCheck | TakeChoice | TakeVerify | TakePairs | TakeMove | Tell
+)

@@ -75,7 +75,9 @@ class LiveConfig:
     solve: SolveConfig
     warnings: tuple[str, ...]
 
-    def context(self, stack: ExitStack, say: Callable[[str], None]) -> DriverContext:
+    def context(
+        self, stack: ExitStack, say: Callable[[str], None], typing: Callable[[str], None] | None = None
+    ) -> DriverContext:
         """What the drivers need; if the simulated room is used, it is started and runs until the stack is left."""
         room = None
         if self.room is not None:
@@ -84,17 +86,27 @@ class LiveConfig:
             process = RoomProcess(self.room.seed, self.room.width, self.settings.aims, self.room.bump_every_s)
             room = stack.enter_context(process).path
         board = self.model.board
-        return DriverContext(say, None if board is None else (board.columns, board.rows), self.rectified, room)
+        return DriverContext(
+            say, None if board is None else (board.columns, board.rows), self.rectified, room, typing=typing
+        )
 
-    def live_setup(self, stack: ExitStack, say: Callable[[str], None], *, seen: bool = True) -> LiveSetup:
+    def live_setup(
+        self,
+        stack: ExitStack,
+        say: Callable[[str], None],
+        *,
+        seen: bool = True,
+        typing: Callable[[str], None] | None = None,
+    ) -> LiveSetup:
         """Set-up of the live session. Opens no device, but starts the simulated room if it is used.
 
         Args:
             stack: ends the room.
             say: shows one line to an operator at the terminal; called from several threads.
             seen: whether pictures that are only displayed are wanted; if not, their device is not opened.
+            typing: shows what is being typed at the terminal; None where the terminal shows it itself.
         """
-        context = self.context(stack, say)
+        context = self.context(stack, say, typing)
 
         def open_devices(devices: ExitStack, _model: SessionModel) -> Devices:
             def opened(chosen: Chosen) -> Any:
@@ -184,6 +196,7 @@ class _Reader:
         if document.stage:
             _check_limits(model, limits)
         _check_ports(devices)
+        _check_keys(devices)
         self.warnings += _open_to_all(devices)
         return LiveConfig(
             self.path,
@@ -369,6 +382,17 @@ def _check_ports(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
         if options.port in taken:
             raise InputError(where, f"port {options.port} again", f"a port besides {taken[options.port]}'s")
         taken[options.port] = where
+
+
+def _check_keys(devices: Mapping[Role, tuple[Chosen, ...]]) -> None:
+    """Check that each operator has a key of its own: a word signed for one counts for no other. Raises InputError."""
+    taken: dict[Path, str] = {}
+    for chosen in devices[Role.OPERATOR]:
+        path = getattr(chosen.options, "key", None)
+        if not isinstance(path, Path):
+            continue
+        if (first := taken.setdefault(path.resolve(), chosen.where)) is not chosen.where:
+            raise InputError(chosen.where, f"the key {path.name} again", f"another key than {first}'s")
 
 
 def _open_to_all(devices: Mapping[Role, tuple[Chosen, ...]]) -> list[str]:

@@ -14,11 +14,12 @@ from typing import Protocol
 
 import numpy as np
 
+from fgreg.camera_moves.validity import Validity
 from fgreg.detection.board import detect_board
-from fgreg.detection.check_points import check_measurement
 from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner
-from fgreg.drivers.base import BmodeFrame, DeviceLost, OperatorCommand, Registration, StereoFrame, host_now
+from fgreg.drivers.base import BmodeFrame, CommandKind, DeviceLost, Registration, StereoFrame, host_now
+from fgreg.drivers.operator_words import asked
 from fgreg.live.actions import (
     Action,
     Ask,
@@ -30,35 +31,38 @@ from fgreg.live.actions import (
     Sweep,
     TakeAim,
     TakeCheck,
+    TakeChoice,
     TakeMove,
     TakePairs,
+    TakeVerify,
     Tell,
 )
 from fgreg.live.device_health import Health, Pictures, Source
+from fgreg.live.heard_words import HeardWords
 from fgreg.live.marker_tracker import MarkerTracker
 from fgreg.live.merge_looks import one_spot
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
 from fgreg.live.scope_holder import Holder, HolderSettings
+from fgreg.live.shots import check_event, pair_events, query_event
 from fgreg.live.stage_commands import Steering
 from fgreg.live.status import Devices, Figures, Status
+from fgreg.live.verification import LiveVerification
 from fgreg.live.workflow import Workflow
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.events import (
     AimEvent,
     CameraMovedEvent,
-    CheckEvent,
+    ExcludeEvent,
+    IncludeEvent,
     MarkerRecord,
     NoteEvent,
-    OtherRecord,
-    PairEvent,
-    PlaneRecord,
-    TrusRecord,
 )
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Latencies, TimedPose
 from fgreg.online.shared_snapshot import NoSnapshotError, Received
+from fgreg.schema.problems import numbers_text
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
@@ -123,7 +127,8 @@ class LiveLoop:
             role: Source(device, self._began_s, sends=role in SENDERS) for role, device in devices.roles().items()
         }
         self._steering = Steering(devices.stage, self._health, lambda text: self._news(Tell(text)), self._began_s)
-        self._commands: list[OperatorCommand] = []
+        self._words = HeardWords()
+        self._verification = LiveVerification(model, self.pulse_locator.locator)
         self._text, self._task, self._number = "", "", 0
         self._bmode: BmodeFrame | None = None
         self._unshown = 0
@@ -160,10 +165,13 @@ class LiveLoop:
         for action in self._workflow.step(self._inputs(now)):
             self._do(action)
         self._take_aim()
+        self._take_verification()
         if self.marker_tracker.newest is not before:  # the frame was processed
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
         self._check_devices(host_now())
+        if text := self._words.news(host_now()):
+            self._note(text)
         return True
 
     @property
@@ -188,6 +196,8 @@ class LiveLoop:
             self.marker_tracker.newest,
             self._bmode,
             self._invalid(),
+            self._words.last,
+            self._words.refused,
         )
 
     def close(self) -> None:
@@ -214,7 +224,7 @@ class LiveLoop:
         pulses = self._sources["probe"].poll()
         self.figures.pulses += len(pulses)
         self.pulse_locator.add_frames(pulses)
-        self._commands += self._sources["operator"].poll()
+        self._words.add(self._sources["operator"].poll())
 
     def _show(self) -> None:
         """Take the newest B-mode picture, which is only displayed."""
@@ -254,8 +264,9 @@ class LiveLoop:
             return None
         self._snapshot = received.snapshot
         stale = received.silent_s > STALE_S or received.closed
-        self._health.found("registration", "its process has ended or hangs" if stale else "")
-        if stale or self._camera_moving_s is not None:
+        begins_again = self._recorder.state.choosing  # its process is replaced by another
+        self._health.found("registration", "its process has ended or hangs" if stale and not begins_again else "")
+        if stale or self._camera_moving_s is not None or self._recorder.state.choosing:
             return None
         if pose is None:
             newest = self.marker_tracker.poses.newest()
@@ -274,8 +285,7 @@ class LiveLoop:
         return track(query, self._snapshot)
 
     def _inputs(self, now: float) -> Inputs:
-        commands, self._commands = tuple(self._commands), []
-        state = self._recorder.state
+        commands, state = self._words.take(host_now()), self._recorder.state
         return Inputs(
             now,
             self.marker_tracker.poses,
@@ -303,6 +313,8 @@ class LiveLoop:
         """Why the registration is invalid; empty if it is valid."""
         if (lost := self._health.lost.get("registration")) is not None:
             return f"the registration is lost: {lost}"
+        if self._recorder.state.choosing:
+            return "shots were left out or taken back by hand, and it is not solved again yet"
         return "" if self._camera_moving_s is None else "the camera is moving, or its move is not in the estimate yet"
 
     def _do(self, action: Action) -> None:
@@ -314,21 +326,24 @@ class LiveLoop:
             case TakeCheck(point, scan_rad):
                 self._check_point(point, scan_rad)
             case TakePairs(pm, looks):
-                spot = one_spot(looks)
-                for look in spot.looks:
-                    self._pair(pm, spot.marker, look)
+                for event in pair_events(pm, one_spot(looks), self._start_s, self._model.stage):
+                    self._recorder.hand_over(event)
+            case TakeVerify(number, count, looks):
+                self._verify(number, count, looks)
+            case TakeChoice(pm, include, by):
+                self._choose(pm, by, include=include)
             case TakeMove():
                 self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
             case Tell():
-                self._tell(action)
+                (self._news if action.answer else self._tell)(action)
 
     def _tell(self, tell: Tell) -> None:
-        self._task = tell.text
+        self._task = asked(tell.text, tell.wants)
         self._news(tell)
 
     def _news(self, tell: Tell) -> None:
         """A message that asks nothing of the operator; the last task stays in force."""
-        self._text = tell.text
+        self._text = asked(tell.text, tell.wants)
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
 
     def _aim(self, corner: tuple[int, int]) -> None:
@@ -375,35 +390,40 @@ class LiveLoop:
 
     def _check_point(self, point: tuple[float, ...], scan_rad: float) -> None:
         """Record a check."""
-        rig = self._model.camera
-        if rig is None or rig.right is None:
-            self._tell(Tell("no check: session.yaml has no stereo camera"))
-            return
-        device = math.degrees(self._model.stage.device_from_scan(scan_rad))
-        plane = PlaneRecord(device, point[4], point[5])
-        event = CheckEvent(self._t(host_now()), 0, left=np.array(point[:2]), right=np.array(point[2:4]), trus=plane)
-        why = check_measurement(event, 0, self._model)
-        if isinstance(why, str):
-            self._tell(Tell(f"no check: {why}"))
+        event = check_event(self._t(host_now()), point, scan_rad, self._model)
+        if isinstance(event, str):
+            self._news(Tell(f"no check: {event}"))
             return
         self._recorder.hand_over(event)
-        self._tell(Tell("check taken", done=True))
+        self._news(Tell("check taken", done=True))
 
-    def _pair(self, pm: int, pose: TimedPose, look: LocatedPulse) -> None:
-        if look.scan_rad is None:
-            raise AssertionError("a look without a plane angle")
-        stage = self._model.stage
-        trus = TrusRecord(
-            math.degrees(stage.device_from_scan(look.scan_rad)),
-            look.x_mm,
-            look.range_mm,
-            covariance=look.covariance,
-            amplitude=look.amplitude,
-            others=tuple(OtherRecord(other.x_mm, other.range_mm, other.covariance) for other in look.others),
-            sweep=stage.direction * look.sweep,
-        )
-        marker = MarkerRecord(pose.parent_T_child, pose.covariance)
-        self._recorder.hand_over(PairEvent(self._t(look.pulse_s), 0, pm, marker, trus))
+    def _choose(self, pm: int, by: str, *, include: bool) -> None:
+        """Record that a PM is left out by hand, or counts again."""
+        state = self._recorder.state
+        there = state.excluded if include else state.pms - state.excluded
+        if pm not in there:
+            word, which = ("include", "that are left out") if include else ("exclude", "that count")
+            self._news(Tell(f"no {word}: the PMs {which}: {numbers_text(there)}"))
+            return
+        kind = IncludeEvent if include else ExcludeEvent
+        self._recorder.hand_over(kind(self._t(host_now()), 0, pm, reason="said in the live session", by=by))
+        effect = "counts again" if include else "is left out by hand"
+        self._news(Tell(f"PM {pm} {effect}: the registration is solved again"))
+
+    def _verify(self, number: int, count: int, looks: tuple[LocatedPulse, ...]) -> None:
+        """Record looks at a new PM beside the estimate, and compare the registration with them after the last."""
+        events = pair_events(number, one_spot(looks), self._start_s, self._model.stage)
+        self._recorder.hand_over(query_event(events))
+        self._verification.add(number, events)
+        if number + 1 == count and self._snapshot is not None:
+            self._verification.compare(self._snapshot, self._recorder.config)
+
+    def _take_verification(self) -> None:
+        found = self._verification.result()
+        if found is not None:
+            text, validity = found
+            self._recorder.hand_over(NoteEvent(self._t(host_now()), 0, text))
+            self._tell(Tell(text, wants=CommandKind.MOVED if validity is Validity.MOVED else None))
 
     def _send(self, now: float) -> None:
         """Send the registration to the sinks."""

@@ -18,7 +18,16 @@ from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.actions import RegistrationState
 from fgreg.model.estimate import Verdict
-from fgreg.model.events import AimEvent, CameraMovedEvent, CheckEvent, NoteEvent, PairEvent
+from fgreg.model.events import (
+    AimEvent,
+    CameraMovedEvent,
+    CheckEvent,
+    HandChoice,
+    NoteEvent,
+    PairEvent,
+    TrackEvent,
+)
+from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine_process import EngineGone
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import LiveSession
@@ -30,7 +39,7 @@ AGAIN_S = 5.0
 RESTARTED = "the registration's process had ended; a new one has taken in the recorded events"
 ENGINE_ENDED = "the registration's process has ended and is being restarted: later events are not in the estimate"
 
-Recorded = AimEvent | PairEvent | CameraMovedEvent | CheckEvent | NoteEvent
+Recorded = AimEvent | PairEvent | CameraMovedEvent | CheckEvent | HandChoice | NoteEvent | TrackEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +52,8 @@ class RecorderState:
         trouble: the last error; empty if there is none.
         camera_moving: a reported camera move is not in the estimate yet, so the registration is invalid.
         blocked: why nothing can be recorded now; waiting events are recorded later. Empty if recording works.
+        pms, excluded: numbers of the PMs that count, and of those that are left out by hand.
+        choosing: shots that were left out or taken back are not in the estimate yet, so the registration is invalid.
     """
 
     registration: RegistrationState
@@ -54,6 +65,9 @@ class RecorderState:
     trouble: str = ""
     camera_moving: bool = False
     blocked: str = ""
+    pms: frozenset[int] = frozenset()
+    excluded: frozenset[int] = frozenset()
+    choosing: bool = False
 
 
 OnTaken = Callable[[Recorded, OnlineEstimate | None, FloatArray | None], None]
@@ -75,9 +89,15 @@ class Recorder:
         self._lock = threading.Lock()
         self._state = self._recorded()
         self._moves, self._move_lost = 0, False  # camera moves that wait; whether one was refused
+        self._choices = 0  # choices by hand that wait
         self._ended, self._left, self._revived_s = False, 0, -math.inf
         self._thread = threading.Thread(target=self._run, name="recorder")
         self._thread.start()
+
+    @property
+    def config(self) -> SolveConfig:
+        """Of the estimate."""
+        return self._session.config
 
     @property
     def state(self) -> RecorderState:
@@ -98,6 +118,10 @@ class Recorder:
             with self._lock:
                 self._moves += 1
                 self._state = replace(self._state, camera_moving=True)
+        elif isinstance(event, HandChoice):
+            with self._lock:
+                self._choices += 1
+                self._state = replace(self._state, choosing=True)
         self._waiting.put(event)
 
     def close(self) -> None:
@@ -126,7 +150,15 @@ class Recorder:
     def _recorded(self) -> RecorderState:
         """State of the session as opened."""
         taken, estimate = self._session.measurements(), self._session.estimate
-        return RecorderState(registration_state(estimate), estimate, aims=len(taken.aims), pairs=len(taken.pairs))
+        excluded = frozenset(shot.pm for shot in self._session.excluded if shot.pm is not None)
+        return RecorderState(
+            registration_state(estimate),
+            estimate,
+            aims=len(taken.aims),
+            pairs=len(taken.pairs),
+            pms=frozenset(pair.pm for pair in taken.pairs),
+            excluded=excluded,
+        )
 
     def _revive(self) -> None:
         """Start a new engine, unless that was tried within ``AGAIN_S``."""
@@ -147,18 +179,27 @@ class Recorder:
             with self._lock:
                 self._state = replace(self._state, trouble=f"{ENGINE_ENDED}: {error}")
             return
+        self._began_again(state)
+
+    def _began_again(self, state: RecorderState, choices: int = 0) -> None:
+        """Take over the state of a session whose engine has begun again from the recorded events, ``choices`` of which
+        had been handed over."""
         with self._lock:
-            self._state = replace(state, refused=self._state.refused, camera_moving=self._moves > 0 or self._move_lost)
+            self._choices -= choices
+            moving, choosing = self._moves > 0 or self._move_lost, self._choices > 0
+            self._state = replace(state, refused=self._state.refused, camera_moving=moving, choosing=choosing)
 
     def _take(self, event: Recorded) -> bool:
         """Record one event; whether the disk took it."""
+        if isinstance(event, HandChoice):
+            return self._choose(event)
         aims = pairs = refused = 0
         trouble, estimate = "", self._session.estimate
         moved = isinstance(event, CameraMovedEvent)
         if isinstance(event, CameraMovedEvent) and self._move_lost:  # it follows a move that is not in the estimate
             event = replace(event, camera_new_T_camera_old=None, covariance=None)
         try:
-            if isinstance(event, NoteEvent):
+            if isinstance(event, NoteEvent | TrackEvent):
                 self._session.record(event)
             else:
                 estimate = self._session.add(event)
@@ -188,6 +229,9 @@ class Recorder:
                 before.refused + refused,
                 trouble=trouble,
                 camera_moving=self._moves > 0 or self._move_lost,
+                pms=before.pms | {event.pm} if pairs and isinstance(event, PairEvent) else before.pms,
+                excluded=before.excluded,
+                choosing=self._choices > 0,
             )
         if self._on_taken is not None and not refused:
             try:
@@ -196,6 +240,27 @@ class Recorder:
                 self._revive()
                 return True
             self._on_taken(event, estimate, beam)
+        return True
+
+    def _choose(self, event: HandChoice) -> bool:
+        """Record a choice by hand: the engine begins again from the recorded events. Whether the disk took it."""
+        try:
+            self._session.add(event)
+        except JournalError as error:
+            with self._lock:
+                self._state = replace(self._state, trouble=str(error), blocked=str(error))
+            return False
+        except EngineGone:
+            with self._lock:
+                self._choices -= 1
+            self._revive()
+            return True
+        except FgregError as error:  # it is on disk; the next refresh finds the engine gone and starts another
+            with self._lock:
+                self._choices -= 1
+                self._state = replace(self._state, trouble=str(error), choosing=self._choices > 0)
+            return True
+        self._began_again(self._recorded(), 1)
         return True
 
     def _refresh(self, *, holding: bool = False) -> None:

@@ -99,8 +99,8 @@ class Steering:
             return False
         try:
             match order:
-                case Ask(kind):
-                    link.request(kind, "operator")
+                case Ask(kind, by):
+                    link.request(kind, f"operator ({by})" if by else "operator")
                     if kind is MotionKind.HOME:
                         link.home("asked for by the operator")
                 case Sweep(scan_rad, reason):

@@ -10,6 +10,7 @@ from typing import Any
 from fgreg.drivers.base import (
     BmodeFrame,
     BmodeSource,
+    CommandKind,
     MotionSource,
     Operator,
     PhotoacousticSource,
@@ -19,8 +20,10 @@ from fgreg.drivers.base import (
 )
 from fgreg.live.actions import StageView
 from fgreg.live.recorder import RecorderState
+from fgreg.live.workflow import Stage
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.time_sync import TimedPose
+from fgreg.stage.limits import MotionKind
 from fgreg.stage.reconnect import ReconnectingStage
 
 LATENCIES = 100_000
@@ -90,6 +93,7 @@ class Status:
         latched: why the stage may not move until a reset; empty if it may.
         pose, frame: newest. bmode: newest, None if its scanner is lost.
         invalid: why the registration is invalid, whatever its verdict was; empty if it is valid.
+        heard: the last word in force and who said it. refused: the last refused one, with the reason.
     """
 
     now_s: float
@@ -106,11 +110,35 @@ class Status:
     frame: StereoFrame | None
     bmode: BmodeFrame | None = None
     invalid: str = ""
+    heard: str = ""
+    refused: str = ""
 
     @property
     def verdict(self) -> Verdict:
         """Current verdict; REFUSED if the registration is invalid."""
         return Verdict.REFUSED if self.invalid else self.recorder.registration.verdict
+
+    @property
+    def words(self) -> tuple[CommandKind, ...]:
+        """The words that have an effect now, a stop last."""
+        recorder, plane = self.recorder, self.plane
+        usable = recorder.registration.registered and self.verdict is not Verdict.REFUSED
+        work = {
+            CommandKind.RESET: bool(self.latched),
+            CommandKind.AIM: self.stage == Stage.AIMING,
+            CommandKind.REGISTER: self.stage == Stage.AIMING,
+            CommandKind.HOME: plane is not None and not self.latched,
+            CommandKind.SEARCH: plane is not None and plane.homed and not self.latched,
+            CommandKind.FOLLOW: plane is not None and plane.homed and not self.latched and usable,
+            CommandKind.NEXT: plane is not None and plane.requested is MotionKind.SEARCH,
+            CommandKind.MOVED: True,
+            CommandKind.CHECK: plane is not None,
+            CommandKind.VERIFY: plane is not None and usable,
+            CommandKind.EXCLUDE: bool(recorder.pms - recorder.excluded),
+            CommandKind.INCLUDE: bool(recorder.excluded),
+            CommandKind.STOP: True,
+        }
+        return tuple(kind for kind, works in work.items() if works)
 
     @property
     def reasons(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from enum import StrEnum
 from typing import Annotated
 
 from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.drivers.operator_words import spelt
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.actions import (
     Action,
@@ -23,8 +24,10 @@ from fgreg.live.actions import (
     Sweep,
     TakeAim,
     TakeCheck,
+    TakeChoice,
     TakeMove,
     TakePairs,
+    TakeVerify,
     Tell,
 )
 from fgreg.live.hold_still import held_pose, moved_mm, turned_rad
@@ -51,6 +54,8 @@ CHECK_S = 0.3
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
 """Wait after which the operator gets a message about what is missing."""
+VERIFY_PMS = 4
+"""New PMs that a verification takes: with one fewer no wrong detection among them could be told from the others."""
 MISSED = 8
 """Number of consecutive pulses without a PM, where one is expected, after which the operator gets a message."""
 
@@ -58,6 +63,11 @@ MISSED = 8
 def _why(registration: RegistrationState) -> str:
     """The first reason for refusing the registration."""
     return registration.reasons[0] if registration.reasons else "no registration"
+
+
+def _usable(registration: RegistrationState) -> bool:
+    """Whether there is a registration that is not refused."""
+    return registration.registered and registration.verdict is not Verdict.REFUSED
 
 
 class Stage(StrEnum):
@@ -125,6 +135,8 @@ class Workflow:
         self._wanted_s = -math.inf
         self._waits_s = -math.inf
         self._checks, self._checked_s = False, -math.inf
+        self._verified: int | None = None  # PMs of the verification under way
+        self._aims = -1  # calibration shots that were taken when the next one was asked for
         self._not_before_s = -math.inf  # earlier pulses belong to another epoch
 
     @property
@@ -142,11 +154,13 @@ class Workflow:
         if inputs.camera_moving_s is not None:
             # The registration is invalid. The motion request stays; the safety gate blocks the motion meanwhile.
             self._search, self._not_before_s = None, max(self._not_before_s, inputs.now_s)
+            self._end_verification("the camera moves", out)
             return tuple(out)
         if inputs.registration.epoch != self._epoch:
             self._epoch, self._pms, self._done_at, self._missed = inputs.registration.epoch, 0, None, 0
             self._refused_pms = 0
             self._search = None
+            self._end_verification("the camera has moved", out)
             out.append(Tell("the camera has moved: the registration starts again"))
         self._advance(inputs, out)
         if any(isinstance(action, Ask | Halt | Release) for action in out):
@@ -154,7 +168,7 @@ class Workflow:
             return tuple(out)  # the next stage order depends on how the stage reacts
         if inputs.stage is not None and not latched and self._may_turn(inputs, inputs.stage, out):
             searches = inputs.stage.requested is MotionKind.SEARCH
-            if self.stage is Stage.COLLECTING or (self.stage is Stage.FOLLOWING and searches):
+            if self._searching or (self.stage is Stage.FOLLOWING and searches):
                 self._collect(inputs, inputs.stage, out)
             elif self.stage is Stage.FOLLOWING:
                 self._follow(inputs, inputs.stage, out)
@@ -178,10 +192,10 @@ class Workflow:
         if not stage.homed:
             self._want(CommandKind.HOME, "the stage has to find its zero position", inputs.now_s, out)
             return False
-        if self.stage is Stage.COLLECTING and stage.requested is not MotionKind.SEARCH:
+        if self._searching and stage.requested is not MotionKind.SEARCH:
             self._want(CommandKind.SEARCH, "the stage has to turn in search of PMs", inputs.now_s, out)
             return False
-        if self.stage is Stage.FOLLOWING and self._settings.follow and self._search is None:
+        if self.stage is Stage.FOLLOWING and not self._searching and self._settings.follow and self._search is None:
             tracking = inputs.tracking
             answered = tracking is not None and tracking.stage_rad is not None
             if answered and stage.requested is not MotionKind.TRACK:
@@ -189,6 +203,11 @@ class Workflow:
             elif not answered and tracking is not None and stage.requested is MotionKind.TRACK:
                 self._want(CommandKind.SEARCH, f"{tracking.reason}: hold it still and search here", inputs.now_s, out)
         return True
+
+    @property
+    def _searching(self) -> bool:
+        """Whether PMs have to be searched now."""
+        return self.stage is Stage.COLLECTING or self._verified is not None
 
     def _want(self, wanted: CommandKind, text: str, now_s: float, out: list[Action]) -> None:
         """Ask the operator for a command, and again after a while."""
@@ -202,37 +221,72 @@ class Workflow:
     def _obey(self, command: OperatorCommand, inputs: Inputs) -> list[Action]:
         match command.kind:
             case CommandKind.HOME:
-                return [Ask(MotionKind.HOME)]
+                return [Ask(MotionKind.HOME, command.peer)]
             case CommandKind.SEARCH:
-                return [Ask(MotionKind.SEARCH)]
+                return [Ask(MotionKind.SEARCH, command.peer)]
             case CommandKind.FOLLOW:
-                return [Ask(MotionKind.TRACK)]
+                out: list[Action] = []
+                self._end_verification("follow was said", out)
+                return [*out, Ask(MotionKind.TRACK, command.peer)]
             case CommandKind.AIM if command.corner is not None:
                 return [TakeAim(command.corner)]
             case CommandKind.REGISTER if self.stage is Stage.AIMING:
                 self.stage = Stage.COLLECTING
+            case CommandKind.REGISTER:
+                return [Tell("no register: the calibration shots are done", answer=True)]
+            case CommandKind.NEXT if self._search is not None:
+                self._done_at, self._search = self._search.held, None
+                return [Tell("this spot is left: hold the fibre elsewhere", answer=True)]
             case CommandKind.NEXT:
-                self._search = None
+                return [Tell("no next: nothing is searched for now", answer=True)]
             case CommandKind.MOVED:
                 self._search = None
                 return [TakeMove()]
             case CommandKind.CHECK if command.point is not None:
                 if inputs.stage is None or inputs.stage.moving:
                     why = "not there" if inputs.stage is None else "turning"
-                    return [Tell(f"no check: the stage is {why}")]
+                    return [Tell(f"no check: the stage is {why}", answer=True)]
                 return [TakeCheck(command.point, inputs.stage.scan_rad)]
+            case CommandKind.EXCLUDE | CommandKind.INCLUDE if command.pm is not None:
+                return [TakeChoice(command.pm, command.kind is CommandKind.INCLUDE, command.peer)]
+            case CommandKind.VERIFY:
+                return [self._begin_verification(inputs)]
             case CommandKind.STOP:
                 self._search = None
                 return [Halt("the operator has stopped the stage")]
             case CommandKind.RESET:
                 if inputs.stage is not None and inputs.stage.latched:
                     return [Release()]
-                return [Tell(f"no reset: the stage is not {'there' if inputs.stage is None else 'latched'}")]
+                return [
+                    Tell(f"no reset: the stage is not {'there' if inputs.stage is None else 'latched'}", answer=True)
+                ]
         return []
+
+    def _begin_verification(self, inputs: Inputs) -> Tell:
+        if inputs.stage is None:
+            return Tell("no verify: the stage is not there", answer=True)
+        if inputs.camera_moving_s is not None or not _usable(inputs.registration):
+            return Tell("no verify: there is no registration that may be used", answer=True)
+        self._verified, self._search = 0, None
+        return Tell(
+            f"verifying with {VERIFY_PMS} new PMs, which are not added to the registration: hold the fibre elsewhere",
+            done=True,
+        )
+
+    def _end_verification(self, why: str, out: list[Action]) -> None:
+        if self._verified is not None:
+            self._verified = None
+            out.append(Tell(f"the verification ends without a result: {why}", answer=True))
 
     def _advance(self, inputs: Inputs, out: list[Action]) -> None:
         registration = inputs.registration
-        usable = registration.registered and registration.verdict is not Verdict.REFUSED
+        usable = _usable(registration)
+        if not usable:
+            self._end_verification(f"the registration is refused: {_why(registration)}", out)
+        if self.stage is Stage.AIMING and inputs.aims != self._aims and inputs.aims < self._settings.aims:
+            self._aims = inputs.aims
+            shots = f"{inputs.aims} of {self._settings.aims} calibration shots are taken"
+            out.append(Tell(f"{shots}: put the beam on a corner of the board, and say {spelt(CommandKind.AIM)}"))
         if self.stage is Stage.AIMING and inputs.aims >= self._settings.aims:
             self.stage = Stage.COLLECTING
             out.append(Tell("calibrated: hold the fibre at the tissue", done=True))
@@ -244,7 +298,8 @@ class Workflow:
         elif self.stage is Stage.COLLECTING and self._pms >= self._refused_pms + self._settings.most_pms:
             self._refused_pms = self._pms
             why = _why(registration)
-            out.append(Tell(f"{self._pms} PMs, and refused: {why}; if the camera was moved, say so (moved)"))
+            moved = spelt(CommandKind.MOVED)
+            out.append(Tell(f"{self._pms} PMs, and refused: {why}; if the camera was moved, say {moved}"))
         elif self.stage is Stage.FOLLOWING and not usable:
             self.stage, self._pms, self._refused_pms = Stage.COLLECTING, 0, 0
             why = _why(registration)
@@ -319,9 +374,13 @@ class Workflow:
             why = next((look.unpaired for look in search.looks if look.unpaired), off_window)
             out.append(Tell(f"the PM was detected, but cannot be paired ({why}): go on to the next spot", done=True))
             return
-        out.append(TakePairs(self._next_pm, looks))
-        self._next_pm += 1
-        self._pms += 1
+        if self._verified is None:
+            out.append(TakePairs(self._next_pm, looks))
+            self._next_pm += 1
+            self._pms += 1
+        else:
+            out.append(TakeVerify(self._verified, VERIFY_PMS, looks))
+            self._verified = self._verified + 1 if self._verified + 1 < VERIFY_PMS else None
         turn, sigma = math.degrees(found.scan_rad), math.degrees(found.sigma_rad)
         text = f"PM detected at {turn:.1f} +- {sigma:.1f} deg (1 sigma) after {found.positions} positions"
         if self._settings.both_sides:
@@ -379,4 +438,6 @@ class Workflow:
                 self._next_pm += 1
                 self._pms += 1
         if self._missed == MISSED:
-            out.append(Tell("the PM is not detected where the registration expects it: has the camera moved?"))
+            moved = spelt(CommandKind.MOVED)
+            text = f"the PM is not detected where the registration expects it: if the camera has moved, say {moved}"
+            out.append(Tell(text))

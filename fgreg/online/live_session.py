@@ -167,6 +167,11 @@ class LiveSession:
         """After the last event that was taken in, with the checks of its epoch; None before the first."""
         return self._with_all(self._estimate)
 
+    @property
+    def excluded(self) -> tuple[ExcludedShot, ...]:
+        """The shots that are left out by hand."""
+        return self._excluded
+
     def _with_all(self, estimate: OnlineEstimate | None) -> OnlineEstimate | None:
         """The engine's estimate with the checks, and with what was left out by hand."""
         checked = self._checks.applied(estimate)
@@ -301,8 +306,8 @@ class LiveSession:
             return replace(self._engine.track(found), causal=True)
         return TrackEstimate(query.t, None, None, None, causal=True, reason=str(found))
 
-    def record(self, event: NoteEvent | StageEvent) -> None:
-        """Record an event that the estimate does not depend on.
+    def record(self, event: NoteEvent | StageEvent | TrackEvent) -> None:
+        """Record an event that the estimate does not depend on; a query is not answered.
 
         Raises:
             InputError: not an event that a session may hold.

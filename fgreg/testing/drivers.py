@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from fgreg.drivers.base import BmodeFrame, DeviceLost, MotionSample, PaFrame, Registration, StereoFrame, host_now
-from fgreg.drivers.plugin_device import ITEMS
+from fgreg.drivers.plugin_device import ITEMS, is_item
 from fgreg.drivers.registry import Role
 from fgreg.geometry.transforms import as_float_array, is_rigid
 from fgreg.model.time_sync import Stamp
@@ -173,7 +173,7 @@ class _Tried:
 
     def _take(self, item: Any) -> None:
         expected = ITEMS[self.role]
-        _rule(isinstance(item, expected), f"gave a {type(item).__name__}, expected {expected.__name__}")
+        _rule(is_item(self.role, item), f"gave a {type(item).__name__}, expected {expected.__name__}")
         if self.role is not Role.OPERATOR:
             self._check_stamp(item)
             arrays = _arrays(item)
