@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fgreg.cli.live import status_line
+from fgreg.cli.live_display import status_line
 from fgreg.drivers.base import CommandKind, MotionSample, OperatorCommand, PaFrame, Registration, StereoFrame, host_now
 from fgreg.errors import EventRefused, FgregError, JournalError
 from fgreg.geometry.transforms import FloatArray, make_transform

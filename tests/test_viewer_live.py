@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fgreg.cli.live import status_panel
+from fgreg.cli.live_display import page as terminal_page
+from fgreg.cli.live_display import status_rows, word_rows
 from fgreg.drivers.base import BmodeFrame
 from fgreg.live.actions import RegistrationState, StageView
 from fgreg.live.recorder import RecorderState
@@ -149,7 +150,7 @@ def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[s
     [
         (
             status(Verdict.OK),
-            ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8° (1 sigma)", "news [red]"],
+            ["OK", "1.87 mm", "hold it still", "at -15.0°; beam at -21.0° ± 0.8° (1 sigma)"],
         ),
         (
             replace(status(Verdict.OK), tracking=None, invalid="the camera is moving"),
@@ -162,9 +163,11 @@ def status(verdict: Verdict | None, lost: tuple[str, ...] = (), reasons: tuple[s
 def test_the_panel_says_it_all_on_a_small_terminal(shown: Status, expected: list[str]) -> None:
     console = Console(width=80, height=24, force_terminal=False, highlight=False, record=True, file=io.StringIO())
     figures = Figures(frames=89_000, skipped=120, found=76_000, pictures=12_000, unshown=333)
-    console.print(status_panel(figures, make_model().stage, shown))
+    said = tuple((f"12:00:0{i}", f"message {i} [red] " + 40 * "long ") for i in range(4))
+    rows = [*status_rows(figures, make_model().stage, shown), *word_rows(shown, said, "sear")]
+    console.print(terminal_page(rows, console))
     text = console.export_text()
-    assert all(word in text for word in expected), text
+    assert all(word in text for word in [*expected, "message 3 [red]", "stop (x, or an empty line)", "sear_"]), text
     assert len(text.splitlines()) <= 23
     assert all(len(line) <= 80 for line in text.splitlines())
 

@@ -3,11 +3,9 @@
 import json
 import math
 import signal
-import sys
-import textwrap
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,9 +15,9 @@ from fgreg.cli.options import LimitOption, solve_config, warn, warn_of_leftovers
 from fgreg.errors import InputError
 
 if TYPE_CHECKING:
-    from fgreg.live.launch import LiveSetup, Running
+    from fgreg.cli.live_display import LiveDisplay
+    from fgreg.live.launch import LiveSetup
     from fgreg.live.status import Figures, Status
-    from fgreg.model.session_model import StageModel
     from fgreg.model.solve_config import SolveConfig
     from fgreg.pipeline.solve import SolveReport
 
@@ -35,11 +33,6 @@ IN_CONFIG = {
     "limit_mm": "settings.limit_mm",
 }
 """Parameters of the command, and their keys in CONFIG.yaml."""
-SHOW_S = 0.25
-SLOW_MS = 250.0
-"""Latency from a frame to its angle above which the stage lags behind and its watchdog may miss the heartbeat."""
-MOST_REASONS, REASON_WIDTH = 2, 170
-"""Limits of the verdict's reasons in the panel, which must fit a small terminal."""
 
 
 def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBar) -> None:
@@ -119,6 +112,7 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
 
             typer.echo(example(), nl=False)
             return
+        from fgreg.cli.live_display import LiveDisplay
         from fgreg.cli.report import print_summary
         from fgreg.cli.report_document import summary_dict
         from fgreg.live.launch import default_folder
@@ -139,13 +133,13 @@ def add_live(app: typer.Typer, make_extras: MakeExtras, progress_bar: ProgressBa
         check_outputs([("the result", result, RESULT_KIND), ("--rrd", rrd, RECORDING)])
         warn_of_leftovers(folder, rrd)
         with ExitStack() as stack:
-            viewer = not (no_viewer or silent)
+            viewer, display = not (no_viewer or silent), LiveDisplay(silent)
             seen = viewer or rrd is not None
             if config is None:
                 setup = _room(stack, seed, aims, bumps, width, seen=seen)
             else:
-                setup, settings = _configured(stack, config, silent=silent, seen=seen)
-            figures = _conduct(setup, folder, settings, duration, rrd, viewer=viewer, silent=silent)
+                setup, settings = _configured(stack, config, display, seen=seen)
+            figures = _conduct(setup, folder, settings, duration, rrd, display, viewer=viewer)
         with progress_bar(silent) as progress:
             report = solve_session(SolveRequest(folder, None, None), settings, progress)
         extras = make_extras(report)
@@ -182,13 +176,13 @@ def _room(stack: ExitStack, seed: int, aims: int, bump_every_s: float, width_px:
     return simulated_room(stack, seed, aims, bump_every_s, width_px, seen=seen)
 
 
-def _configured(stack: ExitStack, path: Path, *, silent: bool, seen: bool) -> "tuple[LiveSetup, SolveConfig]":
+def _configured(stack: ExitStack, path: Path, display: "LiveDisplay", *, seen: bool) -> "tuple[LiveSetup, SolveConfig]":
     from fgreg.live.config import read_config
 
     found = read_config(path)
     for warning in found.warnings:
         warn(warning)
-    return found.live_setup(stack, (lambda _line: None) if silent else typer.echo, seen=seen), found.solve
+    return found.live_setup(stack, display.say, seen=seen, typing=display.typing), found.solve
 
 
 def _conduct(
@@ -197,9 +191,9 @@ def _conduct(
     config: "SolveConfig",
     duration_s: float | None,
     rrd: Path | None,
+    display: "LiveDisplay",
     *,
     viewer: bool,
-    silent: bool,
 ) -> "Figures":
     from fgreg.live.launch import running
     from fgreg.live.viewer_feed import viewer_feed
@@ -212,26 +206,22 @@ def _conduct(
         ended = True
         emergency_stop_all()  # the stage stops now; the loop ends after its current turn
 
-    with _display(silent) as (say, show), viewer_feed(rrd, folder.name, live=viewer, say=say) as feed:
+    with display, viewer_feed(rrd, folder.name, live=viewer, say=display.say) as feed:
         before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
         try:
-            with running(setup, folder, config, feed.taken, say) as session:
+            with running(setup, folder, config, feed.taken, display.say) as session:
                 feed.session(session.model, config.limit_mm)
                 until = math.inf if duration_s is None else time.monotonic() + duration_s
-                shown = -math.inf
 
                 def on_status(status: "Status") -> None:
-                    nonlocal shown
                     feed.status(status)
-                    if status.now_s - shown > SHOW_S:
-                        shown = status.now_s
-                        show(session, status)
+                    display.show(session.loop.figures, session.model.stage, status)
 
-                say(f"recording to {folder}")
+                display.say(f"recording to {folder}", lasting=True)
                 try:
                     session.loop.run(lambda: not ended and time.monotonic() < until, on_status)
                 except KeyboardInterrupt:
-                    say("ending")
+                    display.say("ending")
                 return session.loop.figures
         finally:
             for number, handler in before.items():
@@ -263,90 +253,3 @@ def figures_line(figures: "Figures") -> str:
         f"{found['stage_orders']} orders to the stage; from frame to angle: median {latency['p50']:.0f}, "
         f"99 % {latency['p99']:.0f}, longest {latency['max']:.0f} ms"
     )
-
-
-Say = Callable[[str], None]
-Show = Callable[["Running", "Status"], None]
-
-
-@contextmanager
-def _display(silent: bool) -> Iterator[tuple[Say, Show]]:
-    """A live panel on a terminal, else a line for every new message."""
-    if silent:
-        yield lambda _text: None, lambda _session, _status: None
-        return
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console(highlight=False, emoji=False)
-    if not sys.stdout.isatty():
-        last: list[str] = [""]
-
-        def line(_session: "Running", status: "Status") -> None:
-            if status.text != last[0]:
-                last[0] = status.text
-                console.print(status_line(status), soft_wrap=True)
-
-        yield lambda text: console.print(text, style="dim"), line
-        return
-    with Live(console=console, refresh_per_second=4, transient=True) as area:
-
-        def panel(session: "Running", status: "Status") -> None:
-            area.update(status_panel(session.loop.figures, session.model.stage, status))
-
-        yield lambda text: console.print(text, style="dim"), panel
-
-
-def status_line(status: "Status") -> str:
-    """One line: phase, estimate, last message."""
-    known = status.recorder.registration
-    lost = f"  lost: {', '.join(status.lost)}" if status.lost else ""
-    verdict = status.verdict.value if known.registered else "no registration"
-    state = f"epoch {known.epoch}, {known.pairs} looks, {verdict}"
-    return f"{status.stage:<11} {state:<36} {status.text}{lost}"
-
-
-def status_panel(figures: "Figures", stage: "StageModel", status: "Status") -> Any:
-    """The session's status as a panel, with the most important rows first, as in the viewer."""
-    from rich.panel import Panel
-    from rich.table import Table
-    from rich.text import Text
-
-    from fgreg.cli.report import STYLES
-    from fgreg.live.viewer_feed import now_of
-    from fgreg.viewer.status_line import error_line, next_line, stage_line
-
-    state, now = status.recorder, now_of(status, stage)
-    known, estimate = state.registration, state.estimate
-    table = Table.grid(padding=(0, 2))
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-
-    def row(title: str, text: str, style: str = "") -> None:
-        table.add_row(title, Text(text, style=style))  # messages of devices are not markup
-
-    if known.registered:
-        row("registration", status.verdict.value.upper(), STYLES[status.verdict])
-        tre = None if estimate is None or status.invalid else estimate.predicted_tre
-        row("predicted error", f"{error_line(tre)} (95 % bound, worst target)")
-    else:
-        row("registration", "none yet")
-    for reason in status.reasons[:MOST_REASONS]:
-        row("", textwrap.shorten(reason, REASON_WIDTH, placeholder=" ..."))
-    if status.lost:
-        row("LOST", ", ".join(status.lost), "bold white on red")
-    if state.trouble:
-        row("trouble", state.trouble, "red")
-    row("next", next_line(now), "bold")
-    row("stage", stage_line(now, stage))
-    if now.news != now.task:
-        row("last message", now.news)
-    row("session", f"{status.stage}, camera epoch {known.epoch}, {known.pairs} looks in it")
-    latency = f", {figures.latency_ms[-1]:.0f} ms" if figures.latency_ms else ""
-    slow = bool(figures.latency_ms) and figures.latency_ms[-1] > SLOW_MS
-    seen = f"{figures.frames} frames, {figures.skipped} skipped, marker in {figures.found}{latency}"
-    row("camera", seen + (": this machine cannot keep up" if slow else ""), "yellow" if slow else "")
-    if figures.pictures:
-        row("B-mode", f"{figures.pictures} pictures, {figures.unshown} left out for newer ones")
-    row("recorded", f"{state.aims} aims, {state.pairs} looks, {state.refused} refused, {state.waiting} waiting")
-    return Panel(table, title="fgreg live", subtitle="Ctrl-C ends the session", expand=True)
