@@ -13,11 +13,11 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
@@ -127,6 +127,21 @@ class _Cadence:
         return self.period_s
 
 
+class Input(Protocol):
+    """A source of numbered pictures; fgreg.drivers.video_input.VideoInput says more."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def connected(self) -> bool: ...
+    @property
+    def ended(self) -> bool: ...
+    @property
+    def dropped(self) -> int: ...
+    def poll(self) -> Sequence[Grabbed]: ...
+    def close(self) -> None: ...
+
+
 class Endoscope:
     """A StereoCamera (fgreg.drivers.base) of one or two video inputs.
 
@@ -135,17 +150,24 @@ class Endoscope:
     Args:
         config: inputs and their layout.
         rectified: rectification of the pictures, or None; the session's camera is then ``rectified.rig``.
+        inputs: one or two in place of the configuration's sources, stamped by one clock.
 
     Raises:
         InputError: an invalid source. An absent device is no error: it counts as lost, and the driver tries again.
     """
 
-    def __init__(self, config: EndoscopeConfig, rectified: Rectification | None = None) -> None:
+    def __init__(
+        self,
+        config: EndoscopeConfig,
+        rectified: Rectification | None = None,
+        inputs: Sequence[Input] = (),
+    ) -> None:
         self._config, self._rectified = config, rectified
-        sources = [_Source.of(entry) for entry in (config.left, config.right) if entry is not None]
+        sources = [] if inputs else [_Source.of(entry) for entry in (config.left, config.right) if entry is not None]
         origin = Origin()
-        self._inputs = [VideoInput(s.name, s.open, s.timing, config.queue, origin) for s in sources]
-        one_clock = len({source.clock for source in sources}) == 1 and sources[0].clock != "host"
+        self._inputs: list[Input] = [*inputs]
+        self._inputs += [VideoInput(s.name, s.open, s.timing, config.queue, origin) for s in sources]
+        one_clock = len({source.clock for source in sources}) <= 1 and all(s.clock != "host" for s in sources)
         self._matcher = StereoMatcher(
             config.max_gap_s,
             (lambda g: g.stamp.device_s) if one_clock and not config.by_arrival else (lambda g: g.stamp.host_s),
@@ -183,7 +205,7 @@ class Endoscope:
             DeviceLost: an input is lost; once for each loss, with what continues without it.
             InputError: frames that do not fit the layout or the rectification.
         """
-        grabbed: list[list[Grabbed]] = []
+        grabbed: list[Sequence[Grabbed]] = []
         for i, entry in enumerate(self._inputs):
             try:
                 grabbed.append(entry.poll())

@@ -65,6 +65,16 @@ def trus_T_plane(scan_rad: float) -> FloatArray:
     return make_transform(exp_so3(np.array([-scan_rad, 0.0, 0.0])), np.zeros(3))
 
 
+def usable_verdict(registration: Registration) -> tuple[str, tuple[str, ...]]:
+    """The verdict, ``refused`` where there is no matrix or none that is rigid, and its reasons."""
+    matrix, reasons = registration.trus_T_camera, registration.reasons
+    if registration.verdict not in USABLE or matrix is None:
+        return "refused", reasons
+    if not (np.isfinite(matrix).all() and is_rigid(matrix)):
+        return "refused", ("the transform is not rigid", *reasons)
+    return registration.verdict, reasons
+
+
 def registration_messages(registration: Registration, sent_s: float, names: DeviceNames, version: int = 2) -> bytes:
     """All messages for one registration, in one block: STATUS first.
 
@@ -73,17 +83,13 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
         sent_s: of the data behind it, s since 1970.
         version: of the header; 1 for receivers of OpenIGTLink 1 and 2, without metadata.
     """
-    reasons = registration.reasons
-    matrix = registration.trus_T_camera
-    usable = registration.verdict in USABLE and matrix is not None
-    if usable and matrix is not None and not (np.isfinite(matrix).all() and is_rigid(matrix)):
-        usable, reasons = False, ("the transform is not rigid", *reasons)
-    verdict = registration.verdict if usable else "refused"
+    verdict, reasons = usable_verdict(registration)
+    usable, matrix = verdict in USABLE, registration.trus_T_camera
     text = "; ".join(reasons)[:TEXT_CHARACTERS]
     common = {"TransformStatus": "OK" if usable else "INVALID", "Verdict": verdict, "Reasons": text}
     status = Status(STATUS_OK if usable else STATUS_NOT_READY, 0, verdict.upper(), text)
-    angles = _angles(registration) if usable else {}
-    summary = _summary(verdict, angles, reasons)
+    angles = angles_deg(registration) if usable else {}
+    summary = verdict_text(verdict, angles, reasons)
     messages = [
         pack_status(names.status, status, sent_s, common, version),
         pack_text(names.verdict, summary, sent_s, common, version),
@@ -98,7 +104,7 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
     return b"".join(messages)
 
 
-def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:
+def verdict_text(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:
     """JSON text, ASCII, with as many reasons as fit."""
     cut = [reason[:TEXT_CHARACTERS] for reason in reasons]
     told = {f"{what.lower()}_deg": angles.get(f"{what}Deg") for what in ("Stage", "Plane", "Sigma")}
@@ -109,7 +115,8 @@ def _summary(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -
         cut.pop()
 
 
-def _angles(registration: Registration) -> dict[str, float]:
+def angles_deg(registration: Registration) -> dict[str, float]:
+    """``StageDeg``, ``PlaneDeg``, ``SigmaDeg``, as far as they are known."""
     given = {"StageDeg": registration.stage_rad, "PlaneDeg": registration.scan_rad, "SigmaDeg": registration.sigma_rad}
     return {key: math.degrees(value) for key, value in given.items() if value is not None and math.isfinite(value)}
 
