@@ -91,6 +91,31 @@ _GAP = Number(0.0, 1.0, above=True, unit="s")
 _MM = Number(-500.0, 500.0, unit="mm")
 _RECORDING = ExistingPath()
 
+
+def _check_topic(text: str) -> None:
+    """Raises InputError for an invalid topic."""
+    if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", text):
+        raise InputError("topic", repr(text), "a ROS 2 topic such as /rig/left/image_raw")
+
+
+def _check_frame(text: str) -> None:
+    """Raises InputError for an invalid frame."""
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_/-]*", text):
+        raise InputError("frame", repr(text), "a frame's name such as camera, without a leading /")
+
+
+def _check_router(text: str) -> None:
+    """Raises InputError for an invalid address."""
+    if not re.fullmatch(r"(tcp|tls|quic|udp)/[A-Za-z0-9_.:\[\]-]+:[0-9]{1,5}", text):
+        raise InputError("router", repr(text), "an address such as tcp/127.0.0.1:7447")
+
+
+_TOPIC = Text("a ROS 2 topic such as /rig/left/image_raw", check=_check_topic)
+_FRAME = Text("a frame's name", check=_check_frame)
+_ROUTER = Text("an address such as tcp/127.0.0.1:7447", check=_check_router)
+_WAY = Text(allowed=("rclpy", "zenoh"))
+_POSES = ("PoseStamped", "TransformStamped", "PoseWithCovarianceStamped")
+
 Silent = Annotated[float | None, Key("longest silence until it counts as lost; null: no limit", _SECONDS, null=True)]
 Flip = Annotated[bool, Key("its columns run against TRUS x")]
 Limits = Annotated[Mapping[str, Any] | None, Key("in addition to those of session.yaml", LIMITS)]
@@ -289,3 +314,81 @@ class IgtlOperatorOptions(Connection):
         Path | None,
         Key("file with the key that its words are signed with", ExistingPath(), null=True, example="operator.key"),
     ] = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ros2Connection:
+    """A connection to ROS 2."""
+
+    through: Annotated[
+        str | None,
+        Key("the way to ROS 2; null: rclpy where a workspace is sourced, else zenoh", _WAY, null=True, example="zenoh"),
+    ] = None
+    router: Annotated[str, Key("of rmw_zenoh; by zenoh only", _ROUTER)] = "tcp/127.0.0.1:7447"
+    domain: Annotated[int, Key("ROS_DOMAIN_ID of the peers", Integer(0, 232))] = 0
+    type_hashes: Annotated[bool, Key("false for peers of ROS 2 Humble; by zenoh only")] = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ros2CameraOptions(Ros2Connection):
+    """Image topics."""
+
+    left: Annotated[
+        str,
+        Key("Image topic; CompressedImage where it ends in /compressed", _TOPIC, example="/rig/left/image_raw"),
+    ]
+    right: Annotated[
+        str | None,
+        Key("the same of the right camera", _TOPIC, null=True, example="/rig/right/image_raw"),
+    ] = None
+    info: Annotated[
+        str | None, Key("CameraInfo topic of the left camera", _TOPIC, null=True, example="/rig/left/camera_info")
+    ] = None
+    delay_s: Annotated[float, Key("from the exposure to the message's stamp", Number(-1.0, 1.0, unit="s"))] = 0.0
+    max_gap_s: Annotated[float, Key("longest time between left and right", _GAP)] = 0.017
+    silence_s: Annotated[float, Key("longest silence until it counts as lost", _SECONDS)] = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ros2MotionOptions(Ros2Connection):
+    """Poses of the endoscope's holder."""
+
+    topic: Annotated[str, Key("of the holder's poses, or /tf", _TOPIC)] = "/ECM/measured_cp"
+    type: Annotated[str, Key("of its messages, where it is not /tf", Text(allowed=_POSES))] = "PoseStamped"
+    base: Annotated[str | None, Key("frame of the holder's base; of /tf", null=True, example="ECM_base")] = None
+    tip: Annotated[str | None, Key("frame that moves with the camera; of /tf", null=True, example="ECM")] = None
+    tip_T_camera: Annotated[
+        FloatArray | None, Key("the camera in the frame that the poses are of, mm", Transform(), null=True)
+    ] = None
+    silent_s: Silent = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ros2StageOptions(Ros2Connection):
+    """A rotation stage that speaks CRTK."""
+
+    namespace: Annotated[str, Key("of measured_js, move_jp, operating_state, state_command", _TOPIC)] = "/stage"
+    joint: Annotated[str | None, Key("the joint's name, where there are several", null=True, example="rotation")] = None
+    acceleration_deg_s2: Annotated[
+        float, Key("least deceleration of the device when stopped", Number(0.0, 1000.0, above=True, unit="deg/s^2"))
+    ] = 20.0
+    limits: Limits = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ros2OperatorOptions(Ros2Connection):
+    """Texts of a foot pedal's or a console's node."""
+
+    topic: Annotated[str, Key("String topic of its commands", _TOPIC)] = "/fgreg/operator"
+    answers: Annotated[str, Key("String topic of messages to it", _TOPIC)] = "/fgreg/operator_told"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ros2SinkOptions(Ros2Connection):
+    """Receivers of the registration."""
+
+    parent: Annotated[str, Key("frame of the ultrasound probe", _FRAME)] = "trus"
+    child: Annotated[str, Key("frame of the left camera", _FRAME)] = "camera"
+    static: Annotated[bool, Key("on /tf_static, which later receivers get too, instead of /tf")] = False
+    registration: Annotated[str, Key("topic of pose and covariance", _TOPIC)] = "/fgreg/registration"
+    verdict: Annotated[str, Key("String topic of the verdict", _TOPIC)] = "/fgreg/verdict"

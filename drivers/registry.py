@@ -37,6 +37,7 @@ EXTRAS: Mapping[str, tuple[str, str]] = {
     "igtl": ("pyigtl", "OpenIGTLink"),
     "stage": ("serial", "rotation stages on serial ports"),
     "ros": ("rosbags", "ROS 2 recordings"),
+    "ros2": ("rosbags", "ROS 2, live"),
     "plots": ("matplotlib", "plots of fgreg evaluate"),
 }
 """Extras of the package: the module of each, and its purpose."""
@@ -144,6 +145,15 @@ ENTRIES: tuple[DriverEntry, ...] = (
         check="recorded_devices:check_camera",
     ),
     DriverEntry(
+        Role.CAMERA,
+        "ros2",
+        "images of ROS 2 topics",
+        options.Ros2CameraOptions,
+        "ros2:open_camera",
+        extra="ros2",
+        check="ros2_transport:check",
+    ),
+    DriverEntry(
         Role.CAMERA, "simulated", "of the simulated room", options.NoOptions, "simulated:open_camera", room=True
     ),
     DriverEntry(
@@ -165,6 +175,16 @@ ENTRIES: tuple[DriverEntry, ...] = (
         "thorlabs_stage:open_stage",
         extra="stage",
         ask="thorlabs_identify:ask_stage",
+    ),
+    DriverEntry(
+        Role.STAGE,
+        "ros2",
+        "a stage that speaks CRTK over ROS 2",
+        options.Ros2StageOptions,
+        "ros2_stage:open_stage",
+        extra="ros2",
+        check="ros2_transport:check",
+        ask="ros2_stage:ask_stage",
     ),
     DriverEntry(
         Role.STAGE,
@@ -202,6 +222,15 @@ ENTRIES: tuple[DriverEntry, ...] = (
     ),
     DriverEntry(
         Role.MOTION,
+        "ros2",
+        "poses of the endoscope's holder over ROS 2: CRTK, /tf",
+        options.Ros2MotionOptions,
+        "ros2:open_motion",
+        extra="ros2",
+        check="ros2:check_motion",
+    ),
+    DriverEntry(
+        Role.MOTION,
         "simulated",
         "the endoscope's holder in the simulated room",
         options.NoOptions,
@@ -224,6 +253,15 @@ ENTRIES: tuple[DriverEntry, ...] = (
         extra="igtl",
     ),
     DriverEntry(
+        Role.SINKS,
+        "ros2",
+        "receivers of the registration over ROS 2",
+        options.Ros2SinkOptions,
+        "ros2:open_sink",
+        extra="ros2",
+        check="ros2_transport:check",
+    ),
+    DriverEntry(
         Role.OPERATOR,
         "keyboard",
         "the operator at the terminal",
@@ -239,6 +277,15 @@ ENTRIES: tuple[DriverEntry, ...] = (
         "operators:open_operator",
         extra="igtl",
         check="peer_words:check_operator",
+    ),
+    DriverEntry(
+        Role.OPERATOR,
+        "ros2",
+        "texts over ROS 2: a foot pedal, a console",
+        options.Ros2OperatorOptions,
+        "ros2:open_operator",
+        extra="ros2",
+        check="ros2_transport:check",
     ),
     DriverEntry(
         Role.OPERATOR,

@@ -196,7 +196,7 @@ def test_without_a_config_the_machine_is_searched(
         assert run(monkeypatch, "--json") == 0
         assert (stage.orders, stage.enabled) == ([], False)
     document = json.loads(capsys.readouterr().out)
-    assert {one["name"] for one in document["extras"]} == {"igtl", "stage", "ros", "plots"}
+    assert {one["name"] for one in document["extras"]} == {"igtl", "stage", "ros", "ros2", "plots"}
     assert document["video_devices"] == []
     first, second = document["thorlabs_cubes"]
     assert first["answers"]

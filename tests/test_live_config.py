@@ -60,7 +60,7 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("camera", ABSENT, "camera", "nothing", "a mapping with driver"),
     ("camera", None, "camera (line 3)", "null", "a mapping with driver"),
     ("camera", [{"driver": "endoscope"}], "camera (line 3)", "a list of 1", "a mapping with driver"),
-    ("camera.driver", ABSENT, "camera.driver", "nothing", "one of endoscope, recorded, simulated"),
+    ("camera.driver", ABSENT, "camera.driver", "nothing", "one of endoscope, recorded, ros2, simulated"),
     ("camera.driver", "endoscop", "camera.driver (line 4)", "'endoscop'", "(did you mean endoscope?)"),
     ("camera.driver", ["endoscope"], "camera.driver (line 4)", "['endoscope']", "one of endoscope"),
     ("camera.left", ABSENT, "camera.left", "nothing", "a video device"),
@@ -83,7 +83,7 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("photoacoustic.host", "a b", "photoacoustic.host", "'a b'", "a host name or an IP address"),
     ("photoacoustic.device", "ImageOfTheProbeInUse1", "photoacoustic.device", "'ImageOfTheProbeInUse1'", "1 to 20"),
     ("photoacoustic.silent_s", 0, "photoacoustic.silent_s", "0", "> 0"),
-    ("stage.driver", "PRM1Z8", "stage.driver", "'PRM1Z8'", "one of thorlabs, simulated, stand-in"),
+    ("stage.driver", "PRM1Z8", "stage.driver", "'PRM1Z8'", "one of thorlabs, ros2, simulated, stand-in"),
     ("stage.limits", [1], "stage.limits", "[1]", "a mapping with sweep_deg"),
     ("stage.limits.home_speed_deg_s", 31, "stage.limits.home_speed_deg_s", "31", "<= 30 deg/s"),
     ("stage.limits.home_speed_deg_s", 0, "stage.limits.home_speed_deg_s", "0", "> 0"),
@@ -104,7 +104,7 @@ CASES: list[tuple[str, Any, str, str, str]] = [
     ("operator", "keyboard", "operator", "'keyboard'", "a mapping with driver"),
     ("operator", [], "operator", "[]", "a list of mappings"),
     ("operator.0.port", 3, "operator[0].port", "a key of another driver", "keyboard alone"),
-    ("operator.1.driver", "mouse", "operator[1].driver", "'mouse'", "one of keyboard, igtl, simulated"),
+    ("operator.1.driver", "mouse", "operator[1].driver", "'mouse'", "one of keyboard, igtl, ros2, simulated"),
     ("operator.0.driver", "simulated", "camera", "endoscope, and operator of the simulated room", "all simulated"),
     ("camera", {"driver": "simulated"}, "photoacoustic", "igtl, and camera of the simulated room", "all simulated"),
     ("room", {"seed": 1}, "room", "a room of which no device is used", "drivers called simulated"),
@@ -393,7 +393,7 @@ def test_every_driver_of_the_example_is_one_that_can_be_named_and_has_its_factor
             continue
         *_, last = inspect.signature(load(place)).parameters.values()
         if (entry.role, place) != (Role.STAGE, entry.factory):  # which is called with the options' own keys
-            assert last.annotation == entry.options.__name__
+            assert last.annotation in {kind.__name__ for kind in entry.options.__mro__}
     keys = [key for key in entry.record.fields if key.name != "limits"]
     assert set(yaml.safe_load("\n".join(map(example_line, keys))) or {}) == {key.name for key in keys}
 
