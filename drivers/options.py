@@ -21,6 +21,19 @@ IGTL_PORT, SINK_PORT, BK_PORT = 18944, 18945, 7915
 
 _VIDEO_DEVICE = re.compile(r"/dev/video[0-9]+")
 _STREAM = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://.+")
+Words = Annotated[
+    tuple[str, ...] | None,
+    Key(
+        "what it may say beside stop; home, search, follow and reset need a key",
+        ListOf(Text("a word", allowed=tuple(CommandKind))),
+        null=True,
+        example="[next, moved]",
+    ),
+]
+KeyFile = Annotated[
+    Path | None,
+    Key("file with the key that its words are signed with", ExistingPath(), null=True, example="operator.key"),
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,19 +314,8 @@ class IgtlOperatorOptions(Connection):
 
     device: Annotated[str, _named("of its commands")] = "Operator"
     answers: Annotated[str, _named("of messages to it")] = "OperatorTold"
-    words: Annotated[
-        tuple[str, ...] | None,
-        Key(
-            "what it may say beside stop; home, search, follow and reset need a key",
-            ListOf(Text("a word", allowed=tuple(CommandKind))),
-            null=True,
-            example="[next, moved]",
-        ),
-    ] = None
-    key: Annotated[
-        Path | None,
-        Key("file with the key that its words are signed with", ExistingPath(), null=True, example="operator.key"),
-    ] = None
+    words: Words = None
+    key: KeyFile = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -381,6 +383,8 @@ class Ros2OperatorOptions(Ros2Connection):
 
     topic: Annotated[str, Key("String topic of its commands", _TOPIC)] = "/fgreg/operator"
     answers: Annotated[str, Key("String topic of messages to it", _TOPIC)] = "/fgreg/operator_told"
+    words: Words = None
+    key: KeyFile = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -80,10 +80,15 @@ class PeerWords:
 
 
 def check_operator(options: IgtlOperatorOptions) -> None:
+    """Raises FieldError, InputError: as :func:`check_words`."""
+    check_words(options.words, options.key)
+
+
+def check_words(words: Sequence[str] | None, key: Path | None) -> None:
     """Raises FieldError for words that need a key where there is none, InputError for a key that cannot be used."""
-    if options.key is not None:
-        read_key(options.key)
+    if key is not None:
+        read_key(key)
         return
-    needy = [word for word in options.words or () if word in MOTIONS]
+    needy = [word for word in words or () if word in MOTIONS]
     if needy:
         raise FieldError.of(f"{needy[0]} without a key", "a key beside it, or words that need none", "words")

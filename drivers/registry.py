@@ -285,7 +285,7 @@ ENTRIES: tuple[DriverEntry, ...] = (
         options.Ros2OperatorOptions,
         "ros2:open_operator",
         extra="ros2",
-        check="ros2_transport:check",
+        check="ros2:check_operator",
     ),
     DriverEntry(
         Role.OPERATOR,

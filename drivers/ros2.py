@@ -23,13 +23,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fgreg.drivers import ros2_messages as ros
-from fgreg.drivers.base import CommandKind, DeviceLost, MotionSample, OperatorCommand, Registration, host_now
+from fgreg.drivers.base import (
+    CommandKind,
+    DeviceLost,
+    MotionSample,
+    OperatorCommand,
+    RefusedWord,
+    Registration,
+    host_now,
+)
 from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig, Layout
 from fgreg.drivers.igtl_registration import USABLE, angles_deg, usable_verdict, verdict_text
-from fgreg.drivers.operator_words import asked, understand
+from fgreg.drivers.operator_words import asked
+from fgreg.drivers.peer_words import PeerWords, check_words
 from fgreg.drivers.ros2_stream import Topic
 from fgreg.drivers.ros2_transport import Transport, check, open_transport
 from fgreg.drivers.ros_messages import info_of, picture_of, pose_of
+from fgreg.drivers.word_queue import WordQueue
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import FloatArray, adjoint, as_float_array, inverse
 from fgreg.model.time_sync import Stamp
@@ -187,28 +197,41 @@ class Ros2Motion(_Ros2Source):
 
 
 class Ros2Operator(_Ros2Source):
-    """An Operator whose commands are String messages; messages to it, and replies, are String messages too."""
+    """An Operator whose commands are String messages; messages to it, and replies, are String messages too.
+
+    Words are read as they arrive, into a queue in which a stop has a place of its own.
+    """
 
     _role = "operator"
 
-    def __init__(self, options: Ros2OperatorOptions, corners: tuple[int, int] | None = None) -> None:
+    def __init__(self, options: Ros2OperatorOptions, words: PeerWords | None = None) -> None:
         transport = open_transport(options, ros.hash_of)
-        self._corners = corners
+        self._peer, self._words, self._queue = options.topic, words or PeerWords(), WordQueue()
         self._send = transport.publisher(options.answers, ros.TEXT)
-        topic = Topic(transport, options.topic, ros.TEXT, _each(lambda message: str(message.data)), None)
+        topic = Topic(transport, options.topic, ros.TEXT, _each(self._heard), None, at_once=True)
         super().__init__(transport, topic)
 
-    def poll(self) -> list[OperatorCommand]:
-        """Commands since the last call. Raises DeviceLost."""
-        commands = []
-        for _, words in self._items():
-            command = understand(words, self._corners)
-            if isinstance(command, str):
-                self._topic.rejections.add(command)
-                self._send(ros.text(command))
-            else:
-                commands.append(command)
-        return commands
+    @property
+    def dropped(self) -> int:
+        """Number of words dropped because they were not fetched in time."""
+        return self._queue.dropped
+
+    def poll(self) -> list[OperatorCommand | RefusedWord]:
+        """Words since the last call. Raises DeviceLost, after the words that came before the loss."""
+        words = self._queue.take()
+        if not words:
+            self._items()  # the same messages: the queue has their words
+        return words
+
+    def _heard(self, message: Any) -> None:
+        """A message, in the link's thread. Raises ValueError for a word that is not understood."""
+        word = self._words.take(str(message.data), self._peer, host_now(), time.time())
+        if isinstance(word, str):
+            self._send(ros.text(word))
+            raise ValueError(word)
+        if isinstance(word, RefusedWord):
+            self._send(ros.text(word.text))
+        self._queue.put(word)
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:  # noqa: ARG002
         """Send a message."""
@@ -277,6 +300,12 @@ def check_motion(options: Ros2MotionOptions) -> None:
     check(options)
 
 
+def check_operator(options: Ros2OperatorOptions) -> None:
+    """Raises FieldError, InputError: words or key; MissingExtraError, FgregError: no way to ROS 2."""
+    check_words(options.words, options.key)
+    check(options)
+
+
 def open_camera(context: DriverContext, options: Ros2CameraOptions) -> StereoCamera:
     """Images of ROS 2 topics."""
     return Ros2Camera(options, context)
@@ -288,8 +317,8 @@ def open_motion(_context: DriverContext, options: Ros2MotionOptions) -> MotionSo
 
 
 def open_operator(context: DriverContext, options: Ros2OperatorOptions) -> Operator:
-    """Texts over ROS 2."""
-    return Ros2Operator(options, context.corners)
+    """Texts over ROS 2. Raises InputError for a key that cannot be used."""
+    return Ros2Operator(options, PeerWords.of(options.words, options.key, context.corners))
 
 
 def open_sink(_context: DriverContext, options: Ros2SinkOptions) -> TransformSink:

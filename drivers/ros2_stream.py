@@ -38,6 +38,7 @@ class Topic:
         room: messages that wait to be decoded, and items that wait to be fetched, at most; the newest are kept.
         delay_s: from the event to the message's stamp; subtracted.
         latched: whether the topic keeps its last message for later subscribers.
+        at_once: read in the link's thread, so that no message waits for another; for small messages.
     """
 
     def __init__(
@@ -50,11 +51,12 @@ class Topic:
         room: int = 256,
         delay_s: float = 0.0,
         latched: bool = False,
+        at_once: bool = False,
     ) -> None:
         self.name, self._kind = topic, kind
         self._transport, self._read, self._silent_s, self._delay_s = transport, read, silent_s, delay_s
         self.rejections = Rejections()
-        self._room, self._count, self._dropped = room, 0, 0
+        self._room, self._count, self._dropped, self._at_once = room, 0, 0, at_once
         self._raw: deque[tuple[bytes, str, float, int]] = deque()
         self._items: deque[Grabbed] = deque()
         self._state = threading.Condition()
@@ -120,11 +122,15 @@ class Topic:
             if kind != self._kind:
                 self.rejections.add(f"messages of {kind}, expected {self._kind}")
                 return
-            self._raw.append((data, kind, host_s, self._count))
-            if len(self._raw) > self._room:
-                self._raw.popleft()
-                self._dropped += 1
-            self._state.notify()
+            if not self._at_once:
+                self._raw.append((data, kind, host_s, self._count))
+                if len(self._raw) > self._room:
+                    self._raw.popleft()
+                    self._dropped += 1
+                self._state.notify()
+                return
+            index = self._count
+        self._decode(data, kind, host_s, index)
 
     def _run(self) -> None:
         while True:
@@ -134,15 +140,18 @@ class Topic:
                 if self._closed:
                     return
                 data, kind, host_s, index = self._raw.popleft()
-            try:
-                found = list(self._read(decode(data, kind)))
-                items = [self._item(message, value, host_s, index) for message, value in found]
-            except (ValueError, TypeError, AttributeError, ArithmeticError, IndexError) as error:
-                with self._state:
-                    self.rejections.add(one_line(str(error), 200))
-                continue
+            self._decode(data, kind, host_s, index)
+
+    def _decode(self, data: bytes, kind: str, host_s: float, index: int) -> None:
+        try:
+            found = list(self._read(decode(data, kind)))
+            items = [self._item(message, value, host_s, index) for message, value in found]
+        except (ValueError, TypeError, AttributeError, ArithmeticError, IndexError) as error:
             with self._state:
-                self._put(items)
+                self.rejections.add(one_line(str(error), 200))
+            return
+        with self._state:
+            self._put(items)
 
     def _item(self, message: Any, value: Any, host_s: float, index: int) -> Grabbed:
         stated_ns = stamp_ns(message, 0)
