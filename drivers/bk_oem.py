@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fgreg.drivers.base import BmodeFrame
+from fgreg.drivers.stream_decoder import Decoder, Rejections, StreamBroken
 from fgreg.drivers.tcp_device import LinkedDevice
-from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
+from fgreg.drivers.tcp_link import Endpoint, TcpLink
 from fgreg.errors import InputError, one_line
 from fgreg.model.time_sync import Stamp
 from fgreg.schema.limits import BK_MESSAGE_BYTES, BK_SIDE
@@ -80,7 +81,7 @@ class OemMessage:
         return 256 + len(self.payload)
 
 
-class OemDecoder:
+class OemDecoder(Decoder[OemMessage]):
     """Turns one connection's bytes into payloads. Bytes outside a message and cut-off messages are left out.
 
     Args:
@@ -89,7 +90,8 @@ class OemDecoder:
     """
 
     def __init__(self, rejections: Rejections, counter: Iterator[int]) -> None:
-        self._rejections, self._counter = rejections, counter
+        super().__init__(rejections)
+        self._counter = counter
         self._buffer = bytearray()
 
     @property
@@ -101,23 +103,24 @@ class OemDecoder:
         """Messages completed by these bytes. Raises StreamBroken if a message is too long."""
         messages = []
         *complete, rest = data.split(END)
+        self.completed += len(complete)
         for piece in complete:
             whole, self._buffer = bytes(self._buffer) + piece, bytearray()
             before, start, body = whole.rpartition(START)
             if before or not start:
-                self._rejections.add("bytes outside of a message")
+                self.rejections.add("bytes outside of a message")
             if not start:
                 continue
             try:
                 payload = unescape(body)
             except ValueError as error:
-                self._rejections.add(str(error))
+                self.rejections.add(str(error))
                 continue
             grabbed = payload.startswith(b"DATA:GRAB_FRAME")
             messages.append(OemMessage(payload, host_s, next(self._counter) if grabbed else -1))
         self._buffer += rest
         if self._buffer and START not in self._buffer:
-            self._rejections.add("bytes outside of a message")
+            self.rejections.add("bytes outside of a message")
             self._buffer.clear()
         if len(self._buffer) > BK_MESSAGE_BYTES:
             raise StreamBroken(f"no end of a message within {BK_MESSAGE_BYTES} bytes")

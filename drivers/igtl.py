@@ -9,6 +9,7 @@ pyigtl is needed: ``pip install 'fgreg[igtl]'``.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -18,10 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fgreg.drivers.base import BmodeFrame, MotionSample, PaFrame, Registration, host_now
-from fgreg.drivers.igtl_messages import Image, Message, MessageDecoder, Transform, check_name, require_pyigtl
-from fgreg.drivers.igtl_registration import DeviceNames, registration_messages
+from fgreg.drivers.igtl_contents import Image, Transform
+from fgreg.drivers.igtl_decoder import MessageDecoder, Offers, pack_start
+from fgreg.drivers.igtl_messages import Message, check_name, require_pyigtl
+from fgreg.drivers.igtl_registration import REFUSED_SAID_S, DeviceNames, registration_messages
+from fgreg.drivers.stream_decoder import Rejections
 from fgreg.drivers.tcp_device import LinkedDevice
-from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
+from fgreg.drivers.tcp_link import Endpoint, TcpLink
 from fgreg.errors import InputError
 from fgreg.geometry.transforms import inverse, is_rigid, make_transform, nearest_rotation
 from fgreg.model.time_sync import Stamp
@@ -44,7 +48,8 @@ class _IgtlDevice(LinkedDevice[Message]):
         endpoint: Endpoint,
         wanted: Iterable[tuple[str, str]] = (),
         silent_s: float | None = None,
-        keep_latest: bool = False,
+        greeting: bytes = b"",
+        offers: Offers | None = None,
     ) -> None:
         require_pyigtl()
         chosen = frozenset(wanted)
@@ -55,12 +60,13 @@ class _IgtlDevice(LinkedDevice[Message]):
         counts: Counter[tuple[str, str]] = Counter()
 
         def decoder(rejections: Rejections) -> MessageDecoder:
-            return MessageDecoder(rejections, chosen, counts)
+            return MessageDecoder(rejections, chosen, counts, offers)
 
-        super().__init__(TcpLink(endpoint, decoder, silent_s=silent_s, keep_latest=keep_latest))
+        link = TcpLink(endpoint, decoder, greeting=greeting, silent_s=silent_s, keep_latest=offers is not None)
+        super().__init__(link)
 
     def _leave_out(self, message: Message, why: str) -> None:
-        self._link.rejections.add(f"{message.device}: {why}")
+        self._link.rejections.add(f"{message.peer}: {message.device}: {why}")
 
 
 class IgtlReceiver(_IgtlDevice):
@@ -68,7 +74,8 @@ class IgtlReceiver(_IgtlDevice):
 
     Args:
         endpoint: the sender.
-        wanted: pairs of type (``TRANSFORM``, ``IMAGE``, ``STRING``, ``STATUS``) and device; an empty device takes all.
+        wanted: pairs of type (``TRANSFORM``: also POSITION, and the instruments of TDATA and QTDATA; ``IMAGE``,
+            ``STRING``, ``STATUS``) and device; an empty device takes all.
         silent_s: as for the sources below; None if the sender may be silent.
     """
 
@@ -91,14 +98,14 @@ class _Images(_IgtlDevice):
     def __init__(self, endpoint: Endpoint, device: str, silent_s: float | None) -> None:
         super().__init__(endpoint, [("IMAGE", check_name(device))], silent_s)
 
-    def _pictures(self) -> list[tuple[Stamp, npt.NDArray[np.generic], Image, int]]:
+    def _pictures(self) -> list[tuple[Message, npt.NDArray[np.generic], Image]]:
         pictures = []
         for message in self._messages():
             content = message.content
             if not isinstance(content, Image) or content.pixels.shape[0] != 1:
                 self._leave_out(message, "not a single slice")
                 continue
-            pictures.append((_stamp(message), content.pixels[0], content, message.index))
+            pictures.append((message, content.pixels[0], content))
         return pictures
 
 
@@ -124,11 +131,12 @@ class IgtlPhotoacoustic(_Images):
     def poll(self) -> Sequence[PaFrame]:
         """Pulses since the last call. Raises DeviceLost."""
         frames = []
-        for stamp, pixels, _, index in self._pictures():
+        for message, pixels, _ in self._pictures():
             if pixels.ndim != 2:
-                self._link.rejections.add(f"an image of {pixels.shape[-1]} components, expected 1")
+                self._leave_out(message, f"an image of {pixels.shape[-1]} components, expected 1")
                 continue
-            frames.append(PaFrame(stamp, np.ascontiguousarray(pixels.T if self._transposed else pixels), index))
+            data = np.ascontiguousarray(pixels.T if self._transposed else pixels)
+            frames.append(PaFrame(_stamp(message), data, message.index))
         return frames
 
 
@@ -162,24 +170,26 @@ class IgtlBmode(_Images):
     def poll(self) -> Sequence[BmodeFrame]:
         """Images since the last call. Raises DeviceLost."""
         frames = []
-        for stamp, pixels, image, index in self._pictures():
+        for message, pixels, image in self._pictures():
             if pixels.dtype != np.uint8 or pixels.shape[2:] not in ((), (3,)):
-                self._link.rejections.add(f"an image of {pixels.shape} {pixels.dtype}, expected uint8, grey or RGB")
+                self._leave_out(message, f"an image of {pixels.shape} {pixels.dtype}, expected uint8, grey or RGB")
                 continue
             along_i, along_j = (float(np.linalg.norm(image.world_T_ijk[:3, axis])) for axis in (0, 1))
             bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
             shown = np.array(bgr[:, ::-1] if self._flip else bgr, dtype=np.uint8)
-            frames.append(BmodeFrame(stamp, shown, index, (along_j, along_i), self._origin_mm))
+            frames.append(BmodeFrame(_stamp(message), shown, message.index, (along_j, along_i), self._origin_mm))
         return frames
 
 
 class IgtlMotion(_IgtlDevice):
-    """MotionSource: TRANSFORM messages of the endoscope's holder, millimetres.
+    """MotionSource: poses of the endoscope's holder, millimetres: TRANSFORM, POSITION, or in TDATA or QTDATA.
 
     Args:
         endpoint: the sender.
-        device: e.g. ``CameraToBase``: the matrix maps camera points to the holder's base.
+        device: e.g. ``CameraToBase``: the matrix maps camera points to the holder's base. Of TDATA and QTDATA the name
+            of the instrument.
         inverted: whether the sender has the inverse, ``BaseToCamera``.
+        start: ``TDATA`` or ``QTDATA``: ask for that stream (STT), for trackers that send it only when asked.
 
     Left out and counted: transforms that PLUS marks with a ``TransformStatus`` other than ``OK``, and matrices that are
     not rigid.
@@ -188,9 +198,16 @@ class IgtlMotion(_IgtlDevice):
     _role = "motion source"
 
     def __init__(
-        self, endpoint: Endpoint, device: str, inverted: bool = False, silent_s: float | None = SILENT_S
+        self,
+        endpoint: Endpoint,
+        device: str,
+        inverted: bool = False,
+        silent_s: float | None = SILENT_S,
+        start: str | None = None,
     ) -> None:
-        super().__init__(endpoint, [("TRANSFORM", check_name(device))], silent_s)
+        require_pyigtl()
+        greeting = b"" if start is None else pack_start(start)
+        super().__init__(endpoint, [("TRANSFORM", check_name(device))], silent_s, greeting)
         self._inverted = inverted
 
     def poll(self) -> Sequence[MotionSample]:
@@ -213,6 +230,8 @@ class IgtlMotion(_IgtlDevice):
 class IgtlTransformSink(_IgtlDevice):
     """TransformSink: ``igtl_registration`` describes the messages, also those of a refused registration.
 
+    Receivers may also ask for them: GET_STATUS, GET_STRING, GET_TRANSFORM, GET_CAPABIL.
+
     Args:
         endpoint: ``Endpoint.listening(18944)`` for receivers that connect (several may), or a receiver's address. A
             receiver that connects later gets the newest registration at once.
@@ -226,13 +245,27 @@ class IgtlTransformSink(_IgtlDevice):
     def __init__(self, endpoint: Endpoint, names: DeviceNames | None = None, header_version: int = 2) -> None:
         if header_version not in (1, 2):
             raise InputError("OpenIGTLink header version", str(header_version), "1 or 2")
-        self._names, self._version = names or DeviceNames(), header_version
-        super().__init__(endpoint, keep_latest=True)
+        names = names or DeviceNames()
+        self._names, self._version = names, header_version
+        self._usable: bool | None = None
+        self._since_s = -math.inf
+        transforms = (names.registration, names.plane)
+        devices = {"STATUS": (names.status,), "STRING": (names.verdict,), "TRANSFORM": transforms}
+        self._offers = Offers(devices, why="there is no usable registration")
+        super().__init__(endpoint, offers=self._offers)
 
     def send(self, registration: Registration) -> None:
         """Send the registration; for a slow receiver only the newest is kept. Raises DeviceLost."""
         sent_s = time.time() - (host_now() - registration.stamp.host_s)
-        self._link.offer(registration_messages(registration, max(sent_s, 0.0), self._names, self._version))
+        messages = registration_messages(registration, max(sent_s, 0.0), self._names, self._version)
+        self._offers.ready = messages
+        usable = ("TRANSFORM", self._names.registration) in messages
+        if usable is not self._usable:
+            self._usable, self._since_s = usable, host_now()
+        whole = b"".join(messages.values())
+        stale = not usable and host_now() - self._since_s > REFUSED_SAID_S
+        told = [message for (kind, _), message in messages.items() if not (stale and kind == "STATUS")]
+        self._link.offer(b"".join(told), latest=whole)
         self._raise_loss()
 
 
@@ -253,7 +286,7 @@ def open_bmode(_context: DriverContext, options: IgtlBmodeOptions) -> BmodeSourc
 
 def open_motion(_context: DriverContext, options: IgtlMotionOptions) -> MotionSource:
     """Transforms of the endoscope's holder."""
-    return IgtlMotion(endpoint(options), options.device, options.inverted, options.silent_s)
+    return IgtlMotion(endpoint(options), options.device, options.inverted, options.silent_s, options.start)
 
 
 def open_sink(_context: DriverContext, options: IgtlSinkOptions) -> TransformSink:

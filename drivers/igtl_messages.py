@@ -1,9 +1,10 @@
 """OpenIGTLink messages: bytes to typed content and back, with checks of everything that a sender can get wrong.
 
-Packing and parsing of contents is pyigtl's; header, checksum, sizes and STATUS are checked or made here, since pyigtl
-does none of it. Its own client and server are not used: they keep only the newest message of each device, so laser
-pulses would be lost. They accept any body size and any checksum, do not reconnect after the other side hangs up, and
-loop for ever if it hangs up inside a header.
+Metadata, TRANSFORM and STRING are pyigtl's, and so is the packing of IMAGE; header, checksum, sizes and the other
+contents are read or made here (``igtl_contents``), since pyigtl does not: it has no STATUS, TDATA and QTDATA, takes no
+part of an image, and its POSITION is not that of the protocol. Its own client and server are not used: they keep only
+the newest message of each device, so laser pulses would be lost. They accept any body size and any checksum, do not
+reconnect after the other side hangs up, and loop for ever if it hangs up inside a header.
 
 Header version 2 (OpenIGTLink 3) carries metadata; receivers of protocol 1 and 2 cannot read it and lose the stream.
 """
@@ -13,7 +14,6 @@ from __future__ import annotations
 import functools
 import importlib
 import struct
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -22,48 +22,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.drivers.tcp_link import Rejections, StreamBroken
+from fgreg.drivers.igtl_contents import PARSERS, STATUS, Content, Image, Status, Transform, finite, padded
+from fgreg.drivers.igtl_contents import Text as Text
+from fgreg.drivers.stream_decoder import StreamBroken
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import FloatArray
 from fgreg.schema.limits import IGTL_BODY_BYTES
 
 NAME_BYTES = 20
 HEADER = struct.Struct(">H12s20sIIQQ")
-STATUS = struct.Struct(">Hq20s")
 
-STATUS_OK, STATUS_NOT_READY = 1, 13
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Image:
-    """IMAGE: ``pixels`` (k, j, i) or (k, j, i, components); ``world_T_ijk`` (4, 4), mm per step along i, j, k."""
-
-    pixels: npt.NDArray[Any]
-    world_T_ijk: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Transform:
-    """TRANSFORM: ``to_T_from`` (4, 4), where the device is named ``FromToTo``; millimetres."""
-
-    to_T_from: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class Text:
-    """STRING."""
-
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class Status:
-    """STATUS: ``code`` 1 is fine, all others are not."""
-
-    code: int
-    subcode: int
-    error: str
-    text: str
+STATUS_OK, STATUS_NOT_FOUND, STATUS_UNKNOWN, STATUS_NOT_READY = 1, 4, 12, 13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,14 +45,16 @@ class Message:
         host_s: when it was complete here, ``time.monotonic()``.
         index: counts the messages of one entry of ``wanted`` (a device, or all of a type), including those left out.
         metadata: of header version 2.
+        peer: address and port of who sent it.
     """
 
     device: str
     sent_s: float | None
     host_s: float
     index: int
-    content: Image | Transform | Text | Status
+    content: Content
     metadata: Mapping[str, str] = field(default_factory=dict)
+    peer: str = ""
 
     @property
     def nbytes(self) -> int:
@@ -121,7 +92,7 @@ def parse_header(data: bytes) -> Header:
     if version not in (1, 2):
         raise StreamBroken(f"header version {version}: not OpenIGTLink")
     try:
-        kind_text, device_text = (_padded(raw) for raw in (kind, device))
+        kind_text, device_text = (padded(raw) for raw in (kind, device))
     except UnicodeDecodeError as error:
         raise StreamBroken("names that are not text: not OpenIGTLink") from error
     if not (kind_text.isprintable() and device_text.isprintable() and kind_text):
@@ -132,18 +103,14 @@ def parse_header(data: bytes) -> Header:
     return Header(version, kind_text, device_text, sent_s, body_bytes, checksum)
 
 
-def parse_body(header: Header, body: bytes, host_s: float, index: int = 0) -> Message:
-    """A message from its parts.
+def parse_body(header: Header, body: bytes) -> tuple[Content, Mapping[str, str]]:
+    """A message's content and metadata.
 
     Raises:
         ValueError: wrong checksum, or content that does not fit its type.
     """
-    library = _pyigtl()
-    if library.messages.CRC64(body) != header.checksum:
-        raise ValueError(f"{header.kind} {header.device}: wrong checksum")
-    raw = _status_class()() if header.kind == "STATUS" else library.MessageBase.create_message(header.kind)
-    if raw is None:
-        raise ValueError(f"{header.kind} {header.device}: not a type that is read here")
+    check_body(header, body)
+    raw = _raw_class(header.kind)()
     fields = {
         "header_version": header.version,
         "message_type": header.kind,
@@ -152,82 +119,48 @@ def parse_body(header: Header, body: bytes, host_s: float, index: int = 0) -> Me
     }
     try:
         raw.unpack(fields, body)
-        content = _content(header.kind, raw)
+        return _content(header.kind, raw), dict(raw.metadata)
     except Exception as error:  # a third party's parser on untrusted bytes may raise anything
         raise ValueError(f"{header.kind} {header.device}: {error}") from error
-    return Message(header.device, header.sent_s, host_s, index, content, dict(raw.metadata))
+
+
+def check_body(header: Header, body: bytes) -> None:
+    """Raises ValueError where the checksum is wrong."""
+    if _pyigtl().messages.CRC64(body) != header.checksum:
+        raise ValueError(f"{header.kind} {header.device}: wrong checksum")
 
 
 def pack_transform(
     device: str, to_T_from: FloatArray, sent_s: float, metadata: Mapping[str, str], version: int = 2
 ) -> bytes:
     """TRANSFORM; single precision on the wire."""
-    return _pack(_pyigtl().TransformMessage(to_T_from), device, sent_s, metadata, version)
+    return _pack(_pyigtl().TransformMessage(to_T_from), check_name(device), sent_s, metadata, version)
 
 
 def pack_text(device: str, text: str, sent_s: float, metadata: Mapping[str, str], version: int = 2) -> bytes:
     """STRING, ASCII; cut to 65,535 bytes."""
-    return _pack(_pyigtl().StringMessage(_ascii(text)[:65535]), device, sent_s, metadata, version)
+    return _pack(_pyigtl().StringMessage(_ascii(text)[:65535]), check_name(device), sent_s, metadata, version)
 
 
 def pack_status(device: str, status: Status, sent_s: float, metadata: Mapping[str, str], version: int = 2) -> bytes:
     """STATUS; its error name holds 20 bytes, the text is ASCII."""
-    raw = _status_class()()
-    raw.status = status
-    return _pack(raw, device, sent_s, metadata, version)
+    error, text = _ascii(status.error)[:NAME_BYTES].encode(), _ascii(status.text).encode()
+    content = STATUS.pack(status.code, status.subcode, error) + text + b"\0"
+    return pack_raw("STATUS", check_name(device), content, sent_s, metadata, version)
 
 
 def pack_image(device: str, pixels: npt.NDArray[Any], sent_s: float, version: int = 2) -> bytes:
-    """IMAGE (k, j, i) of one component per pixel, unit spacing: a scanner's part, for tests and simulated rooms."""
-    return _pack(_pyigtl().ImageMessage(np.ascontiguousarray(pixels)), device, sent_s, {}, version)
+    """IMAGE (k, j, i) of one component per pixel or (k, j, i, components), unit spacing."""
+    return _pack(_pyigtl().ImageMessage(np.ascontiguousarray(pixels)), check_name(device), sent_s, {}, version)
 
 
-class MessageDecoder:
-    """Turns one connection's bytes into the messages of the wanted devices.
-
-    Args:
-        rejections: counts messages with a wrong checksum or content. They are left out; the stream continues, since
-            their length is known.
-        wanted: (type, device) pairs; an empty device takes every device of that type. Other messages are skipped.
-        counts: number of messages up to now by (type, device), across connections.
-    """
-
-    def __init__(
-        self, rejections: Rejections, wanted: frozenset[tuple[str, str]], counts: Counter[tuple[str, str]]
-    ) -> None:
-        self._rejections, self._wanted, self._counts = rejections, wanted, counts
-        self._buffer = bytearray()
-        self._header: Header | None = None
-
-    @property
-    def partial(self) -> bool:
-        """Whether a message has begun and is not complete."""
-        return self._header is not None or bool(self._buffer)
-
-    def feed(self, data: bytes, host_s: float) -> list[Message]:
-        """Messages completed by these bytes. Raises StreamBroken."""
-        self._buffer += data
-        messages: list[Message] = []
-        while True:
-            needed = HEADER.size if self._header is None else self._header.body_bytes
-            if len(self._buffer) < needed:
-                return messages
-            taken = bytes(self._buffer[:needed])
-            del self._buffer[:needed]
-            if self._header is None:
-                self._header = parse_header(taken)
-                continue
-            header, self._header = self._header, None
-            if not {(header.kind, header.device), (header.kind, "")} & self._wanted:
-                continue
-            # Only wanted devices are counted separately: the sender may invent any number of names.
-            key = (header.kind, header.device if (header.kind, header.device) in self._wanted else "")
-            index = self._counts[key]
-            self._counts[key] += 1
-            try:
-                messages.append(parse_body(header, taken, host_s, index))
-            except ValueError as error:
-                self._rejections.add(str(error))
+def pack_raw(
+    kind: str, device: str, content: bytes, sent_s: float, metadata: Mapping[str, str] | None = None, version: int = 2
+) -> bytes:
+    """A message of any type from its content; ``device`` may be empty, as in queries."""
+    raw = _raw_class(kind)()
+    raw.content = content
+    return _pack(raw, device, sent_s, metadata or {}, version)
 
 
 def require_pyigtl() -> None:
@@ -244,60 +177,45 @@ def _pyigtl() -> ModuleType:
 
 
 @functools.cache
-def _status_class() -> Any:
-    base = _pyigtl().MessageBase
+def _raw_class(kind: str) -> Any:
+    """pyigtl's class of the types that it reads here; for the others one that holds the content's bytes."""
+    library = _pyigtl()
+    if kind in ("TRANSFORM", "STRING"):
+        return library.messages.message_type_to_class_constructor[kind]
+    base = library.MessageBase
 
-    class StatusMessage(base):  # type: ignore[misc, valid-type]
-        """STATUS, which pyigtl lacks."""
+    class RawMessage(base):  # type: ignore[misc, valid-type]
+        """A message whose content is bytes."""
 
         def __init__(self) -> None:
             base.__init__(self)
-            self._message_type = "STATUS"
-            self._valid_message = True
-            self.status = Status(0, 0, "", "")
+            self._message_type, self._valid_message, self.content = kind, True, b""
 
         def _pack_content(self) -> bytes:
-            error = _ascii(self.status.error)[:NAME_BYTES].encode()
-            text = _ascii(self.status.text).encode()
-            return STATUS.pack(self.status.code, self.status.subcode, error) + text + b"\0"
+            return self.content
 
         def _unpack_content(self, content: bytes) -> None:
-            code, subcode, error = STATUS.unpack(content[: STATUS.size])
-            self.status = Status(code, subcode, _padded(error), _padded(content[STATUS.size :]))
+            self.content = content
 
-    return StatusMessage
+    return RawMessage
 
 
-def _content(kind: str, raw: Any) -> Image | Transform | Text | Status:
+def _content(kind: str, raw: Any) -> Content:
     if kind == "TRANSFORM":
-        matrix = np.array(raw.matrix, dtype=np.float64)
-        if not np.isfinite(matrix).all():
-            raise ValueError("an entry is not finite")
-        return Transform(matrix)
-    if kind == "IMAGE":
-        if 0 in raw.image.shape:
-            raise ValueError(f"an image of {raw.image.shape}")
-        native = raw.image.dtype.newbyteorder("=")
-        return Image(np.array(raw.image, dtype=native), np.array(raw.ijk_to_world_matrix, dtype=np.float64))
+        return Transform(finite(np.array(raw.matrix, dtype=np.float64)))
     if kind == "STRING":
         return Text(str(raw.string))
-    if kind == "STATUS":
-        status: Status = raw.status
-        return status
+    if kind in PARSERS:
+        return PARSERS[kind](raw.content)
     raise ValueError("not a type that is read here")
 
 
 def _pack(raw: Any, device: str, sent_s: float, metadata: Mapping[str, str], version: int) -> bytes:
-    raw.device_name = check_name(device)
+    raw.device_name = device
     raw.timestamp = sent_s
     raw.header_version = version
     raw.metadata = {_ascii(key): _ascii(value) for key, value in metadata.items()} if version > 1 else {}
     return bytes(raw.pack())
-
-
-def _padded(raw: bytes) -> str:
-    """Text of a field of fixed length. Raises UnicodeDecodeError."""
-    return raw.split(b"\0", 1)[0].decode("utf-8").rstrip()
 
 
 def _ascii(text: str) -> str:

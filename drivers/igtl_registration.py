@@ -2,15 +2,20 @@
 
 | message | device | when | content |
 |---|---|---|---|
-| STATUS | `RegistrationStatus` | always | code 1, `OK` or `WARNING`, or code 13 (not ready), `REFUSED`; the reasons |
+| STATUS | `RegistrationStatus` | usable; once refused | code 1, `OK` or `WARNING`; code 13, `REFUSED`; the reasons |
 | STRING | `RegistrationVerdict` | always | JSON: `verdict`, `reasons`, `stage_deg`, `plane_deg`, `sigma_deg` or null |
 | TRANSFORM | `CameraToTrus` | usable | maps camera points to TRUS points, mm; metadata below |
 | TRANSFORM | `PlaneToTrus` | usable, angle known | the image plane (its z axis) turned to where the beam points |
 
 **Refused means no TRANSFORM at all.** 3D Slicer puts the matrix of every TRANSFORM into its node, whatever the status
 in the metadata, so a matrix that must not be used must not be sent; PLUS with `SendValidTransformsOnly` does the same.
-Receivers keep the last valid matrix meanwhile. The STATUS and STRING messages, its time stamp and SlicerIGT's Watchdog
-module, which marks a transform that is no longer updated, show that it is out of date.
+Receivers keep the last valid matrix meanwhile.
+
+SlicerIGT's Watchdog takes a node for valid as long as it was modified within a tolerance (1 s unless set otherwise).
+Slicer modifies a node at every message of its name, whatever the message says. So a refusal is said in STATUS only for
+``REFUSED_SAID_S`` after the registration became refused, and to receivers that come later: then `RegistrationStatus`,
+like `CameraToTrus`, is modified while the registration is usable, and goes stale when it is not. The STRING is always
+sent.
 
 Metadata (header version 2 only): `TransformStatus`, the key that PLUS reads and Slicer hands on (`OK`; `INVALID` on the
 STATUS and STRING of a refused registration), `Verdict`, `Reasons`, and for a transform `Covariance` (36 numbers, row by
@@ -28,10 +33,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgreg.drivers.base import Registration
+from fgreg.drivers.igtl_contents import Status
 from fgreg.drivers.igtl_messages import (
     STATUS_NOT_READY,
     STATUS_OK,
-    Status,
     check_name,
     pack_status,
     pack_text,
@@ -42,6 +47,8 @@ from fgreg.geometry.transforms import FloatArray, exp_so3, is_rigid, make_transf
 USABLE = ("ok", "warning")
 TEXT_CHARACTERS = 4000
 """Reasons are cut to this length, since a receiver shows them in one line."""
+REFUSED_SAID_S = 0.5
+"""For this long after a registration became refused its STATUS is sent, so that none but a stuck receiver misses it."""
 SUMMARY_BYTES = 60_000
 """Largest JSON text; a STRING holds 65,535 bytes."""
 
@@ -75,8 +82,10 @@ def usable_verdict(registration: Registration) -> tuple[str, tuple[str, ...]]:
     return registration.verdict, reasons
 
 
-def registration_messages(registration: Registration, sent_s: float, names: DeviceNames, version: int = 2) -> bytes:
-    """All messages for one registration, in one block: STATUS first.
+def registration_messages(
+    registration: Registration, sent_s: float, names: DeviceNames, version: int = 2
+) -> dict[tuple[str, str], bytes]:
+    """All messages for one registration by type and device: STATUS first, no TRANSFORM where it is refused.
 
     Args:
         registration: without a matrix, or with one that is not rigid, it counts as refused.
@@ -90,18 +99,19 @@ def registration_messages(registration: Registration, sent_s: float, names: Devi
     status = Status(STATUS_OK if usable else STATUS_NOT_READY, 0, verdict.upper(), text)
     angles = angles_deg(registration) if usable else {}
     summary = verdict_text(verdict, angles, reasons)
-    messages = [
-        pack_status(names.status, status, sent_s, common, version),
-        pack_text(names.verdict, summary, sent_s, common, version),
-    ]
+    messages = {
+        ("STATUS", names.status): pack_status(names.status, status, sent_s, common, version),
+        ("STRING", names.verdict): pack_text(names.verdict, summary, sent_s, common, version),
+    }
     if usable and matrix is not None:
         with_covariance = {**common, **_covariance(registration.covariance)}
-        messages.append(pack_transform(names.registration, matrix, sent_s, with_covariance, version))
+        packed = pack_transform(names.registration, matrix, sent_s, with_covariance, version)
+        messages["TRANSFORM", names.registration] = packed
         if registration.scan_rad is not None and "PlaneDeg" in angles:
             told_angles = {**common, **{key: f"{value:.6f}" for key, value in angles.items()}}
             plane = trus_T_plane(registration.scan_rad)
-            messages.append(pack_transform(names.plane, plane, sent_s, told_angles, version))
-    return b"".join(messages)
+            messages["TRANSFORM", names.plane] = pack_transform(names.plane, plane, sent_s, told_angles, version)
+    return messages
 
 
 def verdict_text(verdict: str, angles: dict[str, float], reasons: tuple[str, ...]) -> str:

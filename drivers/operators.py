@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING
 
 from fgreg.drivers.base import CommandKind, DeviceLost, Operator, OperatorCommand, RefusedWord
 from fgreg.drivers.igtl import endpoint
-from fgreg.drivers.igtl_messages import Message, MessageDecoder, Text, check_name, pack_text, require_pyigtl
+from fgreg.drivers.igtl_contents import Text
+from fgreg.drivers.igtl_decoder import MessageDecoder
+from fgreg.drivers.igtl_messages import Message, check_name, pack_text, require_pyigtl
 from fgreg.drivers.operator_words import asked
 from fgreg.drivers.peer_words import PeerWords
+from fgreg.drivers.stream_decoder import Rejections
 from fgreg.drivers.tcp_device import LinkedDevice
-from fgreg.drivers.tcp_link import Endpoint, Rejections, TcpLink
+from fgreg.drivers.tcp_link import Endpoint, TcpLink
 from fgreg.drivers.word_queue import WordQueue
 
 if TYPE_CHECKING:
@@ -104,7 +107,7 @@ class IgtlOperator(LinkedDevice[Message]):
             return
         word = self._words.take(message.content.text, message.device, message.host_s, time.time())
         if isinstance(word, str):
-            self._link.rejections.add(f"{message.device}: {word}")
+            self._link.rejections.add(f"{message.peer}: {message.device}: {word}")
             self._offer(word)
             return
         if isinstance(word, RefusedWord):
@@ -137,6 +140,16 @@ class Operators:
     def dropped(self) -> int:
         """Number of commands that were not fetched in time."""
         return sum(operator.dropped for operator in self._operators)
+
+    @property
+    def rejected(self) -> int:
+        """Number of messages that were left out."""
+        return sum(getattr(operator, "rejected", 0) for operator in self._operators)
+
+    @property
+    def last_rejection(self) -> str:
+        """Why the last one of each was left out."""
+        return "; ".join(filter(None, (getattr(operator, "last_rejection", "") for operator in self._operators)))
 
     def poll(self) -> list[OperatorCommand | RefusedWord]:
         """Commands of all operators since the last call; none is dropped when a loss is raised.

@@ -260,6 +260,15 @@ class IgtlMotionOptions(Connection):
 
     device: Annotated[str, _named("of the holder's transforms")] = "CameraToBase"
     inverted: Annotated[bool, Key("the matrix maps base to camera")] = False
+    start: Annotated[
+        str | None,
+        Key(
+            "stream to ask for, of trackers that send only then",
+            Text(allowed=("TDATA", "QTDATA")),
+            null=True,
+            example="TDATA",
+        ),
+    ] = None
     silent_s: Silent = 0.8
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Generic
 
 from fgreg.drivers.base import DeviceLost
-from fgreg.drivers.tcp_link import Endpoint, Item, TcpLink
+from fgreg.drivers.stream_decoder import Item
+from fgreg.drivers.tcp_link import Endpoint, TcpLink
 
 
 class LinkedDevice(Generic[Item]):

@@ -4,6 +4,12 @@ One class for both ends. As a client it connects, and reconnects after a loss; a
 Incoming bytes go through a decoder (one for each peer) into a queue that keeps the newest messages. Outgoing data are
 one block of bytes per peer at a time; a block that a slow peer has not begun to take is replaced by the newer one. No
 peer can end the thread: a broken stream, or a stall within a message or a block, ends only that peer's connection.
+
+Losses are those of peers. A peer is *known* once it has sent a message (where the link only sends: taken a block). The
+loss of a known peer is always reported, and peers that are not known do not make up for it: only their first message
+does. The loss of another peer is reported if no one else is there. After a loss nothing more is reported until a peer
+is there again: one that sends a message, or that stays for STAYED_S where it may be silent. So a peer that accepts and
+hangs up at once is lost once, however often it is tried.
 """
 
 from __future__ import annotations
@@ -18,8 +24,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Generic
 
+from fgreg.drivers.stream_decoder import Decoder, Item, Rejections, StreamBroken
 from fgreg.errors import InputError, one_line
 
 CHUNK_BYTES = 1 << 18
@@ -29,34 +36,12 @@ RETRY_S, CONNECT_S = 0.5, 2.0
 """Time between two attempts to connect, and the longest time of one."""
 MESSAGE_S = 5.0
 """Time after its first byte within which a message has to be complete, or a block taken."""
+STAYED_S = 1.0
+"""After a loss a peer that may be silent counts as there once it has stayed for this long."""
 MAX_PEERS = 8
+MAX_REPLIES = 16
+"""Largest number of replies that wait for one peer; the rest is left out."""
 QUEUE_ITEMS, QUEUE_BYTES = 256, 128 << 20
-
-
-class StreamBroken(Exception):  # noqa: N818
-    """The stream cannot be decoded any further, and the connection has to be closed. The text says why."""
-
-
-class Sized(Protocol):
-    """An object that knows the memory it holds."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes held."""
-
-
-Item = TypeVar("Item", bound=Sized)
-
-
-class Decoder(Protocol[Item]):
-    """Bytes of one connection to messages."""
-
-    def feed(self, data: bytes, host_s: float) -> list[Item]:
-        """Messages completed by ``data``, which arrived at ``host_s``. Raises StreamBroken."""
-
-    @property
-    def partial(self) -> bool:
-        """Whether a message has begun and is not complete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,30 +70,25 @@ class Endpoint:
         return f"{'listening on ' if self.listen else ''}{self.host}:{self.port}"
 
 
-@dataclass(slots=True)
-class Rejections:
-    """Count of the messages left out, and the reason of the last one."""
-
-    count: int = 0
-    last: str = ""
-
-    def add(self, reason: str) -> None:
-        """Count one more."""
-        self.count += 1
-        self.last = one_line(reason, 200)
-
-
 @dataclass(slots=True, eq=False)
 class _Peer(Generic[Item]):
     socket: socket.socket
-    name: str
     decoder: Decoder[Item]
     connecting: bool
-    since_s: float  # when connecting began
+    since_s: float  # when connecting began, then when it was established
+    heard_s: float = 0.0  # last message, or when it was established
+    there: bool = False  # counts as the device being there
+    known: bool = False  # has sent a message; where the link only sends: taken a block
+    passed_over: bool = False  # was idle when another was lost: only a message makes it count as there
     partial_since_s: float | None = None
     block: memoryview = field(default_factory=lambda: memoryview(b""))  # being sent
     block_since_s: float = 0.0
+    replies: deque[bytes] = field(default_factory=deque)
     next_block: bytes | None = None
+
+    @property
+    def name(self) -> str:
+        return self.decoder.rejections.peer
 
 
 class TcpLink(Generic[Item]):
@@ -116,10 +96,11 @@ class TcpLink(Generic[Item]):
 
     Args:
         endpoint: the other side, or where to listen.
-        decoder: makes a peer's decoder, which counts the messages it leaves out in the given Rejections.
+        decoder: makes a peer's decoder, which counts the messages it leaves out in the given Rejections; their ``peer``
+            is the peer's name.
         greeting: sent to every new peer first.
         farewell: sent on close, as far as the peer takes it at once.
-        keep_latest: whether a new peer gets the block that was offered last.
+        keep_latest: the link only sends: a new peer gets the block that was offered last.
         silent_s: a peer that sends no message for this long counts as lost; None if it may be silent.
 
     Raises:
@@ -146,12 +127,12 @@ class TcpLink(Generic[Item]):
         self._dropped = 0
         self._latest: bytes | None = None
         self._offered: bytes | None = None
-        self._losses: deque[str] = deque(maxlen=1)
-        self._state: Literal["new", "there", "silent", "gone"] = "new"
+        self._losses: deque[str] = deque(maxlen=MAX_PEERS)
+        self._there = False
         # The rest is the thread's own.
         self._peers: list[_Peer[Item]] = []
+        self._gone = False  # a loss was reported, and no one has been there since
         self._next_try_s = 0.0
-        self._received_s = 0.0
         self._server = self._listen() if endpoint.listen else None
         self._selector = selectors.DefaultSelector()
         self._wake, self._woken = socket.socketpair()
@@ -172,7 +153,7 @@ class TcpLink(Generic[Item]):
     @property
     def connected(self) -> bool:
         """Whether the other end is connected and not silent."""
-        return self._state == "there"
+        return self._there
 
     @property
     def dropped(self) -> int:
@@ -188,16 +169,16 @@ class TcpLink(Generic[Item]):
         return items
 
     def take_loss(self) -> str | None:
-        """Why the last peer was lost, once for each loss; None if there was none since the last call."""
+        """Why a peer was lost, once for each loss, oldest first; None if there was no other since the last call."""
         with self._lock:
             return self._losses.popleft() if self._losses else None
 
-    def offer(self, block: bytes) -> None:
-        """Queue a block for every peer; never waits."""
+    def offer(self, block: bytes, latest: bytes | None = None) -> None:
+        """Queue a block for every peer; never waits. ``latest``: what a later peer gets instead of it."""
         with self._lock:
             self._offered = block
             if self._keep_latest:
-                self._latest = block
+                self._latest = block if latest is None else latest
         self._wake_up()
 
     def close(self) -> None:
@@ -250,7 +231,7 @@ class TcpLink(Generic[Item]):
             )[0]
             connection = socket.socket(family, kind, protocol)
         except OSError as error:
-            self._lost("gone", f"{self._endpoint}: {_text(error)}")
+            self._report(f"{self._endpoint}: {_text(error)}")
             return
         connection.setblocking(False)
         result = connection.connect_ex(address)
@@ -265,19 +246,25 @@ class TcpLink(Generic[Item]):
         except OSError:
             time.sleep(TICK_S)  # gone before it was taken in, or no room for more files: not at full speed then
             return
+        name = f"{address[0]}:{address[1]}"
         if len(self._peers) >= MAX_PEERS:
-            self.rejections.add(f"a peer beyond the {MAX_PEERS} that are there")
-            connection.close()
-            return
+            idle = [peer for peer in self._peers if not peer.known]
+            if not idle:
+                self.rejections.add(f"{name}: turned away, since {MAX_PEERS} peers are in use")
+                connection.close()
+                return
+            self.rejections.add(f"{idle[0].name}: was idle and made room for {name}")
+            self._hang_up(idle[0], f"was idle and made room for {name}")
         connection.setblocking(False)
-        peer = self._new_peer(connection, f"{address[0]}:{address[1]}", connecting=False)
+        peer = self._new_peer(connection, name, connecting=False)
         try:
             self._greet(peer)
         except OSError as error:
             self._hang_up(peer, _text(error))
 
     def _new_peer(self, connection: socket.socket, name: str, connecting: bool) -> _Peer[Item]:
-        peer = _Peer(connection, name, self._decoder(self.rejections), connecting, time.monotonic())
+        decoder = self._decoder(Rejections(peer=name, link=self.rejections))
+        peer = _Peer(connection, decoder, connecting, time.monotonic())
         self._peers.append(peer)
         self._selector.register(connection, selectors.EVENT_READ | selectors.EVENT_WRITE, peer)
         return peer
@@ -293,8 +280,9 @@ class TcpLink(Generic[Item]):
                     peer.socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
         with self._lock:
             latest = self._latest if self._offered is None else None  # else it is about to be sent to all
-            self._state = "there"
-        self._received_s = time.monotonic()
+        peer.since_s = peer.heard_s = time.monotonic()
+        if not self._gone:
+            self._is_there(peer)
         first = self._greeting + (latest or b"")
         if first:
             peer.next_block = first
@@ -311,14 +299,15 @@ class TcpLink(Generic[Item]):
                 if peer.socket.getsockname() == peer.socket.getpeername():
                     raise StreamBroken("no one listens there")  # the system connected the socket to itself
                 self._greet(peer)
-            elif events & selectors.EVENT_READ:
+                return
+            if events & selectors.EVENT_READ:
                 self._read(peer)
-            elif events & selectors.EVENT_WRITE:
+            if peer.replies or events & selectors.EVENT_WRITE:
                 self._write(peer)
         except (OSError, StreamBroken) as error:
             self._hang_up(peer, _text(error))
         except Exception as error:  # a decoder that fails on hostile bytes must not take the others with it
-            self.rejections.add(repr(error))
+            peer.decoder.rejections.add(repr(error))
             self._hang_up(peer, repr(error))
 
     def _read(self, peer: _Peer[Item]) -> None:
@@ -329,19 +318,29 @@ class TcpLink(Generic[Item]):
         if not data:
             inside = " in the middle of a message" if peer.decoder.partial else ""
             raise StreamBroken(f"the other side hung up{inside}")
-        now = time.monotonic()
-        items = peer.decoder.feed(data, now)
+        now, before = time.monotonic(), peer.decoder.completed
+        try:
+            items = peer.decoder.feed(data, now)
+        except StreamBroken as error:
+            peer.decoder.rejections.add(str(error))
+            raise
         if not peer.decoder.partial:
             peer.partial_since_s = None
-        elif items or peer.partial_since_s is None:
+        elif peer.decoder.completed > before or peer.partial_since_s is None:
             peer.partial_since_s = now
+        for reply in peer.decoder.replies:
+            if len(peer.replies) < MAX_REPLIES:
+                peer.replies.append(reply)
+            else:
+                peer.decoder.rejections.add(f"asks while {MAX_REPLIES} answers wait for it")
+        peer.decoder.replies.clear()
         if items:
-            self._received_s = now
+            peer.heard_s, peer.known = now, True
+            self._is_there(peer)
             self._take_in(items)
 
     def _take_in(self, items: list[Item]) -> None:
         with self._lock:
-            self._state = "there"
             for item in items:
                 self._items.append(item)
                 self._bytes += item.nbytes
@@ -352,10 +351,13 @@ class TcpLink(Generic[Item]):
     def _write(self, peer: _Peer[Item]) -> None:
         while True:
             if not peer.block:
-                if peer.next_block is None:
+                if peer.replies:
+                    peer.block = memoryview(peer.replies.popleft())
+                elif peer.next_block is not None:
+                    peer.block, peer.next_block = memoryview(peer.next_block), None
+                else:
                     self._selector.modify(peer.socket, selectors.EVENT_READ, peer)
                     return
-                peer.block, peer.next_block = memoryview(peer.next_block), None
                 peer.block_since_s = time.monotonic()
             try:
                 sent = peer.socket.send(peer.block)
@@ -363,6 +365,7 @@ class TcpLink(Generic[Item]):
                 self._selector.modify(peer.socket, selectors.EVENT_READ | selectors.EVENT_WRITE, peer)
                 return
             peer.block = peer.block[sent:]
+            peer.known |= self._keep_latest and not peer.block
 
     def _distribute(self) -> None:
         with self._lock:
@@ -388,26 +391,45 @@ class TcpLink(Generic[Item]):
                 self._hang_up(peer, f"a message was not complete after {MESSAGE_S:g} s")
             elif peer.block and now - peer.block_since_s > MESSAGE_S:
                 self._hang_up(peer, f"did not take what was sent for {MESSAGE_S:g} s")
-        if self._silent_s is not None and self._state == "there" and now - self._received_s > self._silent_s:
-            self._lost("silent", f"{self._endpoint}: nothing received for {self._silent_s:g} s")
+            elif peer.there and self._silent_s is not None and now - peer.heard_s > self._silent_s:
+                peer.there = False
+                self._lost(peer, f"nothing received for {self._silent_s:g} s{peer.decoder.instead}")
+            elif not (peer.there or peer.passed_over) and self._silent_s is None and now - peer.since_s > STAYED_S:
+                self._is_there(peer)
 
     def _hang_up(self, peer: _Peer[Item], reason: str) -> None:
         self._peers.remove(peer)
         self._selector.unregister(peer.socket)
         peer.socket.close()
-        if not any(not other.connecting for other in self._peers):
-            self._lost("gone", f"{peer.name}: {reason}")
+        if peer.there:
+            self._lost(peer, reason)
+        elif self._server is None:
+            self._report(f"{peer.name}: {reason}")
 
-    def _lost(self, state: Literal["silent", "gone"], reason: str) -> None:
-        """Note a loss, once, however many attempts to connect fail after it.
+    def _is_there(self, peer: _Peer[Item]) -> None:
+        peer.there = self._there = True
+        self._gone = False
 
-        A client also notes that it could not connect in the first place; a server waits silently for its first peer.
+    def _lost(self, peer: _Peer[Item], reason: str) -> None:
+        """A peer that was there is gone or silent."""
+        others = [other for other in self._peers if other.there and other is not peer]
+        if peer.known and not self._keep_latest:
+            for other in others:
+                other.there, other.passed_over = other.known, not other.known
+            others = [other for other in others if other.there]
+        self._there = bool(others)
+        if peer.known or not others:
+            self._report(f"{peer.name}: {reason}")
+
+    def _report(self, loss: str) -> None:
+        """Report a loss, once until someone is there again, however many attempts to connect fail after it.
+
+        A client also reports that it could not connect in the first place; a server waits for its first peer.
         """
-        with self._lock:
-            if self._state == "there" or (self._state == "new" and self._server is None):
-                self._losses.append(one_line(reason, 200))
-            if self._state != "new" or self._server is None:
-                self._state = state
+        if not self._gone:
+            with self._lock:
+                self._losses.append(one_line(loss, 200))
+        self._gone = not self._there
 
     def _shut(self) -> None:
         for peer in self._peers:
@@ -418,7 +440,7 @@ class TcpLink(Generic[Item]):
                     while peer.socket.recv(CHUNK_BYTES):  # closed with bytes unread, it would take the farewell along
                         pass
             peer.socket.close()
-        self._state = "gone"
+        self._there = False
         for end in (self._server, self._wake, self._woken):
             if end is not None:
                 end.close()

@@ -42,14 +42,19 @@ def transform_body(matrix: npt.NDArray[np.float64]) -> bytes:
 
 
 def image_body(
-    pixels: npt.NDArray[Any], spacing: tuple[float, float, float] = (1.0, 1.0, 1.0), scalar: int | None = None
+    pixels: npt.NDArray[Any],
+    spacing: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    scalar: int | None = None,
+    size: tuple[int, int, int] | None = None,
+    start: tuple[int, int, int] = (0, 0, 0),
 ) -> bytes:
-    """An image (k, j, i) of one component."""
+    """An image (k, j, i) of one component; or a part of one of ``size``, from ``start`` on, both (k, j, i)."""
     k, j, i = pixels.shape
     order = 1 if pixels.dtype.byteorder == ">" else 2
     kind = SCALARS[pixels.dtype.str[1:]] if scalar is None else scalar
     axes = [spacing[0], 0, 0, 0, spacing[1], 0, 0, 0, spacing[2]]
-    head = struct.pack(">HBBBB3H12f6H", 1, 1, kind, order, 1, i, j, k, *axes, 0, 0, 0, 0, 0, 0, i, j, k)
+    whole = (size or (k, j, i))[::-1]
+    head = struct.pack(">HBBBB3H12f6H", 1, 1, kind, order, 1, *whole, *axes, 0, 0, 0, *start[::-1], i, j, k)
     return head + pixels.tobytes()
 
 

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from fgreg.drivers import bk_oem, tcp_link
 from fgreg.drivers.base import BmodeFrame, BmodeSource, DeviceLost
 from fgreg.drivers.bk_oem import BkOemScanner, OemDecoder, encode, unescape
-from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken
+from fgreg.drivers.stream_decoder import Rejections, StreamBroken
+from fgreg.drivers.tcp_link import Endpoint
 from fgreg.errors import InputError
 from fgreg.schema.limits import BK_MESSAGE_BYTES
 from tests.bk_emulator import Scanner, Unframer, frame, grabbed

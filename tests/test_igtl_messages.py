@@ -13,22 +13,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgreg.drivers.tcp_link import Rejections, StreamBroken
+from fgreg.drivers.stream_decoder import Rejections, StreamBroken
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.schema.limits import IGTL_BODY_BYTES
 from tests.igtl_bytes import crc64, image_body, message, read_message, transform_body
 
 pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
 
+from fgreg.drivers import igtl_contents as contents
 from fgreg.drivers import igtl_messages as igtl
+from fgreg.drivers.igtl_decoder import MessageDecoder
 
 MATRIX = np.array([[0.0, -1.0, 0.0, 10.5], [1.0, 0.0, 0.0, -20.25], [0.0, 0.0, 1.0, 33.0], [0.0, 0.0, 0.0, 1.0]])
 ALL = frozenset({("TRANSFORM", ""), ("IMAGE", ""), ("STRING", ""), ("STATUS", "")})
 
 
-def decoder(wanted: frozenset[tuple[str, str]] = ALL) -> tuple[igtl.MessageDecoder, Rejections]:
+def decoder(wanted: frozenset[tuple[str, str]] = ALL) -> tuple[MessageDecoder, Rejections]:
     rejections = Rejections()
-    return igtl.MessageDecoder(rejections, wanted, Counter()), rejections
+    return MessageDecoder(rejections, wanted, Counter()), rejections
 
 
 def test_the_checksum_is_the_c_librarys() -> None:
@@ -52,7 +54,7 @@ def test_what_is_packed_reads_as_the_protocol_says(version: int) -> None:
     assert read.content == transform_body(MATRIX)
     text = read_message(igtl.pack_text("Note", "angle 3°", 1.0, {}, version))
     assert text.content == struct.pack(">HH", 3, 11) + b"angle 3\\xb0"
-    status = read_message(igtl.pack_status("S", igtl.Status(13, -2, "REFUSED", "why"), 1.0, {}, version))
+    status = read_message(igtl.pack_status("S", contents.Status(13, -2, "REFUSED", "why"), 1.0, {}, version))
     assert status.content == struct.pack(">Hq20s", 13, -2, b"REFUSED") + b"why\0"
 
 
@@ -73,19 +75,19 @@ def test_what_others_send_is_read(version: int) -> None:
     messages = reader.feed(stream, 7.0)
     assert (rejections.count, reader.partial) == (0, False)
     transform, image, swapped, text, status = (found.content for found in messages)
-    assert isinstance(transform, igtl.Transform)
+    assert isinstance(transform, contents.Transform)
     np.testing.assert_allclose(transform.to_T_from, MATRIX, atol=1e-6)
     assert (messages[0].device, messages[0].sent_s, messages[0].host_s) == ("ProbeToTracker", 5.25, 7.0)
     assert messages[0].metadata == metadata
     assert messages[1].sent_s is None
-    assert isinstance(image, igtl.Image)
-    assert isinstance(swapped, igtl.Image)
+    assert isinstance(image, contents.Image)
+    assert isinstance(swapped, contents.Image)
     np.testing.assert_array_equal(image.pixels, pixels)
     np.testing.assert_array_equal(swapped.pixels, pixels)
     np.testing.assert_allclose(np.linalg.norm(image.world_T_ijk[:3, :3], axis=0), [0.2, 0.1, 1.0], rtol=1e-6)
     assert image.pixels.flags.writeable
-    assert text == igtl.Text("50mm")
-    assert status == igtl.Status(1, 0, "OK", "ready")
+    assert text == contents.Text("50mm")
+    assert status == contents.Status(1, 0, "OK", "ready")
 
 
 @given(cuts=st.lists(st.integers(0, 600), max_size=12))
@@ -185,7 +187,7 @@ def test_hostile_bodies_with_the_right_checksum_are_left_out_or_read(body: bytes
     reader, rejections = decoder()
     raw = struct.pack(">H12s20sIIQQ", version, kind.encode(), b"X", 0, 0, len(body), crc64(body)) + body
     found = reader.feed(raw + message("STRING", "Good", struct.pack(">HH", 3, 2) + b"ok"), 0.0)
-    assert found[-1].content == igtl.Text("ok")
+    assert found[-1].content == contents.Text("ok")
     assert len(found) + rejections.count == 2
 
 

@@ -21,7 +21,7 @@ import pytest
 
 from fgreg.drivers.base import DeviceLost, Registration, host_now
 from fgreg.drivers.igtl import IgtlMotion, IgtlPhotoacoustic, IgtlReceiver, IgtlTransformSink
-from fgreg.drivers.igtl_messages import Status, Text
+from fgreg.drivers.igtl_contents import Status, Text
 from fgreg.drivers.tcp_link import Endpoint
 from fgreg.geometry.transforms import exp_so3, make_transform
 from fgreg.model.time_sync import Stamp
@@ -108,6 +108,23 @@ def test_every_transform_of_a_tracker_arrives_though_it_hangs_up_after_a_hundred
         found = np.array([sample.base_T_camera for sample in samples])[:130]
         assert len(sent) >= 100  # the last ones may not be printed yet
         np.testing.assert_allclose(found[: len(sent)], sent, atol=2e-3)  # printed with six digits
+        assert source.rejected == 0
+    finally:
+        source.close()
+
+
+@pytest.mark.parametrize(
+    ("program", "kind"),
+    [("TrackingData/TrackingDataServer", "TDATA"), ("QuaternionTrackingData/QuaternionTrackingDataServer", "QTDATA")],
+)
+def test_a_tracker_that_sends_when_asked_is_asked(programs: Programs, program: str, kind: str) -> None:
+    port = free_port()
+    source = IgtlMotion(Endpoint("127.0.0.1", port), "Channel 1", start=kind)
+    try:
+        programs.start(program, port)
+        samples = collect(patient(source.poll), 10, 15.0)
+        radii = [np.hypot(*sample.base_T_camera[:2, 3]) for sample in samples]
+        np.testing.assert_allclose(radii, 50.0, atol=1e-3)
         assert source.rejected == 0
     finally:
         source.close()

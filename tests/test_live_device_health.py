@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgreg.drivers.base import DeviceLost, StereoFrame
-from fgreg.live.device_health import FLAT, NOTHING_NEW_S, SILENT_S, START_S, Health, Pictures, Source
+from fgreg.live.device_health import FLAT, LEFT_OUT_S, NOTHING_NEW_S, SILENT_S, START_S, Health, Pictures, Source
 from fgreg.model.time_sync import Stamp
 
 FRAME_S = 1.0 / 30.0
@@ -21,6 +21,8 @@ class Device:
     connected: bool = True
     name: str = "the device"
     loses: list[str] = field(default_factory=list)
+    rejected: int = 0
+    last_rejection: str = ""
 
     def poll(self) -> list[int]:
         if self.loses:
@@ -115,3 +117,15 @@ def test_a_video_that_stops_is_reported_and_single_pictures_are_no_video() -> No
     assert video.trouble(last + 0.9 * SILENT_S) == ""
     assert video.trouble(last + 1.1 * SILENT_S) == "it sends no pictures"
     assert stills.trouble(9.0 + 5.0) == ""
+
+
+def test_messages_left_out_are_told_with_their_number_and_not_too_often() -> None:
+    device = Device()
+    source = Source(device, 0.0, sends=True)
+    assert source.left_out(0.0) == ""
+    device.rejected, device.last_rejection = 1, "127.0.0.1:5000: wrong checksum"
+    assert source.left_out(1.0) == "1 message left out, the last one from 127.0.0.1:5000: wrong checksum"
+    device.rejected = 400
+    assert source.left_out(2.0) == ""
+    assert source.left_out(1.1 + LEFT_OUT_S).startswith("399 messages left out")
+    assert source.left_out(3.0 + LEFT_OUT_S) == ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import struct
 import threading
@@ -12,7 +13,8 @@ from dataclasses import dataclass
 import pytest
 
 from fgreg.drivers import tcp_link
-from fgreg.drivers.tcp_link import Endpoint, Rejections, StreamBroken, TcpLink
+from fgreg.drivers.stream_decoder import Decoder, Rejections, StreamBroken
+from fgreg.drivers.tcp_link import Endpoint, TcpLink
 from fgreg.errors import InputError
 from tests.network_peers import collect, free_port, hung_up, serve, wait_for
 
@@ -26,10 +28,11 @@ class Line:
         return len(self.text)
 
 
-class Lines:
-    """Lines; one that says ``broken`` or ``bug`` raises."""
+class Lines(Decoder[Line]):
+    """Lines; one that says ``broken`` or ``bug`` raises, ``?`` is answered, and those with ``-`` are not taken."""
 
-    def __init__(self, _rejections: Rejections) -> None:
+    def __init__(self, rejections: Rejections) -> None:
+        super().__init__(rejections)
         self._rest = b""
 
     @property
@@ -43,7 +46,9 @@ class Lines:
             raise StreamBroken("a broken line")
         if b"bug" in lines:
             raise KeyError("a defect of the decoder")
-        return [Line(line) for line in lines]
+        self.completed += len(lines)
+        self.replies += [b"!\n" for line in lines if line == b"?"]
+        return [Line(line) for line in lines if line[:1] not in (b"-", b"?")]
 
 
 @pytest.fixture
@@ -72,7 +77,10 @@ def test_a_taken_port_and_a_bad_address_are_one_line(server: TcpLink[Line]) -> N
         Endpoint("", 18944)
 
 
-def test_a_client_without_a_peer_reports_it_once_and_connects_when_there_is_one() -> None:
+def test_a_client_without_a_peer_reports_it_once_and_connects_when_there_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tcp_link, "RETRY_S", 0.05)
     port = free_port()
     link = TcpLink(Endpoint("127.0.0.1", port), Lines)
     try:
@@ -98,7 +106,8 @@ def test_a_client_without_a_peer_reports_it_once_and_connects_when_there_is_one(
         link.close()
 
 
-def test_a_device_that_restarts_is_lost_once_and_found_again() -> None:
+def test_a_device_that_restarts_is_lost_once_and_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp_link, "RETRY_S", 0.05)
     device, port = serve()
     link = TcpLink(Endpoint("127.0.0.1", port), Lines)
     try:
@@ -121,8 +130,8 @@ def test_a_broken_stream_or_a_failing_decoder_ends_that_peer_only(server: TcpLin
         worse.sendall(b"bug\n")
         assert hung_up(bad)
         assert hung_up(worse)
-        assert server.rejections.count == 1
-        assert "defect" in server.rejections.last
+        assert server.rejections.count == 2
+        assert re.fullmatch(r"127\.0\.0\.1:\d+: (KeyError.*a defect.*|a broken line)", server.rejections.last)
         good.sendall(b"still here\n")
         assert collect(server.poll, 1) == [Line(b"still here")]
         assert server.connected
@@ -207,6 +216,78 @@ def test_a_silent_device_is_lost_once_and_back_with_its_next_message() -> None:
         link.close()
 
 
+def test_an_idle_peer_neither_hides_a_loss_nor_makes_up_for_it(
+    server: TcpLink[Line], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tcp_link, "STAYED_S", 0.05)
+    with connect(server) as idle:
+        sender = connect(server)
+        sender.sendall(b"a\n")
+        collect(server.poll, 1)
+        name = "{}:{}".format(*sender.getsockname())
+        sender.close()
+        wait_for(lambda: not server.connected)
+        assert server.take_loss() == f"{name}: the other side hung up"
+        time.sleep(0.15)
+        assert not server.connected
+        idle.sendall(b"b\n")
+        assert collect(server.poll, 1) == [Line(b"b")]
+        assert server.connected
+    wait_for(lambda: not server.connected)
+    assert "hung up" in str(server.take_loss())
+    with connect(server):  # a new one that may be silent counts once it has stayed
+        wait_for(lambda: server.connected)
+
+
+def test_a_peer_that_accepts_and_hangs_up_at_once_is_lost_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp_link, "RETRY_S", 0.02)
+    device, port = serve()
+    link = TcpLink(Endpoint("127.0.0.1", port), Lines)
+    try:
+        with device:
+            for _ in range(5):
+                device.accept()[0].close()
+            peer, _ = device.accept()
+            wait_for(lambda: not link.connected)
+            assert link.take_loss() == f"127.0.0.1:{port}: the other side hung up"
+            with peer:
+                assert link.take_loss() is None
+                peer.sendall(b"a\n")
+                assert collect(link.poll, 1) == [Line(b"a")]
+                assert link.connected
+            wait_for(lambda: not link.connected)
+            assert link.take_loss() is not None  # it had been there
+    finally:
+        link.close()
+
+
+def test_a_stream_of_messages_that_are_not_taken_is_healthy(
+    server: TcpLink[Line], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tcp_link, "MESSAGE_S", 0.1)
+    with connect(server) as peer:
+        for _ in range(30):  # the next one has always begun
+            peer.sendall(b"- not taken\n- not ")
+            peer.sendall(b"taken\n- not")
+            time.sleep(0.01)
+        peer.sendall(b"\nx\n")
+        assert collect(server.poll, 1) == [Line(b"x")]
+
+
+def test_a_question_is_answered_to_who_asked_while_it_goes_on_sending(server: TcpLink[Line]) -> None:
+    with connect(server) as asks, connect(server) as other:
+        asks.sendall(b"?\n" * 3)
+        answers = b""
+        while len(answers) < 6:
+            answers += asks.recv(100)
+        assert answers == b"!\n" * 3
+        other.settimeout(0.05)
+        with pytest.raises(TimeoutError):
+            other.recv(100)
+        asks.sendall(b"?\n" * 40)
+        wait_for(lambda: server.rejections.count == 40 - tcp_link.MAX_REPLIES)
+
+
 def test_a_late_receiver_gets_what_was_offered_last() -> None:
     link = TcpLink(Endpoint.listening(0), Lines, greeting=b"hello ", keep_latest=True)
     try:
@@ -221,13 +302,22 @@ def test_a_late_receiver_gets_what_was_offered_last() -> None:
         link.close()
 
 
-def test_more_peers_than_there_is_room_for_are_turned_away(server: TcpLink[Line]) -> None:
+def test_idle_peers_make_room_and_those_in_use_do_not(server: TcpLink[Line]) -> None:
     peers = [connect(server) for _ in range(tcp_link.MAX_PEERS)]
     try:
-        wait_for(lambda: server.connected)
+        for peer in peers[1:]:
+            peer.sendall(b"x\n")
+        collect(server.poll, len(peers) - 1)
         with connect(server) as one_more:
-            assert hung_up(one_more)
-        peers[0].sendall(b"x\n")
+            one_more.sendall(b"y\n")
+            assert collect(server.poll, 1) == [Line(b"y")]
+            assert hung_up(peers[0])
+            with connect(server) as too_many:
+                assert hung_up(too_many)
+                turned_away = f"127.0.0.1:{too_many.getsockname()[1]}: turned away, since 8 peers are in use"
+            assert server.rejections.last == turned_away
+            assert server.take_loss() is None
+        peers[1].sendall(b"x\n")
         assert collect(server.poll, 1) == [Line(b"x")]
     finally:
         for peer in peers:

@@ -418,16 +418,26 @@ def _valid_igtl() -> list[bytes]:
     image = igtl_bytes.image_body(np.ones((1, 3, 4), np.uint8))
     text = struct.pack(">HH", 3, 4) + b"home"
     status = struct.pack(">HQ20s", 1, 0, b"") + b"ok\0"
-    out = []
+    tracked = struct.pack(">20sBB", b"Device", 2, 0)
+    part = igtl_bytes.image_body(np.zeros((1, 2, 5), np.uint8), size=(1, 4, 5), start=(0, 2, 0))
+    kinds = {"TRANSFORM": pose, "IMAGE": image, "STRING": text, "STATUS": status}
+    kinds |= {
+        "GET_STATUS": b"",
+        "STT_TDATA": bytes(36),
+        "TDATA": tracked + pose,
+        "QTDATA": tracked + bytes(24) + pose[-4:],
+        "POSITION": bytes(24) + pose[:4],
+    }
+    out = [igtl_bytes.message("IMAGE", "Device", part)]
     for version in (1, 2):
-        for kind, body in (("TRANSFORM", pose), ("IMAGE", image), ("STRING", text), ("STATUS", status)):
+        for kind, body in kinds.items():
             out.append(igtl_bytes.message(kind, "Device", body, version))
     return [*out, b"".join(out)]
 
 
 def _feed_igtl(data: bytes, _folder: Path) -> None:
-    from fgreg.drivers.igtl_messages import MessageDecoder
-    from fgreg.drivers.tcp_link import Rejections
+    from fgreg.drivers.igtl_decoder import MessageDecoder
+    from fgreg.drivers.stream_decoder import Rejections
 
     wanted = frozenset((kind, "") for kind in ("TRANSFORM", "IMAGE", "STRING", "STATUS"))
     decoder = MessageDecoder(Rejections(), wanted, Counter())
@@ -437,7 +447,7 @@ def _feed_igtl(data: bytes, _folder: Path) -> None:
 
 
 def _igtl_broken() -> tuple[type[Exception], ...]:
-    from fgreg.drivers.tcp_link import StreamBroken
+    from fgreg.drivers.stream_decoder import StreamBroken
 
     return (StreamBroken,)
 
@@ -452,7 +462,7 @@ def _valid_bk() -> list[bytes]:
 
 def _feed_bk(data: bytes, _folder: Path) -> None:
     from fgreg.drivers.bk_oem import OemDecoder
-    from fgreg.drivers.tcp_link import Rejections
+    from fgreg.drivers.stream_decoder import Rejections
 
     decoder = OemDecoder(Rejections(), count())
     half = len(data) // 3

@@ -19,6 +19,8 @@ START_S = 5.0
 """Longest time until a device's first data."""
 SILENT_S = 0.7
 """A video without pictures for this long has stopped, whatever its driver says."""
+LEFT_OUT_S = 10.0
+"""Shortest time between two accounts of messages that a driver has left out."""
 VIDEO_S = 0.15
 """A source with a longer interval between pictures is no video, and no interval is expected of it."""
 NOTHING_NEW_S = 0.4
@@ -69,6 +71,7 @@ class Source:
     def __init__(self, device: Any, began_s: float, *, sends: bool) -> None:
         self._device, self._began_s, self._sends = device, began_s, sends
         self._seen, self._lost = False, ""
+        self._left_out, self._told_s = 0, -math.inf
 
     def poll(self) -> Sequence[Any]:
         """New data; empty if the device is lost."""
@@ -92,6 +95,15 @@ class Source:
         if self._sends and not connected and (self._seen or now_s - self._began_s > START_S):
             return f"{self._device.name} does not answer"
         return ""
+
+    def left_out(self, now_s: float) -> str:
+        """How many messages its driver has left out since the last account, and why the last one; empty if none."""
+        count = int(getattr(self._device, "rejected", 0))
+        new = count - self._left_out
+        if new == 0 or now_s - self._told_s < LEFT_OUT_S:
+            return ""
+        self._left_out, self._told_s = count, now_s
+        return f"{new} message{'s' if new > 1 else ''} left out, the last one from {self._device.last_rejection}"
 
 
 class Pictures:

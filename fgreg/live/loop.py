@@ -460,6 +460,8 @@ class LiveLoop:
         for role, source in self._sources.items():
             trouble = source.trouble(now)
             health.found(role, trouble or (self._pictures.trouble(now) if role == "camera" else ""))
+            if left_out := source.left_out(now):
+                self._note(f"{role}: {left_out}")
         health.found("locator", self.pulse_locator.trouble)
         if "recording" in health.lost and not (state.blocked or state.waiting):
             steering.unwritten = ""  # the note about it has been written
