@@ -9,7 +9,7 @@ import pytest
 
 from fgreg.model.estimate import Verdict
 from fgreg.viewer import blueprint, legend, palette
-from fgreg.viewer.banner import strip
+from fgreg.viewer.verdict_strip import strip
 from tests.color_vision import SEEN, contrast, difference
 
 TOLD_APART = 15.0

@@ -22,7 +22,7 @@ from fgreg.model.estimate import SessionEstimate, TargetEstimate, TrackEstimate,
 from fgreg.model.measurements import Measurements, Track
 from fgreg.model.session_model import ChannelModel, MarkerModel, SessionModel, StageModel, TagModel
 from fgreg.simulation.lens import project_points
-from fgreg.viewer import endoscope_view, palette, scene, shapes
+from fgreg.viewer import endoscope_lines, endoscope_view, palette, scene, shapes
 from fgreg.viewer.blueprint import WORLD_PX
 from fgreg.viewer.null_viewer import NullViewer, open_viewer
 from fgreg.viewer.recording import Viewer
@@ -361,7 +361,7 @@ def test_the_endoscope_shows_pms_beam_and_plane_where_its_bent_picture_has_them(
     scan, half = pair.look.scan_rad, 0.5 * recorded.model.probe.elements * recorded.model.probe.pitch_mm
     radius = recorded.model.probe.radius_mm
     face = np.array([[side * half, radius * math.sin(scan), radius * math.cos(scan)] for side in (-1.0, 1.0)])
-    np.testing.assert_allclose(plane[[0, endoscope_view.POINTS - 1]], pixels(face), atol=0.01)
+    np.testing.assert_allclose(plane[[0, endoscope_lines.POINTS - 1]], pixels(face), atol=0.01)
 
 
 def test_frames_are_named_and_labels_do_not_cover_each_other(recorded: Recorded) -> None:

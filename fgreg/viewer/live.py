@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,17 +15,13 @@ from fgreg.model.measurements import Aim, Look, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.viewer import banner, endoscope_view, palette, scene, shapes, shot_labels, target_map
 from fgreg.viewer.blueprint import WORLD_PX
-from fgreg.viewer.endoscope_view import Seen
+from fgreg.viewer.endoscope_lines import Seen
 from fgreg.viewer.palette import Color
-from fgreg.viewer.scene import Eye
+from fgreg.viewer.scene import Eye, Reach, nearest_on
 from fgreg.viewer.status_line import Now, goal_line, now_markdown
 
 LARGEST_PLOTTED_MM = 30.0
 """Larger predicted errors are plotted at this value."""
-
-
-Reach = Callable[[FloatArray, FloatArray], float | None]
-"""Length of a beam (mm), or None, from its origin (3,) and unit direction (3,) in TRUS."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,14 +285,3 @@ def update_markdown(update: ViewerUpdate) -> str:
     lines = [f"# {state}", "", f"After {update.note}.", "", f"Pairs used in this camera epoch: {update.pairs}.", ""]
     lines += [f"Predicted error at the worst target, 95 % bound: {worst}.", ""]
     return "\n".join([*lines, *(f"- {reason}" for reason in update.reasons)])
-
-
-def nearest_on(strip_mm: FloatArray) -> Reach:
-    """The length (mm) along a beam at which it is nearest to a curve (n, 3)."""
-
-    def reach(origin: FloatArray, direction: FloatArray) -> float | None:
-        along = (strip_mm - origin) @ direction
-        apart = np.linalg.norm(strip_mm - origin - along[:, None] * direction, axis=1)
-        return float(along[np.argmin(apart)])
-
-    return reach

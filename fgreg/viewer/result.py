@@ -15,7 +15,7 @@ from fgreg.model.estimate import PairEstimate, SessionEstimate, TrackEstimate, V
 from fgreg.model.measurements import Look, MarkerObservation, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.viewer import banner, endoscope_view, palette, scene, shapes, shot_labels, target_map
-from fgreg.viewer.endoscope_view import Seen
+from fgreg.viewer.endoscope_lines import Seen
 from fgreg.viewer.scene import Eye
 from fgreg.viewer.summary_page import HEADINGS, summary_markdown
 

@@ -7,6 +7,7 @@ equals ``trus`` at stage angle 0, so a point (x, 0, z) of it lies in the image p
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,6 +53,21 @@ def arc_strip_mm(look: Look, probe: ProbeModel, points: int = 25) -> FloatArray:
     half = ARC_HALF_WIDTHS * float(probe.sensitivity.half_width_at(look.range_mm))
     rotation = np.linspace(-half, half, points)
     return arc_point_mm(look, probe, look.scan_rad + arc_of_rotation(rotation, look.range_mm, probe.radius_mm))
+
+
+Reach = Callable[[FloatArray, FloatArray], float | None]
+"""Length of a beam (mm), or None, from its origin (3,) and unit direction (3,) in TRUS."""
+
+
+def nearest_on(strip_mm: FloatArray) -> Reach:
+    """The length (mm) along a beam at which it is nearest to a curve (n, 3)."""
+
+    def reach(origin: FloatArray, direction: FloatArray) -> float | None:
+        along = (strip_mm - origin) @ direction
+        apart = np.linalg.norm(strip_mm - origin - along[:, None] * direction, axis=1)
+        return float(along[np.argmin(apart)])
+
+    return reach
 
 
 def array_length_mm(probe: ProbeModel) -> float:
