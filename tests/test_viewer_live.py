@@ -21,6 +21,7 @@ from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.time_sync import Stamp
 from fgreg.online.estimate import OnlineEstimate
+from fgreg.viewer.endoscope_view import PATH, REFUSED
 from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.recording import Viewer
 from fgreg.viewer.shapes import CANVAS, canvas
@@ -124,6 +125,21 @@ def test_without_a_registration_no_camera_stands_anywhere_and_lost_devices_are_t
     assert "## Next: get the camera and the stage back" in text
     assert "**Stage:** LOST" in text
     assert rows["/world/goal"][-1].values["Clear:is_recursive"] == [True]
+
+
+def test_a_refused_registration_s_camera_is_crossed_out_as_long_as_it_is_refused(tmp_path: Path) -> None:
+    shown = [update(number, NOW, verdict) for number, verdict in enumerate((Verdict.OK, Verdict.REFUSED, Verdict.OK))]
+    rows = recorded(tmp_path / "a.rrd", [(one, None) for one in shown])
+    crossed = {row.shot: row.values for row in rows["/world/camera/crossed"]}
+    assert [number for number, values in crossed.items() if "LineStrips3D:strips" in values] == [1]
+    assert crossed[2]["Clear:is_recursive"] == [True]
+    colors = [row.values["Pinhole:color"][0] for row in rows["/world/camera/left"] if "Pinhole:color" in row.values]
+    assert len(colors) == 3
+    assert colors[0] == colors[2] != colors[1]
+    said = {
+        row.shot: row.values["Points2D:labels"] for row in rows[f"/{PATH}/refused"] if "Points2D:labels" in row.values
+    }
+    assert said == {1: [REFUSED]}
 
 
 def test_the_last_picture_says_that_the_session_is_over(tmp_path: Path) -> None:
