@@ -127,6 +127,21 @@ class Registration:
     stage_rad: float | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class OverlayPicture:
+    """The endoscope's left picture with what is known of the registration drawn on it.
+
+    Attributes:
+        stamp: of the exposure.
+        image: (h, w, 3) BGR.
+        index: of the frame.
+    """
+
+    stamp: Stamp
+    image: npt.NDArray[np.uint8]
+    index: int
+
+
 class Device(Protocol):
     """Interface that all roles except the stage share."""
 
@@ -243,6 +258,13 @@ class TransformSink(Device, Protocol):
 
     def send(self, registration: Registration) -> None:
         """Send the registration; for a slow receiver only the newest is kept. Raises DeviceLost."""
+
+
+class PictureSink(Device, Protocol):
+    """Display of the endoscope's picture with the registration drawn on it: a window, a program that takes pictures."""
+
+    def send(self, picture: OverlayPicture) -> None:
+        """Show a picture; of several that wait only the newest is. Raises DeviceLost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

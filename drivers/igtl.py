@@ -21,12 +21,11 @@ import numpy.typing as npt
 from fgreg.drivers.base import BmodeFrame, MotionSample, PaFrame, Registration, host_now
 from fgreg.drivers.igtl_contents import Image, Transform
 from fgreg.drivers.igtl_decoder import MessageDecoder, Offers, pack_start
-from fgreg.drivers.igtl_messages import Message, check_name, require_pyigtl
+from fgreg.drivers.igtl_messages import Message, check_name, check_version, require_pyigtl
 from fgreg.drivers.igtl_registration import REFUSED_SAID_S, DeviceNames, registration_messages
 from fgreg.drivers.stream_decoder import Rejections
 from fgreg.drivers.tcp_device import LinkedDevice
 from fgreg.drivers.tcp_link import Endpoint, TcpLink
-from fgreg.errors import InputError
 from fgreg.geometry.transforms import inverse, is_rigid, make_transform, nearest_rotation
 from fgreg.model.time_sync import Stamp
 
@@ -38,7 +37,7 @@ SILENT_S = 0.8
 """Default time after which a silent stream counts as lost, so that the loss is reported within a second."""
 
 
-class _IgtlDevice(LinkedDevice[Message]):
+class IgtlDevice(LinkedDevice[Message]):
     """A connection from which some messages are read."""
 
     _role = "OpenIGTLink"
@@ -69,7 +68,7 @@ class _IgtlDevice(LinkedDevice[Message]):
         self._link.rejections.add(f"{message.peer}: {message.device}: {why}")
 
 
-class IgtlReceiver(_IgtlDevice):
+class IgtlReceiver(IgtlDevice):
     """All transforms, images, texts and states that arrive, or those of some devices, in order.
 
     Args:
@@ -92,7 +91,7 @@ class IgtlReceiver(_IgtlDevice):
         return self._messages()
 
 
-class _Images(_IgtlDevice):
+class _Images(IgtlDevice):
     """Numbered two-dimensional images of one device."""
 
     def __init__(self, endpoint: Endpoint, device: str, silent_s: float | None) -> None:
@@ -181,7 +180,7 @@ class IgtlBmode(_Images):
         return frames
 
 
-class IgtlMotion(_IgtlDevice):
+class IgtlMotion(IgtlDevice):
     """MotionSource: poses of the endoscope's holder, millimetres: TRANSFORM, POSITION, or in TDATA or QTDATA.
 
     Args:
@@ -227,7 +226,7 @@ class IgtlMotion(_IgtlDevice):
         return samples
 
 
-class IgtlTransformSink(_IgtlDevice):
+class IgtlTransformSink(IgtlDevice):
     """TransformSink: ``igtl_registration`` describes the messages, also those of a refused registration.
 
     Receivers may also ask for them: GET_STATUS, GET_STRING, GET_TRANSFORM, GET_CAPABIL.
@@ -243,10 +242,8 @@ class IgtlTransformSink(_IgtlDevice):
     _role = "transform sink"
 
     def __init__(self, endpoint: Endpoint, names: DeviceNames | None = None, header_version: int = 2) -> None:
-        if header_version not in (1, 2):
-            raise InputError("OpenIGTLink header version", str(header_version), "1 or 2")
         names = names or DeviceNames()
-        self._names, self._version = names, header_version
+        self._names, self._version = names, check_version(header_version)
         self._usable: bool | None = None
         self._since_s = -math.inf
         transforms = (names.registration, names.plane)

@@ -116,6 +116,16 @@ def parse_image(content: bytes) -> Image:
     return Image(pixels, world_T_ijk, (depth, rows, columns), (first_k, first_j, first_i))
 
 
+def image_head(pixels: npt.NDArray[Any]) -> bytes:
+    """What stands before the pixels (k, j, i) or (k, j, i, components) of a whole image of unit spacing."""
+    (k, j, i), components = pixels.shape[:3], int(np.prod(pixels.shape[3:]))
+    scalar = next(kind for kind, name in SCALARS.items() if np.dtype(name) == pixels.dtype.newbyteorder("="))
+    order = 1 if pixels.dtype.byteorder == ">" else 2
+    centre = ((i - 1) / 2.0, (j - 1) / 2.0, (k - 1) / 2.0)
+    axes = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    return IMAGE.pack(1, components, scalar, order, 2, i, j, k, *axes, *centre, 0, 0, 0, i, j, k)
+
+
 def parse_position(content: bytes) -> Transform:
     """A position with its orientation as a quaternion; its scalar part may be left away."""
     if len(content) == SHORT_POSE.size:

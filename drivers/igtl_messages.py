@@ -1,6 +1,6 @@
 """OpenIGTLink messages: bytes to typed content and back, with checks of everything that a sender can get wrong.
 
-Metadata, TRANSFORM and STRING are pyigtl's, and so is the packing of IMAGE; header, checksum, sizes and the other
+Metadata, TRANSFORM and STRING are pyigtl's; header, checksum, sizes and the other
 contents are read or made here (``igtl_contents``), since pyigtl does not: it has no STATUS, TDATA and QTDATA, takes no
 part of an image, and its POSITION is not that of the protocol. Its own client and server are not used: they keep only
 the newest message of each device, so laser pulses would be lost. They accept any body size and any checksum, do not
@@ -22,8 +22,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fgreg.drivers.igtl_contents import PARSERS, STATUS, Content, Image, Status, Transform, finite, padded
-from fgreg.drivers.igtl_contents import Text as Text
+from fgreg.drivers.igtl_contents import (
+    PARSERS,
+    STATUS,
+    Content,
+    Image,
+    Status,
+    Text,
+    Transform,
+    finite,
+    image_head,
+    padded,
+)
 from fgreg.drivers.stream_decoder import StreamBroken
 from fgreg.errors import InputError, MissingExtraError
 from fgreg.geometry.transforms import FloatArray
@@ -31,6 +41,8 @@ from fgreg.schema.limits import IGTL_BODY_BYTES
 
 NAME_BYTES = 20
 HEADER = struct.Struct(">H12s20sIIQQ")
+EXTENDED = struct.Struct(">HHII")
+"""Extended header of version 2: its size, those of the metadata's header and of the metadata, the message's number."""
 
 STATUS_OK, STATUS_NOT_FOUND, STATUS_UNKNOWN, STATUS_NOT_READY = 1, 4, 12, 13
 
@@ -80,6 +92,13 @@ def check_name(name: str) -> str:
     if not (name.isascii() and name.isprintable() and 1 <= len(name) <= NAME_BYTES) or name != name.strip():
         raise InputError("OpenIGTLink device name", repr(name), f"1 to {NAME_BYTES} printable ASCII characters")
     return name
+
+
+def check_version(version: int) -> int:
+    """A valid header version. Raises InputError."""
+    if version not in (1, 2):
+        raise InputError("OpenIGTLink header version", str(version), "1 or 2")
+    return version
 
 
 def parse_header(data: bytes) -> Header:
@@ -150,8 +169,17 @@ def pack_status(device: str, status: Status, sent_s: float, metadata: Mapping[st
 
 
 def pack_image(device: str, pixels: npt.NDArray[Any], sent_s: float, version: int = 2) -> bytes:
-    """IMAGE (k, j, i) of one component per pixel or (k, j, i, components), unit spacing."""
-    return _pack(_pyigtl().ImageMessage(np.ascontiguousarray(pixels)), check_name(device), sent_s, {}, version)
+    """IMAGE (k, j, i) of one component per pixel or (k, j, i, components), unit spacing.
+
+    Made here, since pyigtl copies the pixels five times.
+    """
+    head, data = image_head(pixels), np.ascontiguousarray(pixels).data
+    before, after = (EXTENDED.pack(EXTENDED.size, 2, 0, 0), b"\0\0") if version > 1 else (b"", b"")
+    body = b"".join((before, head, data, after))
+    checksum = _pyigtl().messages.CRC64(body)
+    seconds, name = int(sent_s), check_name(device).encode()
+    fraction = int((sent_s - seconds) * 2**32)
+    return b"".join((HEADER.pack(version, b"IMAGE", name, seconds, fraction, len(body), checksum), body))
 
 
 def pack_raw(

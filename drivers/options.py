@@ -17,7 +17,7 @@ from fgreg.schema.record import Key
 from fgreg.stage.limits import LIMITS
 
 NAME_BYTES = 20
-IGTL_PORT, SINK_PORT, BK_PORT = 18944, 18945, 7915
+IGTL_PORT, SINK_PORT, OVERLAY_PORT, BK_PORT = 18944, 18945, 18946, 7915
 
 _VIDEO_DEVICE = re.compile(r"/dev/video[0-9]+")
 _STREAM = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*://.+")
@@ -87,6 +87,12 @@ def _check_fourcc(text: str) -> None:
     """Raises InputError for an invalid FOURCC."""
     if len(text) != 4 or not text.isascii():
         raise InputError("fourcc", repr(text), "four characters such as MJPG")
+
+
+def _check_title(text: str) -> None:
+    """Raises InputError for a title that a window cannot have."""
+    if not (text.isprintable() and 1 <= len(text) <= 60):
+        raise InputError("title", repr(text), "1 to 60 printable characters")
 
 
 _PORT = Integer(1, 65535)
@@ -315,6 +321,24 @@ class IgtlSinkOptions(Connection):
     status: Annotated[str, _named("of the state")] = "RegistrationStatus"
     verdict: Annotated[str, _named("of the verdict")] = "RegistrationVerdict"
     header_version: Annotated[int, Key("1 for receivers of OpenIGTLink 1 and 2", Integer(1, 2))] = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IgtlOverlayOptions(Connection):
+    """Receiver of the endoscope's picture with the registration drawn on it."""
+
+    port: Annotated[int, Key("TCP port", _PORT)] = OVERLAY_PORT
+    listen: Annotated[bool, Key("wait for the peer to connect")] = True
+    device: Annotated[str, _named("of the pictures")] = "Overlay"
+    header_version: Annotated[int, Key("1 for receivers of OpenIGTLink 1 and 2", Integer(1, 2))] = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowOptions:
+    """A window of this machine."""
+
+    title: Annotated[str, Key("of the window", Text("1 to 60 characters", check=_check_title))] = "fgreg"
+    full_screen: Annotated[bool, Key("without frame, as large as the screen")] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,6 +12,7 @@ from fgreg.drivers.base import (
     DeviceLost,
     MotionSample,
     OperatorCommand,
+    OverlayPicture,
     PaFrame,
     RefusedWord,
     Registration,
@@ -79,9 +80,9 @@ class PluginDevice:
             raise DeviceLost(f"{self._driver}: gave a {type(wrong).__name__}, expected {ITEMS[self._role].__name__}")
         return items
 
-    def send(self, registration: Registration) -> None:
-        """Send the registration. Raises DeviceLost, FgregError."""
-        self._called(lambda: self._device.send(registration))
+    def send(self, what: Registration | OverlayPicture) -> None:
+        """Send the registration, or a picture. Raises DeviceLost, FgregError."""
+        self._called(lambda: self._device.send(what))
 
     def tell(self, text: str, *, done: bool = False, wants: CommandKind | None = None) -> None:
         """Show a message; an error is reported by the next ``poll``."""

@@ -51,6 +51,7 @@ METHODS: Mapping[Role, tuple[str, ...]] = {
     Role.BMODE: _SOURCE,
     Role.OPERATOR: ("poll", "tell", "close"),
     Role.SINKS: ("send", "close"),
+    Role.OVERLAY: ("send", "close"),
     Role.STAGE: ("home", "move_to", "stop", "status", "close"),
 }
 """What a class of each role has to have."""

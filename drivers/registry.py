@@ -30,8 +30,12 @@ class Role(StrEnum):
     MOTION = "motion"
     BMODE = "bmode"
     SINKS = "sinks"
+    OVERLAY = "overlay"
     OPERATOR = "operator"
 
+
+SEVERAL = (Role.SINKS, Role.OVERLAY, Role.OPERATOR)
+"""Roles that may have several devices; these send nothing by themselves."""
 
 EXTRAS: Mapping[str, tuple[str, str]] = {
     "igtl": ("pyigtl", "OpenIGTLink"),
@@ -260,6 +264,22 @@ ENTRIES: tuple[DriverEntry, ...] = (
         "ros2:open_sink",
         extra="ros2",
         check="ros2_transport:check",
+    ),
+    DriverEntry(
+        Role.OVERLAY,
+        "igtl",
+        "receivers of the endoscope's picture with the registration drawn on it",
+        options.IgtlOverlayOptions,
+        "igtl_overlay:open_overlay",
+        extra="igtl",
+    ),
+    DriverEntry(
+        Role.OVERLAY,
+        "window",
+        "a window with that picture; needs an OpenCV with windows",
+        options.WindowOptions,
+        "overlay_window:open_window",
+        check="overlay_window:check_window",
     ),
     DriverEntry(
         Role.OPERATOR,

@@ -278,6 +278,10 @@ class TcpLink(Generic[Item]):
             for option, value in (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3)):
                 if hasattr(socket, option):  # a pulled cable shows after 4 s
                     peer.socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+            if self._keep_latest and hasattr(
+                socket, "TCP_NOTSENT_LOWAT"
+            ):  # else old blocks wait in the system's buffer
+                peer.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, CHUNK_BYTES)
         with self._lock:
             latest = self._latest if self._offered is None else None  # else it is about to be sent to all
         peer.since_s = peer.heard_s = time.monotonic()

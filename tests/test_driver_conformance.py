@@ -22,6 +22,7 @@ from fgreg.drivers.base import DeviceLost, PaFrame, Registration, host_now
 from fgreg.drivers.bk_oem import BkOemScanner
 from fgreg.drivers.endoscope import Endoscope, EndoscopeConfig, InputConfig
 from fgreg.drivers.igtl import IgtlBmode, IgtlMotion, IgtlPhotoacoustic, IgtlTransformSink
+from fgreg.drivers.igtl_overlay import IgtlPictureSink
 from fgreg.drivers.operators import IgtlOperator
 from fgreg.drivers.recorded_devices import Pace, RecordedMotion
 from fgreg.drivers.simulated_stage import SimulatedStage
@@ -166,7 +167,14 @@ def test_openigtlink(role: str, server: Server) -> None:
     check_driver(role, bench)
 
 
-def test_an_openigtlink_sink(server: Server) -> None:
+@pytest.mark.parametrize(
+    ("role", "make", "header"),
+    [
+        ("sinks", IgtlTransformSink, b"TRANSFORM\0\0\0CameraToTrus"),
+        ("overlay", IgtlPictureSink, b"IMAGE\0\0\0\0\0\0\0Overlay"),
+    ],
+)
+def test_an_openigtlink_sink(role: str, make: Callable[[Endpoint], Any], header: bytes, server: Server) -> None:
     pytest.importorskip("pyigtl", reason="pyigtl is not installed: pip install 'fgreg[igtl]'")
     read = bytearray()
 
@@ -177,12 +185,10 @@ def test_an_openigtlink_sink(server: Server) -> None:
                 read.extend(peer.recv(1 << 20))
 
         server.each(take)
-        return read.count(b"TRANSFORM\0\0\0CameraToTrus")
+        return read.count(header)
 
-    bench = Bench(
-        lambda: IgtlTransformSink(server.endpoint), lose=server.lose, restore=server.restore, received=received
-    )
-    check_driver("sinks", bench)
+    bench = Bench(lambda: make(server.endpoint), lose=server.lose, restore=server.restore, received=received)
+    check_driver(role, bench)
 
 
 SIMULATED: dict[str, tuple[Callable[[Path], Any], dict[str, Any], bytes]] = {

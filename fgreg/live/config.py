@@ -15,7 +15,7 @@ from typing import Any
 from fgreg.convert.write import camera_yaml
 from fgreg.drivers.base import DriverContext, Operator
 from fgreg.drivers.options import Connection, EndoscopeOptions, NoOptions
-from fgreg.drivers.registry import DriverEntry, Role, drivers_of
+from fgreg.drivers.registry import SEVERAL, DriverEntry, Role, drivers_of
 from fgreg.errors import InputError
 from fgreg.live.config_keys import LIVE, CalibrationOptions, LiveDocument, LiveSettings, RoomOptions
 from fgreg.live.launch import LiveSetup, StageSetup, setup_text
@@ -54,7 +54,7 @@ class LiveConfig:
 
     Attributes:
         setup: text of the new session's ``session.yaml``. model: its content.
-        devices: by role; ``sinks`` and ``operator`` may have several.
+        devices: by role; ``sinks``, ``overlay`` and ``operator`` may have several.
         stage_limits: arguments of MotionLimits.of_session.
         room: options of the simulated room, if its devices are used.
         rectified: fgreg.drivers.rectification.Rectification, if the pictures are to be rectified.
@@ -123,6 +123,7 @@ class LiveConfig:
                 motion=first.get(Role.MOTION),
                 bmode=first.get(Role.BMODE),
                 sinks=tuple(opened(chosen) for chosen in self.devices.get(Role.SINKS, ())),
+                overlay=tuple(opened(chosen) for chosen in self.devices.get(Role.OVERLAY, ())),
             )
 
         return LiveSetup(
@@ -218,7 +219,7 @@ class _Reader:
         found: dict[Role, tuple[Chosen, ...]] = {}
         for role in Role:
             chosen = getattr(document, role)
-            several = chosen if role in (Role.SINKS, Role.OPERATOR) else () if chosen is None else (chosen,)
+            several = chosen if role in SEVERAL else () if chosen is None else (chosen,)
             listed = isinstance(self.data.get(role), list)
             places = [
                 place_text((role, i) if listed else (role,), self.path.name, self.data) for i in range(len(several))

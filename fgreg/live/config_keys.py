@@ -138,6 +138,13 @@ class LiveDocument:
     sinks: Annotated[
         tuple[Choice, ...], Key("Receivers of the registration; any number.", ListOf(DriverChoice(Role.SINKS)))
     ] = ()
+    overlay: Annotated[
+        tuple[Choice, ...],
+        Key(
+            "Displays of the endoscope's picture with the registration drawn on it; any number.",
+            ListOf(DriverChoice(Role.OVERLAY)),
+        ),
+    ] = ()
     operator: Annotated[
         tuple[Choice, ...],
         Key("Sources of the operator's commands; a list if there are several.", OneOrMore(DriverChoice(Role.OPERATOR))),
@@ -148,7 +155,7 @@ class LiveDocument:
 LIVE = record(LiveDocument, ("format", LIVE_FORMAT))
 """``CONFIG.yaml``."""
 
-_ABSENT = (Role.MOTION, Role.BMODE)
+_ABSENT = (Role.MOTION, Role.BMODE, Role.OVERLAY)
 """Roles that the example has as comments only."""
 
 
@@ -183,7 +190,7 @@ def _lines() -> Iterator[str]:
 def _entry(role: Role, entry: DriverEntry, commented: bool) -> Iterator[str]:
     """Lines of a driver's keys."""
     extra = f"; pip install 'fgreg[{entry.extra}]'" if entry.extra else ""
-    dash, indent = ("- ", "    ") if role is Role.SINKS else ("", "  ")
+    dash, indent = ("- ", "    ") if role in (Role.SINKS, Role.OVERLAY) else ("", "  ")
     lines = [f"{role}:", f"  {dash}driver: {entry.name}  # {entry.help}{extra}"]
     for key in entry.record.fields:
         if key.kind is LIMITS:

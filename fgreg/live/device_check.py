@@ -13,7 +13,7 @@ from typing import Any
 from fgreg.drivers import plugins
 from fgreg.drivers.base import BmodeFrame, DeviceLost, DriverContext, PaFrame, StereoFrame
 from fgreg.drivers.options import EndoscopeOptions
-from fgreg.drivers.registry import EXTRAS, Role, distribution, drivers_of, installed
+from fgreg.drivers.registry import EXTRAS, SEVERAL, Role, distribution, drivers_of, installed
 from fgreg.errors import FgregError, MissingExtraError, one_line
 from fgreg.live.config import Chosen, LiveConfig
 from fgreg.model.session_model import SessionModel
@@ -116,7 +116,7 @@ def configured(config: LiveConfig, listen_s: float = LISTEN_S) -> Iterator[Devic
         context = config.context(stack, lambda _: None)
         for role, several in config.devices.items():
             for number, chosen in enumerate(several, 1):
-                what = str(role) if len(several) == 1 and role is not Role.SINKS else f"{role} {number}"
+                what = str(role) if len(several) == 1 and role not in (Role.SINKS, Role.OVERLAY) else f"{role} {number}"
                 name, found = _asked(role, chosen, context, config.model, listen_s)
                 yield DeviceReport(what, chosen.entry.name, name, found.answers, one_line(found.says, 300))
 
@@ -137,7 +137,7 @@ def _asked(
         device = chosen.open(context)
         try:
             name = device.name
-            if role in (Role.SINKS, Role.OPERATOR):
+            if role in SEVERAL:
                 return name, _connected(device, bool(getattr(chosen.options, "listen", False)), listen_s)
             return name, _listened(device, model, listen_s)
         finally:

@@ -13,8 +13,10 @@ import yaml
 
 from fgreg.drivers.base import host_now
 from fgreg.errors import FgregError, InputError
+from fgreg.geometry.transforms import FloatArray
 from fgreg.live.loop import LiveLoop
-from fgreg.live.recorder import OnTaken, Recorder
+from fgreg.live.overlay_feed import OverlayFeed
+from fgreg.live.recorder import OnTaken, Recorded, Recorder
 from fgreg.live.scope_holder import HolderSettings
 from fgreg.live.status import Devices
 from fgreg.live.workflow import Workflow, WorkflowSettings
@@ -22,6 +24,7 @@ from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.time_sync import Latencies
 from fgreg.online.engine_process import EngineProcess
+from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.live_session import Engine, LiveSession
 from fgreg.online.shared_snapshot import NoSnapshotError, Received, SnapshotReader
 from fgreg.output.session_folder import STAGE_LOG, new_session
@@ -193,12 +196,16 @@ def running(
         if live.stage is not None:
             say("starting the stage's watchdog")
             devices.stage = stack.enter_context(_open_stage(live.stage, model, session, start_s, folder))
-        recorder = Recorder(session, on_taken)
+        overlay = None
+        if devices.overlay:
+            overlay = OverlayFeed(model, devices.overlay)
+            stack.callback(overlay.close)
+        recorder = Recorder(session, _both(on_taken, overlay))
         stack.callback(_end_recording, recorder, say)
         taken = session.measurements()
         workflow = Workflow(model, live.settings, 1 + max((pair.pm for pair in taken.pairs), default=-1))
         snapshots = NewestSnapshots(session)
-        loop = LiveLoop(model, devices, recorder, snapshots, workflow, start_s, live.holder, live.latencies)
+        loop = LiveLoop(model, devices, recorder, snapshots, workflow, start_s, live.holder, live.latencies, overlay)
         stack.callback(loop.close)
         stack.enter_context(undisturbed())
         try:
@@ -209,6 +216,19 @@ def running(
         finally:
             if devices.stage is not None:
                 devices.stage.close()  # first; the rest follows in the stack's order
+
+
+def _both(on_taken: OnTaken | None, overlay: OverlayFeed | None) -> OnTaken | None:
+    """Tells both of an event."""
+    if overlay is None:
+        return on_taken
+
+    def taken(event: Recorded, estimate: OnlineEstimate | None, marker_T_laser: FloatArray | None) -> None:
+        overlay.taken(event, estimate, marker_T_laser)
+        if on_taken is not None:
+            on_taken(event, estimate, marker_T_laser)
+
+    return taken
 
 
 def _end_recording(recorder: Recorder, say: Callable[[str], None]) -> None:

@@ -41,6 +41,7 @@ from fgreg.live.device_health import Health, Pictures, Source
 from fgreg.live.heard_words import HeardWords
 from fgreg.live.marker_tracker import MarkerTracker
 from fgreg.live.merge_looks import one_spot
+from fgreg.live.overlay_feed import OverlayFeed
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
 from fgreg.live.scope_holder import Holder, HolderSettings
@@ -98,6 +99,7 @@ class LiveLoop:
         start_s: host time of session time 0.
         holder: accuracy of the endoscope's holder, if there is one (``devices.motion``).
         latencies: of the devices.
+        overlay: shows ``devices.overlay`` the pictures; None without one.
     """
 
     def __init__(
@@ -110,9 +112,10 @@ class LiveLoop:
         start_s: float,
         holder: HolderSettings | None = None,
         latencies: Latencies | None = None,
+        overlay: OverlayFeed | None = None,
     ) -> None:
         self._model, self._devices, self._recorder, self._reader = model, devices, recorder, reader
-        self._workflow, self._start_s = workflow, start_s
+        self._workflow, self._start_s, self._overlay = workflow, start_s, overlay
         latencies = latencies or Latencies()
         self.marker_tracker, self.pulse_locator = (
             MarkerTracker(model, latencies.camera_s),
@@ -169,6 +172,8 @@ class LiveLoop:
         if self.marker_tracker.newest is not before:  # the frame was processed
             self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
         self._send(now)
+        if self._overlay is not None:
+            self._overlay.show(self.status())
         self._check_devices(host_now())
         if text := self._words.news(host_now()):
             self._note(text)
@@ -457,6 +462,8 @@ class LiveLoop:
     def _check_devices(self, now: float) -> None:
         """Update which devices are lost; report and note each change."""
         health, state, steering = self._health, self._recorder.state, self._steering
+        for number, loss in [] if self._overlay is None else self._overlay.losses():
+            self._sources[f"overlay {number + 1}"].failed(loss)
         for role, source in self._sources.items():
             trouble = source.trouble(now)
             health.found(role, trouble or (self._pictures.trouble(now) if role == "camera" else ""))

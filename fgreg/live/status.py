@@ -14,6 +14,7 @@ from fgreg.drivers.base import (
     MotionSource,
     Operator,
     PhotoacousticSource,
+    PictureSink,
     StereoCamera,
     StereoFrame,
     TransformSink,
@@ -32,7 +33,7 @@ LATENCIES = 100_000
 
 @dataclass(slots=True, eq=False)
 class Devices:
-    """The connected devices: one per role, any number of sinks; ``bmode`` only if its pictures are displayed."""
+    """The connected devices: one per role, any number of sinks and overlays; ``bmode`` only if it is displayed."""
 
     camera: StereoCamera
     probe: PhotoacousticSource
@@ -41,6 +42,7 @@ class Devices:
     motion: MotionSource | None = None
     bmode: BmodeSource | None = None
     sinks: Sequence[TransformSink] = ()
+    overlay: Sequence[PictureSink] = ()
 
     def roles(self) -> dict[str, Any]:
         """Devices that can be lost, by role; the stage reports its loss itself."""
@@ -49,8 +51,11 @@ class Devices:
             found["motion"] = self.motion
         if self.bmode is not None:
             found["bmode"] = self.bmode
+        sink: TransformSink | PictureSink
         for number, sink in enumerate(self.sinks):
             found[f"sink {number + 1}"] = sink
+        for number, sink in enumerate(self.overlay):
+            found[f"overlay {number + 1}"] = sink
         return found
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.live.recorder import Recorded
 from fgreg.live.status import Status
 from fgreg.model.estimate import Verdict
-from fgreg.model.events import AimEvent, NoteEvent, PairEvent
+from fgreg.model.events import AimEvent, NoteEvent, PairEvent, TrusRecord
 from fgreg.model.measurements import Aim, Look, MarkerObservation, Pair, Track
 from fgreg.model.session_model import SessionModel, StageModel
 from fgreg.online.estimate import OnlineEstimate
@@ -136,14 +136,8 @@ class RerunFeed(ViewerFeed):
         return MarkerObservation(as_float_array(pose, 4, 4), as_float_array(spread, 6, 6), self._marker)
 
     def _pair(self, event: PairEvent, marker: MarkerObservation, epoch: int) -> Pair | None:
-        model, trus = self._model, event.trus
-        if model is None or trus.x_mm is None or trus.range_mm is None:
-            return None
-        scan = model.stage.scan_from_device(math.radians(trus.scan_deg))
-        spread = np.eye(2) if trus.covariance is None else trus.covariance
-        sweep = model.stage.direction * trus.sweep
-        look = Look(scan, model.noise.scan_rad, trus.x_mm, trus.range_mm, spread, sweep, trus.amplitude)
-        return Pair(event.t, event.pm, epoch, marker, look)
+        look = None if self._model is None else look_of(self._model, event.trus)
+        return None if look is None else Pair(event.t, event.pm, epoch, marker, look)
 
     def _put(self, drawing: _Drawing) -> None:
         while True:
@@ -201,6 +195,16 @@ class RerunFeed(ViewerFeed):
                 epoch=0 if estimate is None else estimate.epoch,
             )
         )
+
+
+def look_of(model: SessionModel, trus: TrusRecord) -> Look | None:
+    """A recorded look; None where nothing was detected."""
+    if trus.x_mm is None or trus.range_mm is None:
+        return None
+    scan = model.stage.scan_from_device(math.radians(trus.scan_deg))
+    spread = np.eye(2) if trus.covariance is None else trus.covariance
+    sweep = model.stage.direction * trus.sweep
+    return Look(scan, model.noise.scan_rad, trus.x_mm, trus.range_mm, spread, sweep, trus.amplitude)
 
 
 def now_of(status: Status, stage: StageModel, *, ended: bool = False) -> Now:

@@ -46,13 +46,15 @@ class Seen:
 class Lines:
     """The same in the left picture: lines of (n, 2) and points (n, 2), px.
 
-    ``array`` is the edge of the plane at the probe's face: it tells which side of the plane is the probe's. ``spot``
-    is the beam's end. ``crosses`` mark PMs that were not used.
+    ``array`` is the edge of the plane at the probe's face: it tells which side of the plane is the probe's. ``turn``
+    leads from the middle of the plane's far edge to that of the goal's, as the stage turns. ``spot`` is the beam's end.
+    ``crosses`` mark PMs that were not used.
     """
 
     plane: list[FloatArray]
     array: list[FloatArray]
     goal: list[FloatArray]
+    turn: list[FloatArray]
     beam: list[FloatArray]
     spot: FloatArray
     pms: FloatArray
@@ -91,11 +93,20 @@ def lines_of(camera: CameraModel, trus_T_camera: FloatArray, seen: Seen) -> Line
         outline(plane),
         line_px(camera, plane[:2]) if len(plane) else [],
         outline(in_camera(seen.goal)),
+        [] if seen.plane is None or seen.goal is None else line_px(camera, in_camera(_turn(seen.plane, seen.goal))),
         line_px(camera, beam) if len(beam) else [],
         points_px(camera, beam[1:]),
         points_px(camera, in_camera(seen.pms)),
         [at + end for at in points_px(camera, in_camera(seen.unused)) for end in ends],
     )
+
+
+def _turn(plane: FloatArray, goal: FloatArray) -> FloatArray:
+    """(n, 3) the arc about the TRUS x axis from the middle of a plane's far edge to that of another."""
+    (x, *start), (_, *end) = plane[2:].mean(axis=0), goal[2:].mean(axis=0)
+    angles = np.linspace(np.arctan2(*start), np.arctan2(*end), 9)
+    radius = np.hypot(*start)
+    return np.column_stack([np.full(9, x), radius * np.sin(angles), radius * np.cos(angles)])
 
 
 def _is_before(camera_p_mm: FloatArray) -> BoolArray:

@@ -75,8 +75,7 @@ class LiveDrawing:
         self._plane_words: tuple[str, FloatArray] | None = None
         self._plane_is_plain = False
         self._last = (0.0, 0)
-        beyond = float(np.linalg.norm(model.targets_mm[:, 1:], axis=1).max()) - model.probe.radius_mm
-        self._depth_mm = beyond + 5.0
+        self._depth_mm = scene.image_depth_mm(model.probe, model.targets_mm)
 
     def draw(self, update: ViewerUpdate, *, textured: bool) -> None:
         """Draw one update; ``textured``: its frame is already on the image plane."""

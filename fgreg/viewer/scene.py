@@ -88,6 +88,11 @@ def plane_corners_mm(probe: ProbeModel, depth_mm: float) -> FloatArray:
     return np.array([[-half, 0.0, near], [half, 0.0, near], [half, 0.0, far], [-half, 0.0, far]])
 
 
+def image_depth_mm(probe: ProbeModel, targets_mm: FloatArray) -> float:
+    """Depth to which the image plane is drawn: beyond the target (n, 3) that is farthest from the axis."""
+    return float(np.linalg.norm(targets_mm[:, 1:], axis=1).max()) - probe.radius_mm + 5.0
+
+
 def picture_corners_mm(
     probe: ProbeModel, shape: tuple[int, int], pixel_mm: tuple[float, float], origin_mm: tuple[float, float]
 ) -> FloatArray:
