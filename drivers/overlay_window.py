@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 import sys
 import threading
 from typing import TYPE_CHECKING
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from fgreg.drivers.base import DriverContext, PictureSink
     from fgreg.drivers.options import WindowOptions
 
+TRIAL = "import cv2; cv2.namedWindow('fgreg'); cv2.waitKey(1); cv2.destroyAllWindows()"
+TRIAL_S = 20.0
 TICK_MS = 10
 """Time that the window's thread waits for keys and events between two looks at what to show."""
 
@@ -32,8 +35,24 @@ def check_window(_options: WindowOptions) -> None:
     if gui is None or gui.group(1) == "NONE":
         expected = "one with windows: opencv-contrib-python instead of opencv-contrib-python-headless"
         raise InputError("overlay window", "an OpenCV without windows", expected)
-    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not sys.platform.startswith("linux"):  # windows belong to a program's main thread there
+        raise InputError("overlay window", f"the system {sys.platform}", "Linux, or the driver igtl")
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError("overlay window", "no display (DISPLAY is not set)", "a screen, or the driver igtl")
+
+
+def try_display() -> None:
+    """Raises InputError where no window opens. Tried in another process: the windows' library ends one that fails."""
+    try:
+        done = subprocess.run([sys.executable, "-P", "-c", TRIAL], timeout=TRIAL_S, check=False, capture_output=True)
+        opened = done.returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        opened = False
+    if not opened:
+        display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        raise InputError(
+            "overlay window", f"a display, {display}, on which no window opens", "a screen, or the driver igtl"
+        )
 
 
 class OverlayWindow:
@@ -45,6 +64,7 @@ class OverlayWindow:
 
     def __init__(self, options: WindowOptions) -> None:
         check_window(options)
+        try_display()
         self._title, self._full_screen = options.title, options.full_screen
         self._newest: OverlayPicture | None = None
         self._loss = ""

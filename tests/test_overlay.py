@@ -205,6 +205,10 @@ def test_without_windows_or_display_there_is_one_clear_error(monkeypatch: pytest
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(InputError, match="no display"):
         overlay_window.check_window(WindowOptions())
+    monkeypatch.setenv("DISPLAY", ":none")
+    monkeypatch.setattr(overlay_window, "TRIAL", "import os; os.abort()")  # as the windows' library does
+    with pytest.raises(InputError, match="a display, :none, on which no window opens"):
+        overlay_window.OverlayWindow(WindowOptions())
 
 
 class Endoscope:
