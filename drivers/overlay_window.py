@@ -107,11 +107,10 @@ class OverlayWindow:
                 picture, self._newest = self._newest, None
             if picture is not None:
                 if not shown:
-                    cv2.namedWindow(self._title, cv2.WINDOW_NORMAL | cv2.WINDOW_KEEPRATIO)
+                    cv2.namedWindow(self._title, cv2.WINDOW_NORMAL | cv2.WINDOW_KEEPRATIO | cv2.WINDOW_GUI_NORMAL)
+                    cv2.resizeWindow(self._title, picture.image.shape[1], picture.image.shape[0])
                     if self._full_screen:
                         cv2.setWindowProperty(self._title, cv2.WND_PROP_FULLSCREEN, cv2.WINDOW_FULLSCREEN)
-                    else:
-                        cv2.resizeWindow(self._title, picture.image.shape[1], picture.image.shape[0])
                 cv2.imshow(self._title, picture.image)
             if not shown and picture is None:
                 self._end.wait(TICK_MS / 1e3)
