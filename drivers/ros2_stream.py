@@ -14,7 +14,7 @@ from fgreg.drivers.base import DeviceLost, host_now
 from fgreg.drivers.ros2_messages import decode, prepare
 from fgreg.drivers.ros2_transport import Transport
 from fgreg.drivers.ros_messages import stamp_ns
-from fgreg.drivers.tcp_link import Rejections
+from fgreg.drivers.stream_decoder import Rejections
 from fgreg.drivers.video_input import Grabbed
 from fgreg.errors import one_line
 from fgreg.model.time_sync import Stamp

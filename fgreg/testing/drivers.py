@@ -249,12 +249,14 @@ def _check_source(tried: _Tried) -> None:
     tried.check_device(True, "while data come")
     _talk(tried)
     tried.run(QUIET_S, lambda: False)
+    before = len(tried.losses)
     for number, send_bad in enumerate(bench.bad):
-        tried.losses.clear()
         send_bad()
         tried.run(QUIET_S / 5, lambda: False)
         tried.until_items(1, f"no data after bad[{number}]")
-        _rule(len(tried.losses) <= 1, f"several losses at bad[{number}]: {tried.losses}")
+        # Counted from the first: on a slow machine a loss may come after the next one was sent.
+        losses = tried.losses[before:]
+        _rule(len(losses) <= number + 1, f"more losses than wrong data up to bad[{number}]: {losses}")
     tried.run(QUIET_S, lambda: False)
     if bench.restore is not None:  # else it may have ended by now
         tried.losses.clear()
