@@ -429,3 +429,12 @@ class Ros2SinkOptions(Ros2Connection):
     static: Annotated[bool, Key("on /tf_static, which later receivers get too, instead of /tf")] = False
     registration: Annotated[str, Key("topic of pose and covariance", _TOPIC)] = "/fgreg/registration"
     verdict: Annotated[str, Key("String topic of the verdict", _TOPIC)] = "/fgreg/verdict"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ros2OverlayOptions(Ros2Connection):
+    """Receivers of the endoscope's picture with the registration drawn on it."""
+
+    topic: Annotated[str, Key("image topic; JPEG where it ends in /compressed", _TOPIC)] = "/fgreg/overlay/compressed"
+    frame: Annotated[str, Key("frame of the left camera", _FRAME)] = "camera"
+    quality: Annotated[int, Key("of the JPEG", Integer(1, 100))] = 85

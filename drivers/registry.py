@@ -275,6 +275,15 @@ ENTRIES: tuple[DriverEntry, ...] = (
     ),
     DriverEntry(
         Role.OVERLAY,
+        "ros2",
+        "the same over ROS 2",
+        options.Ros2OverlayOptions,
+        "ros2_overlay:open_overlay",
+        extra="ros2",
+        check="ros2_transport:check",
+    ),
+    DriverEntry(
+        Role.OVERLAY,
         "window",
         "a window with that picture; needs an OpenCV with windows",
         options.WindowOptions,

@@ -22,6 +22,7 @@ from fgreg.drivers.base import (
     DeviceLost,
     DriverContext,
     OperatorCommand,
+    OverlayPicture,
     RefusedWord,
     Registration,
     host_now,
@@ -30,11 +31,13 @@ from fgreg.drivers.options import (
     Ros2CameraOptions,
     Ros2MotionOptions,
     Ros2OperatorOptions,
+    Ros2OverlayOptions,
     Ros2SinkOptions,
     Ros2StageOptions,
 )
 from fgreg.drivers.peer_words import PeerWords
 from fgreg.drivers.ros2 import Ros2Camera, Ros2Motion, Ros2Operator, Ros2Sink, check_motion
+from fgreg.drivers.ros2_overlay import Ros2PictureSink
 from fgreg.drivers.ros2_transport import open_transport
 from fgreg.geometry.transforms import as_float_array
 from fgreg.model.session_model import StageModel
@@ -298,6 +301,30 @@ def test_a_static_transform_reaches_who_listens_later(peer: Any) -> None:
         assert ros2_messages.decode(data, kind).transforms[0].transform.translation.x == 0.1
     finally:
         late.close()
+        sink.close()
+
+
+@pytest.mark.parametrize("topic", ["/fgreg/overlay", "/fgreg/overlay/compressed"])
+def test_the_overlay_is_an_image_topic(peer: Any, topic: str) -> None:
+    kind = ros2_peer.CompressedImage if topic.endswith("compressed") else ros2_peer.Image
+    peer.listen(topic, kind)
+    sink = Ros2PictureSink(Ros2OverlayOptions(**way(peer), topic=topic))
+    image = np.zeros((48, 64, 3), np.uint8)
+    image[:24, :32] = 250, 20, 20  # blue
+    try:
+        got = collect(
+            lambda: peer.received[topic], 1, lambda: sink.send(OverlayPicture(Stamp(1.0, host_now()), image, 0))
+        )
+        assert abs(got[0].header.stamp.sec - time.time()) < 60
+        data = np.array(list(got[0].data), np.uint8)
+        if kind is ros2_peer.Image:
+            assert (got[0].encoding, got[0].step) == ("bgr8", 192)
+            found = data.reshape(got[0].height, got[0].width, 3)
+        else:
+            found = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+        assert np.abs(found[12, 16].astype(float) - (250, 20, 20)).max() < 12
+        assert found[40, 50].max() < 12
+    finally:
         sink.close()
 
 
