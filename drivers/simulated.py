@@ -66,7 +66,7 @@ class RoomProcess:
     """Starts a room, and ends it when closed or when this program ends. Use as a context manager.
 
     Args:
-        seed, width_px, aims, bump_every_s: of the room (fgreg.simulation.room).
+        seed, width_px, aims, bump_every_s, static_tags: of the room (fgreg.simulation.room).
         run: another room to run in its place, given the path of the socket.
 
     Attributes:
@@ -83,9 +83,12 @@ class RoomProcess:
         aims: int = 10,
         bump_every_s: float = BUMP_EVERY_S,
         *,
+        static_tags: int = 0,
         run: Callable[[Path], AbstractContextManager[Work[tuple[str, str], None]]] | None = None,
     ) -> None:
-        run = run or partial(simulated, seed=seed, width_px=width_px, aims=aims, bump_every_s=bump_every_s)
+        run = run or partial(
+            simulated, seed=seed, width_px=width_px, aims=aims, bump_every_s=bump_every_s, static_tags=static_tags
+        )
         self._folder = Path(tempfile.mkdtemp(prefix="fgreg-room-"))  # of mode 0700
         self.path = self._folder / "socket"
         self._worker: WorkerProcess[tuple[str, str], None] = WorkerProcess(

@@ -335,7 +335,8 @@ def serving(server: RoomServer) -> Iterator[Work[tuple[str, str], None]]:
 
 
 def simulated(
-    path: Path, seed: int, width_px: int, aims: int, bump_every_s: float
+    path: Path, seed: int, width_px: int, aims: int, bump_every_s: float, static_tags: int = 0
 ) -> AbstractContextManager[Work[tuple[str, str], None]]:
     """Run a room (fgreg.simulation.room) whose devices are reached by the Unix socket at ``path``."""
-    return serving(RoomServer(Room(room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s)), path))
+    config = room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s, static_tags=static_tags)
+    return serving(RoomServer(Room(config), path))

@@ -20,6 +20,7 @@ from fgreg.live.loop import LiveLoop
 from fgreg.live.marker_tracker import MarkerTracker
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
+from fgreg.live.scope_holder import HolderMove
 from fgreg.live.status import Devices
 from fgreg.live.workflow import Workflow, WorkflowSettings
 from fgreg.model.estimate import Verdict
@@ -181,6 +182,51 @@ def test_a_move_by_the_arm_holds_everything_and_then_ties_the_epochs(stand: Stan
     assert np.allclose(move.camera_new_T_camera_old, np.linalg.inv(MOVED), atol=1e-9)
     assert stand.recorder.state.registration.registered
     assert not stand.recorder.state.camera_moving
+
+
+class Tags:
+    """In place of the loop's static tags."""
+
+    def __init__(self) -> None:
+        self.moving_since_s: float | None = None
+        self.ended: HolderMove | None = None
+        self.begun_again = 0
+
+    def step(self, _whole: object, _now_s: float, *, with_board: bool) -> HolderMove | None:  # noqa: ARG002
+        if self.ended is not None:
+            self.moving_since_s = None
+        ended, self.ended = self.ended, None
+        return ended
+
+    def news(self) -> list[str]:
+        return []
+
+    def begin_again(self) -> None:
+        self.begun_again += 1
+
+
+def test_a_move_that_tags_and_arm_show_is_one_move_as_the_tags_measured_it(stand: Stand) -> None:
+    tags = Tags()
+    stand.loop._static_tags = tags  # type: ignore[assignment]
+    epoch, since_s = stand.recorder.state.registration.epoch, host_now()
+    tags.moving_since_s = since_s
+    stand.base_T_camera = MOVED
+    stand.turn(0.7)
+    assert stand.link.beats[-1] is None
+    assert not stand.moves(), "the arm is at rest again, the tags are not"
+    stand.operator.waiting.append(OperatorCommand(CommandKind.MOVED))
+    stand.turn(0.05)
+    assert any("show the move already" in text for text in stand.operator.messages)
+    measured = np.linalg.inv(MOVED) @ make_transform(np.eye(3), np.array([0.1, 0.0, 0.0]))
+    tags.ended = HolderMove(since_s, measured, 1e-4 * np.eye(6))
+    stand.turn(5.0, lambda: stand.recorder.state.registration.epoch > epoch and stand.link.beats[-1] is not None)
+    (move,) = stand.moves()
+    assert move.detected
+    assert move.since_t == pytest.approx(stand.loop._t(since_s))
+    assert move.camera_new_T_camera_old is not None
+    assert np.allclose(move.camera_new_T_camera_old, measured)
+    assert stand.recorder.state.registration.registered
+    assert tags.begun_again == 0, "the tags' new poses are the reference of the new epoch"
 
 
 def test_what_is_sent_meanwhile_is_refused(stand: Stand) -> None:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri
 
+from fgreg.camera_moves.view_shift import view_shift_mm
 from fgreg.geometry.transforms import BoolArray, FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
 from fgreg.model.measurements import POSE_FLOOR, usable_covariance
 
@@ -77,12 +78,14 @@ class TagSettings:
         reference_frames: frames at the epoch's start (those first seen later: from then) that it is compared with.
         constant_share: of the detections' variance that stays from frame to frame.
         p: probability of an alarm, per test, while nothing moves.
+        least_mm: a smaller shift of the view is no move.
     """
 
     windows: tuple[int, ...] = (3, 10)
     reference_frames: int = 50
     constant_share: float = 0.2
     p: float = 1e-5
+    least_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.windows or min(self.windows) < 1 or self.reference_frames < 1:
@@ -94,6 +97,10 @@ class TagSettings:
     def threshold(self) -> float:
         """Chi square of an alarm."""
         return float(chdtri(6, self.p))
+
+    def is_move(self, motion: TagMotion) -> bool:
+        """Whether a motion is significant and large enough."""
+        return motion.chi2 > self.threshold and view_shift_mm(motion.camera_new_T_camera_old) >= self.least_mm
 
 
 def _difference(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -229,11 +236,18 @@ class TagMoveDetector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagCheck:
-    """Result of one more frame: whether the camera moved, its motion, and how many of the last frames came after it."""
+    """Result of one more frame: whether the camera moved, its motion (None where the tags do not agree on one), and how
+    many of the last frames came after it."""
 
     alarm: bool
     motion: TagMotion | None
     frames: int
+
+
+def _part_wanted(reference: Sequence[TagFrame], frame: TagFrame, most: int) -> TagFrame:
+    """A frame's tags of which the reference holds fewer than ``most`` poses."""
+    wanted = [tag for tag in frame.camera_T_tag if sum(tag in old.camera_T_tag for old in reference) < most]
+    return TagFrame({t: frame.camera_T_tag[t] for t in wanted}, {t: frame.covariance[t] for t in wanted})
 
 
 def detect_tag_move(
@@ -244,8 +258,9 @@ def detect_tag_move(
     recent = (*detector.recent, usable_frame(frame))
     reference, means = detector.reference, detector.means
     if len(recent) > longest:
-        if len(reference) < settings.reference_frames:
-            reference = (*reference, recent[0])
+        fresh = _part_wanted(reference, recent[0], settings.reference_frames)
+        if fresh.camera_T_tag:
+            reference = (*reference, fresh)
             means = average_tags(reference, settings.constant_share)
         recent = recent[1:]
     detector = TagMoveDetector(reference, recent, means)
@@ -255,11 +270,21 @@ def detect_tag_move(
     for size in settings.windows:
         if size > len(recent):
             continue
-        motion = tag_motion(means, average_tags(recent[-size:], settings.constant_share))
+        newest = average_tags(recent[-size:], settings.constant_share)
+        motion = tag_motion(means, newest)
+        if motion is None and _all_moved(means, newest, settings):
+            return detector, TagCheck(True, None, size)
         if motion is None or (best.motion is not None and motion.chi2 <= best.motion.chi2):
             continue
-        best = TagCheck(motion.chi2 > settings.threshold, motion, size)
+        best = TagCheck(settings.is_move(motion), motion, size)
     return detector, best if best.alarm else _on_its_way(means, recent, settings) or best
+
+
+def _all_moved(old: Mapping[int, TagPose], new: Mapping[int, TagPose], settings: TagSettings) -> bool:
+    """Whether each of several tags shows a motion, though they do not agree on one."""
+    both = set(old) & set(new)
+    alone = [tag_motion({tag: old[tag]}, {tag: new[tag]}) for tag in both]
+    return len(both) > 1 and all(motion is not None and settings.is_move(motion) for motion in alone)
 
 
 def _on_its_way(means: Mapping[int, TagPose], recent: Sequence[TagFrame], settings: TagSettings) -> TagCheck | None:
@@ -268,7 +293,7 @@ def _on_its_way(means: Mapping[int, TagPose], recent: Sequence[TagFrame], settin
     if len(few) < 2 or average_tags(few, settings.constant_share):
         return None
     motions = [tag_motion(means, average_tags([frame], settings.constant_share)) for frame in few]
-    off = [motion for motion in motions if motion is not None and motion.chi2 > settings.threshold]
+    off = [motion for motion in motions if motion is not None and settings.is_move(motion)]
     return TagCheck(True, off[-1], len(few)) if len(off) == len(few) else None
 
 
@@ -304,12 +329,14 @@ class TagMonitor:
         times: of its recent frames.
         before: mean poses of the epoch before, from an alarm until the camera is at rest.
         moving: frames since the alarm.
+        last: result of the last frame, None while the camera moves.
     """
 
     detector: TagMoveDetector = field(default_factory=TagMoveDetector)
     times: tuple[float, ...] = ()
     before: Mapping[int, TagPose] = field(default_factory=dict)
     moving: tuple[TagFrame, ...] = ()
+    last: TagCheck | None = None
 
     @property
     def is_moving(self) -> bool:
@@ -326,7 +353,7 @@ def monitored(
     detector, check = detect_tag_move(monitor.detector, frame, settings)
     times = (*monitor.times, t)[-len(detector.recent) :]
     if not check.alarm:
-        return TagMonitor(detector, times), None
+        return TagMonitor(detector, times, last=check), None
     since = times[-min(check.frames, len(times))]
     return TagMonitor(before=detector.means, moving=(usable_frame(frame),)), TagsMoved(since)
 

@@ -7,6 +7,7 @@ fits equally well: then the result is a reason, not a pose.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,32 +59,42 @@ def _side(tag: FoundTag) -> float:
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewCorners:
     """Detection in one view: the corners, the tag id of each group, messages about what was left out, and the outlines
-    (4 n, 2) px of the tags from the detector."""
+    (4 n, 2) px of the tags from the detector.
+
+    ``others``: tags of the dictionary that are not the body's, as the detector reports them; None where only a part of
+    the image was searched.
+    """
 
     corners: CornerSet | None
     ids: tuple[int, ...]
     left_out: tuple[str, ...]
     outlines_px: FloatArray
+    others: tuple[FoundTag, ...] | None = None
 
 
 Window = tuple[int, int, int, int]
 """Part of an image, px: first and last column, first and last row, the last ones exclusive."""
 
 
-def _tags_in(picture: Image, marker: MarkerModel, view: str, near: Window | None) -> tuple[list[FoundTag], list[str]]:
-    """The body's tags in the whole image or within ``near``, and messages about what was left out."""
+def _tags_in(
+    picture: Image, marker: MarkerModel, view: str, near: Window | None
+) -> tuple[list[FoundTag], list[str], tuple[FoundTag, ...] | None]:
+    """The body's tags in the whole image or within ``near``, messages about what was left out, and all other tags."""
     large = len(marker.tags) == 1 and picture.shape[1] >= LARGE_WIDTH_PX
     if near is not None:
-        return _own_tags(_moved(find_tags(_part(picture, near), marker.dictionary, half=large), near), marker, view)
+        found = _moved(find_tags(_part(picture, near), marker.dictionary, half=large), near)
+        return *_own_tags(found, marker, view), None
+    ids = {tag.id for tag in marker.tags}
     tags: list[FoundTag] = []
     left_out: list[str] = []
-    if large:
-        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, half=True), marker, view)
-    if not tags:
-        tags, left_out = _own_tags(find_tags(picture, marker.dictionary), marker, view)
-    if not tags and not left_out:
-        tags, left_out = _own_tags(find_tags(picture, marker.dictionary, faint=True), marker, view)
-    return tags, left_out
+    others: list[FoundTag] = []
+    for how in ([{"half": True}] if large else []) + [{}, {"faint": True}]:
+        if tags or (how.get("faint") and left_out):
+            break
+        found = find_tags(picture, marker.dictionary, **how)
+        tags, left_out = _own_tags(found, marker, view)
+        others = max(others, [tag for tag in found if tag.id not in ids], key=len)
+    return tags, left_out, tuple(others)
 
 
 def _spoilt_tags_in(picture: Image, marker: MarkerModel, near: Window | None) -> list[FoundTag]:
@@ -127,7 +138,7 @@ def view_corners(
     def refined(tags: list[FoundTag]) -> list[CornerSet]:
         return _corner_sets(tags, picture, camera, view, view_T_camera, marker, edges)
 
-    tags, left_out = _tags_in(whole_levels, marker, VIEW_NAMES[view], near)
+    tags, left_out, others = _tags_in(whole_levels, marker, VIEW_NAMES[view], near)
     sets = refined(tags)
     if not left_out and all(corners.numbers < 6 for corners in sets):
         # Not one tag of which three sides are seen: lines may show more than the outlines that were found.
@@ -135,6 +146,17 @@ def view_corners(
         shown = refined(spoilt)
         if sum(corners.numbers for corners in shown) > sum(corners.numbers for corners in sets):
             tags, sets = spoilt, shown
+    return _in_view(tags, sets, left_out, camera, view, others)
+
+
+def _in_view(
+    tags: list[FoundTag],
+    sets: list[CornerSet],
+    left_out: list[str],
+    camera: CameraModel,
+    view: int,
+    others: tuple[FoundTag, ...] | None = None,
+) -> ViewCorners:
     used = [(tag.id, corners) for tag, corners in zip(tags, sets, strict=True) if len(corners.view)]
     left_out += [
         f"tag {tag.id} {_why_unused(tag, camera, VIEW_NAMES[view])}"
@@ -142,9 +164,24 @@ def view_corners(
         if not len(corners.view)
     ]
     outlines = np.concatenate([tag.corners_px for tag in tags]) if tags else np.empty((0, 2))
-    return ViewCorners(
-        join([corners for _, corners in used]) if used else None, tuple(i for i, _ in used), tuple(left_out), outlines
-    )
+    joined = join([corners for _, corners in used]) if used else None
+    return ViewCorners(joined, tuple(i for i, _ in used), tuple(left_out), outlines, others)
+
+
+def tag_corners(
+    image: npt.NDArray[np.generic],
+    camera: CameraModel,
+    view: int,
+    view_T_camera: FloatArray,
+    marker: MarkerModel,
+    found: Sequence[FoundTag],
+    *,
+    edges: bool = True,
+) -> dict[int, CornerSet]:
+    """Refined corners of a body's tags, by id, from what the detector has found in this view already."""
+    tags, _ = _own_tags(list(found), marker, VIEW_NAMES[view])
+    sets = _corner_sets(tags, grey(image), camera, view, view_T_camera, marker, edges)
+    return {tag.id: corners for tag, corners in zip(tags, sets, strict=True)}
 
 
 def _corner_sets(

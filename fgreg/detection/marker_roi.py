@@ -11,7 +11,8 @@ from fgreg.model.camera_model import CameraModel
 from fgreg.model.session_model import MarkerModel
 
 EVERYWHERE = 10
-"""The whole image is searched once in this many images: a second tag of the same id makes both unusable."""
+"""The whole image is to be searched once in this many images: a second tag of the same id makes both unusable, and tags
+that are not the marker's are found."""
 MARGIN, MARGIN_PX = 0.5, 24.0
 """Margin around the last outline for the search: a share of the marker's size, plus pixels."""
 
@@ -26,18 +27,18 @@ class MarkerRoi:
     def __init__(self, camera: CameraModel, view: int, view_T_camera: FloatArray, marker: MarkerModel) -> None:
         self._camera, self._view, self._view_T_camera, self._marker = camera, view, view_T_camera, marker
         self._last: ViewCorners | None = None
-        self._since = 0
 
-    def detect(self, image: npt.NDArray[np.generic]) -> ViewCorners:
-        """The body's corners in the next image. If the search window loses a tag, the whole image is searched."""
+    def detect(self, image: npt.NDArray[np.generic], *, whole: bool = False) -> ViewCorners:
+        """The body's corners in the next image. If the search window loses a tag, the whole image is searched.
+
+        ``whole``: the whole image is searched in any case, which the caller asks for once in :data:`EVERYWHERE` images.
+        """
         last, found = self._last, None
-        if last is not None and self._since < EVERYWHERE:
-            self._since += 1
+        if last is not None and not whole:
             found = self._look(image, window_about(last.outlines_px, (image.shape[0], image.shape[1])))
             if found.corners is None or len(found.outlines_px) < len(last.outlines_px):
                 found = None
         if found is None:
-            self._since = 0
             found = self._look(image, None)
         self._last = found if found.corners is not None else None
         return found

@@ -83,7 +83,13 @@ class LiveConfig:
         if self.room is not None:
             from fgreg.drivers.simulated import RoomProcess
 
-            process = RoomProcess(self.room.seed, self.room.width, self.settings.aims, self.room.bump_every_s)
+            process = RoomProcess(
+                self.room.seed,
+                self.room.width,
+                self.settings.aims,
+                self.room.bump_every_s,
+                static_tags=self.room.static_tags,
+            )
             room = stack.enter_context(process).path
         board = self.model.board
         return DriverContext(
@@ -277,7 +283,9 @@ class _Reader:
             from fgreg.simulation.documents import session_document
             from fgreg.simulation.room import room_config
 
-            config = room_config(room.seed, room.width, aims=aims, bump_every_s=room.bump_every_s)
+            config = room_config(
+                room.seed, room.width, aims=aims, bump_every_s=room.bump_every_s, static_tags=room.static_tags
+            )
             return setup_text(session_document(config.scene)), "the simulated room", None
         path = document.session
         if path is None:

@@ -31,6 +31,7 @@ class RoomOptions:
         BUMP_EVERY_S
     )
     width: Annotated[int, Key("of its camera's images, px", Integer(160, 1920))] = 640
+    static_tags: Annotated[int, Key("beside the tissue", Integer(0, 3))] = 0
 
 
 @dataclass(frozen=True, slots=True)

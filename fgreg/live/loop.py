@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -44,12 +45,13 @@ from fgreg.live.merge_looks import one_spot
 from fgreg.live.overlay_feed import OverlayFeed
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
-from fgreg.live.scope_holder import Holder, HolderSettings
+from fgreg.live.scope_holder import Holder, HolderMove, HolderSettings
 from fgreg.live.shots import check_event, pair_events, query_event
 from fgreg.live.stage_commands import Steering
+from fgreg.live.static_tags import StaticTags
 from fgreg.live.status import Devices, Figures, Status
 from fgreg.live.verification import LiveVerification
-from fgreg.live.workflow import Workflow
+from fgreg.live.workflow import Stage, Workflow
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.events import (
     AimEvent,
@@ -122,6 +124,9 @@ class LiveLoop:
             PulseLocator(model, latencies.pulse_s),
         )
         self._holder = Holder(holder or HolderSettings(), latencies.holder_s)
+        self._static_tags = StaticTags(model, self.pulse_locator.locator)
+        self._by_holder: list[HolderMove] = []  # moves that have ended, not recorded yet
+        self._by_tags: HolderMove | None = None
         self._camera_moving_s: float | None = None
         self.figures = Figures()
         self._began_s = host_now()
@@ -246,20 +251,41 @@ class LiveLoop:
         self.figures.unshown = self._unshown + device.dropped
 
     def _follow_camera(self) -> None:
-        """Update since when the camera has been moving, from its holder and from the recorded moves."""
+        """Update since when the camera has been moving: by its holder, the static tags, and the recorded moves."""
+        now = host_now()
         if self._devices.motion is not None:
-            move = self._holder.take(self._sources["motion"].poll(), host_now())
-            if move is not None:
-                self._recorder.hand_over(
-                    CameraMovedEvent(self._t(host_now()), 0, move.camera_new_T_camera_old, move.covariance)
-                )
-                self.marker_tracker.poses.clear()  # earlier poses are in another camera frame
-        since_s = self._holder.moving_since_s
+            move = self._holder.take(self._sources["motion"].poll(), now)
+            self._by_holder += [] if move is None else [move]
+        aiming = self._workflow.stage is Stage.AIMING
+        move = self._static_tags.step(self.marker_tracker.whole, now, with_board=not aiming)
+        self._by_tags = move or self._by_tags
+        for text in self._static_tags.news():
+            self._note(text)
+        under_way = [t for t in (self._holder.moving_since_s, self._static_tags.moving_since_s) if t is not None]
+        if (self._by_tags or self._by_holder) and not under_way:
+            self._record_move(now)
+        since_s = min(under_way, default=None)
         if since_s is None and self._recorder.state.camera_moving:
-            since_s = host_now() if self._camera_moving_s is None else self._camera_moving_s
+            since_s = now if self._camera_moving_s is None else self._camera_moving_s
         if since_s is not None and self._camera_moving_s is None:
             self._tell(Tell("the camera moves: the registration is invalid until it rests and is registered again"))
         self._camera_moving_s = since_s
+
+    def _record_move(self, now: float) -> None:
+        """Record the move that has ended: by the static tags where they measured it, as they are more accurate."""
+        by_tags, by_holder = self._by_tags, self._by_holder
+        self._by_tags, self._by_holder = None, []
+        if by_tags is None:
+            self._static_tags.begin_again()
+        measured = by_holder if by_tags is None or by_tags.covariance is None else [by_tags]
+        motion, covariance = None, None
+        if len(measured) == 1:  # of several in a row one may be missing
+            motion, covariance = measured[0].camera_new_T_camera_old, measured[0].covariance
+        event = CameraMovedEvent(self._t(now), 0, motion, covariance)
+        if by_tags is not None:  # noticed some frames after it: pairs in between belong to the new epoch
+            event = replace(event, detected=True, since_t=min(event.t, self._t(by_tags.since_s)))
+        self._recorder.hand_over(event)
+        self.marker_tracker.poses.clear()  # earlier poses are in another camera frame
 
     def _track_beam(self, pose: TimedPose | None) -> TrackEstimate | None:
         """Tracking result for the new pose; without one the last result, as long as its pose is recent."""
@@ -338,6 +364,10 @@ class LiveLoop:
             case TakeChoice(pm, include, by):
                 self._choose(pm, by, include=include)
             case TakeMove():
+                if self._static_tags.moving_since_s is not None:
+                    self._news(Tell("the static tags show the move already: it is recorded once the camera rests"))
+                    return
+                self._static_tags.begin_again()
                 self._recorder.hand_over(CameraMovedEvent(self._t(host_now()), 0))
             case Tell():
                 (self._news if action.answer else self._tell)(action)

@@ -23,8 +23,8 @@ from fgreg.workers.worker_process import Work, WorkerProcess
 ANSWER_S = 0.3
 """A process that takes longer counts as hung; on a busy machine detection takes a third of this."""
 
-Shape = tuple[tuple[int, ...], str]
-"""Shape and data type of a picture."""
+Shape = tuple[tuple[int, ...], str, bool]
+"""Shape and data type of a picture, and whether the whole of it is to be searched."""
 
 
 class RightViewWorker:
@@ -39,7 +39,7 @@ class RightViewWorker:
         self._worker: WorkerProcess[Shape, ViewCorners] | None = None
         self._picture: Any = None
 
-    def submit(self, image: npt.NDArray[np.generic]) -> bool:
+    def submit(self, image: npt.NDArray[np.generic], *, whole: bool = False) -> bool:
         """Hand over a right picture; False if no process is ready for it."""
         if self._worker is None or len(self._picture) != image.nbytes:
             self._start(image.nbytes)
@@ -48,7 +48,7 @@ class RightViewWorker:
         if self._worker.busy or not self._worker.ready:
             return False
         np.frombuffer(self._picture, image.dtype).reshape(image.shape)[...] = image
-        self._worker.send((image.shape, image.dtype.str))
+        self._worker.send((image.shape, image.dtype.str, whole))
         return True
 
     def result(self) -> ViewCorners | None:
@@ -91,5 +91,5 @@ def _looking(picture: Any, rig: StereoRig, marker: MarkerModel) -> Work[Shape, V
 
 
 def _look(picture: Any, roi: MarkerRoi, shape: Shape) -> ViewCorners:
-    size, kind = shape
-    return roi.detect(np.frombuffer(picture, np.dtype(kind)).reshape(size))
+    size, kind, whole = shape
+    return roi.detect(np.frombuffer(picture, np.dtype(kind)).reshape(size), whole=whole)

@@ -11,8 +11,9 @@ from typing import Annotated
 
 import numpy as np
 
+from fgreg.camera_moves.view_shift import view_shift_mm
 from fgreg.drivers.base import MotionSample
-from fgreg.geometry.transforms import FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform, transform_points
+from fgreg.geometry.transforms import FloatArray, adjoint, exp_so3, inverse, log_so3, make_transform
 from fgreg.model.time_sync import DeviceClock
 from fgreg.schema.kinds import Number
 from fgreg.schema.record import Key
@@ -23,8 +24,6 @@ FEWEST = 4
 """Least number of samples of a rest."""
 SILENT_S = 2.0
 """A holder that was silent for longer may have been switched off and on, and may have a new origin."""
-SEEN_MM = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 100.0], [40.0, 0.0, 100.0], [0.0, 40.0, 100.0]])
-"""points in the camera frame, (4, 3), mm, about where tissue is; a move's size is their largest displacement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,9 +125,8 @@ class Holder:
         return 0.0 if self._rest is None else self._shift_mm(self._rest.base_T_camera, base_T_camera)
 
     def _shift_mm(self, before: FloatArray, after: FloatArray) -> float:
-        """Largest displacement of ``SEEN_MM``, in units of ``settings.least_mm``."""
-        shift = transform_points(inverse(after) @ before, SEEN_MM) - SEEN_MM
-        return float(np.linalg.norm(shift, axis=1).max()) / self.settings.least_mm
+        """Displacement of what the camera sees, in units of ``settings.least_mm``."""
+        return view_shift_mm(np.asarray(inverse(after) @ before)) / self.settings.least_mm
 
     def _settle(self) -> HolderMove | None:
         """Detect a rest; returns the move that it ends, or None."""

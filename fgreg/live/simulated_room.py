@@ -36,6 +36,7 @@ def simulated_room(
     bump_every_s: float = BUMP_EVERY_S,
     width_px: int = 640,
     *,
+    static_tags: int = 0,
     seen: bool = True,
 ) -> LiveSetup:
     """A room that runs until the stack is left.
@@ -46,13 +47,15 @@ def simulated_room(
         aims: calibration shots before the surgeon turns to the tissue.
         bump_every_s: mean time between moves of the camera.
         width_px: of its images.
+        static_tags: beside the tissue.
         seen: whether pictures that are only displayed are wanted.
 
     Raises:
         FgregError: the room did not start.
     """
-    room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s))
-    return room_setup(room.path, room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s), seen=seen)
+    room = stack.enter_context(RoomProcess(seed, width_px, aims, bump_every_s, static_tags=static_tags))
+    config = room_config(seed, width_px, aims=aims, bump_every_s=bump_every_s, static_tags=static_tags)
+    return room_setup(room.path, config, seen=seen)
 
 
 def room_setup(path: Path, config: RoomConfig, *, seen: bool = False) -> LiveSetup:

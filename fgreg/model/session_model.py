@@ -18,6 +18,7 @@ from fgreg.geometry.rig import COUNT
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.camera_model import STEREO_RIG, StereoRig
 from fgreg.model.commissioned_rig import CommissionedRig
+from fgreg.model.static_tags import StaticTag, check_static_tags
 from fgreg.model.systematic import CAREFUL_LAB, SYSTEMATIC, Systematic
 from fgreg.schema.files import FileName
 from fgreg.schema.kinds import (
@@ -436,6 +437,14 @@ class SessionModel:
         tuple[Target, ...],
         Key("the same with names, instead of `targets_mm`", ListOf(record(Target)), brief=True),
     ] = ()
+    static_tags: Annotated[
+        tuple[StaticTag, ...],
+        Key(
+            "fixed to patient or table, for camera moves; where they are is learnt from the views",
+            ListOf(record(StaticTag)),
+            brief=True,
+        ),
+    ] = ()
     systematic: Annotated[
         Systematic,
         Key(
@@ -455,6 +464,8 @@ class SessionModel:
     def __post_init__(self) -> None:
         if self.targets:
             self._take_named_targets()
+        if self.static_tags:
+            self._check_static_tags()
         if not len(self.targets_mm):
             object.__setattr__(self, "targets_mm", default_targets_mm(self.probe.radius_mm))
         if not self.systematic.declared and (self.rig_file is not None or self.rig is not None):
@@ -462,6 +473,15 @@ class SessionModel:
             raise FieldError.of(
                 "none beside a rig", "one of the two, since a rig has standard deviations", "systematic"
             )
+
+    def _check_static_tags(self) -> None:
+        if self.marker is None:
+            raise FieldError.of("them without a marker", "a marker, whose dictionary they are of", "static_tags")
+        taken = {tag.id: "a tag of the marker" for tag in self.marker.tags}
+        charuco = None if self.board is None else self.board.charuco
+        if self.board is not None and charuco is not None and charuco.dictionary == self.marker.dictionary:
+            taken |= dict.fromkeys(range(self.board.markers), "a marker of the board")
+        check_static_tags(self.static_tags, taken, DICTIONARY_SIZES.get(self.marker.dictionary, 1_000_000) - 1)
 
     def _take_named_targets(self) -> None:
         named = as_float_array([target.trus_p_mm for target in self.targets])

@@ -24,6 +24,7 @@ from fgreg.model.session_model import (
     StageModel,
     TagModel,
 )
+from fgreg.model.static_tags import StaticTag
 from fgreg.model.systematic import Systematic
 from fgreg.simulation.acoustics import Artefact, Elevation, Pulse
 from fgreg.simulation.array import TrueArray
@@ -119,6 +120,7 @@ class SimulationConfig:
         declared: values that the session has instead of the true ones, by key: ``{"probe.radius_mm": 0.01}``.
         systematic: what the session says of its constants' standard deviations.
         disturbances: what spoils the images.
+        static_tags: of the session; where they are is the room's (fgreg.simulation.room).
 
     Geometry:
         pm_x_mm, pm_angle_rad, pm_depth_mm: half extent along the axis and in stage angle, span of depths from the
@@ -196,6 +198,7 @@ class SimulationConfig:
     camera: StereoRig = field(default_factory=default_rig)
     marker: MarkerModel = field(default_factory=lambda: MarkerModel("DICT_4X4_50", (TagModel(0, 25.0),)))
     board: BoardModel = field(default_factory=lambda: BoardModel(9, 6, 9.0, CharucoModel("DICT_5X5_100", 6.5)))
+    static_tags: tuple[StaticTag, ...] = ()
     optics: Optics = field(default_factory=Optics)
     disturbances: Disturbances = field(default_factory=Disturbances)
     pulse: Pulse = field(default_factory=Pulse)

@@ -58,6 +58,7 @@ def session_document(config: SimulationConfig, marker_T_laser_guess: FloatArray 
         noise=config.declared_noise or config.noise,
         initial_marker_T_laser=marker_T_laser_guess,
         systematic=config.systematic,
+        static_tags=config.static_tags if config.has_camera else (),
     )
     document: dict[str, Any] = _rounded(SESSION.write(model))
     document.pop("targets_mm")

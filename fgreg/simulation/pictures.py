@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -46,6 +47,7 @@ class ShotPicture:
         camera_p_spot_mm: where the beam ends; it glows on tissue.
         scene_seed: of what is the same in all shots of a session.
         noise_seed: of this shot's sensor noise.
+        camera_T_tags: the static tags by id, where they are in the scene.
     """
 
     camera_T_marker: FloatArray
@@ -55,6 +57,7 @@ class ShotPicture:
     noise_seed: tuple[int, ...]
     camera_T_board: FloatArray | None = None
     camera_T_trus: FloatArray | None = None
+    camera_T_tags: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def render(self, config: SimulationConfig, right: bool) -> UInt8Image:
         """The image of the left or the right camera, (h, w) or (h, w, 3) 8-bit; deinterlaced, of half the height.
@@ -93,6 +96,11 @@ class ShotPicture:
             background, surfaces = _tissue(config, self.camera_T_trus, self.scene_seed)
             half = np.array([0.5, 0.0, 0.0])
             surfaces.append(_strip(self.camera_p_spot_mm - half, self.camera_p_spot_mm + half, 1.0, 1.1))
+        surfaces += [
+            TagSurface(config.marker.dictionary, tag.id, tag.size_mm, self.camera_T_tags[tag.id])
+            for tag in config.static_tags
+            if tag.id in self.camera_T_tags
+        ]
         wet = None
         if what.specular > 0.0:
             wet = Wetness(what.specular, transform_points(camera_T_left, _light_at_tip(config)), self.scene_seed)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform, transform_points
 from fgreg.model.session_model import ChannelModel, NoiseModel
+from fgreg.model.static_tags import StaticTag
 from fgreg.simulation import sweeps
 from fgreg.simulation.config import SimulationConfig, default_probe, default_rig
 from fgreg.simulation.pictures import LookPicture, ShotPicture
@@ -37,6 +38,9 @@ BUMP_S = 0.5
 SCENES = 6
 """Largest number of scenes drawn until one is found in which the camera sees the marker."""
 BMODE_PIXEL_MM, BMODE_DEPTH_MM = 0.3, 60.0
+STATIC_TAGS = ((1, -24.0, -52.0), (2, 24.0, -52.0), (3, 0.0, 56.0))
+"""Id and TRUS x and y (mm) of the tags that may lie beside the tissue."""
+STATIC_TAG_MM, STATIC_TAG_LEAN_RAD = 20.0, 0.2
 REACH_MM = 140.0
 """Beams that meet no tissue within this distance end there."""
 
@@ -72,9 +76,14 @@ class RoomConfig:
 
 
 def room_config(
-    seed: int = 1, width_px: int = 640, *, aims: int = 10, bump_every_s: float = BUMP_EVERY_S
+    seed: int = 1,
+    width_px: int = 640,
+    *,
+    aims: int = 10,
+    bump_every_s: float = BUMP_EVERY_S,
+    static_tags: int = 0,
 ) -> RoomConfig:
-    """A room with a stereo camera of this width and a probe that records channel data."""
+    """A room with a stereo camera of this width, a probe that records channel data, and up to three static tags."""
     scene = SimulationConfig(
         name="room",
         frames=True,
@@ -85,6 +94,7 @@ def room_config(
         samples=1160,
         snr_db=18.0,
         optics=Optics(samples=16),
+        static_tags=tuple(StaticTag(number, STATIC_TAG_MM) for number, _, _ in STATIC_TAGS[:static_tags]),
     )
     return RoomConfig(seed=seed, aims=aims, bump_every_s=bump_every_s, scene=scene)
 
@@ -240,6 +250,16 @@ class Room:
         """(4, 4) the true registration."""
         return _at(self._cameras, t_s)
 
+    def trus_T_tags(self, t_s: float) -> dict[int, FloatArray]:  # noqa: ARG002
+        """(4, 4) the static tags by id: beside the tissue, leaning towards its middle."""
+        depth_mm = self.config.scene.probe.radius_mm + 0.5 * sum(self.config.scene.pm_depth_mm)
+        poses = {}
+        for number, x, y in STATIC_TAGS:
+            lean = STATIC_TAG_LEAN_RAD / math.hypot(x, y) * np.array([y, -x, 0.0])
+            turned = exp_so3(lean) @ exp_so3(np.array([0.0, 0.0, float(number)]))
+            poses[number] = make_transform(turned, np.array([x, y, depth_mm]))
+        return {tag.id: poses[tag.id] for tag in self.config.scene.static_tags}
+
     def trus_T_marker(self, t_s: float) -> FloatArray:
         """(4, 4) the marker, with the hand's tremor."""
         wave = np.sin(2.0 * math.pi * np.array(self.config.tremor_hz) * t_s + self._phase).sum(axis=1)
@@ -314,6 +334,7 @@ class Room:
             (seed, index),
             None if board is None else camera_T_trus @ board,
             camera_T_trus if board is None else None,
+            {number: np.asarray(camera_T_trus @ pose) for number, pose in self.trus_T_tags(t_s).items()},
         )
         return picture.render(self.config.scene, right=False), picture.render(self.config.scene, right=True)
 

@@ -1,0 +1,221 @@
+"""Camera moves that static tags show, in the live frames: board and tags that stay in view while the camera stands.
+
+The marker's detector searches the whole picture once in some frames, and finds the tags in it on the way. Their poses
+are fitted in the locator's worker process, at a share :data:`SHARE` of one processor at most, so that a slow machine
+looks less often. A move is under way from the alarm until the camera is at rest again; it is then known with its
+covariance, against the poses kept for this epoch. Tags that do not stand still are reported and no longer used: they
+must not divide the session into epochs for ever.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
+from fgreg.camera_moves.view_shift import view_shift_mm
+from fgreg.detection.corners import grey
+from fgreg.detection.static_tags import BOARD, StaticView, static_poses
+from fgreg.geometry.transforms import FloatArray, log_so3
+from fgreg.live.marker_tracker import WholeFrame
+from fgreg.live.pa_worker import Locator
+from fgreg.live.scope_holder import HolderMove
+from fgreg.model.session_model import SessionModel
+
+SETTINGS = TagSettings(windows=(2, 6), least_mm=0.3)
+SHAKING = np.diag(np.square([0.0005] * 3 + [0.05] * 3))
+"""Added to the detections' covariance (rad, mm): what shakes, and light that changes."""
+MOVE_MM, MOVE_RAD, MOVE_SHARE = 0.1, 0.001, 0.01
+"""Standard deviations of a measured move, and their part in proportion to it: errors of the lens' model and of the
+detection that are not the same on both sides of it."""
+SHARE = 0.06
+"""Largest share of one processor's time."""
+EVERY_S, MOST_S = 0.6, 3.0
+"""Least and largest time between two frames while the camera stands; while it moves each frame counts."""
+BOARD_EVERY_S = 10.0
+"""Time between two frames in which a board that was not in view is looked for."""
+UNREST_S = 12.0
+"""A move that has not ended after this long ends with an unknown motion."""
+MOST_ALARMS, ALARMS_S = 4, 300.0
+"""More alarms in this time than any bumped scope gives: the tags are not static."""
+UNSTEADY, APART = 12, 6
+"""Frames after which a tag without a steady pose, or one that goes its own way, is no longer used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """A frame under way: host times of its exposure and of its start, whether the board was asked for, its poses."""
+
+    t_s: float
+    began_s: float
+    board: bool
+    poses: Future[dict[int, tuple[FloatArray, FloatArray]]]
+
+
+class StaticTags:
+    """Looks for static tags, and for the camera's moves against them.
+
+    Args:
+        model: of the session.
+        locator: whose process fits the poses.
+
+    Attributes:
+        moving_since_s: host time of the first frame after a move that has not ended; None while the camera stands.
+        frames: in which a tag was found. next_s: host time from which the next one is looked at.
+    """
+
+    def __init__(self, model: SessionModel, locator: Locator) -> None:
+        self._model, self._locator = model, locator
+        self._tags = {tag.id: tag for tag in model.static_tags}
+        self._board = model.board
+        self._monitor = TagMonitor()
+        self._job: _Job | None = None
+        self._board_s = -np.inf
+        self._newest: WholeFrame | None = None
+        self._alarm_s = 0.0
+        self._alarms: deque[float] = deque(maxlen=MOST_ALARMS + 1)
+        self._apart: Counter[int] = Counter()
+        self._disagree = 0
+        self._news: list[str] = []
+        self.moving_since_s: float | None = None
+        self.frames = 0
+        self.next_s = -np.inf
+
+    @property
+    def in_use(self) -> frozenset[int]:
+        """Numbers of the tags that are looked for."""
+        return frozenset(self._tags) | (frozenset() if self._board is None else {BOARD})
+
+    def news(self) -> list[str]:
+        """Messages about tags since the last call."""
+        news, self._news = self._news, []
+        return news
+
+    def begin_again(self) -> None:
+        """The camera has moved, as others tell: where the tags are is learnt again."""
+        self._monitor, self.moving_since_s = TagMonitor(), None
+        self._apart.clear()
+        self._disagree = 0
+
+    def step(self, whole: WholeFrame | None, now_s: float, *, with_board: bool) -> HolderMove | None:
+        """Take in the newest frame that was searched as a whole; the move that has just ended, or None.
+
+        ``with_board``: whether the board lies still now, which it does not while the laser is aimed at it.
+        """
+        move = self._take(now_s)
+        if self.moving_since_s is not None and now_s - self._alarm_s > UNREST_S:
+            move = HolderMove(self.moving_since_s, None, None)
+            self.begin_again()
+        if self.in_use and self._job is None and whole is not None and whole is not self._newest:
+            board = with_board and self._board is not None and now_s >= self._board_s
+            if now_s >= self.next_s and not self._locator.busy and (self._in_view(whole) or board):
+                self._newest = whole
+                self._submit(whole, now_s, board)
+        return move
+
+    def _in_view(self, whole: WholeFrame) -> bool:
+        views = [whole.left] + ([] if whole.right is None else [whole.right])
+        shown = [{tag.id for tag in view.others or ()} for view in views]
+        return bool(set(self._tags).intersection(*shown))
+
+    def _submit(self, whole: WholeFrame, now_s: float, board: bool) -> None:
+        pictures = [(whole.frame.left, whole.left)]
+        if whole.frame.right is not None and whole.right is not None:
+            pictures.append((whole.frame.right, whole.right))
+        views = tuple(
+            (grey(picture), tuple(tag for tag in view.others or () if tag.id in self._tags))
+            for picture, view in pictures
+        )
+        rig, marker = self._model.camera, self._model.marker
+        if rig is None or marker is None:
+            raise AssertionError("the live loop needs a camera and a marker")
+        view = StaticView(views, rig, marker.dictionary, tuple(self._tags.values()), self._board if board else None)
+        self._job = _Job(whole.t_s, now_s, board, self._locator.run(static_poses, view))
+
+    def _take(self, now_s: float) -> HolderMove | None:
+        """Take in the poses of a frame, once they are there."""
+        if self._job is None or not self._job.poses.done():
+            return None
+        job, self._job = self._job, None
+        try:
+            poses = job.poses.result()
+        except Exception as error:  # a fault of one picture; the next may be good
+            self._news.append(f"static tags: {error}")
+            poses = {}
+        if self.moving_since_s is None:
+            self.next_s = now_s + min(max(EVERY_S, (now_s - job.began_s) / SHARE), MOST_S)
+        if job.board and BOARD not in poses:
+            self._board_s = now_s + BOARD_EVERY_S
+        if not poses:
+            return None
+        self.frames += 1
+        frame = TagFrame(
+            {number: pose for number, (pose, _) in poses.items()},
+            {number: covariance + SHAKING for number, (_, covariance) in poses.items()},
+        )
+        self._monitor, found = monitored(self._monitor, job.t_s, frame, SETTINGS)
+        if isinstance(found, TagsMoved):
+            return self._alarm(found.since_t, now_s)
+        if isinstance(found, TagsAtRest):
+            return self._at_rest(found)
+        self._check_tags(frame)
+        return None
+
+    def _alarm(self, since_s: float, now_s: float) -> HolderMove | None:
+        self.moving_since_s, self._alarm_s = since_s, now_s
+        self._alarms.append(now_s)
+        if len(self._alarms) <= MOST_ALARMS or now_s - self._alarms[0] > ALARMS_S:
+            return None
+        self._tags.clear()
+        self._board = None
+        self.begin_again()
+        self._news.append(
+            f"the static tags moved {len(self._alarms)} times in {ALARMS_S / 60.0:.0f} minutes: they are not fixed, or "
+            "the endoscope is not held. They are not used any more"
+        )
+        return HolderMove(since_s, None, None)
+
+    def _at_rest(self, found: TagsAtRest) -> HolderMove | None:
+        since_s, self.moving_since_s = self.moving_since_s, None
+        motion = found.camera_new_T_camera_old
+        shift_mm = view_shift_mm(motion)
+        turn_rad = float(np.linalg.norm(log_so3(motion[:3, :3])))
+        if since_s is None:
+            raise AssertionError("a rest without a move")
+        if shift_mm < SETTINGS.least_mm:
+            self._news.append("the camera is back where it was, by the static tags")
+            return None
+        self._news.append(
+            f"the static tags show that the camera has moved: {shift_mm:.1f} mm and {math.degrees(turn_rad):.1f} deg"
+        )
+        sigmas = [MOVE_RAD + MOVE_SHARE * turn_rad] * 3 + [MOVE_MM + MOVE_SHARE * shift_mm] * 3
+        return HolderMove(since_s, motion, found.covariance + np.diag(np.square(sigmas)))
+
+    def _check_tags(self, frame: TagFrame) -> None:
+        """Leave out tags that do not stand still, or that go their own way."""
+        detector, last = self._monitor.detector, self._monitor.last
+        apart = () if last is None or last.motion is None else last.motion.apart
+        for number in frame.camera_T_tag:
+            self._apart[number] = self._apart[number] + 1 if number in apart else 0
+            seen = sum(number in kept.camera_T_tag for kept in detector.reference)
+            if seen >= UNSTEADY and number not in detector.means:
+                self._leave_out(number, "does not stand still")
+            elif self._apart[number] >= APART:
+                self._leave_out(number, "has moved by itself")
+        both = set(detector.means).intersection(frame.camera_T_tag)
+        disagree = last is not None and last.motion is None and len(both) > 1
+        self._disagree = self._disagree + 1 if disagree else 0
+        if self._disagree >= APART:
+            self.begin_again()
+            self._news.append("the static tags contradict each other: where they are is learnt again")
+
+    def _leave_out(self, number: int, why: str) -> None:
+        self._tags.pop(number, None)
+        if number == BOARD:
+            self._board = None
+        name = "the board" if number == BOARD else f"static tag {number}"
+        self._news.append(f"{name} {why}: it is not used to look for camera moves")

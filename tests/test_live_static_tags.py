@@ -1,0 +1,190 @@
+"""Static tags in live frames: a bumped camera is held and measured; tags that are not static are no longer used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fgreg.detection.marker import ViewCorners
+from fgreg.detection.static_tags import static_tag_fits, tags_beside
+from fgreg.detection.tags import FoundTag
+from fgreg.drivers.base import StereoFrame
+from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform
+from fgreg.live import static_tags
+from fgreg.live.marker_tracker import WholeFrame
+from fgreg.live.scope_holder import HolderMove
+from fgreg.live.static_tags import MOST_ALARMS, UNREST_S, StaticTags
+from fgreg.model.session_model import SessionModel
+from fgreg.model.time_sync import Stamp
+from fgreg.session.setup_reader import read_setup
+from fgreg.simulation.documents import session_document
+from fgreg.simulation.room import Room, RoomConfig, room_config
+
+SIGMA = np.array([0.0005] * 3 + [0.03] * 3)
+BUMP = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([1.0, -0.5, 0.5]))
+
+
+def of_room(config: RoomConfig) -> SessionModel:
+    model = read_setup(session_document(config.scene), "session.yaml", "room", []).model
+    assert model is not None
+    return model
+
+
+class Pictures:
+    """Whole frames whose tags have given poses with noise; the worker process is this one, and takes no time."""
+
+    busy = False
+
+    def __init__(self, model: SessionModel) -> None:
+        self.rng, self.now_s = np.random.default_rng(1), 0.0
+        self.poses: dict[int, FloatArray] = {
+            tag.id: make_transform(np.eye(3), np.array([30.0 * tag.id - 60.0, 10.0 * tag.id, 120.0]))
+            for tag in model.static_tags
+        }
+        self.tags, self.told = StaticTags(model, self), list[str]()  # type: ignore[arg-type]
+
+    def run(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        done.set_result(work(*arguments))
+        return done
+
+    def seen(self, _view: object) -> Mapping[int, tuple[FloatArray, FloatArray]]:
+        noise = {number: SIGMA * self.rng.normal(size=6) for number in self.poses}
+        return {
+            number: (pose @ make_transform(exp_so3(noise[number][:3]), noise[number][3:]), np.diag(SIGMA**2))
+            for number, pose in self.poses.items()
+            if number in self.tags.in_use
+        }
+
+    def frames(self, count: int, moved: Callable[[float], None] = lambda _t: None) -> HolderMove | None:
+        """More frames, 0.7 s apart; the move that has ended in them."""
+        ended = None
+        found = tuple(FoundTag(number, np.zeros((4, 2))) for number in self.poses)
+        view = ViewCorners(None, (), (), np.zeros((0, 2)), found)
+        picture = np.zeros((2, 2), np.uint8)
+        for _ in range(count):
+            self.now_s += 0.7
+            moved(self.now_s)
+            frame = StereoFrame(Stamp(self.now_s, self.now_s), picture, picture, 0)
+            for whole in (WholeFrame(self.now_s, frame, view, view), None):
+                ended = self.tags.step(whole, self.now_s, with_board=False) or ended
+            self.told += self.tags.news()
+        return ended
+
+    def bump(self, motion: FloatArray = BUMP) -> None:
+        self.poses = {number: motion @ pose for number, pose in self.poses.items()}
+
+
+@pytest.fixture
+def pictures(monkeypatch: pytest.MonkeyPatch) -> Pictures:
+    made = Pictures(of_room(room_config(1, 320, static_tags=3)))
+    monkeypatch.setattr(static_tags, "static_poses", made.seen)
+    return made
+
+
+def test_a_bump_is_noticed_within_two_frames_and_measured_once_the_camera_rests(pictures: Pictures) -> None:
+    assert pictures.frames(30) is None
+    assert pictures.tags.moving_since_s is None
+    at = pictures.now_s
+    pictures.bump()
+    pictures.frames(2)
+    assert pictures.tags.moving_since_s is not None
+    assert at < pictures.tags.moving_since_s <= at + 1.5
+    move = pictures.frames(8)
+    assert move is not None
+    assert move.camera_new_T_camera_old is not None
+    assert move.covariance is not None
+    off = inverse(BUMP) @ move.camera_new_T_camera_old
+    error = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]])
+    assert error @ np.linalg.solve(move.covariance, error) < 16.8  # 99 % of 6 degrees of freedom
+    assert pictures.tags.moving_since_s is None
+    assert any("has moved" in text for text in pictures.told)
+    assert pictures.frames(30) is None, "the new epoch has a reference of its own"
+
+
+def test_a_camera_that_comes_back_has_not_moved(pictures: Pictures) -> None:
+    pictures.frames(20)
+    pictures.bump()
+    pictures.frames(2)
+    assert pictures.tags.moving_since_s is not None
+    pictures.bump(inverse(BUMP))
+    assert pictures.frames(8) is None
+    assert pictures.tags.moving_since_s is None
+
+
+def test_a_move_without_a_rest_ends_with_an_unknown_motion(pictures: Pictures) -> None:
+    pictures.frames(20)
+    ended = pictures.frames(math.ceil(UNREST_S / 0.7) + 3, lambda _t: pictures.bump())
+    assert ended is not None
+    assert ended.camera_new_T_camera_old is None
+
+
+def test_a_tag_that_moves_by_itself_is_left_out_and_the_others_go_on(pictures: Pictures) -> None:
+    pictures.frames(20)
+    pictures.poses[2] = BUMP @ pictures.poses[2]
+    assert pictures.frames(10) is None
+    assert [text for text in pictures.told if "static tag 2 has moved by itself" in text]
+    pictures.bump()
+    assert pictures.frames(10) is not None
+
+
+def test_a_tag_that_breathes_is_never_used(pictures: Pictures) -> None:
+    still = pictures.poses[1].copy()
+
+    def breathe(t_s: float) -> None:
+        pictures.poses = {1: still.copy()}
+        pictures.poses[1][2, 3] += 3.0 * math.sin(2.0 * math.pi * t_s / 4.3)
+
+    assert pictures.frames(40, breathe) is None
+    assert pictures.tags.moving_since_s is None
+    assert [text for text in pictures.told if "static tag 1 does not stand still" in text]
+
+
+def test_tags_that_move_again_and_again_are_no_longer_used(pictures: Pictures) -> None:
+    pictures.frames(20)
+    moves = 0
+    for _ in range(MOST_ALARMS + 3):
+        pictures.bump()
+        moves += pictures.frames(14) is not None
+    assert moves == MOST_ALARMS + 1
+    assert [text for text in pictures.told if "they are not fixed" in text]
+    assert not pictures.tags.in_use
+
+
+def test_static_tags_are_found_in_pictures_of_the_room() -> None:
+    room = Room(room_config(4, 640, aims=0, bump_every_s=math.inf, static_tags=3))
+    model = of_room(room.config)
+    assert model.camera is not None
+    assert model.marker is not None
+    views = [
+        (picture, tags_beside(picture, model.camera, view, model.marker))
+        for view, picture in enumerate(room.pictures(0.0, 0))
+    ]
+    fits = static_tag_fits(views, model.camera, model.marker.dictionary, model.static_tags)
+    assert sorted(fits) == [1, 2, 3]
+    camera_T_trus = inverse(room.trus_T_camera(0.0))
+    for number, true in room.trus_T_tags(0.0).items():
+        off = inverse(camera_T_trus @ true) @ fits[number].camera_T_marker
+        assert np.linalg.norm(off[:3, 3]) < 0.15
+        assert np.linalg.norm(log_so3(off[:3, :3])) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("tags", "found"),
+    [
+        ([{"id": 0, "size_mm": 20.0}], "a tag of the marker"),
+        ([{"id": 7, "size_mm": 20.0}, {"id": 7, "size_mm": 20.0}], "a static tag before it"),
+        ([{"id": 50, "size_mm": 20.0}], "50"),
+    ],
+)
+def test_static_tags_have_ids_of_their_own(tags: list[dict[str, object]], found: str) -> None:
+    problems: list[Any] = []
+    read_setup(session_document(room_config(1).scene) | {"static_tags": tags}, "session.yaml", "room", problems)
+    assert len(problems) == 1
+    assert "static_tags[" in str(problems[0])
+    assert found in str(problems[0])
