@@ -21,6 +21,7 @@ from fgreg.model.estimate import PredictedTre, TrackEstimate, Verdict
 from fgreg.model.measurements import MarkerObservation, Track
 from fgreg.model.time_sync import Stamp
 from fgreg.online.estimate import OnlineEstimate
+from fgreg.viewer import shapes
 from fgreg.viewer.endoscope_view import PATH, REFUSED
 from fgreg.viewer.live import ViewerUpdate
 from fgreg.viewer.recording import Viewer
@@ -68,6 +69,26 @@ def recorded(path: Path, shown: list[tuple[ViewerUpdate, BmodeFrame | None]]) ->
             viewer.bmode(one.t, one.number, picture)
             viewer.update(one)
     return read_recording(path)
+
+
+def test_of_pictures_between_events_the_file_keeps_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shapes, "PASSING_BYTES", 60_000)
+    image = np.random.default_rng(1).integers(0, 255, (64, 64), dtype=np.uint8)
+    with Viewer(tmp_path / "a.rrd", "live") as viewer:
+        viewer.session(make_model(), 3.0)
+        for number in range(60):
+            event = number in (3, 30)
+            viewer.shot_images(float(number), "pair" if event else "track", number, image, passing=not event)
+            viewer.update(update(number, NOW))
+    rows = read_recording(tmp_path / "a.rrd")
+    of_left = rows["/world/camera/left"]
+    shots = [row.shot for row in of_left if row.shot is not None and "EncodedImage:blob" in row.values]
+    assert {3, 30, 59} <= set(shots)
+    kept = sorted(shot for shot in shots if shot not in (3, 30))
+    assert 5 < len(kept) < 25
+    assert kept == list(range(kept[0], 60)), "all of the last ones"
+    assert len(rows["/summary"]) == 60, "only pictures are dropped"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.rrd"]
 
 
 def page(rows: dict[str, list[Row]], number: int) -> str:

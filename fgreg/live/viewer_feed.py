@@ -173,7 +173,7 @@ class RerunFeed(ViewerFeed):
                 kind = "aim" if isinstance(drawing.shot, Aim) else "pair"
             right = None if kind == "track" else drawing.frame.right  # one view is enough between events
             shown = to_display(drawing.frame.left), None if right is None else to_display(right)
-            self._viewer.shot_images(drawing.t, kind, number, *shown)
+            self._viewer.shot_images(drawing.t, kind, number, *shown, passing=kind == "track")
         self._viewer.bmode(drawing.t, number, None if status is None else status.bmode)
         self._viewer.update(
             ViewerUpdate(

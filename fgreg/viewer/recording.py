@@ -165,6 +165,8 @@ class Viewer:
         right: Image8 | None = None,
         marker_outlines_px: Iterable[FloatArray] | None = None,
         corner_px: FloatArray | None = None,
+        *,
+        passing: bool = False,
     ) -> None:
         """Show the endoscope's images of a shot.
 
@@ -175,6 +177,7 @@ class Viewer:
             left, right: (h, w) grey or (h, w, 3) BGR, uint8; None where there is none.
             marker_outlines_px: the tags' (4, 2) corners found in the left image.
             corner_px: (2,) the board corner aimed at, in the left image.
+            passing: between the events of a live session: newer images make room in the file by dropping it.
         """
         rec = self._rec
         rec.at(t, index)
@@ -182,7 +185,8 @@ class Viewer:
             if image is not None:
                 self._shown.add(side)
                 self._shapes[side] = image.shape
-                rec.log(f"world/camera/{side}", shapes.picture(image))
+                log = rec.log_passing if passing else rec.log
+                log(f"world/camera/{side}", shapes.picture(image))
         if left is None:
             return
         rec.clear("world/camera/left/marker", "world/camera/left/corner")
@@ -256,6 +260,8 @@ class Viewer:
     def bmode(self, t: float, index: int, picture: BmodePicture | None) -> None:
         """Show a B-mode image in its view and, where its geometry is known, on the image plane.
 
+        In the file newer images make room by dropping it.
+
         Args:
             t: seconds.
             index: number of the update that is drawn next.
@@ -273,7 +279,7 @@ class Viewer:
             return
         image, pixel_mm, origin_mm = picture.image, picture.pixel_mm, picture.origin_mm
         self._shown.add("bmode")
-        rec.log("bmode", shapes.picture(shapes.canvas(image)))
+        rec.log_passing("bmode", shapes.picture(shapes.canvas(image)))
         text = f"t = {t:.1f} s" + ("" if pixel_mm and origin_mm else "; its position in the plane is not known")
         rec.log("bmode/caption", shapes.points_2d(caption, palette.SOUND, 0.5, [text]))
         if pixel_mm is None or origin_mm is None:
@@ -284,7 +290,7 @@ class Viewer:
         step = -(-max(rows, columns) // LARGEST_TEXTURE)
         small = image[::step, ::step]
         rgb = np.repeat(small[..., None], 3, axis=2) if small.ndim == 2 else small[..., ::-1]
-        rec.log("world/stage/plane", shapes.plane_mesh(corners, np.ascontiguousarray(rgb)))
+        rec.log_passing("world/stage/plane", shapes.plane_mesh(corners, np.ascontiguousarray(rgb)))
         rec.log("world/stage/outline", shapes.plane_outline(corners))
 
     def result(
@@ -368,3 +374,4 @@ class Viewer:
             for side, shape in self._shapes.items():
                 self._rec.log(f"world/camera/{side}", shapes.no_picture(shape))
         self._live.draw(update, textured=update.number in self._textured)
+        self._textured.clear()  # they are needed no more: there is one a drawing, for hours

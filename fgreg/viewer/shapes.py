@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
+import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from fgreg.model.camera_model import CameraModel
 from fgreg.model.session_model import SessionModel
 from fgreg.viewer.pa_frame import PaPicture
 from fgreg.viewer.palette import AXES, BEAM, CAMERA, PLANE, PM, PROBE, REFUSED, SOUND, UNUSED, Color
+from fgreg.viewer.picture_ring import PictureRing
 from fgreg.viewer.scene import Label, ellipsoid_95, frustum_strips_mm, quaternion_xyzw
 
 Image8 = npt.NDArray[np.uint8]
@@ -36,60 +39,106 @@ JPEG_QUALITY = 80
 
 
 FLUSH_S = 600.0
+GATHER_S, GATHER_BYTES = 5.0, 1_000_000
+"""Rows of a file are gathered for this long, or up to this size."""
+PASSING_BYTES = 100_000_000
+"""Of pictures between the events of a live session: a quarter of an hour of them."""
 
 
 class Recorder:
     """A recording stream into a file, a running viewer, or both, with the timelines ``shot`` and ``time``.
+
+    The file's rows are gathered for :data:`GATHER_S`, since each write has an overhead of some kB; a viewer gets them
+    at once.
 
     Args:
         path: of the file. name: of the recording. url: of the viewer. own_id: of the recording; None: a random one.
     """
 
     def __init__(self, path: Path | None, name: str, url: str | None = None, own_id: str | None = None) -> None:
-        self._stream = rr.RecordingStream("fgreg", recording_id=own_id)
-        sinks: list[rr.FileSink | rr.GrpcSink] = []
+        own_id = own_id or uuid.uuid4().hex
+        self._at = (0.0, 0)
+        self._file: rr.RecordingStream | None = None
+        self._viewer: rr.RecordingStream | None = None
+        self._passing: PictureRing | None = None
         if path is not None:
-            sinks.append(rr.FileSink(path))
+            gather = rr.ChunkBatcherConfig(flush_tick=GATHER_S, flush_num_bytes=GATHER_BYTES)
+            self._file = rr.RecordingStream("fgreg", recording_id=own_id, batcher_config=gather)
+            self._file.set_sinks(rr.FileSink(path))
+            self._folder = path.parent
         if url is not None:
-            sinks.append(rr.GrpcSink(url))
-        self._stream.set_sinks(*sinks)
-        self._stream.send_recording_name(name)
+            self._viewer = rr.RecordingStream("fgreg", recording_id=own_id)
+            self._viewer.set_sinks(rr.GrpcSink(url))
+        self._streams = [stream for stream in (self._file, self._viewer) if stream is not None]
+        for stream in self._streams:
+            stream.send_recording_name(name)
 
     def at(self, t: float, shot: int) -> None:
         """Set shot number and time (s) of what is logged next."""
-        self._stream.set_time("shot", sequence=shot)
-        self._stream.set_time("time", duration=t)
+        self._at = (t, shot)
+        for stream in self._streams:
+            _set_time(stream, t, shot)
 
     def log(self, path: str, *what: rr.AsComponents) -> None:
         """Log at the current time."""
-        self._stream.log(path, *what)
+        for stream in self._streams:
+            stream.log(path, *what)
+
+    def log_passing(self, path: str, *what: rr.AsComponents) -> None:
+        """Log a picture at the current time, of which the file keeps the newest :data:`PASSING_BYTES` only."""
+        if self._viewer is not None:
+            self._viewer.log(path, *what)
+        if self._file is not None:
+            self._passing = self._passing or PictureRing(PASSING_BYTES, self._folder)
+            self._passing.add(pickle.dumps((*self._at, path, what)))
 
     def static(self, path: str, *what: rr.AsComponents) -> None:
         """Log for all times."""
-        self._stream.log(path, *what, static=True)
+        for stream in self._streams:
+            stream.log(path, *what, static=True)
 
     def clear(self, *paths: str) -> None:
         """Clear these paths and all below them from the current time on."""
         for path in paths:
-            self._stream.log(path, rr.Clear(recursive=True))
+            self.log(path, rr.Clear(recursive=True))
 
     def series(self, path: str, shots: Sequence[int], seconds: Sequence[float], values: Sequence[float]) -> None:
         """Log all values of a plot at once; three sequences of the same length."""
         indexes = [rr.TimeColumn("shot", sequence=shots), rr.TimeColumn("time", duration=seconds)]
-        self._stream.send_columns(path, indexes=indexes, columns=rr.Scalars.columns(scalars=values))
+        for stream in self._streams:
+            stream.send_columns(path, indexes=indexes, columns=rr.Scalars.columns(scalars=values))
 
     def blueprint(self, blueprint: rrb.Blueprint) -> None:
         """Send the blueprint with which the recording opens."""
-        self._stream.send_blueprint(blueprint)
+        for stream in self._streams:
+            stream.send_blueprint(blueprint)
 
     def close(self) -> None:
-        """Flush and end the recording.
+        """Write the pictures that are kept, flush and end the recording.
 
         Raises:
             RuntimeError: it is not written, for example on a full disk.
         """
-        self._stream.flush(timeout_sec=FLUSH_S)  # its default waits forever where the file's thread has ended
-        self._stream.disconnect()
+        if self._passing is not None and self._file is not None:
+            with self._passing as kept:
+                for entry in kept:
+                    t, shot, path, what = pickle.loads(entry)  # noqa: S301 - this process wrote it, to a nameless file
+                    _set_time(self._file, t, shot)
+                    self._file.log(path, *what)
+        failure: RuntimeError | None = None
+        for stream in self._streams:
+            try:
+                stream.flush(timeout_sec=FLUSH_S)  # its default waits forever where the file's thread has ended
+            except RuntimeError as error:
+                failure = failure or error
+            stream.disconnect()
+        if failure is not None:
+            raise failure
+
+
+def _set_time(stream: rr.RecordingStream, t: float, shot: int) -> None:
+    stream.set_time("shot", sequence=shot)
+    stream.set_time("time", duration=t)
 
 
 def ui(points: float) -> float:
