@@ -101,6 +101,8 @@ def test_a_killed_process_is_said_and_ends_without_a_wait(case: Case) -> None:
     engine.close()
     assert not engine.alive
     assert time.monotonic() - began < 3.0
+    with pytest.raises(FileNotFoundError):  # its memory is gone with it
+        engine.reader()
 
 
 def test_it_ends_when_it_is_closed_and_its_memory_with_it(case: Case) -> None:

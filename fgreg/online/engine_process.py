@@ -24,7 +24,7 @@ from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.online.events import OnlineEvent
-from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader
+from fgreg.online.shared_snapshot import NoSnapshotError, SharedSnapshot, SnapshotReader, remove_memory
 from fgreg.online.snapshot_record import Layout
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
@@ -57,6 +57,7 @@ class EngineProcess:
 
     def __init__(self, model: SessionModel, config: SolveConfig) -> None:
         self._turn = threading.Lock()
+        self._name = ""  # of the shared memory
         self._estimate: OnlineEstimate | None = None
         self._moves: tuple[DetectedMove, ...] = ()
         self._loop_closures: tuple[DetectedLoopClosure, ...] = ()
@@ -184,8 +185,9 @@ class EngineProcess:
         return self._loop_closures
 
     def close(self) -> None:
-        """End the process."""
+        """End the process, and remove its shared memory if it was killed."""
         self._worker.close()
+        remove_memory(self._name)
 
 
 @contextmanager

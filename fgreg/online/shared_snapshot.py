@@ -147,6 +147,18 @@ def _prefix() -> str:
         return "fgreg-0-"
 
 
+def remove_memory(name: str) -> None:
+    """Remove the memory of a writer that was killed, if it was; this program's resource tracker forgets it, too."""
+    if not name:
+        return
+    try:
+        memory = SharedMemory(name)
+    except (FileNotFoundError, ValueError):  # removed; or its writer was killed before it had a size
+        return
+    memory.unlink()
+    memory.close()
+
+
 def remove_left_behind() -> None:
     """Remove the memory of writers that were killed together with the tracker of their resources (Linux)."""
     for path in Path("/dev/shm").glob(f"{_prefix()}*-*"):
