@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from fgreg.camera_moves.recorded_tags import with_tag_moves
+from fgreg.detection.events_to_measurements import number_epochs
 from fgreg.detection.marker import ViewCorners
 from fgreg.detection.static_tags import static_tag_fits, tags_beside
 from fgreg.detection.tags import FoundTag
 from fgreg.drivers.base import StereoFrame
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, log_so3, make_transform
 from fgreg.live import static_tags
+from fgreg.live.launch import setup_text
 from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.scope_holder import HolderMove
 from fgreg.live.static_tags import MOST_ALARMS, UNREST_S, StaticTags
+from fgreg.model.events import CameraMovedEvent
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Stamp
+from fgreg.session.session_reader import read_session
 from fgreg.session.setup_reader import read_setup
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, RoomConfig, room_config
@@ -172,6 +180,36 @@ def test_static_tags_are_found_in_pictures_of_the_room() -> None:
         off = inverse(camera_T_trus @ true) @ fits[number].camera_T_marker
         assert np.linalg.norm(off[:3, 3]) < 0.15
         assert np.linalg.norm(log_so3(off[:3, :3])) < 0.02
+
+
+def test_static_tags_in_recorded_frames_divide_the_session_where_the_camera_moved(tmp_path: Path) -> None:
+    room = Room(room_config(4, 480, aims=0, bump_every_s=math.inf, static_tags=3))
+    (tmp_path / "session.yaml").write_text(setup_text(session_document(room.config.scene)))
+    (tmp_path / "frames").mkdir()
+    lines = []
+    for number in range(5):
+        if number == 3:
+            room.bump(3.0)
+        for side, picture in zip(("left", "right"), room.pictures(number + 0.9, number), strict=True):
+            assert cv2.imwrite(str(tmp_path / "frames" / f"{side}{number}.png"), picture)
+        marker = {side: f"frames/{side}{number}.png" for side in ("left", "right")}
+        trus = {"scan_deg": 0.0, "x_mm": 1.0, "range_mm": 30.0}
+        lines.append({"type": "pair", "t": number + 0.9, "pm": number, "marker": marker, "trus": trus})
+    (tmp_path / "events.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    session = read_session(tmp_path)
+    found = with_tag_moves(session)
+    (move,) = [event for event in found.events if isinstance(event, CameraMovedEvent)]
+    assert found.events.index(move) == 3
+    assert move.detected
+    true = inverse(room.trus_T_camera(9.0)) @ room.trus_T_camera(0.0)
+    assert move.camera_new_T_camera_old is not None
+    off = inverse(true) @ move.camera_new_T_camera_old
+    assert np.linalg.norm(off[:3, 3]) < 0.5
+    assert "before line 4" in found.warnings[-1]
+    starts, epoch_of = number_epochs(found.events)
+    assert len(starts) == 2
+    assert epoch_of == (0, 0, 0, 1, 1, 1)
+    assert with_tag_moves(found) is found, "moves that a recording has are not looked for again"
 
 
 @pytest.mark.parametrize(

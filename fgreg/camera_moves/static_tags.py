@@ -34,6 +34,13 @@ REST_P = 0.05
 """Two halves of these differ by more than chance has it with this probability: then it is not sure to rest yet."""
 
 
+SHAKING = np.diag(np.square([0.0005] * 3 + [0.05] * 3))
+"""Added to the covariance of poses in pictures (rad, mm): what shakes, and light that changes."""
+MOVE_MM, MOVE_RAD, MOVE_SHARE = 0.1, 0.001, 0.01
+"""Standard deviations of a measured move, and their part in proportion to it: errors of the lens' model and of the
+detection that are not the same on both sides of it."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TagPose:
     """One tag, averaged over frames: camera_T_tag (4, 4), covariance (6, 6) right tangent, frames that saw it."""
@@ -133,6 +140,25 @@ def average_tags(frames: Sequence[TagFrame], constant_share: float) -> dict[int,
         mean = covariance[good].mean(axis=0) * (constant_share + (1.0 - constant_share) / count)
         out[tag] = TagPose(_moved(base, steps[good].mean(axis=0)), mean, count)
     return out
+
+
+def observed(poses: Mapping[int, tuple[FloatArray, FloatArray]]) -> TagFrame:
+    """Poses (4, 4) and covariances (6, 6) in a picture, with what their detection does not know of."""
+    return TagFrame(
+        {tag: pose for tag, (pose, _) in poses.items()},
+        {tag: covariance + SHAKING for tag, (_, covariance) in poses.items()},
+    )
+
+
+def turn_rad(motion: FloatArray) -> float:
+    """Angle of a motion (4, 4)."""
+    return float(np.linalg.norm(log_so3(motion[:3, :3])))
+
+
+def move_covariance(motion: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a measured move (4, 4), with what the tags' covariance does not know of."""
+    rotation, shift = MOVE_RAD + MOVE_SHARE * turn_rad(motion), MOVE_MM + MOVE_SHARE * view_shift_mm(motion)
+    return np.asarray(covariance + np.diag(np.square([rotation] * 3 + [shift] * 3)))
 
 
 def _moved(transform: FloatArray, step: FloatArray) -> FloatArray:

@@ -178,12 +178,13 @@ def named_apart(cases: "list[Case]", folders: list[Path]) -> "list[Case]":
 
 def read_case(folder: Path, progress: Progress) -> "tuple[Case, list[Condition]]":
     """A session as a case, with detection in its frames done once, and the conditions from the detection."""
+    from fgreg.camera_moves.recorded_tags import with_tag_moves
     from fgreg.detection.events_to_measurements import extract_measurements
     from fgreg.evaluation.case import Case, Truth
     from fgreg.pipeline.solve import detection_conditions
     from fgreg.session.session_reader import read_ground_truth, read_session
 
-    session = read_session(folder)
+    session = with_tag_moves(read_session(folder))
     known = read_ground_truth(folder)
     for warning in session.warnings:
         warn(warning)

@@ -16,22 +16,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgreg.camera_moves.static_tags import TagFrame, TagMonitor, TagsAtRest, TagSettings, TagsMoved, monitored
+from fgreg.camera_moves.static_tags import (
+    TagFrame,
+    TagMonitor,
+    TagsAtRest,
+    TagSettings,
+    TagsMoved,
+    monitored,
+    move_covariance,
+    observed,
+    turn_rad,
+)
 from fgreg.camera_moves.view_shift import view_shift_mm
 from fgreg.detection.corners import grey
 from fgreg.detection.static_tags import BOARD, StaticView, static_poses
-from fgreg.geometry.transforms import FloatArray, log_so3
+from fgreg.geometry.transforms import FloatArray
 from fgreg.live.marker_tracker import WholeFrame
 from fgreg.live.pa_worker import Locator
 from fgreg.live.scope_holder import HolderMove
 from fgreg.model.session_model import SessionModel
 
 SETTINGS = TagSettings(windows=(2, 6), least_mm=0.3)
-SHAKING = np.diag(np.square([0.0005] * 3 + [0.05] * 3))
-"""Added to the detections' covariance (rad, mm): what shakes, and light that changes."""
-MOVE_MM, MOVE_RAD, MOVE_SHARE = 0.1, 0.001, 0.01
-"""Standard deviations of a measured move, and their part in proportion to it: errors of the lens' model and of the
-detection that are not the same on both sides of it."""
 SHARE = 0.06
 """Largest share of one processor's time."""
 EVERY_S, MOST_S = 0.6, 3.0
@@ -153,10 +158,7 @@ class StaticTags:
         if not poses:
             return None
         self.frames += 1
-        frame = TagFrame(
-            {number: pose for number, (pose, _) in poses.items()},
-            {number: covariance + SHAKING for number, (_, covariance) in poses.items()},
-        )
+        frame = observed(poses)
         self._monitor, found = monitored(self._monitor, job.t_s, frame, SETTINGS)
         if isinstance(found, TagsMoved):
             return self._alarm(found.since_t, now_s)
@@ -183,17 +185,16 @@ class StaticTags:
         since_s, self.moving_since_s = self.moving_since_s, None
         motion = found.camera_new_T_camera_old
         shift_mm = view_shift_mm(motion)
-        turn_rad = float(np.linalg.norm(log_so3(motion[:3, :3])))
         if since_s is None:
             raise AssertionError("a rest without a move")
         if shift_mm < SETTINGS.least_mm:
             self._news.append("the camera is back where it was, by the static tags")
             return None
         self._news.append(
-            f"the static tags show that the camera has moved: {shift_mm:.1f} mm and {math.degrees(turn_rad):.1f} deg"
+            "the static tags show that the camera has moved: "
+            f"{shift_mm:.1f} mm and {math.degrees(turn_rad(motion)):.1f} deg"
         )
-        sigmas = [MOVE_RAD + MOVE_SHARE * turn_rad] * 3 + [MOVE_MM + MOVE_SHARE * shift_mm] * 3
-        return HolderMove(since_s, motion, found.covariance + np.diag(np.square(sigmas)))
+        return HolderMove(since_s, motion, move_covariance(motion, found.covariance))
 
     def _check_tags(self, frame: TagFrame) -> None:
         """Leave out tags that do not stand still, or that go their own way."""

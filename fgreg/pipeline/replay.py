@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fgreg.camera_moves.recorded_tags import with_tag_moves
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.errors import EventRefused, InputError
 from fgreg.model.estimate import ExcludedShot, Quantiles, Timing, TrackEstimate, Verdict
@@ -138,6 +139,7 @@ def replay_session(
         raise InputError("--speed", str(request.speed), "1, 10 or another number > 0, or max")
     result_path = result_place(request.folder, request.out, request.rrd)
     session, inputs = read_with_hashes(request.folder)
+    session = with_tag_moves(session)
     if (pairs := sum(isinstance(event, PairEvent) for event in session.events)) > REPLAYED_PAIRS:
         raise InputError(
             EVENTS_FILE, f"{pairs} pairs", f"at most {REPLAYED_PAIRS} for a replay; fgreg solve takes more"

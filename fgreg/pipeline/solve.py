@@ -16,6 +16,7 @@ import numpy as np
 
 from fgreg.camera_moves.found import DetectedMove
 from fgreg.camera_moves.recorded_session import EpochsFound, find_epochs, renumbered, split_epochs
+from fgreg.camera_moves.recorded_tags import with_tag_moves
 from fgreg.detection.events_to_measurements import ExtractedMeasurements, extract_measurements
 from fgreg.detection.results import MarkerFit, NoSignal, PaFind
 from fgreg.geometry.target_error import beam_error, tre_mm
@@ -142,6 +143,7 @@ def solve_session(
     result_path = result_place(request.folder, request.out, request.rrd)
     session, inputs = read_with_hashes(request.folder)
     session = without_shots(session, request.without, ("--without-pm", "--without-aim"))
+    session = with_tag_moves(session) if request.detect_moves else session
     truth = read_ground_truth(request.folder)
     with open_viewer(request.rrd, session.model.name, made_from=inputs) as viewer:
         extracted = extract_measurements(

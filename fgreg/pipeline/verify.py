@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from fgreg.camera_moves.recorded_session import find_epochs
+from fgreg.camera_moves.recorded_tags import with_tag_moves
 from fgreg.camera_moves.validity import Validity, Verification, verify
 from fgreg.detection.events_to_measurements import extract_measurements
 from fgreg.errors import InputError
@@ -166,6 +167,9 @@ def _solved_again(
     Raises:
         InputError: it is not.
     """
+    tagged = with_tag_moves(session)
+    if sum(isinstance(event, CameraMovedEvent) for event in tagged.events) < len(epochs):
+        session = tagged  # else solved without looking for moves
     extracted = extract_measurements(
         session.events,
         session.model,
