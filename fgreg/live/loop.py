@@ -258,7 +258,8 @@ class LiveLoop:
             self._by_holder += [] if move is None else [move]
         aiming = self._workflow.stage is Stage.AIMING
         move = self._static_tags.step(self.marker_tracker.whole, now, with_board=not aiming)
-        self._by_tags = move or self._by_tags
+        if move is not None:  # of two in a row the second one alone is not the motion
+            self._by_tags = move if self._by_tags is None else HolderMove(self._by_tags.since_s, None, None)
         for text in self._static_tags.news():
             self._note(text)
         under_way = [t for t in (self._holder.moving_since_s, self._static_tags.moving_since_s) if t is not None]
