@@ -99,13 +99,14 @@ def made_up(hours: float, folder: Path, seed: int, memory: Memory) -> bool:
             minute = rehearsal.now_s / 60.0
             memory.sample(minute)
             if rehearsal.now_s % CLEANED_S < 60.0:
+                said = rehearsal.messages[-1][1].text if rehearsal.messages else "nothing"
                 for notes in (rehearsal.messages, rehearsal.actions, rehearsal.errors_deg, told.events, told.estimates):
                     notes.clear()
                 looks, epochs = len(session.measurements().pairs), len(session.measurements().epochs)
                 size_mb, took = (folder / "events.jsonl").stat().st_size / 1e6, time.monotonic() - began
                 print(
                     f"  minute {minute:.0f}: {looks} looks, {epochs} epochs, events.jsonl {size_mb:.1f} MB, "
-                    f"{took:.0f} s of work",
+                    f"{took:.0f} s of work; said last: {said}",
                     flush=True,
                 )
     opening = time.monotonic()
