@@ -20,6 +20,7 @@ from fgreg.model.events import ExcludeEvent as ExcludeEvent
 from fgreg.model.events import IncludeEvent as IncludeEvent
 from fgreg.model.events import MarkerRecord as MarkerRecord
 from fgreg.model.events import PairEvent as PairEvent
+from fgreg.model.events import SpotRecord as SpotRecord
 from fgreg.model.events import TrackEvent as TrackEvent
 from fgreg.model.events import TrusRecord as TrusRecord
 from fgreg.model.measurement_checks import problems_of_all
@@ -31,6 +32,7 @@ from fgreg.model.measurements import MarkerObservation as MarkerObservation
 from fgreg.model.measurements import Measurements as Measurements
 from fgreg.model.measurements import Pair as Pair
 from fgreg.model.measurements import Track as Track
+from fgreg.model.measurements import VisibleSpot as VisibleSpot
 from fgreg.model.session_model import SessionModel as SessionModel
 from fgreg.model.solve_config import SolveConfig as SolveConfig
 from fgreg.online.engine import OnlineRegistration as OnlineRegistration

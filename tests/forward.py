@@ -30,6 +30,7 @@ from fgreg.model.measurements import (
     MarkerObservation,
     Measurements,
     Pair,
+    VisibleSpot,
     default_marker_covariance,
 )
 from fgreg.model.session_model import (
@@ -160,7 +161,14 @@ def with_dependences(measurements: Measurements, seed: int) -> Measurements:
     return replace(
         measurements,
         aims=tuple(replace(aim, marker=marker(aim.marker), dependence=dependence(3)) for aim in measurements.aims),
-        pairs=tuple(replace(pair, marker=marker(pair.marker)) for pair in measurements.pairs),
+        pairs=tuple(
+            replace(
+                pair,
+                marker=marker(pair.marker),
+                spot=None if pair.spot is None else replace(pair.spot, dependence=dependence(3)),
+            )
+            for pair in measurements.pairs
+        ),
     )
 
 
@@ -271,6 +279,7 @@ def make_measurements(
     spread_deg: float = 20.0,
     roll_deg: float = 180.0,
     sound_speed_ratio: float = 1.0,
+    spot_sigma_mm: tuple[float, float, float] | None = None,
     session: SessionModel | None = None,
     marker_T_laser: FloatArray | None = None,
     trus_T_camera: FloatArray | None = None,
@@ -295,6 +304,7 @@ def make_measurements(
         spread_deg: largest angle between beam and line of sight.
         roll_deg: largest roll of the marker about its beam.
         sound_speed_ratio: true over assumed.
+        spot_sigma_mm: the camera sees the spot of each look with these sigmas along its axes; None: it does not.
         session: noise and probe to use; ``make_session()`` where absent.
         marker_T_laser, trus_T_camera: (4, 4) truth (of the first epoch), random where absent.
 
@@ -379,7 +389,12 @@ def make_measurements(
                 sweep=sweep,
                 amplitude=amplitude,
             )
-            pair_list.append(Pair(t, pm, epoch, marker, look))
+            spot_seen = None
+            if spot_sigma_mm is not None:
+                away = rng.normal(size=3) * spot_sigma_mm if noise else np.zeros(3)
+                around = as_float_array(np.diag(np.square(spot_sigma_mm)), 3, 3)
+                spot_seen = VisibleSpot(as_float_array(camera_p_pm + away, 3), around)
+            pair_list.append(Pair(t, pm, epoch, marker, look, spot=spot_seen))
             pair_poses.append(pose)
             pair_lambdas.append(lambda_mm)
             scans.append(scan)

@@ -88,14 +88,22 @@ def events() -> list[dict[str, Any]]:
     both_views = {"left": "frames/a.png", "right": "frames/b.png"}
     heard = {"scan_deg": -12.0, "x_mm": 3.2, "range_mm": 31.4, "amplitude": 0.8, "sweep": 1}
     recorded = {"scan_deg": 4.0, "frame": "frames/c.npy", "sweep": -1}
+    pixels = {"left": [330, 250.5], "right": [300, 250.5]}
     data = [
         {"type": "note", "t": 0.0, "text": "start\nof the session"},
         {"type": "aim", "t": 1.0, "marker": pose, "camera_p_spot_mm": [1, 2, 150], "covariance": diagonal(1, 1, 0.01)},
         {"type": "aim", "t": 2.0, "marker": {"left": "frames/a.png"}, "corner": [8, 5]},
         {"type": "pair", "t": 3.0, "pm": 0, "marker": pose_with_covariance, "trus": heard},
-        {"type": "pair", "t": 3.0, "pm": 0, "marker": both_views, "trus": recorded},
+        {"type": "pair", "t": 3.0, "pm": 0, "marker": both_views, "trus": recorded, "spot": pixels},
         {"type": "pair", "t": 4.0, "pm": 7, "marker": {**pose, **both_views}, "trus": {**heard, "sweep": 0}},
-        {"type": "pair", "t": 5, "pm": 8, "marker": pose, "trus": {**heard, "covariance": diagonal(0.09, 0.04)}},
+        {
+            "type": "pair",
+            "t": 5,
+            "pm": 8,
+            "marker": pose,
+            "trus": {**heard, "covariance": diagonal(0.09, 0.04)},
+            "spot": {"camera_p_mm": [1, 2, 150], "covariance": diagonal(0.04, 0.04, 1)},
+        },
         {"type": "track", "t": 6.0, "marker": pose, "trus": heard},
         {"type": "track", "t": 6.5, "marker": pose, "looks": [heard, recorded]},
         {"type": "track", "t": 7.0, "marker": pose, "scan_deg": 3.0},

@@ -195,7 +195,7 @@ def test_the_page_of_devices_has_the_drivers_of_today() -> None:
 def test_the_format_page_has_the_tables_of_today() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert TABLES["with_tables"](page) == page, "run python tools/make_format_tables.py"
-    assert page.count("<!-- table: ") == 9
+    assert page.count("<!-- table: ") == 10
     recordings = TABLES["PAGES"][2].read_text(encoding="utf-8")
     assert TABLES["with_tables"](recordings) == recordings
     for key in ("probe.sensitivity.edge_sigma_deg", "camera_new_T_camera_old", "epochs[].predicted_tre_mm.p95"):

@@ -29,6 +29,14 @@ CASES: dict[str, dict[str, Any]] = {
     "looks share a marker": {"pairs": 8, "looks_per_pm": 3, "share_marker": True},
     "looks with markers of their own": {"pairs": 8, "looks_per_pm": 2},
     "camera moved, motion known": {"pairs": 16, "epochs": 2, "known_motion": True},
+    "spots seen": {
+        "pairs": 10,
+        "looks_per_pm": 2,
+        "share_marker": True,
+        "epochs": 2,
+        "known_motion": True,
+        "spot_sigma_mm": (0.4, 0.4, 1.5),
+    },
     "marker bias": {"pairs": 12, "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.3))},
 }
 
@@ -85,6 +93,7 @@ def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:
         looks_per_pm=2,
         epochs=2,
         known_motion=True,
+        spot_sigma_mm=(0.5, 0.4, 1.5),
         session=make_session(noise_model=NoiseModel(marker_bias_mm=0.1), systematic=Systematic()),
     )
     problem = pack(with_dependences(measurements, 5), model)
@@ -107,7 +116,9 @@ def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:
 
 
 def test_contributions_of_pms_sum_to_the_whole() -> None:
-    model, measurements, truth = make_measurements(np.random.default_rng(3), pairs=9, looks_per_pm=2)
+    model, measurements, truth = make_measurements(
+        np.random.default_rng(3), pairs=9, looks_per_pm=2, spot_sigma_mm=(0.4, 0.4, 1.5)
+    )
     problem = pack(measurements, model)
     found = optimize(problem, make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser))
     parts = contributions(problem, found.state, found.evaluation.private)
@@ -170,7 +181,9 @@ def test_a_hypothesis_that_cannot_reach_the_wanted_cost_is_dropped() -> None:
 
 
 def test_a_loss_weighs_as_shots_left_out_do() -> None:
-    model, measurements, truth = make_measurements(np.random.default_rng(9), pairs=9, looks_per_pm=2)
+    model, measurements, truth = make_measurements(
+        np.random.default_rng(9), pairs=9, looks_per_pm=2, spot_sigma_mm=(0.4, 0.4, 1.5)
+    )
     problem = pack(measurements, model)
     state = make_state(np.stack(truth.trus_T_camera)[None], truth.marker_T_laser)
     private = private_at(problem, state)

@@ -18,7 +18,7 @@ from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate
 from fgreg.graph.shared_state import make_state
-from fgreg.model.measurements import Aim, Look, MarkerObservation, Measurements
+from fgreg.model.measurements import Aim, Look, MarkerObservation, Measurements, Pair, VisibleSpot
 from fgreg.model.session_model import SessionModel
 
 
@@ -55,6 +55,14 @@ def _exact_look(look: Look, trus_p: FloatArray, radius_mm: float) -> Look:
     return replace(look, x_mm=float(trus_p[0]), range_mm=float(np.hypot(dy, dz)))
 
 
+def _exact_spot(pair: Pair, truth: FullTruth) -> VisibleSpot | None:
+    """The pair's spot as it would be seen without noise."""
+    if pair.spot is None:
+        return None
+    camera_p = transform_points(inverse(truth.trus_T_camera[pair.epoch]), truth.trus_p_pm_mm[pair.pm])
+    return replace(pair.spot, camera_p_mm=as_float_array(camera_p, 3))
+
+
 def _exact_aim(aim: Aim, true_T: FloatArray, truth: FullTruth, bias_mm: FloatArray) -> Aim:
     """The aim with its marker as it was and its spot on the true beam, as far along as the recorded one."""
     camera_T_laser = true_T @ truth.marker_T_laser
@@ -89,6 +97,7 @@ def _truth_information(measurements: Measurements, model: SessionModel, truth: F
             pair,
             marker=_exact_marker(pair.marker, true_T, bias),
             look=_exact_look(pair.look, truth.trus_p_pm_mm[pair.pm], model.probe.radius_mm),
+            spot=_exact_spot(pair, truth),
         )
         for pair, true_T in zip(measurements.pairs, truth.pair_camera_T_marker, strict=True)
     )

@@ -16,7 +16,7 @@ from fgreg.convert.mapping import MAPPING
 from fgreg.drivers.registry import ENTRIES
 from fgreg.model.commissioned_rig import RIG
 from fgreg.model.estimate import RESULT
-from fgreg.model.events import EVENTS, MarkerRecord, PlaneRecord, TrusRecord
+from fgreg.model.events import EVENTS, MarkerRecord, PlaneRecord, SpotRecord, TrusRecord
 from fgreg.model.session_model import SESSION
 from fgreg.model.setup_recording import SETUP_LINES
 from fgreg.schema.kinds import Converted, Kind, ListOf
@@ -27,7 +27,7 @@ from fgreg.session.ground_truth import GROUND_TRUTH
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "docs" / "devices.md", ROOT / "sessions" / "README.md", ROOT / "docs" / "setup.md")
 _LINES = {"events": EVENTS, "recording": SETUP_LINES}
-_PARTS = {MarkerRecord: "marker", TrusRecord: "trus", PlaneRecord: "plane"}
+_PARTS = {MarkerRecord: "marker", TrusRecord: "trus", PlaneRecord: "plane", SpotRecord: "spot"}
 _TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from fgreg.geometry.transforms import BoolArray, IntArray
 from fgreg.graph.packing import BeamArrays, LookArrays, PackedProblem, RotationShapes
+from fgreg.graph.visible_spots import SpotArrays
 from fgreg.model.sensitivity import WindowShapes
 
 
@@ -25,10 +26,16 @@ def select_pms(problem: PackedProblem, index: IntArray) -> PackedProblem:
         beams=BeamArrays(*(getattr(problem.beams, name)[beams] for name in BeamArrays.__slots__)),
         look_pm=place[problem.look_pm[looks]],
         look_beam=beam_place[problem.look_beam[looks]],
+        spots=_select_spots(problem.spots, beams, beam_place),
         looks=LookArrays(*(getattr(problem.looks, name)[looks] for name in LookArrays.__slots__)),
         shapes=None if problem.shapes is None else _select_shapes(problem.shapes, index, looks),
         log_outlier=None if problem.log_outlier is None else problem.log_outlier[index],
     )
+
+
+def _select_spots(spots: SpotArrays, beams: BoolArray, beam_place: IntArray) -> SpotArrays:
+    kept = spots.take(np.flatnonzero(beams[spots.beam]))
+    return replace(kept, beam=beam_place[kept.beam])
 
 
 def _select_shapes(shapes: RotationShapes, index: IntArray, looks: BoolArray) -> RotationShapes:

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgreg.geometry.transforms import FloatArray
+from fgreg.geometry.rig import CAMERA
+from fgreg.geometry.transforms import FloatArray, as_float_array
+from fgreg.model.camera_dependence import nominal_point_dependence
 from fgreg.model.camera_model import StereoRig
-from fgreg.model.events import CheckEvent, PlaneRecord
+from fgreg.model.events import CheckEvent, PlaneRecord, SpotRecord
 from fgreg.model.lens import focal_px, normalized_from_pixels
 from fgreg.model.measurement_checks import problem_of
-from fgreg.model.measurements import FLOOR_MM, Check, usable_covariance
+from fgreg.model.measurements import FLOOR_MM, Check, VisibleSpot, usable_covariance
 from fgreg.model.session_model import SessionModel
 
 PIXEL_SIGMA = 0.5
@@ -26,16 +28,10 @@ _ROUNDS = 10
 
 def check_measurement(event: CheckEvent, epoch: int, model: SessionModel) -> Check | str:
     """The check as a measurement in camera epoch ``epoch``, or the reason why it is not usable."""
-    if event.camera_p_mm is None:
-        if model.camera is None or event.left is None or event.right is None:
-            raise AssertionError("the reader requires both pixels and the cameras")
-        seen = triangulate(model.camera, event.left, event.right)
-        if isinstance(seen, str):
-            return seen
-        camera_p, covariance = seen
-    else:
-        default = np.diag(np.square(model.noise.marker_translation_mm))
-        camera_p, covariance = event.camera_p_mm, default if event.covariance is None else event.covariance
+    seen = _camera_point(event, model)
+    if isinstance(seen, str):
+        return seen
+    camera_p, covariance = seen
     if event.trus is not None:
         trus_p, trus_covariance = in_plane(event.trus, model)
     elif event.trus_p_mm is not None:
@@ -52,6 +48,27 @@ def check_measurement(event: CheckEvent, epoch: int, model: SessionModel) -> Che
         covariance=usable_covariance(covariance, floor),
         trus_covariance=usable_covariance(trus_covariance, floor),
     )
+
+
+def _camera_point(record: CheckEvent | SpotRecord, model: SessionModel) -> tuple[FloatArray, FloatArray] | str:
+    """The point (3,) mm in the camera's frame and its covariance (3, 3), or the reason why there is none."""
+    if record.camera_p_mm is not None:
+        default = np.diag(np.square(model.noise.marker_translation_mm))
+        return record.camera_p_mm, default if record.covariance is None else record.covariance
+    if model.camera is None or record.left is None or record.right is None:
+        raise AssertionError("the reader requires both pixels and the cameras")
+    return triangulate(model.camera, record.left, record.right)
+
+
+def visible_spot(record: SpotRecord, model: SessionModel) -> VisibleSpot | str:
+    """The laser's spot as a measurement of where the sound comes from, or the reason why it is not usable."""
+    seen = _camera_point(record, model)
+    if isinstance(seen, str):
+        return f"the visible spot: {seen}"
+    camera_p, covariance = seen
+    whole = covariance + np.diag(np.square(model.noise.spot_mm))
+    dependence = nominal_point_dependence(model, camera_p) if model.constant_sigmas[CAMERA].any() else None
+    return VisibleSpot(as_float_array(camera_p, 3), as_float_array(whole, 3, 3), dependence)
 
 
 def in_plane(point: PlaneRecord, model: SessionModel) -> tuple[FloatArray, FloatArray]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgreg.detection.check_points import check_measurement
+from fgreg.detection.check_points import check_measurement, visible_spot
 from fgreg.detection.corner_noise import CornerNoise, Misfit, Weighed, pool_corner_noise
 from fgreg.detection.results import (
     BoardFit,
@@ -254,9 +254,12 @@ class _Builder:
             else:
                 looks.append(look)
         if isinstance(event, PairEvent):
-            if looks:
+            spot_seen = None if event.spot is None else visible_spot(event.spot, self.model)
+            if isinstance(spot_seen, str):
+                self.unused[index] = spot_seen
+            elif looks:
                 offset_mm = self.model.noise_per_pm.beam_offset_mm
-                self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0], offset_mm))
+                self.pairs.append(Pair(event.t, event.pm, epoch, marker, looks[0], offset_mm, spot_seen))
                 self.pair_events.append(index)
             return
         if event.looks and not looks:

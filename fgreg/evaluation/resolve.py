@@ -18,6 +18,7 @@ from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import pm_contributions, refine
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.measurements import Pair
+from fgreg.registration.outliers import pm_degrees_of_freedom
 from fgreg.registration.posterior_mean import posterior_mean
 from fgreg.registration.register import Registration, register
 
@@ -164,17 +165,17 @@ def predict(registration: Registration, pairs: Sequence[Pair]) -> tuple[HeldOutP
     information = registration.optimum.evaluation.hessian[0]
     moved = np.linalg.solve(information + parts.hessian, parts.gradient[..., None])[..., 0]
     nis = parts.cost - np.sum(parts.gradient * moved, axis=-1)
+    freedom = pm_degrees_of_freedom(problem)
     out = []
     for index, pm in enumerate(problem.pms):
         mine = problem.look_pm == index
-        freedom = 2 * int(np.sum(problem.beam_pm == index)) + 3 * int(mine.sum()) - 3
         out.append(
             HeldOutPm(
                 pm=pm,
                 epoch=next(pair.epoch for pair in pairs if pair.pm == pm),
                 pair_residual_mm=float(np.sqrt(np.mean(residual[mine] ** 2))),
                 nis=float(nis[index]),
-                degrees_of_freedom=freedom,
+                degrees_of_freedom=int(freedom[index]),
             )
         )
     return tuple(out)

@@ -25,11 +25,13 @@ from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
 from fgreg.factors.rig import RigKey, rig_prior_factor, spot_factor
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
+from fgreg.factors.visible_spot import visible_spot_factor
 from fgreg.geometry.rig import CAMERA, COUNT
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import make_columns
 from fgreg.graph.packing import ConstantsPrior, constants_prior, least_sigmas, line_sigma_mm, marker_gain
-from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Measurements, usable_covariance
+from fgreg.graph.visible_spots import spot_gain, usable_spot_covariance
+from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Measurements, usable_covariance, visible_spots
 from fgreg.model.sensitivity import sensitivity_priors
 from fgreg.model.session_model import SessionModel
 
@@ -242,8 +244,10 @@ def build_graph(
         else:
             spot_noise = gtsam.noiseModel.Gaussian.Covariance(spot_covariance)
             graph.add(gtsam.PriorFactorPoint3(own.camera_p_spot, aim.camera_p_spot_mm, spot_noise))
+    spots = visible_spots(measurements.pairs)
     for shot in keys.shots:
-        marker = measurements.pairs[shot.pair].marker
+        pair = measurements.pairs[shot.pair]
+        marker = pair.marker
         covariance = usable_covariance(marker.covariance, POSE_FLOOR)
         gain = marker_gain(marker)
         graph.add(marker_pose_factor(shot.camera_T_marker, marker.camera_T_marker, covariance, gain, keys.rig))
@@ -255,9 +259,15 @@ def build_graph(
                 shot.lam,
                 shot.trus_p_pm,
                 nominal,
-                line_sigma_mm(measurements.pairs[shot.pair].beam_offset_mm),
+                line_sigma_mm(pair.beam_offset_mm),
             )
         )
+        if (spot := spots.get((pair.pm, marker.id))) is not None:
+            covariance = usable_spot_covariance(spot)
+            gain = spot_gain(spot)
+            graph.add(
+                visible_spot_factor(shot.trus_T_camera, shot.trus_p_pm, spot.camera_p_mm, covariance, gain, keys.rig)
+            )
     for index, look in enumerate(looks):
         graph.add(
             point_on_arc_factor(

@@ -17,6 +17,7 @@ from fgreg.geometry.rig import CAMERA, COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
 from fgreg.graph.shared_state import Quadratic
+from fgreg.graph.visible_spots import SpotArrays, spot_arrays
 from fgreg.model.corner_information import corner_information, observed_dependences
 from fgreg.model.measurements import (
     FLOOR_MM,
@@ -26,6 +27,7 @@ from fgreg.model.measurements import (
     Measurements,
     Pair,
     usable_covariance,
+    visible_spots,
 )
 from fgreg.model.sensitivity import AMPLITUDE_SIGMA, WindowShapes, amplitude_table, sensitivity_priors, window_shapes
 from fgreg.model.session_model import SensitivityModel, SessionModel
@@ -136,6 +138,7 @@ class PackedProblem:
     look_pm: IntArray
     look_beam: IntArray
     looks: LookArrays
+    spots: SpotArrays
     aims: BeamArrays
     aim_spot_mm: FloatArray
     aim_spot_covariance: FloatArray
@@ -384,6 +387,7 @@ def pack_pairs(
             centre_rad=priors.centre_rad,
             edge_gain=priors.edge_gain,
         ),
+        spots=spot_arrays({beam_index[key]: spot for key, spot in visible_spots(pairs).items()}),
         aims=_beam_arrays([], np.zeros(0)),
         aim_spot_mm=np.zeros((0, 3)),
         aim_spot_covariance=np.zeros((0, 3, 3)),
@@ -445,6 +449,7 @@ def only_aims(problem: PackedProblem) -> PackedProblem:
         look_pm=none,
         look_beam=none,
         looks=LookArrays(*(getattr(looks, name)[:0] for name in LookArrays.__slots__)),
+        spots=problem.spots.take(none),
         links=(),
         prior=ConstantsPrior.none(problem.columns),
         shapes=None,

@@ -7,6 +7,7 @@ variables (registration, beam, window edge, ...) they enter through small blocks
   (w, n) has a Gaussian prior and enters linearly around its current estimate. Eliminating it leaves the same residual,
   shifted, with covariance ``J Sigma J'`` (the update of an iterated Kalman filter). The estimate is updated at every
   evaluation, so the fixed point is the optimum of the explicit graph, not of a linearised one.
+- visible spot: three residuals in the point, seen from the camera.
 - point on arc, theta' free, and the sensitivity prior: three residuals (x, range, rotation offset) in the point.
 - the point itself: a 3 x 3 Schur complement.
 
@@ -46,6 +47,7 @@ from fgreg.graph.reduced_blocks import (
 )
 from fgreg.graph.reduced_priors import add_priors, prior_cost
 from fgreg.graph.shared_state import SharedState
+from fgreg.graph.visible_spots import spot_derivatives, spot_rows
 from fgreg.graph.window_likelihood import log_shape_ratios
 
 DIVERGED_MM = 1.0
@@ -92,6 +94,7 @@ class _System:
         line: (n, 4, 2, S) residual and derivative by the point, camera axes, of points ``camera_p`` (n, 3, S).
         laser_p: (n, 3, S) those points in the chart's nominal frame. whitening: of the lines.
         beam_by_point: (B, 3, 2, S) derivative by the PM, TRUS axes.
+        spot: (N, 3, S) residual of the visible spots. spot_by_point: (N, 3, 3, S) derivative by the PM, TRUS axes.
         by_turn: (n, 3, 2, S) derivative of the residuals by the markers' turns, mm per rad.
         look: (L, 3, 4 + K, S) residual, derivatives by the PM and by the constants that looks depend on (K = 0 where
             derivatives by shared variables are not wanted); ``look_raw`` the same in mm and rad.
@@ -102,12 +105,15 @@ class _System:
 
     beams: Groups
     looks: Groups
+    spots: Groups
     line: FloatArray
     by_turn: FloatArray
     camera_p: FloatArray
     laser_p: FloatArray
     whitening: Whitening
     beam_by_point: FloatArray
+    spot: FloatArray
+    spot_by_point: FloatArray
     look: FloatArray
     look_raw: FloatArray
     aim_residual_mm: FloatArray
@@ -164,11 +170,20 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState, *
     h_pp = h_pp + looks.sum(np.einsum("nkis,nkjs->nijs", look_by_point, look_by_point))
     b_p = beams.sum(np.einsum("niks,nks->nis", by_point, line[:count, 0]))
     b_p = b_p + looks.sum(np.einsum("nkis,nks->nis", look_by_point, look_residual))
+    at = problem.spots.beam
+    spots = Groups.of(problem.beam_pm[at], pms)
+    turn = rotation[at] if len(rotation) > 1 else rotation
+    spot, spot_by_point = spot_rows(problem.spots, camera_p[at], turn, chart.constants)
+    if len(at):
+        h_pp = h_pp + spots.sum(np.einsum("niks,njks->nijs", spot_by_point, spot_by_point))
+        b_p = b_p + spots.sum(np.einsum("niks,nks->nis", spot_by_point, spot))
     point_covariance = inverse3(h_pp)
     point_step = -np.einsum("nijs,njs->nis", point_covariance, b_p)
     line_cost = np.einsum("nis,nis->ns", line[:, 0], line[:, 0])
     pm_cost = beams.sum(line_cost[:count]) + looks.sum(np.einsum("nks,nks->ns", look_residual, look_residual))
     pm_cost = pm_cost + np.einsum("nis,nis->ns", b_p, point_step)
+    if len(at):
+        pm_cost = pm_cost + spots.sum(np.einsum("nks,nks->ns", spot, spot))
 
     # Optimum of the private variables at these shared ones, as linearised here.
     updated = line[:, 0].copy()
@@ -184,12 +199,15 @@ def _system(problem: PackedProblem, state: SharedState, private: PrivateState, *
     return _System(
         beams=beams,
         looks=looks,
+        spots=spots,
         line=line,
         by_turn=block.by_turn,
         camera_p=camera_p,
         laser_p=block.laser_p,
         whitening=whitening,
         beam_by_point=by_point,
+        spot=spot,
+        spot_by_point=spot_by_point,
         look=look,
         look_raw=look_raw,
         aim_residual_mm=block.rows[count:, 0],
@@ -273,11 +291,12 @@ def _log_shapes(problem: PackedProblem, state: SharedState, system: _System) -> 
 class _SharedDerivatives:
     """Derivatives of all residuals by the shared variables, in units of standard deviations.
 
-    ``line`` (S, B + A, 2, D); ``h_ps`` (S, J, 3, D) of the PMs' normal equations, ``point_gain`` (S, J, 3, D) how the
-    PMs move with the shared variables.
+    ``line`` (S, B + A, 2, D); ``spot`` (S, N, 3, D); ``h_ps`` (S, J, 3, D) of the PMs' normal equations,
+    ``point_gain`` (S, J, 3, D) how the PMs move with the shared variables.
     """
 
     line: FloatArray
+    spot: FloatArray
     h_ps: FloatArray
     point_gain: FloatArray
 
@@ -310,7 +329,11 @@ def _shared_derivatives(problem: PackedProblem, state: SharedState, system: _Sys
     h_ps = _summed(system.beams, outer(system.beam_by_point) @ line[:, :pms])
     by_look = np.einsum("nkis,nkjs->nijs", system.look[:, :, 1:4], system.look[:, :, 4:])
     h_ps[..., look_columns(columns)] += outer(system.looks.sum(by_look))
-    return _SharedDerivatives(line, h_ps, -outer(system.point_covariance) @ h_ps)
+    at_beam = problem.spots.beam
+    spot = spot_derivatives(problem.spots, problem.beam_epoch[at_beam], system.camera_p[at_beam], columns)
+    if len(at_beam):
+        h_ps += _summed(system.spots, outer(system.spot_by_point) @ spot)
+    return _SharedDerivatives(line, spot, h_ps, -outer(system.point_covariance) @ h_ps)
 
 
 def _summed(groups: Groups, values: FloatArray) -> FloatArray:
@@ -351,6 +374,10 @@ def contributions(problem: PackedProblem, state: SharedState, private: PrivateSt
     line_hessian, line_gradient = line_t @ by.line, times(line_t, residual)
     hessian = _summed(system.beams, line_hessian[:, :pms]) + transposed(by.h_ps) @ by.point_gain
     gradient = _summed(system.beams, line_gradient[:, :pms]) + times(transposed(by.h_ps), outer(system.point_step))
+    if by.spot.shape[1]:
+        spot_t = transposed(by.spot)
+        hessian += _summed(system.spots, spot_t @ by.spot)
+        gradient += _summed(system.spots, times(spot_t, outer(system.spot)))
     look_hessian = np.einsum("nkis,nkjs->nijs", look[:, :, 4:], look[:, :, 4:])
     hessian[..., rig, rig] += outer(system.looks.sum(look_hessian))
     look_gradient = np.einsum("nkis,nks->nis", look[:, :, 4:], look[:, :, 0])
@@ -418,14 +445,18 @@ def evaluate(
     by = _shared_derivatives(problem, state, system)
     weights = loss(Costs(outer(system.pm_cost), outer(system.aim_cost), system.prior_cost, outer(system.moved_mm)))
     look, rig, pms = system.look, look_columns(problem.columns), len(problem.beam_pm)
-    line, h_ps, look_t = by.line, by.h_ps, look[:, :, 4:]
+    line, spot, h_ps, look_t = by.line, by.spot, by.h_ps, look[:, :, 4:]
     if loss is not least_squares:
         line = line * np.concatenate([weights.pm[:, problem.beam_pm], weights.aim], axis=1)[..., None, None]
+        spot = spot * weights.pm[:, problem.beam_pm[problem.spots.beam], None, None]
         h_ps = h_ps * weights.pm[..., None, None]
         look_t = look_t * inner(weights.pm)[problem.look_pm, None, None]
     hessian = _stacked(line, by.line) + _stacked(h_ps, by.point_gain)
     hessian[:, rig, rig] += np.einsum("nkis,nkjs->sij", look_t, look[:, :, 4:])
     gradient = _stacked(line, outer(system.line[:, 0])[..., None])
+    if spot.shape[1]:
+        hessian += _stacked(spot, by.spot)
+        gradient = gradient + _stacked(spot, outer(system.spot)[..., None])
     gradient = (gradient + _stacked(h_ps, outer(system.point_step)[..., None]))[..., 0]
     gradient[:, rig] += np.einsum("nkis,nks->si", look_t, look[:, :, 0])
     add_priors(problem, state, gradient, hessian)

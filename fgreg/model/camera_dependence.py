@@ -258,6 +258,11 @@ def nominal_spot_dependence(model: SessionModel, camera_p_mm: FloatArray) -> Cam
     return _untold(nominal_spot_gain(model, camera_p_mm))
 
 
+def nominal_point_dependence(model: SessionModel, camera_p_mm: FloatArray) -> CameraDependence:
+    """Dependence of a point (3,) that the cameras see by itself: it tells nothing about the constants."""
+    return _untold(nominal_point_gain(model, camera_p_mm[None])[0])
+
+
 def _untold(gain: FloatArray) -> CameraDependence:
     return CameraDependence(gain, np.zeros((CONSTANTS, CONSTANTS)), np.zeros(CONSTANTS))
 

@@ -138,6 +138,43 @@ class AimEvent:
             raise FieldError.of("neither" if self.corner is None else "both", "camera_p_spot_mm or corner")
 
 
+_CAMERA_POINT = {"oneOf": [{"required": ["camera_p_mm"]}, {"required": ["left", "right"]}]}
+_BOTH_VIEWS = {"dependentRequired": {"left": ["right"], "right": ["left"]}}
+
+
+def _check_camera_point(point: FloatArray | None, left: FloatArray | None, right: FloatArray | None) -> None:
+    """Whether a point is given in the camera's frame, or else in both views."""
+    if (left is None) != (right is None):
+        given, absent = ("left", "right") if right is None else ("right", "left")
+        raise FieldError.of("nothing", f"[u, v], with {given}", absent)
+    if (point is None) == (left is None):
+        raise FieldError.of("neither" if left is None else "both", "camera_p_mm, or left and right")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SpotRecord:
+    """The laser's spot on the tissue as the camera sees it: a point, or its pixels in both views."""
+
+    JSON_RULES: ClassVar = (_CAMERA_POINT, _BOTH_VIEWS)
+
+    camera_p_mm: Annotated[FloatArray | None, Key("[x, y, z] of the spot in the camera's frame", POINT_MM)] = None
+    covariance: Annotated[
+        FloatArray | None,
+        Key(
+            "of `camera_p_mm`, of seeing it alone; `noise.marker_translation_mm` where absent",
+            Covariance(3),
+            requires="camera_p_mm",
+        ),
+    ] = None
+    left: Annotated[
+        FloatArray | None, Key("[u, v] of the spot in the left frame, as recorded; instead of `camera_p_mm`", _PIXEL)
+    ] = None
+    right: Annotated[FloatArray | None, Key("[u, v] in the right frame", _PIXEL, requires="left")] = None
+
+    def __post_init__(self) -> None:
+        _check_camera_point(self.camera_p_mm, self.left, self.right)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PairEvent:
     """A registration shot: a beam and one look at its photoacoustic marker."""
@@ -147,6 +184,7 @@ class PairEvent:
     pm: Annotated[int, Key("events with the same `pm` are looks at the same spot", Integer(0, 2**31 - 1))]
     marker: Annotated[MarkerRecord, Key("the marker's pose or frames")]
     trus: Annotated[TrusRecord, Key("the look")]
+    spot: Annotated[SpotRecord | None, Key("the laser's spot, where the camera sees it", brief=True)] = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,8 +261,8 @@ class CheckEvent:
     """A point known to both devices. It is never added to the estimate: it checks the registration."""
 
     JSON_RULES: ClassVar = (
-        {"oneOf": [{"required": ["camera_p_mm"]}, {"required": ["left", "right"]}]},
-        {"dependentRequired": {"left": ["right"], "right": ["left"]}},
+        _CAMERA_POINT,
+        _BOTH_VIEWS,
         {"oneOf": [{"required": ["trus_p_mm"]}, {"required": ["trus"]}]},
     )
 
@@ -251,11 +289,7 @@ class CheckEvent:
     trus: Annotated[PlaneRecord | None, Key("the point as seen in the plane; instead of `trus_p_mm`")] = None
 
     def __post_init__(self) -> None:
-        if (self.left is None) != (self.right is None):
-            given, absent = ("left", "right") if self.right is None else ("right", "left")
-            raise FieldError.of("nothing", f"[u, v], with {given}", absent)
-        if (self.camera_p_mm is None) == (self.left is None):
-            raise FieldError.of("neither" if self.left is None else "both", "camera_p_mm, or left and right")
+        _check_camera_point(self.camera_p_mm, self.left, self.right)
         if (self.trus_p_mm is None) == (self.trus is None):
             raise FieldError.of("neither" if self.trus is None else "both", "trus_p_mm or trus")
 

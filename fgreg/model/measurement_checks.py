@@ -83,6 +83,10 @@ def _problems(measured: Measured) -> Iterator[str]:
     elif isinstance(measured, Pair):
         yield from _look(measured.look)
         yield from _number("beam_offset_mm", measured.beam_offset_mm, NOT_NEGATIVE)
+        if (spot := measured.spot) is not None:
+            yield from _point("camera_p_mm of the spot", spot.camera_p_mm, "covariance of the spot", spot.covariance)
+            if spot.dependence is not None and not np.isfinite(spot.dependence.gain).all():
+                yield "the spot's dependence on the camera's constants has an entry that is not finite"
         if not -INT64 <= measured.pm < INT64:
             yield f"pm is {measured.pm}, expected a number of 64 bits"
     else:

@@ -143,10 +143,23 @@ class Aim:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class VisibleSpot:
+    """The laser's spot on the tissue as the camera sees it: (3,) mm, camera frame.
+
+    ``covariance`` (3, 3): also of the sound's origin about the spot. ``dependence``: on the rig's constants.
+    """
+
+    camera_p_mm: FloatArray
+    covariance: FloatArray
+    dependence: CameraDependence | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Pair:
     """A registration shot: one look at PM ``pm`` with the marker pose of its beam, in camera epoch ``epoch``.
 
-    ``beam_offset_mm``: standard deviation of the sound's origin beside the beam, each axis.
+    ``beam_offset_mm``: standard deviation of the sound's origin beside the beam, each axis. ``spot``: where the camera
+    sees the PM's spot; looks of one PM with one marker observation have one spot, the first one's that has it.
     """
 
     t: float
@@ -155,6 +168,16 @@ class Pair:
     marker: MarkerObservation
     look: Look
     beam_offset_mm: float = 0.0
+    spot: VisibleSpot | None = None
+
+
+def visible_spots(pairs: Sequence[Pair]) -> dict[tuple[int, int], VisibleSpot]:
+    """The spot of each shot that has one, by PM and marker observation: a picture shows it once for all its looks."""
+    spots: dict[tuple[int, int], VisibleSpot] = {}
+    for pair in pairs:
+        if pair.spot is not None:
+            spots.setdefault((pair.pm, pair.marker.id), pair.spot)
+    return spots
 
 
 @dataclass(frozen=True, slots=True, eq=False)

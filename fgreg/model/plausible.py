@@ -151,6 +151,7 @@ def implausible_noise(noise: NoiseModel) -> Iterator[str]:
         ("lateral_mm", noise.lateral_mm),
         ("range_mm", noise.range_mm),
         ("beam_offset_mm", noise.beam_offset_mm),
+        ("spot_mm", max(noise.spot_mm)),
     ):
         yield from NOISE_LENGTH.doubt(f"noise.{key}", value)
     yield from NOISE_RADIANS.doubt("noise.marker_rotation_rad", max(noise.marker_rotation_rad))

@@ -372,6 +372,14 @@ class NoiseModel:
     beam_offset_mm: Annotated[
         float, Key("per PM: of the sound's origin beside the beam, each axis", NOISE_MM, brief=True)
     ] = 0.15
+    spot_mm: Annotated[
+        tuple[float, float, float],
+        Key(
+            "per PM: of the sound's origin against the visible spot, along the camera's x, y, z",
+            NumberTuple(3, NOISE_MM),
+            brief=True,
+        ),
+    ] = (0.3, 0.3, 1.0)
     window_rad: Annotated[
         float, Key("per PM: of the window's half width", Number(0.0, 45.0, unit="deg", degrees=True), brief=True)
     ] = math.radians(0.4)

@@ -59,10 +59,11 @@ UNKNOWN = 1e-9
 
 
 def pm_degrees_of_freedom(problem: PackedProblem) -> IntArray:
-    """(J,) degrees of freedom of each PM: 2 equations per beam and 3 per look, less its 3 coordinates."""
+    """(J,) degrees of freedom of each PM: 2 equations per beam, 3 per look and per spot, less its 3 coordinates."""
     pms = len(problem.pms)
     beams = np.bincount(problem.beam_pm, minlength=pms)
-    return np.asarray(2 * beams + 3 * np.bincount(problem.look_pm, minlength=pms) - 3)
+    spots = np.bincount(problem.beam_pm[problem.spots.beam], minlength=pms)
+    return np.asarray(2 * beams + 3 * (np.bincount(problem.look_pm, minlength=pms) + spots) - 3)
 
 
 def pm_limits(problem: PackedProblem, p: float = OUTLIER_P) -> FloatArray:

@@ -14,6 +14,7 @@ from fgreg.model.estimate import AimEstimate, LaserEstimate, PairEstimate
 from fgreg.model.measurements import Measurements
 from fgreg.model.sensitivity import wrap_angle
 from fgreg.model.session_model import SessionModel
+from fgreg.registration.outliers import pm_degrees_of_freedom
 from fgreg.registration.register import Registration
 
 
@@ -88,6 +89,7 @@ def read_pairs(
     looks = problem.looks
     radius = problem.radius_mm + float(state.constant(Constant.RADIUS)[0])
     expected = expected_rotation(problem, state)[0]
+    equations = pm_degrees_of_freedom(problem)
     out: list[PairEstimate] = []
     look = 0
     for pair in measurements.pairs:
@@ -96,7 +98,6 @@ def read_pairs(
             out.append(PairEstimate(pair.t, pair.pm, pair.epoch, used=False, reason=reason))
             continue
         pm, scan = int(problem.look_pm[look]), float(looks.scan_rad[look])
-        beams, seen = int(np.sum(problem.beam_pm == pm)), int(np.sum(problem.look_pm == pm))
         dy = float(points[pm, 1]) - radius * np.sin(scan)
         dz = float(points[pm, 2]) - radius * np.cos(scan)
         delta = float(wrap_angle(np.arctan2(dy, dz) - scan))
@@ -115,7 +116,7 @@ def read_pairs(
                 covariance=covariance[pm],
                 residual_mm=float(np.hypot(*at.look_residual[0, look, :2])),
                 nis=float(nis[pm]),
-                nis_dof=2 * beams + 3 * seen - 3,  # equations of beams and looks, less the PM's coordinates
+                nis_dof=int(equations[pm]),
             )
         )
         look += 1

@@ -41,7 +41,7 @@ from fgreg.registration.error_budget import (
 from fgreg.registration.group_tests import group_conditions
 from fgreg.registration.move_doubt import may_share_a_registration, move_doubt, outliers_in_a_row
 from fgreg.registration.multistart import EpochSearch
-from fgreg.registration.outliers import free_variables
+from fgreg.registration.outliers import free_variables, pm_degrees_of_freedom
 from fgreg.registration.posterior import Posterior
 from fgreg.registration.posterior_mean import (
     estimated_radius,
@@ -231,7 +231,7 @@ def _common_conditions(
     """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
     shots, inlier_aims = registration.shots, len(registration.measurements.aims)
-    equations = 2 * inlier_aims + 2 * len(problem.beam_pm) + 3 * len(problem.look_pm) - 3 * len(problem.pms)
+    equations = 2 * inlier_aims + int(pm_degrees_of_freedom(problem).sum())
     unknowns = free_variables(problem)
     lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
     lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]

@@ -198,10 +198,6 @@ def _misfits(event: Event, setup: Setup | None, seen: ShotsSeen) -> Iterator[Pro
         yield missing
     if setup is None:
         return
-    if isinstance(event, CheckEvent) and event.left is not None and not {"camera", "camera.right"} <= setup.present:
-        yield Problem(
-            ("left",), "pixels, but no camera with camera.right in session.yaml", "them there, or camera_p_mm"
-        )
     corner = event.corner if isinstance(event, AimEvent) else None
     for path, record in _records(event):
         if isinstance(record, MarkerRecord):
@@ -210,6 +206,11 @@ def _misfits(event: Event, setup: Setup | None, seen: ShotsSeen) -> Iterator[Pro
         elif record.frame is not None and not setup.present & {"probe.channels", "probe.image"}:
             found = "a frame, but neither probe.channels nor probe.image in session.yaml"
             yield Problem((*path, "frame"), found, "one of them there, to read the frame by")
+    spot = event.spot if isinstance(event, PairEvent) else None
+    point = event if isinstance(event, CheckEvent) else spot
+    if point is not None and point.left is not None and not {"camera", "camera.right"} <= setup.present:
+        found = "pixels, but no camera with camera.right in session.yaml"
+        yield Problem(("left",) if spot is None else ("spot", "left"), found, "them there, or camera_p_mm")
     if corner is not None:
         board = setup.board
         if "board" not in setup.present:

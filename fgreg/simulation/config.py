@@ -99,6 +99,7 @@ class SimulationConfig:
         initial_laser: record a rough ``initial.marker_T_laser`` (3 deg, 2 mm off per axis).
         camera_declared: poses, but of a session that has the camera, marker and board: what deviates in these acts on
             poses as it would on frames.
+        spots: pairs have the pixels of the PM's visible spot in both views. spot_px: their error (sigma, each axis).
         checks: points known to both devices (``SimulatedSession.checks``). check_sigma_mm: per axis, of the camera's
             and of the TRUS side.
 
@@ -155,6 +156,8 @@ class SimulationConfig:
     camera_moves_reported: bool = True
     initial_laser: bool = False
     camera_declared: bool = False
+    spots: bool = False
+    spot_px: float = 0.5
     checks: int = 0
     check_sigma_mm: tuple[float, float] = (0.35, 0.35)
 
@@ -219,6 +222,8 @@ class SimulationConfig:
             raise ValueError("water_mm has to be 0 or more, water_index at least 1")
         if not 0 <= self.outlier_pairs <= self.pairs:
             raise ValueError(f"outlier_pairs is {self.outlier_pairs}, expected 0 to {self.pairs}")
+        if self.spots and not (self.has_camera and self.camera.right):
+            raise ValueError("spots are pixels of two declared cameras: frames or camera_declared")
         if self.frames and self.probe.channels is None:
             if self.probe.image is None:
                 raise ValueError("raw frames need probe.channels or probe.image")

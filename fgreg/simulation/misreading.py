@@ -140,6 +140,12 @@ def points_read(config: SimulationConfig, camera_p_mm: FloatArray) -> FloatArray
     return _fitted(config, start, body, body, np.ones((n, 2, 1)), turns=False)[:, :3, 3]
 
 
+def pixels_seen(config: SimulationConfig, camera_p_mm: FloatArray) -> FloatArray:
+    """(2, 2) where the true cameras, left and right, have a point (3,)."""
+    views = _views(true_rig(config))
+    return np.stack([project_points(camera, transform_points(turn, camera_p_mm)) for camera, turn in views])
+
+
 def _scaled(config: SimulationConfig, camera_p_mm: FloatArray) -> FloatArray:
     """Points (n, 3) as read where lengths are wrong, and depths by the focal lengths: disparity grows with them."""
     by = config.deviations

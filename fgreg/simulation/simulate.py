@@ -31,6 +31,7 @@ from fgreg.model.events import (
     Event,
     MarkerRecord,
     PairEvent,
+    SpotRecord,
     TrackEvent,
     TrusRecord,
 )
@@ -40,7 +41,7 @@ from fgreg.simulation.config import SimulationConfig, Sweep
 from fgreg.simulation.deviations import named
 from fgreg.simulation.disturbances import Disturbances
 from fgreg.simulation.documents import degrees, round_array, rows, session_document
-from fgreg.simulation.misreading import marker_poses_read, points_read, spots_read
+from fgreg.simulation.misreading import marker_poses_read, pixels_seen, points_read, spots_read
 from fgreg.simulation.pictures import LookPicture, ShotPicture
 from fgreg.simulation.scene import AimShots, Scene, Shots, UnseenError, draw_aim_shots, draw_pm_shots, draw_scene
 
@@ -107,11 +108,11 @@ class _Recorder:
     """Collects the events of one session in the order in which they happen."""
 
     def __init__(self, config: SimulationConfig, seed: int) -> None:
-        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(10)]
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(11)]
         self.config, self.seed = config, seed
         self.scene_rng, self.aim_rng, self.shot_rng, self.miss_rng = streams[:4]
         self.marker_rng, self.stage_rng, self.look_rng, self.misc_rng = streams[4:8]
-        self.beside_rng, self.check_rng = streams[8:]
+        self.beside_rng, self.check_rng, self.spot_rng = streams[8:]
         self.events: list[Document] = []
         self.frames: dict[str, Callable[[], Frame]] = {}
         self.true_markers: dict[int, FloatArray] = {}
@@ -300,9 +301,18 @@ class _Recorder:
     def _pair(self, i: int, epoch: int, pms: Shots, markers: list[MarkerRecord | None], looks: _Looks) -> None:
         name = f"pm-{i:02d}"
         marker = self._pm_marker(name, i, epoch, pms, markers)
+        spot = self._spot(pms.spot_mm[i], epoch) if self.config.spots else None
         for k in range(looks.scan_deg.shape[1]):
             trus = self._look(name if k == 0 else f"{name}-look-{k}", looks, i, k)
-            self._add(PairEvent(self._now(), 0, i, marker, trus), pms.camera_T_marker[i])
+            self._add(PairEvent(self._now(), 0, i, marker, trus, spot), pms.camera_T_marker[i])
+
+    def _spot(self, trus_p_mm: FloatArray, epoch: int) -> SpotRecord:
+        """Where the true cameras see the spot whose sound comes from a point (3,)."""
+        camera_p = transform_points(inverse(self.scene.trus_T_camera[epoch]), trus_p_mm)
+        seen = camera_p + self.config.noise.spot_mm * self.spot_rng.standard_normal(3)
+        noise = self.config.spot_px * self.spot_rng.standard_normal((2, 2))
+        left, right = round_array(pixels_seen(self.config, seen) + noise)
+        return SpotRecord(left=left, right=right)
 
     def _track(
         self,

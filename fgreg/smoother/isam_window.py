@@ -24,6 +24,7 @@ from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import point_on_line_factor
 from fgreg.factors.rig import RigKey
 from fgreg.factors.sensitivity_prior import sensitivity_prior_factor
+from fgreg.factors.visible_spot import visible_spot_factor
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
@@ -31,7 +32,8 @@ from fgreg.graph.gtsam_graph import Variable, make_ordering
 from fgreg.graph.gtsam_values import beam_of_chart, bearing_from_array
 from fgreg.graph.packing import line_sigma_mm, marker_gain
 from fgreg.graph.shared_state import Quadratic, SharedState
-from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance
+from fgreg.graph.visible_spots import spot_gain, usable_spot_covariance
+from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Pair, usable_covariance, visible_spots
 from fgreg.model.sensitivity import arc_of_rotation, sensitivity_priors
 from fgreg.model.session_model import SessionModel
 from fgreg.model.systematic import TEXTS
@@ -180,6 +182,7 @@ def factors_of(
     radius_mm = model.probe.radius_mm
     centres, gains, sigmas = windows
     graph = gtsam.NonlinearFactorGraph()
+    spots = visible_spots(pairs)
     shot_of: dict[int, int] = {}
     for i, pair in enumerate(pairs):
         look, marker = pair.look, pair.marker
@@ -193,6 +196,9 @@ def factors_of(
                     shared[0], markers[shot], shared[1], lambdas[shot], point, layout.marker_T_nominal, sigma_mm
                 )
             )
+            if (spot := spots.get((pair.pm, marker.id))) is not None:
+                covariance = usable_spot_covariance(spot)
+                graph.add(visible_spot_factor(shared[0], point, spot.camera_p_mm, covariance, spot_gain(spot), rig))
         covariance = usable_covariance(look.covariance, (FLOOR_MM,) * 2)
         graph.add(
             point_on_arc_factor(
