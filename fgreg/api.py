@@ -20,13 +20,16 @@ from fgreg.model.events import ExcludeEvent as ExcludeEvent
 from fgreg.model.events import IncludeEvent as IncludeEvent
 from fgreg.model.events import MarkerRecord as MarkerRecord
 from fgreg.model.events import PairEvent as PairEvent
+from fgreg.model.events import PointEvent as PointEvent
 from fgreg.model.events import SpotRecord as SpotRecord
 from fgreg.model.events import TrackEvent as TrackEvent
 from fgreg.model.events import TrusRecord as TrusRecord
+from fgreg.model.known_points import data_at
 from fgreg.model.measurement_checks import problems_of_all
 from fgreg.model.measurements import Aim as Aim
 from fgreg.model.measurements import Check as Check
 from fgreg.model.measurements import EpochStart as EpochStart
+from fgreg.model.measurements import KnownPoint as KnownPoint
 from fgreg.model.measurements import Look as Look
 from fgreg.model.measurements import MarkerObservation as MarkerObservation
 from fgreg.model.measurements import Measurements as Measurements
@@ -46,7 +49,7 @@ from fgreg.pipeline.solve import SolveReport as SolveReport
 from fgreg.pipeline.solve import SolveRequest, solve_session
 from fgreg.pipeline.verify import VerifyReport as VerifyReport
 from fgreg.pipeline.verify import verify_session
-from fgreg.registration.checks import with_checks
+from fgreg.registration.checks import not_compared, with_checks
 from fgreg.registration.rig_at_checks import rig_at_checks
 from fgreg.registration.solve import solve as solve_batch
 from fgreg.session.session_reader import Session as Session
@@ -130,11 +133,12 @@ def solve_measurements(
     """Solve measurements of your own, without files.
 
     Args:
-        measurements: aims, pairs and camera epochs. Without a registration the verdict is ``refused``, and says why.
+        measurements: aims, pairs, known points and camera epochs. Without a registration the verdict is ``refused``,
+            and says why.
         model: how the session was set up.
         config: limit of the verdict, and settings of the estimate.
         tracks: queries, answered from all measurements; they never enter the estimate.
-        checks: points known to both devices; nor do they.
+        checks: points known to both devices; nor do they. One that is a point of ``measurements`` is not compared.
 
     Raises:
         InputError: a number that is no measurement: not finite, no covariance, beyond reason.
@@ -143,8 +147,10 @@ def solve_measurements(
         raise InputError(where, problem, "numbers that are a measurement")
     config = config or SolveConfig()
     solution = solve_batch(measurements, tracks, model, config)
+    data = [data_at(check, measurements.points) for check in checks]
+    compared = [c if why is None else not_compared(c.t, why) for c, why in zip(checks, data, strict=True)]
     rigs = rig_at_checks(model, solution.snapshot, checks)
-    return with_checks(solution.as_session(model.name), checks, config.limit_mm, model.targets_mm, rigs)
+    return with_checks(solution.as_session(model.name), compared, config.limit_mm, model.targets_mm, rigs)
 
 
 def _path(path: str | Path | None) -> Path | None:

@@ -26,6 +26,7 @@ from fgreg.model.measurements import (
     Aim,
     CameraDependence,
     EpochStart,
+    KnownPoint,
     Look,
     MarkerObservation,
     Measurements,
@@ -280,6 +281,7 @@ def make_measurements(
     roll_deg: float = 180.0,
     sound_speed_ratio: float = 1.0,
     spot_sigma_mm: tuple[float, float, float] | None = None,
+    points: int = 0,
     session: SessionModel | None = None,
     marker_T_laser: FloatArray | None = None,
     trus_T_camera: FloatArray | None = None,
@@ -305,6 +307,7 @@ def make_measurements(
         roll_deg: largest roll of the marker about its beam.
         sound_speed_ratio: true over assumed.
         spot_sigma_mm: the camera sees the spot of each look with these sigmas along its axes; None: it does not.
+        points: known points, divided evenly among the epochs, located to 0.4 mm by each device.
         session: noise and probe to use; ``make_session()`` where absent.
         marker_T_laser, trus_T_camera: (4, 4) truth (of the first epoch), random where absent.
 
@@ -417,7 +420,18 @@ def make_measurements(
         theta_rad=tuple(thetas),
         rotation_rad=tuple(rotations),
     )
-    return session, Measurements(tuple(aim_list), tuple(pair_list), tuple(starts)), truth
+    around, point_list = as_float_array(np.diag([0.16] * 3), 3, 3), []
+    for place in range(points):
+        of = place * epochs // points
+        bearing, reach = rng.uniform(-0.5, 0.5), probe.radius_mm + rng.uniform(22.0, 42.0)
+        trus_p = np.array([rng.uniform(-20.0, 20.0), reach * math.sin(bearing), reach * math.cos(bearing)])
+        camera_p = (inverse(registrations[of]) @ np.array([*trus_p, 1.0]))[:3]
+        off = rng.normal(size=(2, 3)) * 0.4 if noise else np.zeros((2, 3))
+        mine = [pair.t for pair in pair_list if pair.epoch == of]
+        at = mine[len(mine) // 3]
+        seen, shown = as_float_array(camera_p + off[0], 3), as_float_array(trus_p + off[1], 3)
+        point_list.append(KnownPoint(at, of, seen, around, shown, around))
+    return session, Measurements(tuple(aim_list), tuple(pair_list), tuple(starts), tuple(point_list)), truth
 
 
 def with_noise(session: SessionModel, **changes: float | tuple[float, float, float]) -> SessionModel:

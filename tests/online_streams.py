@@ -20,7 +20,7 @@ from tests.forward import Truth, make_measurements, random_marker_T_laser, rando
 
 
 def events(measurements: Measurements) -> Iterator[OnlineEvent]:
-    """Aims, pairs and moves in the order in which they happened."""
+    """Aims, pairs, known points and moves in the order in which they happened."""
     yield from measurements.aims
     epoch = 0
     for pair in measurements.pairs:
@@ -29,6 +29,7 @@ def events(measurements: Measurements) -> Iterator[OnlineEvent]:
             start: EpochStart = measurements.epochs[epoch]
             yield CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance)
         yield pair
+        yield from (point for point in measurements.points if (point.epoch, point.t) == (pair.epoch, pair.t))
 
 
 def run(engine: OnlineRegistration, measurements: Measurements) -> list[OnlineEstimate]:
@@ -47,7 +48,8 @@ def first(measurements: Measurements, pairs: int) -> Measurements:
     """The measurements up to a number of pairs."""
     taken = measurements.pairs[:pairs]
     epochs = measurements.epochs[: taken[-1].epoch + 1] if taken else measurements.epochs[:1]
-    return replace(measurements, pairs=taken, epochs=epochs)
+    points = tuple(point for point in measurements.points if taken and point.t <= taken[-1].t)
+    return replace(measurements, pairs=taken, epochs=epochs, points=points)
 
 
 def batch(measurements: Measurements, model: SessionModel) -> Registration:

@@ -134,6 +134,14 @@ def events() -> list[dict[str, Any]]:
         {"type": "exclude", "t": 13.0, "pm": 0, "reason": "the fibre was bumped", "by": "A. N."},
         {"type": "exclude", "t": 13.0, "line": 2},
         {"type": "include", "t": 14.0, "pm": 0, "reason": "it was not"},
+        {
+            "type": "point",
+            "t": 15.0,
+            "left": [330, 250.5],
+            "right": [300, 250.5],
+            "trus_p_mm": [3, 4, 40],
+            "trus_covariance": diagonal(0.04, 0.04, 0.04),
+        },
     ]
     return cast(list[dict[str, Any]], json.loads(json.dumps(data)))
 

@@ -36,6 +36,8 @@ SHAPES: dict[str, dict[str, Any]] = {
     "three looks, own markers": {"pairs": 10, "looks_per_pm": 3},
     "two looks, one marker": {"pairs": 12, "looks_per_pm": 2, "share_marker": True},
     "spots seen": {"pairs": 8, "looks_per_pm": 2, "share_marker": True, "spot_sigma_mm": (0.4, 0.4, 1.5)},
+    "known points": {"pairs": 12, "points": 3},
+    "known points, two epochs": {"pairs": 24, "epochs": 2, "points": 4, "known_motion": True},
     "marker bias": {"pairs": 18, "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.3))},
 }
 

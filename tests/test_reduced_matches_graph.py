@@ -37,6 +37,13 @@ CASES: dict[str, dict[str, Any]] = {
         "known_motion": True,
         "spot_sigma_mm": (0.4, 0.4, 1.5),
     },
+    "known points": {
+        "pairs": 10,
+        "epochs": 2,
+        "known_motion": True,
+        "points": 4,
+        "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.2), systematic=Systematic()),
+    },
     "marker bias": {"pairs": 12, "session": make_session(noise_model=NoiseModel(marker_bias_mm=0.3))},
 }
 
@@ -94,6 +101,7 @@ def test_gradient_is_the_derivative_of_the_profiled_cost() -> None:
         epochs=2,
         known_motion=True,
         spot_sigma_mm=(0.5, 0.4, 1.5),
+        points=3,
         session=make_session(noise_model=NoiseModel(marker_bias_mm=0.1), systematic=Systematic()),
     )
     problem = pack(with_dependences(measurements, 5), model)

@@ -342,7 +342,7 @@ def test_places_where_no_result_can_be(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             check_output(path, RESULT_KIND)
         assert caught.value.found == found
-    assert len(read_session(session).events) == 19
+    assert len(read_session(session).events) == 20
 
 
 def written(tmp_path: Path, model: SessionModel) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from fgreg.model.events import (
     IncludeEvent,
     NoteEvent,
     PairEvent,
+    PointEvent,
     RefusedEvent,
     StageEvent,
     TrackEvent,
@@ -124,10 +125,10 @@ def test_what_the_probe_is_made_of_is_never_guessed(tmp_path: Path, key: str) ->
 def test_every_event(tmp_path: Path) -> None:
     session = read_session(session_files.write(tmp_path))
     events = session.events
-    assert [event.line for event in events] == list(range(1, 20))
+    assert [event.line for event in events] == list(range(1, 21))
     assert [event.t for event in events[3:6]] == [3.0, 3.0, 4.0]
     kinds = [NoteEvent, AimEvent, AimEvent, *[PairEvent] * 4, *[TrackEvent] * 3, *[CameraMovedEvent] * 2]
-    left_out = [ExcludeEvent, ExcludeEvent, IncludeEvent]
+    left_out = [ExcludeEvent, ExcludeEvent, IncludeEvent, PointEvent]
     assert [type(event) for event in events] == [*kinds, RefusedEvent, StageEvent, CheckEvent, CheckEvent, *left_out]
     frames = tmp_path.resolve() / "frames"
 
@@ -260,7 +261,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_tolerated(tmp_path: Path) -
         path = folder / name
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
     session = read_session(folder)
-    assert len(session.events) == 19
+    assert len(session.events) == 20
     assert session.warnings == ()
 
 
@@ -273,9 +274,9 @@ def test_a_last_line_cut_short_is_dropped_with_a_warning(tmp_path: Path, rest: b
     with (folder / "events.jsonl").open("ab") as file:
         file.write(rest)
     session = read_session(folder)
-    assert len(session.events) == 19
+    assert len(session.events) == 20
     assert len(session.warnings) == 1
-    assert "line 20" in session.warnings[0]
+    assert "line 21" in session.warnings[0]
 
 
 def test_a_whole_last_line_without_its_line_end_counts(tmp_path: Path) -> None:
@@ -283,7 +284,7 @@ def test_a_whole_last_line_without_its_line_end_counts(tmp_path: Path) -> None:
     path = folder / "events.jsonl"
     path.write_bytes(path.read_bytes().rstrip(b"\n"))
     session = read_session(folder)
-    assert (len(session.events), session.warnings) == (19, ())
+    assert (len(session.events), session.warnings) == (20, ())
 
 
 def test_every_cut_of_the_log_reads(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from fgreg.graph.packing import pack
 from fgreg.graph.reduced_blocks import initial_private
 from fgreg.graph.reduced_graph import evaluate
 from fgreg.graph.shared_state import make_state
-from fgreg.model.measurements import Aim, Look, MarkerObservation, Measurements, Pair, VisibleSpot
+from fgreg.model.measurements import Aim, KnownPoint, Look, MarkerObservation, Measurements, Pair, VisibleSpot
 from fgreg.model.session_model import SessionModel
 
 
@@ -63,6 +63,12 @@ def _exact_spot(pair: Pair, truth: FullTruth) -> VisibleSpot | None:
     return replace(pair.spot, camera_p_mm=as_float_array(camera_p, 3))
 
 
+def _exact_point(point: KnownPoint, truth: FullTruth) -> KnownPoint:
+    """The point as the camera would have it without noise, where the scanner has it."""
+    camera_p = transform_points(inverse(truth.trus_T_camera[point.epoch]), point.trus_p_mm)
+    return replace(point, camera_p_mm=as_float_array(camera_p, 3))
+
+
 def _exact_aim(aim: Aim, true_T: FloatArray, truth: FullTruth, bias_mm: FloatArray) -> Aim:
     """The aim with its marker as it was and its spot on the true beam, as far along as the recorded one."""
     camera_T_laser = true_T @ truth.marker_T_laser
@@ -78,7 +84,7 @@ def truth_covariance(measurements: Measurements, model: SessionModel, truth: Ful
 
 def beam_covariance(measurements: Measurements, model: SessionModel, truth: FullTruth) -> FloatArray:
     """(4, 4) bound of the beam chart (x, y, a, b) about the true beam, from the aims alone."""
-    alone = replace(measurements, pairs=(), epochs=measurements.epochs[:1])
+    alone = replace(measurements, pairs=(), epochs=measurements.epochs[:1], points=())
     information, at = _truth_information(alone, model, replace(truth, pair_camera_T_marker=()))
     # Without pairs the registration is undetermined; only the aims and the prior of the bias determine the beam.
     return _inverse(information[at:, at:])[:4, :4]
@@ -105,7 +111,8 @@ def _truth_information(measurements: Measurements, model: SessionModel, truth: F
         _exact_aim(aim, true_T, truth, bias)
         for aim, true_T in zip(measurements.aims, truth.aim_camera_T_marker, strict=True)
     )
-    problem = pack(replace(measurements, aims=aims, pairs=pairs), model)
+    known = tuple(_exact_point(point, truth) for point in measurements.points)
+    problem = pack(replace(measurements, aims=aims, pairs=pairs, points=known), model)
     epochs = len(measurements.epochs)
     state = make_state(np.stack(truth.trus_T_camera[:epochs])[None], truth.marker_T_laser)
     state.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad

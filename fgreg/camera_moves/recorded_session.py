@@ -273,7 +273,7 @@ def split_epochs(
 
     A loop closure links its epoch to the earlier one by a motion prior.
 
-    All looks at a PM are of the epoch of its first.
+    All looks at a PM are of the epoch of its first, known points of that of their time.
     """
     starts: list[EpochStart] = []
     for epoch, start in enumerate(measurements.epochs):
@@ -288,7 +288,15 @@ def split_epochs(
         replace(pair, epoch=_with_moves(pair.epoch, first[pair.epoch, pair.pm], [(m.epoch, m.since) for m in moves]))
         for pair in measurements.pairs
     )
-    return replace(measurements, pairs=pairs, epochs=tuple(starts))
+    points = tuple(
+        replace(
+            point,
+            epoch=point.epoch
+            + sum(m.epoch < point.epoch or (m.epoch == point.epoch and m.since_t <= point.t) for m in moves),
+        )
+        for point in measurements.points
+    )
+    return replace(measurements, pairs=pairs, epochs=tuple(starts), points=points)
 
 
 def _with_moves(epoch: int, index: int, places: Sequence[tuple[int, int]]) -> int:

@@ -24,6 +24,7 @@ from fgreg.model.estimate import (
     EpochEstimate,
     LaserEstimate,
     PairEstimate,
+    PointEstimate,
     SessionEstimate,
     Timing,
     Verdict,
@@ -146,7 +147,7 @@ def render_summary(model: SessionModel, estimate: SessionEstimate, extra: Summar
         parts += ["", *_checks(estimate)]
     if estimate.assumptions:
         parts += ["", *_assumptions(estimate)]
-    closing = [*_aims(estimate.aims), *_timing(estimate.timing), *_closing(extra)]
+    closing = [*_aims(estimate.aims), *_points(estimate.points), *_timing(estimate.timing), *_closing(extra)]
     if closing:
         parts += ["", *closing]
     return Group(*(Text(part) if isinstance(part, str) else part for part in parts))
@@ -398,6 +399,17 @@ def _aims(aims: Sequence[AimEstimate]) -> Iterator[RenderableType]:
     for number, aim in enumerate(aims):
         if not aim.used:
             yield bullet(f"aim {number}, {aim.t:.1f} s, not used: {aim.reason}")
+
+
+def _points(points: Sequence[PointEstimate]) -> Iterator[RenderableType]:
+    if not points:
+        return
+    nis = [point.nis for point in points if point.nis is not None]
+    text = f"Known points: {sum(point.used for point in points)} of {len(points)} used as data"
+    yield text + (f", nis against the other shots {max(nis):.1f} at most (three degrees of freedom)" if nis else "")
+    for point in points:
+        if not point.used:
+            yield bullet(f"known point, {point.t:.1f} s, not used: {point.reason}")
 
 
 def _closing(extra: SummaryExtras) -> Iterator[RenderableType]:

@@ -78,6 +78,16 @@ def summary_dict(model: SessionModel, estimate: SessionEstimate, extra: SummaryE
             }
             for aim in estimate.aims
         ],
+        "points": [
+            {
+                "t": point.t,
+                "used": point.used,
+                "reason": point.reason,
+                "error_mm": None if point.error_mm is None else [_plain(value) for value in point.error_mm],
+                "nis": _plain(point.nis),
+            }
+            for point in estimate.points
+        ],
         "targets": len(model.targets_mm),
     }
     if estimate.timing is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,10 +12,10 @@ from fgreg.geometry.rig import CAMERA
 from fgreg.geometry.transforms import FloatArray, as_float_array
 from fgreg.model.camera_dependence import nominal_point_dependence
 from fgreg.model.camera_model import StereoRig
-from fgreg.model.events import CheckEvent, PlaneRecord, SpotRecord
+from fgreg.model.events import CheckEvent, PlaneRecord, PointEvent, SpotRecord
 from fgreg.model.lens import focal_px, normalized_from_pixels
 from fgreg.model.measurement_checks import problem_of
-from fgreg.model.measurements import FLOOR_MM, Check, VisibleSpot, usable_covariance
+from fgreg.model.measurements import FLOOR_MM, Check, KnownPoint, VisibleSpot, usable_covariance
 from fgreg.model.session_model import SessionModel
 
 PIXEL_SIGMA = 0.5
@@ -25,9 +26,20 @@ PLANE_SHARE = 1.0 / 6.0
 """How well the brightest stage angle is found, as a share of the window's half width (1 deg at 6 deg)."""
 _ROUNDS = 10
 
+PointT = TypeVar("PointT", Check, KnownPoint)
+
 
 def check_measurement(event: CheckEvent, epoch: int, model: SessionModel) -> Check | str:
     """The check as a measurement in camera epoch ``epoch``, or the reason why it is not usable."""
+    return _located(event, epoch, model, Check)
+
+
+def known_point(event: PointEvent, epoch: int, model: SessionModel) -> KnownPoint | str:
+    """The point as a measurement in camera epoch ``epoch``, or the reason why it is not usable."""
+    return _located(event, epoch, model, KnownPoint)
+
+
+def _located(event: CheckEvent | PointEvent, epoch: int, model: SessionModel, kind: type[PointT]) -> PointT | str:
     seen = _camera_point(event, model)
     if isinstance(seen, str):
         return seen
@@ -42,15 +54,17 @@ def check_measurement(event: CheckEvent, epoch: int, model: SessionModel) -> Che
     else:
         raise AssertionError("the reader requires the point in the TRUS frame")
     floor = (FLOOR_MM,) * 3
-    check = Check(event.t, epoch, camera_p, covariance, trus_p, trus_covariance)
-    return problem_of(check) or replace(
-        check,
+    point = kind(event.t, epoch, camera_p, covariance, trus_p, trus_covariance)
+    return problem_of(point) or replace(
+        point,
         covariance=usable_covariance(covariance, floor),
         trus_covariance=usable_covariance(trus_covariance, floor),
     )
 
 
-def _camera_point(record: CheckEvent | SpotRecord, model: SessionModel) -> tuple[FloatArray, FloatArray] | str:
+def _camera_point(
+    record: CheckEvent | PointEvent | SpotRecord, model: SessionModel
+) -> tuple[FloatArray, FloatArray] | str:
     """The point (3,) mm in the camera's frame and its covariance (3, 3), or the reason why there is none."""
     if record.camera_p_mm is not None:
         default = np.diag(np.square(model.noise.marker_translation_mm))

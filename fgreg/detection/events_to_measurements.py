@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgreg.detection.check_points import check_measurement, visible_spot
+from fgreg.detection.check_points import check_measurement, known_point, visible_spot
 from fgreg.detection.corner_noise import CornerNoise, Misfit, Weighed, pool_corner_noise
 from fgreg.detection.results import (
     BoardFit,
@@ -36,6 +36,7 @@ from fgreg.model.events import (
     Event,
     MarkerRecord,
     PairEvent,
+    PointEvent,
     TrackEvent,
     TrusRecord,
     looks_of,
@@ -45,12 +46,14 @@ from fgreg.model.events import (
     refused_lines,
 )
 from fgreg.model.excluded_shots import excluded_shots
+from fgreg.model.known_points import data_at
 from fgreg.model.measurement_checks import look_problem, marker_problem, spot_problem
 from fgreg.model.measurements import (
     Aim,
     CameraDependence,
     Check,
     EpochStart,
+    KnownPoint,
     Look,
     MarkerObservation,
     Measurements,
@@ -97,6 +100,7 @@ class ExtractedMeasurements:
     marker_noise: CornerNoise
     board_noise: CornerNoise
     epoch_of: tuple[int, ...]
+    point_events: tuple[int, ...] = ()
     checks: Mapping[int, Check] = field(default_factory=dict)
     excluded: tuple[ExcludedShot, ...] = ()
     refused: tuple[str, ...] = ()
@@ -144,10 +148,14 @@ def extract_measurements(
             if event.line in by_hand:
                 set_aside |= builder.take_out(index)
                 builder.unused[index] = by_hand[event.line].text
-        elif isinstance(event, AimEvent | PairEvent | TrackEvent | CheckEvent):
+        elif isinstance(event, AimEvent | PairEvent | TrackEvent | PointEvent | CheckEvent):
             builder.unused[index] = f"it was refused when it was taken: {refused[event.line]}"
+    for index, check in [*builder.checks.items()]:
+        if (reason := data_at(check, builder.points.values())) is not None:
+            builder.unused[index] = reason
+            del builder.checks[index]
     return ExtractedMeasurements(
-        measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts),
+        measurements=Measurements(tuple(builder.aims), tuple(builder.pairs), starts, tuple(builder.points.values())),
         tracks=tuple(builder.tracks),
         aim_events=tuple(builder.aim_events),
         pair_events=tuple(builder.pair_events),
@@ -162,6 +170,7 @@ def extract_measurements(
         marker_noise=builder.marker_noise,
         board_noise=builder.board_noise,
         epoch_of=epoch_of,
+        point_events=tuple(builder.points),
         checks=builder.checks,
         excluded=tuple(by_hand.values()),
         refused=refused_evidence(events),
@@ -218,6 +227,7 @@ class _Builder:
         self.pair_events: list[int] = []
         self.track_events: list[int] = []
         self.checks: dict[int, Check] = {}
+        self.points: dict[int, KnownPoint] = {}
         self.unused: dict[int, str] = {}
         self.ids: dict[object, int] = {}
         self.next_id = 0
@@ -225,6 +235,13 @@ class _Builder:
 
     def add(self, index: int, event: Event, epoch: int) -> None:
         """Turn one event into a measurement, or store the reason why not."""
+        if isinstance(event, PointEvent):
+            point = known_point(event, epoch, self.model)
+            if isinstance(point, str):
+                self.unused[index] = point
+            else:
+                self.points[index] = point
+            return
         if isinstance(event, CheckEvent):
             check = check_measurement(event, epoch, self.model)
             if isinstance(check, str):

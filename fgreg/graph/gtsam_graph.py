@@ -20,6 +20,7 @@ import numpy as np
 
 from fgreg.errors import EstimationError
 from fgreg.factors.epoch_change import epoch_change_factor
+from fgreg.factors.known_point import known_point_factor
 from fgreg.factors.marker_pose import marker_pose_factor
 from fgreg.factors.point_on_arc import point_on_arc_factor
 from fgreg.factors.point_on_line import aim_point_on_line_factor, point_on_line_factor
@@ -29,6 +30,7 @@ from fgreg.factors.visible_spot import visible_spot_factor
 from fgreg.geometry.rig import CAMERA, COUNT
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import make_columns
+from fgreg.graph.known_points import point_arrays
 from fgreg.graph.packing import ConstantsPrior, constants_prior, least_sigmas, line_sigma_mm, marker_gain
 from fgreg.graph.visible_spots import spot_gain, usable_spot_covariance
 from fgreg.model.measurements import FLOOR_MM, POSE_FLOOR, Measurements, usable_covariance, visible_spots
@@ -86,6 +88,7 @@ class GraphKeys:
         pair_shot: per pair, its place in ``shots``.
         theta: one per pair.
         trus_p_pm: by PM.
+        points: where the known points are in the camera's frame.
     """
 
     trus_T_camera: tuple[int, ...]
@@ -96,6 +99,7 @@ class GraphKeys:
     pair_shot: tuple[int, ...]
     theta: tuple[int, ...]
     trus_p_pm: dict[int, int]
+    points: tuple[int, ...]
 
     @property
     def shared(self) -> tuple[int, ...]:
@@ -115,7 +119,7 @@ class GraphKeys:
     @property
     def private(self) -> tuple[int, ...]:
         """All private variables in elimination order: points, distances and angles, marker poses."""
-        points = (*(aim.camera_p_spot for aim in self.aims), *self.trus_p_pm.values())
+        points = (*(aim.camera_p_spot for aim in self.aims), *self.trus_p_pm.values(), *self.points)
         return (*points, *self.lam, *self.theta, *self.camera_T_marker)
 
 
@@ -202,6 +206,7 @@ def _make_keys(measurements: Measurements, constants: tuple[int, ...]) -> GraphK
         pair_shot=tuple(pair_shot),
         theta=tuple(Variable.theta.key(i) for i in range(len(measurements.pairs))),
         trus_p_pm=points,
+        points=tuple(Variable.camera_p_spot.key(len(aims) + i) for i in range(len(measurements.points))),
     )
 
 
@@ -244,6 +249,8 @@ def build_graph(
         else:
             spot_noise = gtsam.noiseModel.Gaussian.Covariance(spot_covariance)
             graph.add(gtsam.PriorFactorPoint3(own.camera_p_spot, aim.camera_p_spot_mm, spot_noise))
+    if keys.rig is not None:
+        _add_points(graph, keys, measurements, session, keys.rig)
     spots = visible_spots(measurements.pairs)
     for shot in keys.shots:
         pair = measurements.pairs[shot.pair]
@@ -305,6 +312,19 @@ def build_graph(
         session=session,
         marker_T_nominal=nominal,
     )
+
+
+def _add_points(
+    graph: gtsam.NonlinearFactorGraph, keys: GraphKeys, measurements: Measurements, session: SessionModel, rig: RigKey
+) -> None:
+    """What camera and scanner say of the known points. (There is a rig always: the window's edge.)"""
+    points = point_arrays(measurements.points, session, [point.epoch for point in measurements.points])
+    for i, own in enumerate(keys.points):
+        graph.add(spot_factor(own, points.camera_p_mm[i], points.covariance[i], points.seen[i], rig))
+        registration = keys.trus_T_camera[points.epoch[i]]
+        graph.add(
+            known_point_factor(registration, own, points.trus_p_mm[i], points.trus_covariance[i], points.shown[i], rig)
+        )
 
 
 def _rig_of(measurements: Measurements, session: SessionModel) -> Rig:

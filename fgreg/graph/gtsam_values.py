@@ -15,6 +15,7 @@ import numpy as np
 from fgreg.geometry.rig import COUNT, Constant
 from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.gtsam_graph import ExplicitGraph
+from fgreg.graph.known_points import camera_places, point_arrays
 from fgreg.model.measurements import Look
 
 
@@ -111,6 +112,11 @@ def values_at(explicit: ExplicitGraph, shared: SharedValues, private: PrivateVal
     points = dict(zip(keys.trus_p_pm.values(), private.trus_p_pm_mm, strict=True))
     for key, point in points.items():
         values.insertPoint3(key, np.array(point))
+    if keys.points:
+        located = point_arrays(measurements.points, explicit.session, [point.epoch for point in measurements.points])
+        places = camera_places(located, np.stack(shared.trus_T_camera), np.asarray(shared.constants))
+        for key, point in zip(keys.points, places, strict=True):
+            values.insertPoint3(key, point)
     for shot, pose in zip(keys.shots, private.camera_T_marker, strict=True):
         origin, direction = place(shot.camera_T_marker, pose)
         trus_T_camera = shared.trus_T_camera[measurements.pairs[shot.pair].epoch]

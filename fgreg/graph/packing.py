@@ -16,6 +16,7 @@ import numpy as np
 from fgreg.geometry.rig import CAMERA, COUNT, Constant
 from fgreg.geometry.transforms import BoolArray, FloatArray, IntArray, adjoint, inverse, parent_from_right_covariance
 from fgreg.graph.columns import Columns, make_columns
+from fgreg.graph.known_points import NO_POINTS, PointArrays, point_arrays
 from fgreg.graph.shared_state import Quadratic
 from fgreg.graph.visible_spots import SpotArrays, spot_arrays
 from fgreg.model.corner_information import corner_information, observed_dependences
@@ -143,6 +144,7 @@ class PackedProblem:
     aim_spot_mm: FloatArray
     aim_spot_covariance: FloatArray
     aim_spot_by_constants: FloatArray
+    points: PointArrays
     links: tuple[EpochLink, ...]
     radius_mm: float
     prior: ConstantsPrior
@@ -317,6 +319,7 @@ def pack(
             np.array([aim.covariance for aim in aims], dtype=np.float64).reshape(-1, 3, 3), (FLOOR_MM,) * 3
         ),
         aim_spot_by_constants=by_constants,
+        points=point_arrays(measurements.points, model, [point.epoch for point in measurements.points]),
         links=_links(measurements.epochs),
         prior=constants_prior(measurements, columns, sigmas, mean, correlation),
     )
@@ -392,6 +395,7 @@ def pack_pairs(
         aim_spot_mm=np.zeros((0, 3)),
         aim_spot_covariance=np.zeros((0, 3, 3)),
         aim_spot_by_constants=np.zeros((0, 3, _CAMERA_COUNT)),
+        points=NO_POINTS,
         links=(),
         radius_mm=radius_mm,
         prior=ConstantsPrior.none(columns),
@@ -450,6 +454,7 @@ def only_aims(problem: PackedProblem) -> PackedProblem:
         look_beam=none,
         looks=LookArrays(*(getattr(looks, name)[:0] for name in LookArrays.__slots__)),
         spots=problem.spots.take(none),
+        points=NO_POINTS,
         links=(),
         prior=ConstantsPrior.none(problem.columns),
         shapes=None,

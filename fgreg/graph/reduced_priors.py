@@ -1,10 +1,11 @@
-"""Priors on the shared variables: constants, anchor, and the links between epochs."""
+"""Terms of the shared variables alone: constants, anchor, known points, and the links between epochs."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fgreg.geometry.transforms import FloatArray, hat, log_so3
+from fgreg.graph.known_points import point_cost, point_terms
 from fgreg.graph.packing import EpochLink, PackedProblem
 from fgreg.graph.reduced_blocks import times, transposed
 from fgreg.graph.shared_state import SharedState, step_between
@@ -16,7 +17,7 @@ def _prior_deviation(problem: PackedProblem, state: SharedState) -> FloatArray:
 
 
 def prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
-    """(S,) chi square of the priors and of the links between epochs."""
+    """(S,) chi square of the priors, of the known points and of the links between epochs."""
     deviation = _prior_deviation(problem, state)
     cost = np.sum(deviation * (deviation @ problem.prior.information), axis=1)
     for link in problem.links:
@@ -25,11 +26,13 @@ def prior_cost(problem: PackedProblem, state: SharedState) -> FloatArray:
     if problem.anchor is not None:
         anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
         cost = cost + anchor.cost + np.sum(step * (2.0 * anchor.gradient + step @ anchor.hessian), axis=1)
+    if len(problem.points):
+        cost = cost + point_cost(problem.points, state).sum(axis=1)
     return np.asarray(cost)
 
 
 def add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray, hessian: FloatArray) -> None:
-    """Gaussian priors of the shared variables and links between epochs, added in place."""
+    """Priors of the shared variables, known points and links between epochs, added in place."""
     rig = problem.columns.rig
     gradient[:, rig] += _prior_deviation(problem, state) @ problem.prior.information
     hessian[:, rig, rig] += problem.prior.information
@@ -43,6 +46,10 @@ def add_priors(problem: PackedProblem, state: SharedState, gradient: FloatArray,
         anchor, step = problem.anchor, step_between(problem.anchor.state, state, problem.columns)
         hessian += anchor.hessian
         gradient += anchor.gradient + step @ anchor.hessian
+    if len(problem.points):
+        terms = point_terms(problem.points, state, problem.columns)
+        gradient += terms.gradient.sum(axis=1)
+        hessian += terms.hessian.sum(axis=1)
 
 
 def _link_residual(link: EpochLink, state: SharedState) -> tuple[FloatArray, FloatArray]:

@@ -268,6 +268,22 @@ class AimEstimate:
     nis: Annotated[float | None, Key("as of a pair, two degrees of freedom", _NOT_NEGATIVE)] = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PointEstimate:
+    """The registration at one of its known points. Figures are None where they are not known."""
+
+    t: Annotated[float, Key("of the point", SECONDS)]
+    epoch: Annotated[int, Key("its camera epoch", _COUNT)]
+    used: Annotated[bool, Key("whether it is data of the estimate")]
+    reason: Annotated[str, Key("why it was not used", brief=True, required_if=_UNUSED)] = ""
+    error_mm: Annotated[
+        FloatArray | None, Key("as of a check; but the point has drawn the registration to itself", Numbers(3, _SIZE))
+    ] = None
+    nis: Annotated[
+        float | None, Key("against all other shots, as of a pair, three degrees of freedom", _NOT_NEGATIVE)
+    ] = None
+
+
 @dataclass(frozen=True, slots=True)
 class SettingsUsed:
     """The settings that a result was made with."""
@@ -373,6 +389,9 @@ class SessionEstimate:
     ] = field(default=(), kw_only=True)
     aims: Annotated[
         tuple[AimEstimate, ...], Key("one per aim event", ListOf(record(AimEstimate), empty=True), brief=True)
+    ] = field(default=(), kw_only=True)
+    points: Annotated[
+        tuple[PointEstimate, ...], Key("one per point event", ListOf(record(PointEstimate), empty=True), brief=True)
     ] = field(default=(), kw_only=True)
     systematic: Annotated[
         tuple[SystematicEstimate, ...],

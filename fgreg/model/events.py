@@ -257,8 +257,8 @@ class PlaneRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CheckEvent:
-    """A point known to both devices. It is never added to the estimate: it checks the registration."""
+class _SeenByBoth:
+    """What ``check`` and ``point`` have in common: a point that both devices locate."""
 
     JSON_RULES: ClassVar = (
         _CAMERA_POINT,
@@ -292,6 +292,16 @@ class CheckEvent:
         _check_camera_point(self.camera_p_mm, self.left, self.right)
         if (self.trus_p_mm is None) == (self.trus is None):
             raise FieldError.of("neither" if self.trus is None else "both", "trus_p_mm or trus")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckEvent(_SeenByBoth):
+    """A point known to both devices. It is never added to the estimate: it checks the registration."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointEvent(_SeenByBoth):
+    """A point known to both devices as data of the registration: a tool's tip, a bead. It never checks it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -378,6 +388,7 @@ Event = (
     | TrackEvent
     | CameraMovedEvent
     | CheckEvent
+    | PointEvent
     | HandChoice
     | RefusedEvent
     | StageEvent
@@ -392,6 +403,7 @@ EVENTS = Tagged(
         "track": TrackEvent,
         "camera_moved": CameraMovedEvent,
         "check": CheckEvent,
+        "point": PointEvent,
         "exclude": ExcludeEvent,
         "include": IncludeEvent,
         "refused": RefusedEvent,
@@ -405,7 +417,7 @@ EVENTS = Tagged(
 Shot = AimEvent | PairEvent | TrackEvent
 """Events with a marker."""
 
-EVIDENCE = AimEvent | PairEvent | CheckEvent | CameraMovedEvent
+EVIDENCE = AimEvent | PairEvent | PointEvent | CheckEvent | CameraMovedEvent
 """Events that tests of a registration rest on."""
 
 
@@ -434,7 +446,7 @@ def needs_frames(event: Event, *, redetect: bool) -> bool:
 
 
 def refused_evidence(events: Sequence[Event]) -> tuple[str, ...]:
-    """Why each recorded aim, look, check or camera move was refused that does not count for that reason."""
+    """Why each recorded aim, look, point, check or camera move was refused that does not count for that reason."""
     refused = refused_lines(events)
     return tuple(refused[event.line] for event in events if event.line in refused and isinstance(event, EVIDENCE))
 

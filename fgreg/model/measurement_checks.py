@@ -13,7 +13,16 @@ import numpy as np
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.events import LATERAL_MM, RANGE_MM
-from fgreg.model.measurements import Aim, Check, Look, MarkerObservation, Measurements, Pair, Track
+from fgreg.model.measurements import (
+    Aim,
+    Check,
+    LocatedPoint,
+    Look,
+    MarkerObservation,
+    Measurements,
+    Pair,
+    Track,
+)
 from fgreg.schema.kinds import COORDINATE_MM, MAX_TRANSLATION_MM, NOT_NEGATIVE, Number
 from fgreg.schema.matrices import covariance_problem, transform_problem
 
@@ -22,7 +31,7 @@ TURN_RAD = Number(-2.0 * math.pi, 2.0 * math.pi)
 """Stage angles: zero and direction of the stage may bring those of the files to any angle of a turn."""
 MAX_SIGMA = 1e6
 """Largest standard deviation of an entry, in mm or rad, as in files."""
-Measured = Aim | Pair | Track | Check
+Measured = Aim | Pair | Track | LocatedPoint
 
 
 def problem_of(measured: Measured) -> str | None:
@@ -32,14 +41,22 @@ def problem_of(measured: Measured) -> str | None:
 
 def problems_of_all(measurements: Measurements, checks: Sequence[Check]) -> Iterator[tuple[str, str]]:
     """Faults of a program's measurements, each with its place (``pairs[3]``)."""
-    listed: dict[str, Sequence[Measured]] = {"aims": measurements.aims, "pairs": measurements.pairs, "checks": checks}
+    listed: dict[str, Sequence[Measured]] = {
+        "aims": measurements.aims,
+        "pairs": measurements.pairs,
+        "points": measurements.points,
+        "checks": checks,
+    }
     for name, all_measured in listed.items():
         for index, measured in enumerate(all_measured):
             if (problem := problem_of(measured)) is not None:
                 yield f"{name}[{index}]", problem
-    for index, pair in enumerate(measurements.pairs):
-        if not 0 <= pair.epoch < len(measurements.epochs):
-            yield f"pairs[{index}]", f"its epoch is {pair.epoch}, of {len(measurements.epochs)}"
+    epochs = {"pairs": [pair.epoch for pair in measurements.pairs]}
+    epochs["points"] = [point.epoch for point in measurements.points]
+    for name, each in epochs.items():
+        for index, epoch in enumerate(each):
+            if not 0 <= epoch < len(measurements.epochs):
+                yield f"{name}[{index}]", f"its epoch is {epoch}, of {len(measurements.epochs)}"
     for index, start in enumerate(measurements.epochs):
         if (problem := motion_problem(start.camera_new_T_camera_old, start.covariance)) is not None:
             yield f"epochs[{index}]", problem
@@ -73,7 +90,7 @@ def pose_problem(name: str, pose: FloatArray, covariance: FloatArray) -> str | N
 def _problems(measured: Measured) -> Iterator[str]:
     if not math.isfinite(measured.t):
         yield f"its time is {measured.t}, expected a number"
-    if isinstance(measured, Check):
+    if isinstance(measured, LocatedPoint):
         yield from _point("camera_p_mm", measured.camera_p_mm, "covariance of the point", measured.covariance)
         yield from _point("trus_p_mm", measured.trus_p_mm, "trus_covariance of the point", measured.trus_covariance)
         return

@@ -196,8 +196,8 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Check:
-    """A point known to both devices, in camera epoch ``epoch``; it never enters the estimate.
+class LocatedPoint:
+    """A point known to both devices, in camera epoch ``epoch``.
 
     Attributes:
         camera_p_mm, trus_p_mm: (3,) in the camera's and in the TRUS frame.
@@ -210,6 +210,16 @@ class Check:
     covariance: FloatArray
     trus_p_mm: FloatArray
     trus_covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Check(LocatedPoint):
+    """A point known to both devices that checks the registration; it never enters the estimate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownPoint(LocatedPoint):
+    """A point known to both devices as data of the registration, such as a tool's tip; it never checks it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,6 +252,11 @@ class Measurements:
     aims: tuple[Aim, ...]
     pairs: tuple[Pair, ...]
     epochs: tuple[EpochStart, ...]
+    points: tuple[KnownPoint, ...] = ()
+
+    def points_of(self, epoch: int) -> tuple[KnownPoint, ...]:
+        """The known points of a camera epoch, as of epoch 0."""
+        return tuple(replace(point, epoch=0) for point in self.points if point.epoch == epoch)
 
 
 def default_marker_covariance(camera_T_marker: FloatArray, noise: NoiseModel) -> FloatArray:

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fgreg.model.estimate import Verdict, worst_verdict
-from fgreg.model.measurements import Check
+from fgreg.model.known_points import data_at
+from fgreg.model.measurements import Check, KnownPoint
 from fgreg.model.session_model import SessionModel
 from fgreg.online.estimate import OnlineEstimate
 from fgreg.registration.checks import check_registration
@@ -27,11 +28,17 @@ class CheckPoints:
     def __init__(self, model: SessionModel, limit_mm: float, snapshot: Callable[[], Snapshot | None]) -> None:
         self._model, self._limit_mm, self._snapshot = model, limit_mm, snapshot
         self._checks: list[Check] = []
+        self._data: list[KnownPoint] = []
         self._last: tuple[OnlineEstimate, OnlineEstimate] | None = None
 
     def add(self, check: Check) -> None:
         """One more check."""
         self._checks.append(check)
+        self._last = None
+
+    def leave_out(self, point: KnownPoint) -> None:
+        """A point is data of the registration: checks of it, earlier or later ones, do not count."""
+        self._data.append(point)
         self._last = None
 
     def moved(self, since_s: float, epoch: int) -> None:
@@ -44,6 +51,7 @@ class CheckPoints:
     def applied(self, estimate: OnlineEstimate | None) -> OnlineEstimate | None:
         """The estimate with the checks of its camera epoch, and their effect on its verdict."""
         mine = [] if estimate is None else [check for check in self._checks if check.epoch == estimate.epoch]
+        mine = [check for check in mine if data_at(check, self._data) is None]
         if not mine or estimate is None or estimate.trus_T_camera is None or estimate.covariance is None:
             return estimate
         if self._last is None or self._last[0] is not estimate:

@@ -25,7 +25,7 @@ from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray, make_transform, rotation_to_direction
 from fgreg.graph.shared_state import Quadratic
 from fgreg.model.estimate import TrackEstimate, Verdict
-from fgreg.model.measurements import Aim, EpochStart, Measurements, Pair, Track
+from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.tissue_surface import TissueSurface
@@ -50,6 +50,7 @@ from fgreg.smoother.updates import (
     with_motion,
     with_move,
     with_pair,
+    with_point,
     without_move,
 )
 from fgreg.tracking.query import track
@@ -180,16 +181,20 @@ class OnlineRegistration:
             return with_pair(state, event, setting)
         if isinstance(event, Aim):
             return with_aim(state, event, setting)
+        if isinstance(event, KnownPoint):
+            return with_point(state, event, setting)
         if isinstance(event, CameraMoved):
             start = EpochStart(event.t, event.camera_new_T_camera_old, event.covariance)
             if event.since_t is not None:
-                return with_move(state, replace(start, t=event.since_t), setting, self._pairs_since(event.since_t))
+                last, since_t = self._pairs_since(event.since_t), event.since_t
+                return with_move(state, replace(start, t=since_t), setting, last, since_t)
             if self._noticed.get(state.epoch) and state.epoch_pms < LEAST_PMS:
                 # This may be the move that was detected, or another one, so the measured motion cannot be used.
                 start = EpochStart(event.t)
             return with_move(state, start, setting)
         if isinstance(found, TagsMoved):
-            return with_move(state, EpochStart(found.since_t), setting, self._pairs_since(found.since_t))
+            last = self._pairs_since(found.since_t)
+            return with_move(state, EpochStart(found.since_t), setting, last, found.since_t)
         if isinstance(found, TagsAtRest):
             start = EpochStart(state.now.start.t, found.camera_new_T_camera_old, found.covariance)
             return with_motion(state, start, setting)
@@ -205,7 +210,7 @@ class OnlineRegistration:
 
     def _misplaced_now(self, state: State, event: OnlineEvent) -> frozenset[int]:
         """PMs of the state that are inliers beyond their limit, or outliers within it; none where no shot was added."""
-        return misplaced_pms(state, self._setting) if isinstance(event, Pair | Aim) else frozenset()
+        return misplaced_pms(state, self._setting) if isinstance(event, Pair | Aim | KnownPoint) else frozenset()
 
     def _divided(self, *, by_tags: bool = False) -> None:
         """Note that the division of the pairs into epochs has changed: results of earlier cases are invalid."""
@@ -230,7 +235,7 @@ class OnlineRegistration:
             due = is_due(state.epoch_pairs) or state.epoch_pms <= FIRST_PMS
             if no_estimate or rejected or due or not misplaced <= self._misplaced:
                 self._solve_wanted = True
-        elif isinstance(event, Aim):
+        elif isinstance(event, Aim | KnownPoint):
             first = state.active_window is None or state.epoch_pairs <= FIRST_PAIRS
             if state.epoch_pairs and (first or not misplaced <= self._misplaced):
                 self._solve_wanted = True
@@ -369,7 +374,7 @@ class OnlineRegistration:
         """Begin a new epoch at the first pair after an unreported camera move."""
         before = self._state
         since_t = before.shots[found.first].pair.t
-        self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - found.first)
+        self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - found.first, since_t)
         self._serial += 1
         self._divided()
         self._solve_wanted = True
@@ -388,7 +393,7 @@ class OnlineRegistration:
         known = next((move for move in self._moves if move.since == old), None)
         before = without_move(state)
         since_t = state.shots[first].pair.t
-        self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - first)
+        self._state = with_move(before, EpochStart(since_t), self._setting, len(before.shots) - first, since_t)
         self._serial += 1
         self._divided()
         self._solve_wanted = True

@@ -6,7 +6,7 @@ import math
 
 from fgreg.errors import EventRefused
 from fgreg.model.measurement_checks import motion_problem, pose_problem, problem_of
-from fgreg.model.measurements import Aim, Pair
+from fgreg.model.measurements import Aim, KnownPoint, Pair
 from fgreg.online.events import CameraMoved, LoopClosed, OnlineEvent, StaticTags
 
 
@@ -18,7 +18,7 @@ def check(event: OnlineEvent, after: float) -> None:
     Raises:
         EventRefused: with the first fault found.
     """
-    if not isinstance(event, Aim | Pair | CameraMoved | StaticTags | LoopClosed):
+    if not isinstance(event, Aim | Pair | KnownPoint | CameraMoved | StaticTags | LoopClosed):
         raise EventRefused(f"a {type(event).__name__} is not an event of a registration")
     if not math.isfinite(event.t):
         raise EventRefused(f"its time is {event.t}, expected a number")
@@ -29,7 +29,7 @@ def check(event: OnlineEvent, after: float) -> None:
 
 
 def _problem(event: OnlineEvent) -> str | None:
-    if isinstance(event, Aim | Pair):
+    if isinstance(event, Aim | Pair | KnownPoint):
         return problem_of(event)
     if isinstance(event, CameraMoved):
         return motion_problem(event.camera_new_T_camera_old, event.covariance)

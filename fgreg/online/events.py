@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fgreg.camera_moves.found import LOOP_TEXT
 from fgreg.geometry.transforms import FloatArray
-from fgreg.model.measurements import Aim, Measurements, Pair
+from fgreg.model.measurements import Aim, KnownPoint, Measurements, Pair
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,16 +65,17 @@ class StaticTags:
     covariance: Mapping[int, FloatArray]
 
 
-OnlineEvent = Aim | Pair | CameraMoved | StaticTags | LoopClosed
+OnlineEvent = Aim | Pair | KnownPoint | CameraMoved | StaticTags | LoopClosed
 
 
 def events_in_order(measurements: Measurements) -> Iterator[tuple[int | None, OnlineEvent]]:
-    """Aims, pairs (with their index) and reported moves in the order of time; of the same time moves first."""
+    """Aims, pairs (with their index), points and reported moves in the order of time; of the same time moves first."""
     timed: list[tuple[float, int, int, int | None, OnlineEvent]] = []
     for place, start in enumerate(measurements.epochs[1:]):
         moved = CameraMoved(start.t, start.camera_new_T_camera_old, start.covariance)
         timed.append((start.t, 0, place, None, moved))
     timed.extend((aim.t, 1, place, None, aim) for place, aim in enumerate(measurements.aims))
     timed.extend((pair.t, 1, len(measurements.aims) + i, i, pair) for i, pair in enumerate(measurements.pairs))
+    timed.extend((point.t, 2, place, None, point) for place, point in enumerate(measurements.points))
     for _, _, _, index, event in sorted(timed, key=lambda entry: entry[:3]):
         yield index, event

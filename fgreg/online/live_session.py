@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from fgreg.camera_moves.found import DetectedLoopClosure, DetectedMove
-from fgreg.detection.check_points import check_measurement
+from fgreg.detection.check_points import check_measurement, known_point
 from fgreg.detection.events_to_measurements import MeasurementExtractor
 from fgreg.errors import EventRefused, InputError, JournalError
 from fgreg.geometry.transforms import FloatArray
@@ -26,6 +26,7 @@ from fgreg.model.events import (
     HandChoice,
     NoteEvent,
     PairEvent,
+    PointEvent,
     RefusedEvent,
     StageEvent,
     TrackEvent,
@@ -33,7 +34,7 @@ from fgreg.model.events import (
     refused_lines,
 )
 from fgreg.model.excluded_shots import excluded_shots
-from fgreg.model.measurements import Aim, Check, EpochStart, Measurements, Pair, Track
+from fgreg.model.measurements import Aim, Check, EpochStart, KnownPoint, Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.checks import CheckPoints
@@ -47,7 +48,7 @@ from fgreg.session.event_writer import event_document, type_of, writable
 from fgreg.session.journal import Journal
 from fgreg.tracking.snapshot import Snapshot
 
-Estimating = AimEvent | PairEvent | CameraMovedEvent | CheckEvent | HandChoice
+Estimating = AimEvent | PairEvent | PointEvent | CameraMovedEvent | CheckEvent | HandChoice
 """Events that the estimate or its verdict depends on."""
 
 
@@ -95,7 +96,7 @@ class EpochFeed:
         self.epoch = 0
         self.noticed = 0
 
-    def add(self, event: Aim | Pair | CameraMovedEvent) -> OnlineEstimate | None:
+    def add(self, event: Aim | Pair | KnownPoint | CameraMovedEvent) -> OnlineEstimate | None:
         """Take in one measurement or move; None for a move that the engine has detected already.
 
         Raises:
@@ -110,7 +111,9 @@ class EpochFeed:
             self.epoch = estimate.epoch
             self._checks.moved(event.t if event.since_t is None else event.since_t, self.epoch)
             return estimate
-        estimate = self._engine.add(replace(event, epoch=self.epoch) if isinstance(event, Pair) else event)
+        estimate = self._engine.add(event if isinstance(event, Aim) else replace(event, epoch=self.epoch))
+        if isinstance(event, KnownPoint):
+            self._checks.leave_out(event)
         self.notice(estimate)
         return estimate
 
@@ -400,6 +403,10 @@ class LiveSession:
                         raise
             elif isinstance(event, CameraMovedEvent):
                 estimate = self._feed.add(event)
+            elif isinstance(event, PointEvent):
+                point = known_point(event, self._feed.epoch, self.journal.model)
+                if isinstance(point, KnownPoint):
+                    estimate = self._feed.add(point)
             elif isinstance(event, CheckEvent):
                 check = check_measurement(event, self._feed.epoch, self.journal.model)
                 if isinstance(check, Check):

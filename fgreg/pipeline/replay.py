@@ -27,11 +27,12 @@ from fgreg.model.events import (
     HandChoice,
     IncludeEvent,
     PairEvent,
+    PointEvent,
     TrackEvent,
     refused_lines,
 )
 from fgreg.model.excluded_shots import excluded_shots
-from fgreg.model.measurements import Aim, Check, Pair, Track
+from fgreg.model.measurements import Aim, Check, KnownPoint, LocatedPoint, Pair, Track
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.checks import CheckPoints
 from fgreg.online.estimate import OnlineEstimate, with_conditions
@@ -58,7 +59,7 @@ from fgreg.viewer.spawn import spawn_viewer
 if TYPE_CHECKING:
     from fgreg.viewer.recording import Viewer
 
-Shown = AimEvent | PairEvent | TrackEvent | CameraMovedEvent | CheckEvent | HandChoice
+Shown = AimEvent | PairEvent | TrackEvent | PointEvent | CameraMovedEvent | CheckEvent | HandChoice
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,12 +193,13 @@ class _Player:
         self._session, self._extracted = session, extracted
         self._make_engine, self._config = make_engine, config
         self._viewer, self._speed = viewer, speed
-        self._measured: dict[int, Aim | Pair | Track | Check] = {
+        self._measured: dict[int, Aim | Pair | KnownPoint | Track | Check] = {
             **extracted.checks,
             **extracted.set_aside,
             **dict(zip(extracted.aim_events, extracted.measurements.aims, strict=True)),
             **dict(zip(extracted.pair_events, extracted.measurements.pairs, strict=True)),
             **dict(zip(extracted.track_events, extracted.tracks, strict=True)),
+            **dict(zip(extracted.point_events, extracted.measurements.points, strict=True)),
         }
         self._add_ms: list[float] = []
         self._track_ms: list[float] = []
@@ -238,7 +240,7 @@ class _Player:
         refused = refused_lines(events)
         for earlier, event in enumerate(events[:index]):
             counts = event.line not in refused and event.line not in excluded
-            if counts and isinstance(event, AimEvent | PairEvent | CameraMovedEvent | CheckEvent):
+            if counts and isinstance(event, AimEvent | PairEvent | PointEvent | CameraMovedEvent | CheckEvent):
                 self._take(earlier, event)
 
     def play(self, on_step: OnStep | None) -> None:
@@ -286,7 +288,7 @@ class _Player:
                 self._add_ms.append(elapsed_ms)
                 self._estimate = estimate or self._estimate
                 noticed = self._feed.noticed > before
-                self._shots += not isinstance(event, CameraMovedEvent)
+                self._shots += isinstance(event, AimEvent | PairEvent)
             except EventRefused as error:
                 refused = self._unused[index] = error.reason
         return ReplayStep(event, 0, 0, self.estimate, answer, refused, elapsed_ms, noticed)
@@ -301,7 +303,7 @@ class _Player:
             ViewerUpdate(
                 t=event.t,
                 number=shot,
-                shot=None if step.refused or isinstance(measured, Check) else measured,
+                shot=None if step.refused or isinstance(measured, LocatedPoint) else measured,
                 note=describe(step),
                 trus_T_camera=None if known is None else known.trus_T_camera,
                 covariance=None if known is None else known.covariance,
@@ -322,15 +324,18 @@ class _Player:
         unused = {**self._unused, **{i: extracted.unused[i] for i in extracted.set_aside}}
         aims = [i for i, event in enumerate(extracted.aim_events) if event not in self._unused]
         pairs = [i for i, event in enumerate(extracted.pair_events) if event not in self._unused]
+        points = [i for i, event in enumerate(extracted.point_events) if event not in self._unused]
         return replace(
             extracted,
             measurements=replace(
                 measurements,
                 aims=tuple(measurements.aims[i] for i in aims),
                 pairs=tuple(measurements.pairs[i] for i in pairs),
+                points=tuple(measurements.points[i] for i in points),
             ),
             aim_events=tuple(extracted.aim_events[i] for i in aims),
             pair_events=tuple(extracted.pair_events[i] for i in pairs),
+            point_events=tuple(extracted.point_events[i] for i in points),
             tracks=(),
             track_events=(),
             unused=unused,
@@ -347,9 +352,9 @@ class _Player:
         return Timing(quantiles(self._add_ms), quantiles(self._track_ms))
 
 
-def _shot(measured: Aim | Pair | Track | Check | None) -> Aim | Pair:
-    if not isinstance(measured, Aim | Pair):
-        raise AssertionError("neither an aim nor a pair")
+def _shot(measured: Aim | Pair | KnownPoint | Track | Check | None) -> Aim | Pair | KnownPoint:
+    if not isinstance(measured, Aim | Pair | KnownPoint):
+        raise AssertionError("neither an aim nor a pair nor a known point")
     return measured
 
 
@@ -380,6 +385,8 @@ def describe(step: ReplayStep) -> str:
             what = "camera moved" + (" (found out)" if event.detected else "")
         case CheckEvent():
             what = "check"
+        case PointEvent():
+            what = "known point"
         case ExcludeEvent() | IncludeEvent():
             shot = f"PM {event.pm}" if event.pm is not None else f"line {event.shot_line}"
             what = f"{shot} " + ("left out by hand" if isinstance(event, ExcludeEvent) else "counts again")

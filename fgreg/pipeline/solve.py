@@ -25,12 +25,13 @@ from fgreg.model.estimate import (
     AimEstimate,
     CheckEstimate,
     PairEstimate,
+    PointEstimate,
     SessionEstimate,
     SettingsUsed,
     TrackEstimate,
     Verdict,
 )
-from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, TrackEvent, looks_of
+from fgreg.model.events import AimEvent, CheckEvent, Event, PairEvent, PointEvent, TrackEvent, looks_of
 from fgreg.model.lens import project
 from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
@@ -259,6 +260,7 @@ def session_estimate(
     pairs = dict(zip(extracted.pair_events, with_influence(solution, session.model), strict=True))
     tracks = dict(zip(extracted.track_events, solution.tracks, strict=True))
     aims = dict(zip(extracted.aim_events, solution.aims, strict=True))
+    points = dict(zip(extracted.point_events, solution.points, strict=True))
     checks: dict[int, Check | CheckEstimate] = dict(extracted.checks)
     for index, event in enumerate(session.events):
         reason = extracted.unused.get(index, "")
@@ -268,6 +270,8 @@ def session_estimate(
             tracks[index] = TrackEstimate(event.t, None, None, None, causal=False, reason=reason)
         elif isinstance(event, AimEvent) and index not in aims:
             aims[index] = AimEstimate(event.t, used=False, reason=reason)
+        elif isinstance(event, PointEvent) and index not in points:
+            points[index] = PointEstimate(event.t, extracted.epoch_of[index], used=False, reason=reason)
         elif isinstance(event, CheckEvent) and index not in checks:
             checks[index] = not_compared(event.t, reason)
     solved = solution.as_session(session.model.name)
@@ -284,6 +288,7 @@ def session_estimate(
         pairs=tuple(pairs[i] for i in sorted(pairs)),
         tracks=tuple(tracks[i] for i in sorted(tracks)),
         aims=tuple(aims[i] for i in sorted(aims)),
+        points=tuple(points[i] for i in sorted(points)),
         excluded=extracted.excluded,
     )
 

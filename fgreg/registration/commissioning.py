@@ -30,17 +30,16 @@ from scipy.special import chdtrc, ndtri
 
 from fgreg.errors import EstimationError
 from fgreg.geometry.rig import CAMERA, COUNT, Constant
-from fgreg.geometry.transforms import BoolArray, FloatArray, hat
-from fgreg.graph.columns import Columns
+from fgreg.geometry.transforms import BoolArray, FloatArray
+from fgreg.graph.known_points import point_arrays
 from fgreg.graph.packing import PackedProblem, constants_prior, least_sigmas
 from fgreg.graph.reduced_blocks import PrivateState
 from fgreg.graph.reduced_graph import Evaluation, evaluate, refine
 from fgreg.graph.scaled_inverse import scaled_inverse, scaled_solve
 from fgreg.graph.shared_state import SharedState
-from fgreg.model.camera_dependence import nominal_point_gain, nominal_spot_gain
+from fgreg.model.camera_dependence import nominal_spot_gain
 from fgreg.model.measurements import Check
 from fgreg.model.session_model import SessionModel
-from fgreg.registration.error_budget import scanner_displacement
 from fgreg.registration.register import Registration
 
 OWN = (Constant.WINDOW_EDGE, Constant.MARKER_BIAS_X, Constant.MARKER_BIAS_Y, Constant.MARKER_BIAS_Z)
@@ -119,7 +118,6 @@ class _Session:
 
     problem: PackedProblem
     common: BoolArray
-    checks: _Checks | None
     slope: FloatArray
     state: SharedState
     at: Evaluation
@@ -129,7 +127,7 @@ class _Session:
         points = self.at.private.trus_p_pm + (self.at.point_gain @ step[:, None])[..., 0]
         state = self.state.retract(step[None], self.problem.columns)
         _, private = refine(self.problem, state, replace(self.at.private, trus_p_pm=points))
-        return replace(self, state=state, at=_evaluated(self.problem, state, private, self.checks, self.slope))
+        return replace(self, state=state, at=_evaluated(self.problem, state, private, self.slope))
 
     @property
     def value(self) -> FloatArray:
@@ -160,57 +158,6 @@ class _Session:
         return step
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Checks:
-    """Check points of one session as measurements: where the camera has them less where the scanner shows them.
-
-    Attributes:
-        checks: with the place of their epoch among the columns.
-        shown: (n, 3, K) by how much they lie elsewhere than the scanner shows them, per constant; TRUS axes.
-        seen: (n, 3, C) the same of the camera's, per constant of the camera; camera axes.
-        columns: of the problem.
-    """
-
-    checks: tuple[tuple[Check, int], ...]
-    shown: FloatArray
-    seen: FloatArray
-    columns: Columns
-
-    @classmethod
-    def of(cls, checks: Sequence[Check], registration: Registration) -> _Checks | None:
-        """Those of solved epochs; None without any."""
-        mine = tuple((c, registration.epochs.index(c.epoch)) for c in checks if c.epoch in registration.epochs)
-        if not mine:
-            return None
-        model, columns = registration.model, registration.problem.columns
-        points = np.stack([check.trus_p_mm for check, _ in mine])
-        shown = scanner_displacement(model, registration.optimum.state, columns, points)
-        seen = nominal_point_gain(model, np.stack([check.camera_p_mm for check, _ in mine]))
-        return cls(mine, shown, seen, columns)
-
-    def add_to(self, at: Evaluation, state: SharedState) -> Evaluation:
-        """The evaluation with the checks' terms."""
-        cost, gradient, hessian = at.cost.copy(), at.gradient.copy(), at.hessian.copy()
-        columns = self.columns
-        camera = [constant - Constant.MARKER_BIAS_X for constant in columns.of_camera]
-        c = state.constants[0, list(columns.constants)]
-        for (check, place), shown, seen in zip(self.checks, self.shown, self.seen, strict=True):
-            rotation = state.rotation[0, place]
-            of_camera = np.zeros((3, len(c)))
-            of_camera[:, len(c) - len(camera) :] = seen[:, camera]
-            camera_p = check.camera_p_mm + of_camera @ c
-            error = rotation @ camera_p + state.translation_mm[0, place] - check.trus_p_mm - shown @ c
-            jacobian = np.zeros((3, columns.size))
-            jacobian[:, 6 * place : 6 * place + 6] = np.concatenate([-rotation @ hat(camera_p), rotation], axis=1)
-            jacobian[:, columns.rig] = rotation @ of_camera - shown
-            spread = rotation @ check.covariance @ rotation.T + check.trus_covariance
-            weighted = np.linalg.solve(spread, np.column_stack([jacobian, error]))
-            hessian[0] += jacobian.T @ weighted[:, :-1]
-            gradient[0] += jacobian.T @ weighted[:, -1]
-            cost[0] += error @ weighted[:, -1]
-        return replace(at, cost=cost, gradient=gradient, hessian=hessian)
-
-
 def noise_slope(registration: Registration) -> FloatArray:
     """(K,) by how much half the chi square falls per unit of each constant, since noise is the measurement's own.
 
@@ -235,15 +182,12 @@ def noise_slope(registration: Registration) -> FloatArray:
     return out[list(problem.columns.constants)]
 
 
-def _evaluated(
-    problem: PackedProblem, state: SharedState, private: PrivateState, checks: _Checks | None, slope: FloatArray
-) -> Evaluation:
+def _evaluated(problem: PackedProblem, state: SharedState, private: PrivateState, slope: FloatArray) -> Evaluation:
     at = evaluate(problem, state, private)
     gradient = at.gradient.copy()
     gradient[0, problem.columns.rig] -= slope
     cost = at.cost - 2.0 * slope @ state.constants[0, list(problem.columns.constants)]
-    at = replace(at, cost=cost, gradient=gradient)
-    return at if checks is None else checks.add_to(at, state)
+    return replace(at, cost=cost, gradient=gradient)
 
 
 def _session(registration: Registration, constants: Sequence[Constant], checks: Sequence[Check]) -> _Session:
@@ -253,13 +197,18 @@ def _session(registration: Registration, constants: Sequence[Constant], checks: 
     sigmas = least_sigmas(model.constant_sigmas)
     sigmas[list(constants)] = np.inf
     prior = constants_prior(registration.measurements, columns, sigmas, model.constant_means)
-    problem = replace(problem, prior=prior, shapes=None)
+    points = [*registration.measurements.points]
+    places = [point.epoch for point in points]
+    data = [check for check in checks if check.epoch in registration.epochs]
+    places += [registration.epochs.index(check.epoch) for check in data]
+    located = point_arrays([*points, *data], model, places)
+    problem = replace(problem, prior=prior, shapes=None, points=located)
     common = np.zeros(columns.size, dtype=bool)
     common[columns.rig] = np.isin(columns.constants, constants)
-    points, state = _Checks.of(checks, registration), registration.optimum.state
+    state = registration.optimum.state
     slope = noise_slope(registration)
-    at = _evaluated(problem, state, registration.optimum.evaluation.private, points, slope)
-    return _Session(problem, common, points, slope, state, at)
+    at = _evaluated(problem, state, registration.optimum.evaluation.private, slope)
+    return _Session(problem, common, slope, state, at)
 
 
 def session_evidence(

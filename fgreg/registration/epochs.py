@@ -31,10 +31,11 @@ def has_registration(prior: Quadratic) -> bool:
 
 
 def last_epoch(measurements: Measurements) -> Measurements:
-    """The aims, and the pairs of the last epoch; the epochs keep their numbers, without the motions."""
+    """The aims, and the pairs and points of the last epoch; the epochs keep their numbers, without the motions."""
     last = len(measurements.epochs) - 1
     pairs = tuple(pair for pair in measurements.pairs if pair.epoch == last)
-    return Measurements(measurements.aims, pairs, tuple(EpochStart(start.t) for start in measurements.epochs))
+    points = tuple(point for point in measurements.points if point.epoch == last)
+    return Measurements(measurements.aims, pairs, tuple(EpochStart(start.t) for start in measurements.epochs), points)
 
 
 def solvable_epochs(measurements: Measurements, searches: tuple[EpochSearch, ...]) -> list[int]:
@@ -69,4 +70,5 @@ def restrict_epochs(measurements: Measurements, epochs: list[int]) -> Measuremen
         for k, start in ((k, measurements.epochs[k]) for k in epochs)
     )
     pairs = tuple(replace(pair, epoch=place[pair.epoch]) for pair in measurements.pairs if pair.epoch in place)
-    return Measurements(measurements.aims, pairs, starts)
+    points = tuple(replace(point, epoch=place[point.epoch]) for point in measurements.points if point.epoch in place)
+    return Measurements(measurements.aims, pairs, starts, points)

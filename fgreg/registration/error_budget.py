@@ -23,12 +23,8 @@ import numpy as np
 from fgreg.geometry.rig import Constant
 from fgreg.geometry.target_error import target_jacobians
 from fgreg.geometry.transforms import FloatArray
-from fgreg.graph.columns import Columns
-from fgreg.graph.packing import pack_more
-from fgreg.graph.reduced_blocks import inner, look_rows
-from fgreg.graph.shared_state import SharedState
 from fgreg.model.estimate import PredictedPart, PredictedTre, SystematicEstimate, TargetEstimate, Verdict
-from fgreg.model.measurements import Look, MarkerObservation, Pair
+from fgreg.model.scanner_dependence import scanner_gain
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.model.systematic import TEXTS
@@ -283,35 +279,11 @@ def _causes_mm(registration: Registration, place: int) -> FloatArray:
     return np.asarray(np.linalg.norm(moved, axis=0))
 
 
-def scanner_displacement(model: SessionModel, state: SharedState, columns: Columns, points: FloatArray) -> FloatArray:
-    """(n, 3, K) by how much points (n, 3) that the scanner shows in its plane truly lie elsewhere, per constant.
-
-    TRUS axes. The plane is turned to each point; ``x``, range and rotation are held while the constants change.
-    """
-    nowhere = MarkerObservation(np.eye(4), np.eye(6), 0)
-    pairs = []
-    for number, (x, y, z) in enumerate(points.tolist()):
-        scan = float(np.arctan2(y, z))
-        look = Look(scan, 1e-3, x, float(np.hypot(y, z)) - model.probe.radius_mm, np.eye(2))
-        pairs.append(Pair(0.0, number, 0, nowhere, look))
-    problem = pack_more(pairs, model, columns)
-    declared = SharedState(
-        state.rotation[:, :1], state.translation_mm[:, :1], state.marker_T_nominal, state.beam, 0.0 * state.constants
-    )
-    wanted = columns.of_looks
-    rows = look_rows(problem, declared, inner(points[None]), wanted)[..., 0]
-    out = np.zeros((len(points), 3, len(columns.constants)))
-    out[:, :, : len(wanted)] = -np.linalg.solve(rows[:, :, 1:4], rows[:, :, 4:])
-    edge = columns.constants.index(Constant.WINDOW_EDGE)
-    out[:, :, edge] = 0.0
-    return out
-
-
 def _seen(registration: Registration, place: int, jacobian: FloatArray, targets_mm: FloatArray) -> PredictedPart:
     """Predicted distance between where the registration puts targets and where the scanner shows them."""
     state, columns = registration.optimum.state, registration.problem.columns
     transform = state.trus_T_camera(place)[0]
-    shown = scanner_displacement(registration.model, state, columns, targets_mm)
+    shown = scanner_gain(registration.model.probe.radius_mm, targets_mm)[..., list(columns.constants)]
     shown = np.einsum("ji,njk->nik", transform[:3, :3], shown)  # to the camera's axes
     gain = np.concatenate([jacobian, -shown], axis=2)
     pose, cross, own = _parts(registration, place)

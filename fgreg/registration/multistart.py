@@ -105,7 +105,7 @@ def calibrate_beam(measurements: Measurements, model: SessionModel) -> Calibrati
         raise EstimationError("no aims and no initial.marker_T_laser: the beam has no start; take at least 6 aim shots")
     if not aims:
         return Calibration(tuple(candidates), everything)
-    alone = pack(replace(measurements, pairs=(), epochs=measurements.epochs[:1]), model, sigmas=search_sigmas(model))
+    alone = pack(Measurements(aims, (), measurements.epochs[:1]), model, sigmas=search_sigmas(model))
     found = optimize(alone, _beam_states(candidates, model))
     if len(aims) > MIN_INLIER_AIMS and not _is_clean(alone, found):
         candidates += [nominal_frame(origin, direction) for origin, direction in consensus_beams(aims)]
@@ -164,7 +164,8 @@ def _mirrored(problem: PackedProblem) -> PackedProblem:
     A stage that turns the other way gives the same, apart from half a turn of the TRUS frame about z. So one hypothesis
     covers both.
     """
-    return replace(problem, looks=replace(problem.looks, x_mm=-problem.looks.x_mm))
+    looks = replace(problem.looks, x_mm=-problem.looks.x_mm)
+    return replace(problem, looks=looks, points=problem.points.mirrored())
 
 
 def _other_way(problem: PackedProblem) -> PackedProblem:
@@ -220,7 +221,9 @@ def search_epoch(
     pairs = tuple(replace(pair, epoch=0) for pair in measurements.pairs if pair.epoch == epoch)
     if len({pair.pm for pair in pairs}) < 3:
         return EpochSearch((), None)
-    subset = replace(measurements, pairs=_search_subset(pairs), epochs=measurements.epochs[:1])
+    subset = Measurements(
+        measurements.aims, _search_subset(pairs), measurements.epochs[:1], measurements.points_of(epoch)
+    )
     problem = pack(subset, model, sigmas=search_sigmas(model))
     found = optimize(problem, _starts(problem, frames, model), keep_within=keep_within)
     minima = _distinct(found.evaluation.cost, found.state, model.targets_mm)

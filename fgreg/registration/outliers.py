@@ -124,7 +124,7 @@ def plausible_cost(problem: PackedProblem) -> float:
     """Chi square of all shots beyond which they do not fit together, whatever their innovations."""
     unknowns = free_variables(problem)
     seen = unknowns if len(problem.pms) else 4  # aims alone determine the beam only
-    equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation)
+    equations = int(pm_degrees_of_freedom(problem).sum()) + 2 * len(problem.aims.rotation) + 3 * len(problem.points)
     return float(chdtri(max(equations - seen, 1), IMPLAUSIBLE_P))
 
 

@@ -17,8 +17,8 @@ from fgreg.graph.columns import Columns
 from fgreg.graph.shared_state import SharedState
 from fgreg.model.camera_dependence import nominal_point_gain
 from fgreg.model.measurements import Check
+from fgreg.model.scanner_dependence import scanner_gain
 from fgreg.model.session_model import SessionModel
-from fgreg.registration.error_budget import scanner_displacement
 from fgreg.tracking.snapshot import Snapshot
 
 
@@ -48,7 +48,7 @@ class RigAtChecks:
 
     def shown(self, trus_p_mm: FloatArray) -> FloatArray:
         """(n, 3, K) by how much points (n, 3) truly lie elsewhere than the scanner shows them; TRUS axes."""
-        return scanner_displacement(self.model, self.state, self.columns, trus_p_mm)
+        return scanner_gain(self.model.probe.radius_mm, trus_p_mm)[..., list(self.columns.constants)]
 
 
 def rig_at_checks(model: SessionModel, snapshot: Snapshot | None, checks: Sequence[Check]) -> dict[int, RigAtChecks]:

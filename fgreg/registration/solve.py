@@ -19,6 +19,7 @@ from fgreg.model.estimate import (
     EpochEstimate,
     LaserEstimate,
     PairEstimate,
+    PointEstimate,
     SessionEstimate,
     SystematicEstimate,
     TrackEstimate,
@@ -39,6 +40,7 @@ from fgreg.registration.error_budget import (
     with_effects,
 )
 from fgreg.registration.group_tests import group_conditions
+from fgreg.registration.known_points import point_conditions, read_points
 from fgreg.registration.move_doubt import may_share_a_registration, move_doubt, outliers_in_a_row
 from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.outliers import free_variables, pm_degrees_of_freedom
@@ -97,9 +99,9 @@ class EpochReport:
 class Solution:
     """The estimate for a session's measurements: everything but the session's name.
 
-    ``pairs``, ``tracks`` and ``aims`` are in the order of the measurements and queries. ``registration``, ``posterior``
-    and ``snapshot`` (which answers tracking queries) are None where nothing could be computed. ``reports``: of the
-    epochs; those of the solve as a whole are with the last one.
+    ``pairs``, ``tracks``, ``aims`` and ``points`` are in the order of the measurements and queries. ``registration``,
+    ``posterior`` and ``snapshot`` (which answers tracking queries) are None where nothing could be computed.
+    ``reports``: of the epochs; those of the solve as a whole are with the last one.
     """
 
     verdict: Verdict
@@ -109,6 +111,7 @@ class Solution:
     pairs: tuple[PairEstimate, ...]
     tracks: tuple[TrackEstimate, ...]
     aims: tuple[AimEstimate, ...]
+    points: tuple[PointEstimate, ...] = ()
     systematic: tuple[SystematicEstimate, ...] = ()
     registration: Registration | None = None
     posterior: Posterior | None = None
@@ -126,6 +129,7 @@ class Solution:
             self.pairs,
             self.tracks,
             aims=self.aims,
+            points=self.points,
             systematic=self.systematic,
         )
 
@@ -168,6 +172,7 @@ def solve(
     pairs = read_pairs(measurements, centred, model, readout.origin_shift_mm)
     aims = read_aims(measurements, centred, readout.origin_shift_mm)
     registrations = [state.trus_T_camera(k)[0] for k in range(len(centred.epochs))]
+    points = read_points(measurements, registration, registrations) if measurements.points else ()
     pictures = camera_conditions(measurements, model, config, registrations)
     budget = error_budget(registration, posterior, config)
     common = [
@@ -175,6 +180,7 @@ def solve(
         *pictures,
         *random_errors_only(model),
         *_common_conditions(registration, pairs, aims),
+        *point_conditions(points, measurements),
         *sampling(posterior.effective),
         *_variable_conditions(centred, config),
         # A camera that is not as declared makes the shots contradict any other constant, too: it is to be mended first.
@@ -199,6 +205,7 @@ def solve(
         pairs=pairs,
         tracks=tuple(track(query, snapshot) for query in tracks),
         aims=aims,
+        points=points,
         systematic=budget.constants,
         registration=registration,
         posterior=posterior,
@@ -222,6 +229,7 @@ def _no_solution(measurements: Measurements, tracks: Sequence[Track], conditions
         pairs=tuple(PairEstimate(p.t, p.pm, p.epoch, used=False, reason=why) for p in measurements.pairs),
         tracks=tuple(TrackEstimate(q.t, None, None, None, False, f"no registration: {why}") for q in tracks),
         aims=tuple(AimEstimate(a.t, used=False, reason=why) for a in measurements.aims),
+        points=tuple(PointEstimate(p.t, p.epoch, used=False, reason=why) for p in measurements.points),
     )
 
 
@@ -231,7 +239,7 @@ def _common_conditions(
     """Conditions of the solve as a whole: residuals, beam, agreement of the two forms of the graph."""
     problem, cost = registration.problem, float(registration.optimum.evaluation.cost[0])
     shots, inlier_aims = registration.shots, len(registration.measurements.aims)
-    equations = 2 * inlier_aims + int(pm_degrees_of_freedom(problem).sum())
+    equations = 2 * inlier_aims + int(pm_degrees_of_freedom(problem).sum()) + 3 * len(problem.points)
     unknowns = free_variables(problem)
     lambdas = [pair.lambda_mm for pair in pairs if pair.used and pair.lambda_mm is not None]
     lambdas += [aim.lambda_mm for aim in aims if aim.used and aim.lambda_mm is not None]

@@ -18,6 +18,7 @@ from fgreg.model.events import (
     HandChoice,
     MarkerRecord,
     PairEvent,
+    PointEvent,
     RefusedEvent,
     TrackEvent,
     TrusRecord,
@@ -207,7 +208,7 @@ def _misfits(event: Event, setup: Setup | None, seen: ShotsSeen) -> Iterator[Pro
             found = "a frame, but neither probe.channels nor probe.image in session.yaml"
             yield Problem((*path, "frame"), found, "one of them there, to read the frame by")
     spot = event.spot if isinstance(event, PairEvent) else None
-    point = event if isinstance(event, CheckEvent) else spot
+    point = event if isinstance(event, CheckEvent | PointEvent) else spot
     if point is not None and point.left is not None and not {"camera", "camera.right"} <= setup.present:
         found = "pixels, but no camera with camera.right in session.yaml"
         yield Problem(("left",) if spot is None else ("spot", "left"), found, "them there, or camera_p_mm")

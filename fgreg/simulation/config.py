@@ -100,8 +100,9 @@ class SimulationConfig:
         camera_declared: poses, but of a session that has the camera, marker and board: what deviates in these acts on
             poses as it would on frames.
         spots: pairs have the pixels of the PM's visible spot in both views. spot_px: their error (sigma, each axis).
+        points: points known to both devices as data, at the end of the session.
         checks: points known to both devices (``SimulatedSession.checks``). check_sigma_mm: per axis, of the camera's
-            and of the TRUS side.
+            and of the TRUS side, of points as well.
 
     Errors that the session does not declare:
         outlier_pairs: number of outlier PMs: their looks are at another source, anywhere in the image.
@@ -158,6 +159,7 @@ class SimulationConfig:
     camera_declared: bool = False
     spots: bool = False
     spot_px: float = 0.5
+    points: int = 0
     checks: int = 0
     check_sigma_mm: tuple[float, float] = (0.35, 0.35)
 
@@ -216,8 +218,8 @@ class SimulationConfig:
             raise ValueError("epochs, looks_per_pm and track_looks have to be at least 1")
         if self.camera_move_mm is not None and self.epochs < 2:
             raise ValueError("camera_move_mm needs a session in which the camera moves: 2 epochs or more")
-        if min(self.aims, self.pairs, self.tracks_heard, self.tracks_silent, self.checks) < 0:
-            raise ValueError("aims, pairs, tracks and checks have to be 0 or more")
+        if min(self.aims, self.pairs, self.tracks_heard, self.tracks_silent, self.points, self.checks) < 0:
+            raise ValueError("aims, pairs, tracks, points and checks have to be 0 or more")
         if not (self.water_mm >= 0.0 and self.water_index >= 1.0):
             raise ValueError("water_mm has to be 0 or more, water_index at least 1")
         if not 0 <= self.outlier_pairs <= self.pairs:

@@ -108,11 +108,11 @@ class _Recorder:
     """Collects the events of one session in the order in which they happen."""
 
     def __init__(self, config: SimulationConfig, seed: int) -> None:
-        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(11)]
+        streams = [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(12)]
         self.config, self.seed = config, seed
         self.scene_rng, self.aim_rng, self.shot_rng, self.miss_rng = streams[:4]
         self.marker_rng, self.stage_rng, self.look_rng, self.misc_rng = streams[4:8]
-        self.beside_rng, self.check_rng, self.spot_rng = streams[8:]
+        self.beside_rng, self.check_rng, self.spot_rng, self.point_rng = streams[8:]
         self.events: list[Document] = []
         self.frames: dict[str, Callable[[], Frame]] = {}
         self.true_markers: dict[int, FloatArray] = {}
@@ -153,7 +153,8 @@ class _Recorder:
                     float(config.array.plane_angle_rad(tracks.spot_mm[j]))
                 )
                 answers.append({"t": self.events[-1]["t"], "stage_deg": degrees(angle + config.stage_slip_rad)})
-        checks, check_points = self._checks()
+        self.events += self._seen_by_both("point", config.points, self.point_rng)[0]
+        checks, check_points = self._seen_by_both("check", config.checks, self.check_rng)
         return SimulatedSession(
             config,
             self.seed,
@@ -210,9 +211,9 @@ class _Recorder:
         away -= np.sum(away * trus_beam, axis=1, keepdims=True) * trus_beam
         return replace(shots, spot_mm=shots.spot_mm + away)
 
-    def _checks(self) -> tuple[list[Document], FloatArray]:
+    def _seen_by_both(self, kind: str, n: int, rng: np.random.Generator) -> tuple[list[Document], FloatArray]:
         """Points of the tissue as the camera (in its last place) and the scanner, turned to them, read them."""
-        config, rng, n = self.config, self.check_rng, self.config.checks
+        config = self.config
         x = rng.uniform(-config.pm_x_mm, config.pm_x_mm, n)
         trus_p = self.scene.tissue.point(x, rng.uniform(-config.pm_angle_rad, config.pm_angle_rad, n))
         camera_p = transform_points(inverse(self.scene.trus_T_camera[-1]), trus_p)
@@ -223,9 +224,9 @@ class _Recorder:
         noise = sigma[:, None, None] * rng.standard_normal((2, n, 3))
         by_camera = rows(points_read(config, camera_p) + noise[0])
         covariances = [rows(s**2 * np.eye(3)) for s in sigma]
-        checks = [
+        events: list[Document] = [
             {
-                "type": "check",
+                "type": kind,
                 "t": self._now(),
                 "camera_p_mm": by_camera[i],
                 "covariance": covariances[0],
@@ -234,7 +235,7 @@ class _Recorder:
             }
             for i in range(n)
         ]
-        return checks, trus_p
+        return events, trus_p
 
     def _looks(
         self,

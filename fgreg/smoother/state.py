@@ -14,7 +14,7 @@ from fgreg.geometry.transforms import FloatArray
 from fgreg.graph.columns import Columns
 from fgreg.graph.packing import ConstantsPrior, PackedProblem, evidence
 from fgreg.graph.shared_state import Quadratic, SharedState, one_epoch
-from fgreg.model.measurements import Aim, EpochStart, Look, Measurements, Pair
+from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Look, Measurements, Pair
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.registration.epochs import restrict_epochs
@@ -111,13 +111,13 @@ class State:
     Attributes:
         epochs: the last one is the current one.
         aims, aim_inlier: calibration shots, and which of them are inliers.
-        shots: pairs, in the session's order.
+        shots: pairs, in the session's order. points: known points, each with its epoch.
         layout: None until a first registration.
         active_window: None where the current epoch has no registration (yet).
         finished: prior on the current epoch's shared variables from the pairs of the earlier epochs and the measured
             motions between epochs; None where it was not made, or nothing is known of earlier epochs.
-        carried: ``finished``, with the aims and the priors of the configuration; older: from the epoch's own pairs that
-            have left the active window. Their sum is the marginal prior of the active window.
+        carried: ``finished``, with the aims, the epoch's known points and the priors of the configuration; older: from
+            the epoch's own pairs that have left the active window. Their sum is the active window's marginal prior.
         marginalised: labels of the PMs in ``older``.
         why_none: why there is no registration, where there is none.
         nis, used: of the last event, where it was a pair.
@@ -127,6 +127,7 @@ class State:
     aims: tuple[Aim, ...] = ()
     aim_inlier: tuple[bool, ...] = ()
     shots: tuple[Shot, ...] = ()
+    points: tuple[KnownPoint, ...] = ()
     layout: Layout | None = None
     active_window: ActiveWindow | None = None
     finished: Quadratic | None = None
@@ -170,7 +171,7 @@ class State:
     def measurements(self) -> Measurements:
         """All measurements, as the batch solve takes them."""
         pairs = tuple(shot.as_measured for shot in self.shots)
-        return Measurements(self.aims, pairs, tuple(epoch.start for epoch in self.epochs))
+        return Measurements(self.aims, pairs, tuple(epoch.start for epoch in self.epochs), self.points)
 
     def counts(self) -> tuple[int, int]:
         """Numbers of inlier PMs, and of all PMs, over the epochs that have a registration."""
@@ -236,7 +237,8 @@ def finished_prior(state: State, at: SharedState, setting: Setting) -> State:
     shots = [shot for shot in state.shots[: state.now.first] if shot.inlier and shot.pair.epoch in known]
     numbers = {key: number for number, key in enumerate(looks_by_pm(shots))}
     starts = tuple(epoch.start for epoch in state.epochs)
-    finished = restrict_epochs(Measurements((), numbered(shots, numbers), starts), [*known, now])
+    points = tuple(point for point in state.points if point.epoch != now)  # the current epoch's are not of the earlier
+    finished = restrict_epochs(Measurements((), numbered(shots, numbers), starts, points), [*known, now])
     problem = setting.pack(finished)
     # The configuration's priors are those of the solve that uses this one.
     problem = replace(problem, prior=evidence(finished, problem.columns))
@@ -256,7 +258,8 @@ def carried_prior(state: State, at: SharedState, setting: Setting) -> State:
     """
     state = finished_prior(state, at, setting)
     aims = tuple(aim for aim, inlier in zip(state.aims, state.aim_inlier, strict=True) if inlier)
-    carried, _ = marginal_prior(setting.pack(Measurements(aims, (), (EpochStart(0.0),))), at)
+    points = tuple(replace(point, epoch=0) for point in state.points if point.epoch == state.epoch)
+    carried, _ = marginal_prior(setting.pack(Measurements(aims, (), (EpochStart(0.0),), points)), at)
     if state.finished is not None:
         carried = carried.plus(state.finished.at(at, setting.columns))
     return replace(state, carried=carried)

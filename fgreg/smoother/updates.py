@@ -1,12 +1,13 @@
-"""Updates of a state: by one more pair, by one more aim, by a camera move."""
+"""Updates of a state: by one more pair, aim or known point, by a camera move."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from fgreg.graph.packing import tells_of_constants
 from fgreg.graph.shared_state import Quadratic, SharedState
-from fgreg.model.measurements import Aim, EpochStart, Pair
+from fgreg.model.measurements import Aim, EpochStart, KnownPoint, Pair
 from fgreg.smoother.innovation import aim_fits, innovation, limit_of, sigma_distance
 from fgreg.smoother.isam_window import ActiveWindow, Change, Group, free_number, open_active_window, prepare, updated
 from fgreg.smoother.marginal_prior import carried_over, has_moved
@@ -159,8 +160,20 @@ def with_aim(state: State, aim: Aim, setting: Setting) -> State:
     return settled(state, active, layout, change, setting)
 
 
-def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) -> State:
-    """The state with a new epoch, to which the ``last`` pairs belong already.
+def with_point(state: State, point: KnownPoint, setting: Setting) -> State:
+    """The state with one more known point, which belongs to the current epoch."""
+    points = (*state.points, replace(point, epoch=state.epoch))
+    state, active, layout = replace(state, points=points, nis=None, used=False), state.active_window, state.layout
+    if active is None or layout is None:
+        return state
+    state = carried_prior(state, active.state, setting)
+    return settled(state, active, layout, Change(prior=total_prior(state, active.state, setting)), setting)
+
+
+def with_move(
+    state: State, start: EpochStart, setting: Setting, last: int = 0, points_since: float = math.inf
+) -> State:
+    """The state with a new epoch, to which the ``last`` pairs, and known points from a time on, belong already.
 
     With a measured motion the new epoch has a registration at once, from the motion prior between the epochs. Without
     one, and where pairs change their epoch, the epoch has none until it is registered.
@@ -176,10 +189,15 @@ def with_move(state: State, start: EpochStart, setting: Setting, last: int = 0) 
     for place in range(first, len(shots)):
         pair = replace(shots[place].as_measured, epoch=state.epoch + 1)
         shots[place] = Shot(pair, pair.look, pair.pm, inlier=False)
+    points = [
+        replace(point, epoch=state.epoch + 1) if point.epoch == state.epoch and point.t >= points_since else point
+        for point in state.points
+    ]
     moved = replace(
         state,
         epochs=(*state.epochs[:-1], ended, Epoch(start, first)),
         shots=tuple(shots),
+        points=tuple(points),
         active_window=None,
         finished=None,
         carried=None,
@@ -197,7 +215,12 @@ def without_move(state: State) -> State:
     first = state.now.first
     shots = [replace(shot, pair=replace(shot.pair, epoch=state.epoch - 1)) for shot in state.shots[first:]]
     return replace(
-        state, epochs=state.epochs[:-1], shots=(*state.shots[:first], *shots), active_window=None, why_none=""
+        state,
+        epochs=state.epochs[:-1],
+        shots=(*state.shots[:first], *shots),
+        points=tuple(replace(point, epoch=min(point.epoch, state.epoch - 1)) for point in state.points),
+        active_window=None,
+        why_none="",
     )
 
 
