@@ -91,7 +91,7 @@ def test_reading_needs_no_frames_but_checking_does(folder: Path) -> None:
     (folder / "frames" / "a.png").unlink()
     (folder / "frames" / "c.npy").unlink()
     (folder / "frames" / "c.npy").mkdir()
-    assert len(read_session(folder).events) == 19
+    assert len(read_session(folder).events) == 20
     assert checked(folder) == [
         "events.jsonl: line 3: marker.left: found 'frames/a.png': no such file, expected a file",
         "events.jsonl: line 5: trus.frame: found 'frames/c.npy': a folder, expected a file",

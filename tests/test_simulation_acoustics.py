@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.signal import hilbert
 
 from fgreg.geometry.transforms import FloatArray
 from fgreg.model.session_model import ChannelModel, ImageModel, ProbeModel, SensitivityModel
 from fgreg.simulation.acoustics import (
+    ElementHeight,
     Elevation,
     FaceSound,
     Hearing,
@@ -210,3 +212,40 @@ def test_probes_without_sampling_are_refused() -> None:
         simulate_channels(bare, np.array([0.0, 0.0, 40.0]), 0.0, rng())
     with pytest.raises(ValueError, match=r"probe\.image"):
         simulate_envelope_image(bare, np.array([0.0, 0.0, 40.0]), 0.0, rng())
+
+
+def spectrum_off_the_plane(angle_deg: float, element: ElementHeight | None) -> npt.NDArray[np.complex128]:
+    """Of the middle element, without noise, of a source 60 mm away at an angle off the plane."""
+    a = math.radians(angle_deg)
+    source = np.array([0.0, 60.0 * math.sin(a), 10.0 + 60.0 * math.cos(a)])
+    hearing = Hearing(elevation=None, element=element)
+    heard = simulate_channels(probe(), source, 0.0, rng(), snr_db=40.0, samples=2400, hearing=hearing)
+    return np.fft.rfft(heard[32].astype(np.float64) - noise_channels(probe(), rng(), 2400)[32])
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 4.0, -8.0])
+def test_an_element_with_a_height_averages_the_wave_over_it(angle_deg: float) -> None:
+    # Far away, or where its lens focuses, it is the mean over H sin(angle) / c: a sinc of the frequency.
+    frequency = np.fft.rfftfreq(2400, 1.0 / 40.0)
+    band = (frequency > 3.0) & (frequency < 7.0)
+    tall = spectrum_off_the_plane(angle_deg, ElementHeight(4.0, focus_mm=60.0))[band]
+    point = spectrum_off_the_plane(angle_deg, None)[band]
+    expected = np.sinc(frequency[band] * 4.0 * math.sin(math.radians(angle_deg)) / 1.5)
+    np.testing.assert_allclose(np.abs(tall / point), np.abs(expected), atol=0.02)
+
+
+def test_a_lens_brings_a_source_in_the_plane_together() -> None:
+    # 10 mm high, 5 MHz at 20 mm: the edges are 0.6 mm farther than the middle, two wavelengths.
+    a_source = np.array([0.0, 0.0, 30.0])
+    levels = []
+    for element in (None, ElementHeight(10.0, 20.0), ElementHeight(10.0)):
+        hearing = Hearing(elevation=None, element=element)
+        heard = simulate_channels(probe(), a_source, 0.0, rng(), snr_db=40.0, hearing=hearing)
+        levels.append(float(np.abs(heard[32]).max()))
+    assert levels[1] == pytest.approx(levels[0], rel=0.02)
+    assert levels[2] < 0.7 * levels[0]
+
+
+def test_an_element_with_a_height_has_no_other_loss_off_the_plane() -> None:
+    with pytest.raises(ValueError, match="elevation has to be None"):
+        Hearing(element=ElementHeight(5.0))

@@ -77,9 +77,14 @@ def _exact_aim(aim: Aim, true_T: FloatArray, truth: FullTruth, bias_mm: FloatArr
     return replace(aim, marker=_exact_marker(aim.marker, true_T, bias_mm), camera_p_spot_mm=as_float_array(spot, 3))
 
 
-def truth_covariance(measurements: Measurements, model: SessionModel, truth: FullTruth) -> FloatArray:
-    """(D, D) inverse information of the shared variables at the truth; epochs' right tangents come first."""
-    return _inverse(_truth_information(measurements, model, truth)[0])
+def truth_covariance(
+    measurements: Measurements, model: SessionModel, truth: FullTruth, rotation_sigma_rad: float | None = None
+) -> FloatArray:
+    """(D, D) inverse information of the shared variables at the truth; epochs' right tangents come first.
+
+    ``rotation_sigma_rad``: were each look's rotation measured besides, about the window's middle.
+    """
+    return _inverse(_truth_information(measurements, model, truth, rotation_sigma_rad)[0])
 
 
 def beam_covariance(measurements: Measurements, model: SessionModel, truth: FullTruth) -> FloatArray:
@@ -95,7 +100,9 @@ def _inverse(information: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(information * scale * scale[:, None]) * scale * scale[:, None])
 
 
-def _truth_information(measurements: Measurements, model: SessionModel, truth: FullTruth) -> tuple[FloatArray, int]:
+def _truth_information(
+    measurements: Measurements, model: SessionModel, truth: FullTruth, rotation_sigma_rad: float | None = None
+) -> tuple[FloatArray, int]:
     """Information (D, D) of the shared variables at the truth, and where the beam chart's part begins."""
     bias = np.zeros(3) if truth.marker_bias_mm is None else np.asarray(truth.marker_bias_mm, dtype=np.float64)
     pairs = tuple(
@@ -113,6 +120,10 @@ def _truth_information(measurements: Measurements, model: SessionModel, truth: F
     )
     known = tuple(_exact_point(point, truth) for point in measurements.points)
     problem = pack(replace(measurements, aims=aims, pairs=pairs, points=known), model)
+    if rotation_sigma_rad is not None:
+        weight = problem.looks.weight.copy()
+        weight[:, 2, 2] += rotation_sigma_rad**-2
+        problem = replace(problem, looks=replace(problem.looks, weight=weight))
     epochs = len(measurements.epochs)
     state = make_state(np.stack(truth.trus_T_camera[:epochs])[None], truth.marker_T_laser)
     state.constants[:, Constant.WINDOW_EDGE] = truth.window_edge_rad

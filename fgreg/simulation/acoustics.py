@@ -21,6 +21,8 @@ from fgreg.model.session_model import ChannelModel, ProbeModel
 from fgreg.simulation.array import TrueArray
 
 ChannelArray = npt.NDArray[np.float32]
+MOST_ELEVATION_RAD = math.radians(30.0)
+"""Angle off the plane up to which strips of an element are fine enough."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +93,32 @@ class Elevation:
 
 
 @dataclass(frozen=True, slots=True)
+class ElementHeight:
+    """A rectangular element across the image plane, in strips: each receives the wave at its own time.
+
+    Far from the element that is the mean over a time H sin(angle) / c of the wave that a point would receive.
+
+    Attributes:
+        height_mm: H.
+        focus_mm: distance at which the lens brings the wave of a source in the plane together.
+    """
+
+    height_mm: float
+    focus_mm: float = math.inf
+
+    def strips(self, pulse: Pulse, speed_mm_us: float) -> FloatArray:
+        """(n, 2) where the strips are across the plane, and the lens' delay in each, mm.
+
+        They are so fine that neighbours receive the shortest wave of a source at ``MOST_ELEVATION_RAD`` a fifth apart.
+        """
+        highest_mhz = pulse.centre_mhz * (1.0 + pulse.fractional_bandwidth)
+        n = max(8, math.ceil(5.0 * self.height_mm * highest_mhz / speed_mm_us * math.sin(MOST_ELEVATION_RAD)))
+        at = self.height_mm * ((np.arange(n) + 0.5) / n - 0.5)
+        lens = np.zeros(n) if math.isinf(self.focus_mm) else self.focus_mm - np.hypot(self.focus_mm, at)
+        return np.column_stack([at, lens])
+
+
+@dataclass(frozen=True, slots=True)
 class Hearing:
     """Directivity and losses across the array.
 
@@ -98,11 +126,18 @@ class Hearing:
         element_width: of the pitch; sets the directivity sinc(width sin(angle) / wavelength) cos(angle).
         spreading: amplitude falls with distance to the power -spreading (1 spherical, 0.5 cylindrical).
         elevation: loss off the image plane; None if every source is received as if it were in the plane.
+        element: height and lens of the elements, which spread the wave of a source off the plane over time: a loss off
+            the plane of its own (``elevation`` is None then). None: points.
     """
 
     element_width: float = 0.9
     spreading: float = 1.0
     elevation: Elevation | None = field(default_factory=Elevation)
+    element: ElementHeight | None = None
+
+    def __post_init__(self) -> None:
+        if self.element is not None and self.elevation is not None:
+            raise ValueError("an element with a height has a loss off the plane of its own: elevation has to be None")
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,6 +267,7 @@ def simulate_channels(
     out = rng.standard_normal((probe.elements, samples), dtype=np.float32)
     array = array or TrueArray.of(probe, {})
     elements = element_positions(probe, scan_rad, array)
+    across = array.across(np.asarray(scan_rad))
     in_plane = 1.0
     if hearing.elevation is not None:
         offset = float(rotation_offset_rad(source, scan_rad, array))
@@ -246,7 +282,10 @@ def simulate_channels(
     def arrive_from(trus_p_mm: FloatArray, peak: float, waveform: Pulse, share: float = 1.0) -> None:
         amplitude = _element_amplitudes(probe, trus_p_mm, elements, waveform, hearing, speed_mm_us)
         amplitude *= peak / amplitude.max()
-        arrive(np.linalg.norm(trus_p_mm - elements, axis=1), amplitude * share, waveform)
+        strips = np.zeros((1, 2)) if hearing.element is None else hearing.element.strips(waveform, speed_mm_us)
+        for height_mm, delay_mm in strips.tolist():
+            distance = np.linalg.norm(trus_p_mm - elements - height_mm * across, axis=1)
+            arrive(distance + delay_mm, amplitude * share / len(strips), waveform)
 
     arrive_from(source, _peak_of(snr_db), pulse, in_plane)
     along, outwards = array.along(np.asarray(scan_rad)), source - elements.mean(axis=0)

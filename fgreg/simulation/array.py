@@ -61,8 +61,15 @@ class TrueArray:
 
     def along(self, scan_rad: FloatArray) -> FloatArray:
         """(..., 3) unit vectors along the array, in the order of x, at stage angles (...)."""
+        return self._axis(0, scan_rad)
+
+    def across(self, scan_rad: FloatArray) -> FloatArray:
+        """(..., 3) unit vectors across the image plane, towards larger stage angles, at stage angles (...)."""
+        return self._axis(1, scan_rad)
+
+    def _axis(self, which: int, scan_rad: FloatArray) -> FloatArray:
         c, s = np.cos(scan_rad), np.sin(scan_rad)
-        x, y, z = self.trus_R_array[:, 0]
+        x, y, z = self.trus_R_array[:, which]
         return np.stack([x + 0.0 * c, y * c + z * s, z * c - y * s], axis=-1)
 
     def x_mm(self, trus_p_mm: FloatArray, scan_rad: FloatArray) -> FloatArray:
