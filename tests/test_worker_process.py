@@ -27,6 +27,11 @@ def _answer(request: Any) -> Any:
             os._exit(1)
         case "sleep":
             time.sleep(600.0)
+        case "work":
+            end = time.process_time() + 0.5
+            while time.process_time() < end:
+                pass
+            return 0.5
         case "not to be sent":
             return lambda: None
         case "pid":
@@ -172,6 +177,22 @@ def test_an_overdue_answer_is_reported_then_its_process_is_killed(
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
     assert asked(worker, 3.0) == 1.5
+
+
+def test_a_process_that_works_is_slow_and_not_dead_until_it_has_worked_too_much(
+    start: Callable[..., Worker], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker_process, "SLOW_S", 0.15)
+    worker, endless = start(answer_s=0.3), start(answer_s=PATIENCE_S, work_s=0.2)
+    worker.send("work")
+    endless.send("work")
+    troubles = set()
+    while (reply := worker.fetch(0.02)) is None:
+        troubles.add(worker.trouble)
+    assert reply == (0.5,)
+    assert troubles == {""}
+    assert endless.fetch(PATIENCE_S) == (None,)
+    assert "has worked for 0.2 s without an answer" in endless.failure
 
 
 def test_a_process_that_hangs_while_idle_is_reported_and_goes_on_where_it_can(

@@ -35,7 +35,12 @@ from fgreg.stage.client import StageLink, StageRecord
 from fgreg.stage.limits import MotionLimits
 from fgreg.stage.reconnect import ReconnectingStage
 from fgreg.stage.stop_on_exit import emergency_stop_all
+from fgreg.workers.progress import Progress
 from fgreg.workers.threads import undisturbed
+
+MOST_WORK_S = 30.0
+"""A registration without a new snapshot for longer is lost, also where its process still works: camera moves would go
+undetected."""
 
 OpenDevices = Callable[[ExitStack, SessionModel], Devices]
 """Opens all devices except the stage; they are closed with the stack."""
@@ -118,17 +123,24 @@ class NewestSnapshots:
         self._session = session
         self._engine: Engine | None = None
         self._reader: SnapshotReader | None = None
+        self._progress: Progress | None = None
 
     def read(self) -> Received:
-        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.read`; also ``closed`` if the process was killed."""
+        """As :meth:`fgreg.online.shared_snapshot.SnapshotReader.read`; also ``closed`` if the process was killed.
+
+        ``silent_s`` is 0 while the process works: one that takes seconds for a solve is slow and not dead.
+        """
         engine = self._session.engine
         if engine is not self._engine and isinstance(engine, EngineProcess):
             with suppress(FileNotFoundError):  # the new process has ended as well
                 self._reader = engine.reader()
+                self._progress = Progress(engine.pid or 0)
             self._engine = engine
         if self._reader is None:
             raise NoSnapshotError("the registration's process has ended")
         received = self._reader.read()
+        if self._progress is not None and received.silent_s < MOST_WORK_S:
+            received = replace(received, silent_s=min(received.silent_s, self._progress.idle_s()))
         alive = isinstance(self._engine, EngineProcess) and self._engine.alive
         return received if alive else replace(received, closed=True)
 

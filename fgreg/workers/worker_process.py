@@ -17,6 +17,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
+from fgreg.workers.progress import LOOK_S, Progress
+
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from types import FrameType
@@ -24,9 +26,11 @@ if TYPE_CHECKING:
 NICENESS = 5
 """Added to the owner's niceness, so that a worker gives way to its owner, and its own workers to it."""
 START_S, ANSWER_S, END_S = 60.0, 120.0, 0.5
-"""Default limits of start, answer and end."""
+"""Default limits of start, answer and end: of the time without progress (fgreg.workers.progress)."""
+WORK_S = 300.0
+"""Default of the most processor time for one answer: more is an endless loop."""
 SLOW_S = 2.0
-"""An answer that takes longer is reported as trouble."""
+"""A process without progress for longer, although an answer is due, is reported as trouble."""
 RESTART_S = 1.0
 """Time between two starts: a worker that cannot start must not keep a processor busy."""
 PING_S = 0.2
@@ -55,7 +59,10 @@ class WorkerProcess(Generic[Request, Answer]):
             method ``idle``, that is called every 0.1 s while no request comes.
         name: of the process; top shows its first 15 letters. what: its name in messages: ``the full solve's process``.
         niceness: added to the owner's.
-        start_s, answer_s, end_s: longest start, answer and end; then the process is killed.
+        start_s, answer_s: longest time without progress before its start and an answer; then the process is killed.
+            A process that computes, or waits for a processor, is slow and not dead.
+        work_s: most processor time for its start or an answer; then the process is killed as well.
+        end_s: longest end.
         restart: whether to start another process after one has ended; if not, every request fails from then on.
         daemon: False if the work starts processes itself.
 
@@ -75,14 +82,17 @@ class WorkerProcess(Generic[Request, Answer]):
         start_s: float = START_S,
         answer_s: float = ANSWER_S,
         end_s: float = END_S,
+        work_s: float = WORK_S,
         restart: bool = True,
         daemon: bool = True,
     ) -> None:
         self._make, self._arguments, self._name, self._what = make, arguments, name, what
         self._niceness, self._restart, self._daemon = niceness, restart, daemon
-        self.start_s, self.answer_s, self._end_s = start_s, answer_s, end_s
+        self.start_s, self.answer_s, self._end_s, self._work_s = start_s, answer_s, end_s, work_s
         self.failure, self.lost, self.trouble = "", False, ""
         self._child: _Child | None = None
+        self._progress: Progress | None = None  # of the child
+        self._worked_s = 0.0  # its processor time at _sent_s
         self._awaited: Kind | None = None  # the one message that has not been answered, sent at _sent_s
         self._sent_s = self._received_s = self._started_s = 0.0
         self._waiting: tuple[Request] | None = None  # to be handed over
@@ -154,6 +164,7 @@ class WorkerProcess(Generic[Request, Answer]):
         except OSError as error:
             self.trouble = f"it cannot be started: {error}"
         else:
+            self._progress, self._worked_s = Progress(self._child.process.pid or 0), 0.0
             self._awaited = "ready"
 
     def _advance(self, wait_s: float) -> None:
@@ -167,10 +178,8 @@ class WorkerProcess(Generic[Request, Answer]):
             else:
                 time.sleep(min(wait_s, PING_S))
             return
-        limit_s = self.start_s if self._awaited == "ready" else self.answer_s
-        left_s = 0.0 if self._awaited is None else max(0.0, self._sent_s + limit_s - now_s)
         try:
-            if child.connection.poll(min(wait_s, left_s)):
+            if child.connection.poll(0.0 if self._awaited is None else min(wait_s, LOOK_S)):
                 self._take(*child.connection.recv())
         except (EOFError, OSError):
             self._lose("has ended")
@@ -181,11 +190,20 @@ class WorkerProcess(Generic[Request, Answer]):
                 (request,), self._waiting = self._waiting, None
                 self._post(child, "request", request)
             return
-        waited_s = time.monotonic() - self._sent_s
-        if waited_s >= limit_s:
-            self._lose(f"has not answered for {waited_s:.1f} s")
-        elif waited_s > SLOW_S and self._awaited != "ready":
-            self.trouble = f"it has not answered for {waited_s:.1f} s"
+        self._judge()
+
+    def _judge(self) -> None:
+        """Whether the process hangs although an answer is due, or works on it without end."""
+        if self._progress is None or self._awaited is None:
+            return
+        limit_s = self.start_s if self._awaited == "ready" else self.answer_s
+        stuck_s = min(time.monotonic() - self._sent_s, self._progress.idle_s())
+        if stuck_s >= limit_s:
+            self._lose(f"has not answered for {stuck_s:.1f} s")
+        elif self._progress.worked_s - self._worked_s > self._work_s:
+            self._lose(f"has worked for {self._work_s:g} s without an answer")
+        elif self._awaited != "ready":
+            self.trouble = f"it has not answered for {stuck_s:.1f} s" if stuck_s > SLOW_S else ""
 
     def _take(self, kind: Kind, value: Any) -> None:
         if kind == "broken":
@@ -201,6 +219,9 @@ class WorkerProcess(Generic[Request, Answer]):
         """Send a message to an idle process."""
         child.send((kind, request))
         self._awaited, self._sent_s = kind, time.monotonic()
+        if self._progress is not None:
+            self._progress.idle_s()
+            self._worked_s = self._progress.worked_s
 
     def _lose(self, why: str) -> None:
         """The process has ended or has to be killed."""
@@ -218,7 +239,7 @@ class WorkerProcess(Generic[Request, Answer]):
     def _end(self, patience_s: float) -> None:
         if self._child is not None:
             self._child.end(patience_s)
-        self._child = self._awaited = None
+        self._child = self._awaited = self._progress = None
 
 
 @contextmanager
