@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 
 AGAIN_S = 0.2
 """Time between attempts to connect."""
-SILENT_S = 0.5
-"""A device that sends by itself is lost after this long without data."""
+SILENT_S = 1.0
+"""A device that sends by itself is lost after this long without data; a busy machine needs half a second."""
 START_S = 60.0
 TRUTH_S = 20.0
 """Longest time that a room may take to send the ground truth."""
@@ -317,7 +317,8 @@ class RoomStage(SimulatedStage):
         """The reported status; the room gets the true angle."""
         status = super().status()
         try:
-            send(self._room, {"scan": self.model.scan_from_device(self.device_rad)})
+            scan_rad = self.model.scan_from_device(self.device_rad)
+            send(self._room, {"scan": scan_rad, "at_s": host_now()})
         except WireClosed as error:
             self._room.close()
             raise StageLost(f"simulated stage: the room is gone ({error})") from None

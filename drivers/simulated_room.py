@@ -17,11 +17,14 @@ import queue
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from fgreg.drivers.simulated_wire import WireClosed, receive, send
 from fgreg.simulation.room import Room, room_config
@@ -33,6 +36,8 @@ PICTURE_RATE = 4.0
 """Largest number of B-mode pictures per second; they come between pulses."""
 FRAMES_WAITING, PULSES_WAITING = 2, 64
 """Largest number of unread frames and pulses; after that the oldest is dropped."""
+SLOW_S = 0.06
+"""Where a picture takes longer, the next one waits as long as it took: the machine has more to do than the room."""
 SETTLE_S = 0.4
 """The surgeon sends an aim once the fibre has been still for this long."""
 SAY_AGAIN_S = 3.0
@@ -113,7 +118,9 @@ class RoomServer:
         self._clients: list[_Client] = []
         self._asked: queue.Queue[dict[str, Any]] = queue.Queue()
         self._end = threading.Event()
-        self._scan_rad = 0.0  # where the plane truly stands
+        self._planes: deque[tuple[float, float]] = deque(
+            [(0.0, 0.0)], maxlen=128
+        )  # when, and where the plane truly stood
         self.start_s = time.monotonic()
         self._said_s = self._pictured_s = -math.inf
         self._pictures = 0
@@ -191,7 +198,7 @@ class RoomServer:
         try:
             while True:
                 header, _ = receive(connection)
-                self._scan_rad = float(header["scan"])
+                self._planes.append((float(header["at_s"]) - self.start_s, float(header["scan"])))
         except (WireClosed, KeyError, TypeError, ValueError):
             connection.close()
         with self._lock:
@@ -217,6 +224,11 @@ class RoomServer:
 
     # --- time -------------------------------------------------------------------------------------------------------
 
+    def _scan_at(self, t_s: float) -> float:
+        """Where the plane stood at a time, also where its data are made late on a busy machine."""
+        times, angles = np.array(self._planes).T
+        return float(np.interp(t_s, times, angles))
+
     def now_s(self) -> float:
         """Seconds since the room started."""
         return time.monotonic() - self.start_s
@@ -239,7 +251,9 @@ class RoomServer:
                 pulse = max(pulse + 1, math.floor((now - 0.2) * self._pulse_rate))
             else:
                 self._frame(due_frame, frame)
-                frame = max(frame + 1, math.floor(now * self._frame_rate))  # what cannot be kept up with is skipped
+                took = self.now_s() - now
+                free = now + 2.0 * took if took > SLOW_S else now  # what cannot be kept up with is skipped
+                frame = max(frame + 1, math.floor(free * self._frame_rate))
         self._listener.close()
         for client in list(self._clients):
             client.close()
@@ -269,7 +283,7 @@ class RoomServer:
         clients = self._to("probe")
         if not clients or self._faults["probe"] == "silent":
             return
-        data = self.room.channel_data(t_s, self._scan_rad, index)
+        data = self.room.channel_data(t_s, self._scan_at(t_s), index)
         header = {"index": index, "device_s": PROBE_CLOCK_S + t_s, "shape": list(data.shape)}
         for client in clients:
             client.put(header, data.tobytes())
@@ -279,7 +293,7 @@ class RoomServer:
         if not clients or t_s - self._pictured_s < 1.0 / PICTURE_RATE:
             return
         self._pictured_s = t_s
-        image, pixel_mm, origin_mm = self.room.bmode(self._scan_rad, self._pictures)
+        image, pixel_mm, origin_mm = self.room.bmode(self._scan_at(t_s), self._pictures)
         header = {
             "index": self._pictures,
             "device_s": PROBE_CLOCK_S + t_s,

@@ -20,7 +20,7 @@ from fgreg.stage.limits import MotionKind, MotionLimits
 from fgreg.stage.stop_on_exit import emergency_stop_all
 
 STAGE = StageModel(math.radians(2.0), (math.radians(-60.0), math.radians(60.0)))
-LIMITS = MotionLimits.of_session(STAGE, heartbeat_s=0.5, search_speed_rad_s=math.radians(4.0))
+LIMITS = MotionLimits.of_session(STAGE, heartbeat_s=0.5, step_heartbeat_s=0.5, search_speed_rad_s=math.radians(4.0))
 
 
 def beat_for(link: StageLink, seconds: float) -> None:

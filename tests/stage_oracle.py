@@ -39,9 +39,11 @@ class Oracle:
         beats = [d for _, name, d in self.history[self._since("clock jump") :] if name == "beat"]
         return max(beats, key=lambda beat: beat["sent"], default=None)
 
-    def alive(self, now: float) -> bool:
+    def alive(self, now: float, kind: str | None = None) -> bool:
+        """For a motion of a kind; without one, for what was asked for last."""
+        kind = kind or (self._newest("request") or {}).get("kind")
         beat = self._last_beat()
-        return beat is not None and now - 0.25 - 1e-9 <= beat["sent"]
+        return beat is not None and now - (0.25 if kind == "track" else 1.0) - 1e-9 <= beat["sent"]
 
     def trackable(self, now: float) -> bool:
         beat = self._last_beat()
@@ -88,7 +90,7 @@ class Oracle:
             return "the last request since then is for something else, if there is one"
         if kind == "home" and self._newest("drive home", self._since("request")) is not None:
             return "homed already on this request"
-        if not self.alive(now):
+        if not self.alive(now, kind):
             return "no heartbeat"
         if not -1e-3 <= now - sent <= 0.2 + 1e-9:
             return "command too old"
@@ -118,7 +120,7 @@ class Oracle:
         for what in ("clock jump", "emergency", "fault", "stop"):
             if self._newest(what, started) is not None:
                 return what
-        if not self.alive(now):
+        if not self.alive(now, kind):
             return "no heartbeat"
         status = self.heard_of_stage(now)
         if status is None:

@@ -331,9 +331,16 @@ def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
             return True
 
     marker_tracker.poses = History()  # type: ignore[assignment]
-    assert marker_tracker.detect(StereoFrame(Stamp(now, now), blank, blank, 0)) is None
-    assert poses == []
     config = room_config(1)
     left, right = Room(config).pictures(0.0, 0)
-    assert marker_tracker.detect(StereoFrame(Stamp(now, now), left, right, 1)) is not None
+    end = time.monotonic() + 60.0
+    try:
+        for number, (first, second) in enumerate([(blank, blank), (left, right)]):
+            marker_tracker.add(StereoFrame(Stamp(now, now), first, second, number))
+            while not marker_tracker.poll():
+                assert time.monotonic() < end
+                time.sleep(0.01)
+            assert bool(marker_tracker.missing) is (number == 0)
+    finally:
+        marker_tracker.close()
     assert poses == [pytest.approx(now - 0.08)]

@@ -216,7 +216,7 @@ class GateMachine(RuleBasedStateMachine):
         if "clock back, old beats" in faults:
             self.clock_jumps(-0.01)
         if "heartbeat gap" in faults:
-            for _ in range(15):
+            for _ in range(15 if kind is MotionKind.TRACK else 55):
                 self.now += 0.02
                 self._tick()
             self._live()
@@ -269,7 +269,7 @@ class GateMachine(RuleBasedStateMachine):
             self.request(MotionKind.TRACK)
         marker = {"no marker": None, "marker old": 0.21, "marker ahead": -0.05}.get(disturbance, 0.03)
         registration = {"refused": "refused", "no registration": None}.get(disturbance, "ok")
-        for _ in range(20):
+        for _ in range(60 if disturbance == "no beat" else 20):
             if disturbance == "no beat":
                 self.now += 0.02
                 self._tick()

@@ -154,7 +154,7 @@ class Watch:
         locator.complete_pulses = _counted(locator.complete_pulses, self._heard)  # type: ignore[method-assign]
         locator.add_frames = _counted(locator.add_frames, self._hear)  # type: ignore[method-assign]
         recorder.hand_over = _counted(recorder.hand_over, self._handed_over)  # type: ignore[method-assign]
-        loop.marker_tracker.detect = self._timed(loop.marker_tracker.detect, "look")  # type: ignore[method-assign]
+        loop.marker_tracker.poll = self._timed(loop.marker_tracker.poll, "look")  # type: ignore[method-assign]
         loop.turn = self._timed(loop.turn, "turn")  # type: ignore[method-assign]
         loop._steering.order = self._timed(loop._steering.order, "order")  # type: ignore[method-assign]
 

@@ -13,6 +13,8 @@ STILL_MM, STILL_RAD = 0.8, 0.02
 """Largest distance and rotation from the median pose."""
 FEWEST = 4
 """Least number of poses."""
+SLOW_S = 1.5
+"""Where fewer than that come in ``STILL_S``, the last ones count up to this long: a slow machine has few frames."""
 
 
 def held_pose(poses: PoseHistory, now_s: float, over_s: float = STILL_S) -> FloatArray | None:
@@ -21,6 +23,8 @@ def held_pose(poses: PoseHistory, now_s: float, over_s: float = STILL_S) -> Floa
     Uses the poses of the last ``over_s`` before ``now_s``; they have to span most of that time.
     """
     recent = poses.since(now_s - over_s)
+    if len(recent) < FEWEST and len(slow := poses.since(now_s - SLOW_S)[-FEWEST:]) == FEWEST:
+        recent, over_s = slow, max(over_s, now_s - slow[0].t_s)
     if len(recent) < FEWEST or now_s - recent[-1].t_s > 0.5 * over_s or recent[0].t_s > now_s - 0.5 * over_s:
         return None
     points = np.stack([pose.parent_T_child[:3, 3] for pose in recent])

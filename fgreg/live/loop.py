@@ -1,14 +1,16 @@
 """The live loop: frames and pulses in, events and stage orders out, once per frame.
 
-One step: newest frame -> marker pose -> angle to turn to (from the shared snapshot, which is read without waiting) ->
-actions of the workflow -> stage watchdog, recorder, operator. The loop polls all devices; none of them can block it.
+One step: newest marker pose -> angle to turn to (from the shared snapshot, which is read without waiting) -> actions of
+the workflow -> stage watchdog, recorder, operator. The loop polls all devices; none of them can block it. What takes
+processor time, above all the marker's detection, runs in worker processes of lower priority: a step takes some
+milliseconds, so that its heartbeat comes also from a machine that others keep busy.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Protocol
@@ -19,7 +21,7 @@ from fgreg.camera_moves.validity import Validity
 from fgreg.detection.board import detect_board
 from fgreg.detection.corner_noise import pool_corner_noise
 from fgreg.detection.results import BoardFit, NotFound, board_corner
-from fgreg.drivers.base import BmodeFrame, CommandKind, DeviceLost, Registration, StereoFrame, host_now
+from fgreg.drivers.base import BmodeFrame, CommandKind, DeviceLost, Registration, host_now
 from fgreg.drivers.operator_words import asked
 from fgreg.live.actions import (
     Action,
@@ -43,6 +45,7 @@ from fgreg.live.heard_words import HeardWords
 from fgreg.live.marker_tracker import MarkerTracker
 from fgreg.live.merge_looks import one_spot
 from fgreg.live.overlay_feed import OverlayFeed
+from fgreg.live.pace import Pace
 from fgreg.live.pulse_locator import PulseLocator
 from fgreg.live.recorder import Recorder
 from fgreg.live.scope_holder import Holder, HolderMove, HolderSettings
@@ -138,6 +141,8 @@ class LiveLoop:
         self._words = HeardWords()
         self._verification = LiveVerification(model, self.pulse_locator.locator)
         self._text, self._task, self._number = "", "", 0
+        self._pace = Pace(self._began_s)
+        self._unused = 0  # frames that were older than another, or repeated
         self._bmode: BmodeFrame | None = None
         self._unshown = 0
         self._sent_s, self._stepped_s = -math.inf, -math.inf
@@ -150,17 +155,18 @@ class LiveLoop:
         while going():
             if not self.turn():
                 time.sleep(IDLE_S)
-            if on_status is not None:
+            elif on_status is not None:
                 on_status(self.status())
 
     def turn(self) -> bool:
         """One step; whether there was anything to do."""
-        frames = self._sources["camera"].poll()
+        self._take_frames()
+        processed = self.marker_tracker.poll()
         now = host_now()
-        if not frames and now - self._stepped_s < STEP_S:
+        if not processed and now - self._stepped_s < STEP_S:
             return False
-        before = self.marker_tracker.newest
-        pose = self._track_marker(frames)
+        self._pace.step(now)
+        pose = self._processed() if processed else None
         self._take_pulses()
         self._show()
         self._follow_camera()
@@ -168,14 +174,17 @@ class LiveLoop:
             self.pulse_locator.plane(plane.at_s, plane.scan_rad, plane.moving)
         self._tracking = self._track_beam(pose)
         self._stepped_s = now
+        self._say_pace(now)
         newest, verdict = self.marker_tracker.poses.newest(), self._verdict()
         self._steering.beat(None if newest is None else newest.t_s, None if verdict is None else verdict.value)
         for action in self._workflow.step(self._inputs(now)):
             self._do(action)
         self._take_aim()
         self._take_verification()
-        if self.marker_tracker.newest is not before:  # the frame was processed
-            self.figures.latency_ms.append(1e3 * (host_now() - frames[-1].stamp.host_s))
+        if processed and self.marker_tracker.newest is not None:
+            latency_s = host_now() - self.marker_tracker.newest.stamp.host_s
+            self.figures.latency_ms.append(1e3 * latency_s)
+            self._pace.frame(now, latency_s)
         self._send(now)
         if self._overlay is not None:
             self._overlay.show(self.status())
@@ -183,6 +192,12 @@ class LiveLoop:
         if text := self._words.news(host_now()):
             self._note(text)
         return True
+
+    def _say_pace(self, now: float) -> None:
+        """Say what this machine can do before anything moves, and what is too slow; hold the stage until then."""
+        for text in self._pace.news(now):
+            self._note(text)
+        self._workflow.not_yet = self._pace.not_yet(now)
 
     @property
     def lost(self) -> Mapping[str, str]:
@@ -208,6 +223,7 @@ class LiveLoop:
             self._invalid(),
             self._words.last,
             self._words.refused,
+            self._pace.slow,
         )
 
     def close(self) -> None:
@@ -217,17 +233,25 @@ class LiveLoop:
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
-    def _track_marker(self, frames: Sequence[StereoFrame]) -> TimedPose | None:
+    def _take_frames(self) -> None:
+        frames = self._sources["camera"].poll()
         if not frames:
+            return
+        now = host_now()
+        new = self._pictures.is_new(frames[-1], now)
+        self._pace.arrived(now, len(frames))
+        self._unused += len(frames) - new
+        if new:
+            self.marker_tracker.add(frames[-1])
+        self.figures.skipped = self._unused + self.marker_tracker.dropped
+
+    def _processed(self) -> TimedPose | None:
+        """The pose in the frame that was processed last; None if the marker was not found."""
+        self.figures.frames += 1
+        if self.marker_tracker.missing:
             return None
-        new = self._pictures.is_new(frames[-1], host_now())
-        self.figures.frames += new
-        self.figures.skipped += len(frames) - new
-        if not new:
-            return None
-        pose = self.marker_tracker.detect(frames[-1])
-        self.figures.found += pose is not None
-        return pose
+        self.figures.found += 1
+        return self.marker_tracker.poses.newest()
 
     def _take_pulses(self) -> None:
         self.pulse_locator.wanted = self._workflow.wants_pulses
@@ -501,6 +525,7 @@ class LiveLoop:
             if left_out := source.left_out(now):
                 self._note(f"{role}: {left_out}")
         health.found("locator", self.pulse_locator.trouble)
+        health.found("marker detection", self.marker_tracker.trouble)
         if "recording" in health.lost and not (state.blocked or state.waiting):
             steering.unwritten = ""  # the note about it has been written
         health.found("recording", state.blocked or steering.unwritten)

@@ -1,26 +1,29 @@
 """Marker poses from the camera's frames, on the host's clock.
 
-The marker is detected in the newest frame only; older frames are dropped and counted.
+The views are processed by workers (fgreg.live.view_worker), one frame at a time: the newest waits, older ones are
+dropped and counted. So the frame rate follows from what the machine can do, and a slow one does not delay the loop.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 from fgreg.detection.corner_noise import CornerNoise, pool_corner_noise
 from fgreg.detection.marker import ViewCorners, marker_from_views
-from fgreg.detection.marker_roi import EVERYWHERE, MarkerRoi
+from fgreg.detection.marker_roi import EVERYWHERE
 from fgreg.detection.results import MarkerFit, NotFound, marker_covariance
-from fgreg.drivers.base import StereoFrame
-from fgreg.live.right_view_worker import RightViewWorker, right_roi
+from fgreg.drivers.base import StereoFrame, host_now
+from fgreg.live.view_worker import ViewWorker
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import DeviceClock, PoseHistory, TimedPose
 
 POOL_EVERY, POOL_OVER = 15, 60
 """The corner noise is pooled again after every ``POOL_EVERY`` detections, over the last ``POOL_OVER``."""
+LEAVES = 1.25
+"""The next frame begins no sooner than this many times what the last one took: on a slow machine the registration and
+the locator need a processor, too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,64 +37,111 @@ class WholeFrame:
 
 
 class MarkerTracker:
-    """Detects the marker in each frame.
+    """Detects the marker, one frame after another.
 
     Attributes:
         poses: recent ``camera_T_marker`` at host times.
         missing: why the marker was not found in the newest frame; empty if it was.
-        newest: the newest frame.
+        newest: the newest frame that was processed. took_s: the time that it took.
         whole: the newest frame that was searched as a whole, once in some frames.
+        processed, dropped: number of frames processed, and of frames dropped for newer ones.
     """
 
     def __init__(self, model: SessionModel, latency_s: float = 0.0) -> None:
         if model.camera is None or model.marker is None:
             raise ValueError("the session has no camera or no marker")
-        self._rig, self._marker = model.camera, model.marker
-        rig = self._rig
-        self._left = MarkerRoi(rig.left, 0, np.eye(4), self._marker)
-        self._right = None if rig.right is None else right_roi(rig, self._marker)
-        self._right_worker = RightViewWorker(rig, self._marker)
+        self._marker = model.marker
+        sides = 1 if model.camera.right is None else 2
+        self._workers = [ViewWorker(model.camera, model.marker, side) for side in range(sides)]
         self._clock = DeviceClock(latency_s)
         self._fits: deque[MarkerFit] = deque(maxlen=POOL_OVER)
         self._noise: CornerNoise = pool_corner_noise(())
         self._found = 0
+        self._waiting: StereoFrame | None = None
+        self._flying: tuple[StereoFrame, float] | None = None  # the frame in hand, its exposure's host time
+        self._views: list[tuple[ViewCorners | None] | None] = []
+        self._began_s, self._next_s = 0.0, -math.inf
         self.poses = PoseHistory()
         self.missing = ""
         self.newest: StereoFrame | None = None
         self.whole: WholeFrame | None = None
-        self._frames = 0
+        self._begun = 0  # number of frames handed to the workers
+        self.took_s = 0.0
+        self.processed = self.dropped = 0
 
-    def detect(self, frame: StereoFrame) -> TimedPose | None:
-        """The marker's pose at the frame's exposure; None if it is not found, and ``missing`` gives the reason."""
-        t_s = self._clock.host_time(frame.stamp)
-        fit = self._detect(frame, t_s)
+    @property
+    def trouble(self) -> str:
+        """What is wrong with the workers; empty if they answer."""
+        return next((worker.trouble for worker in self._workers if worker.trouble), "")
+
+    def add(self, frame: StereoFrame) -> None:
+        """Take in a frame; one that still waits is dropped for it."""
+        self._clock.host_time(frame.stamp)
+        self.dropped += self._waiting is not None
+        self._waiting = frame
+        self._begin()
+
+    def poll(self) -> bool:
+        """Take in results and begin with the next frame, without waiting; whether a frame was processed.
+
+        Its pose is then the last of ``poses``, or ``missing`` gives the reason why there is none.
+        """
+        done = self._flying is not None and self._take()
+        self._begin()
+        return done
+
+    def _begin(self) -> None:
+        """Hand the waiting frame to the workers, if they are free."""
+        frame, now_s = self._waiting, host_now()
+        if frame is None or self._flying is not None or now_s < self._next_s:
+            return
+        pictures = [frame.left] if frame.right is None or len(self._workers) == 1 else [frame.left, frame.right]
+        # Each view is asked, so that all processes start at once.
+        ready = [worker.ready(picture) for worker, picture in zip(self._workers, pictures, strict=False)]
+        if not all(ready):
+            return
+        for worker, picture in zip(self._workers, pictures, strict=False):
+            worker.submit(picture, whole=self._begun % EVERYWHERE == 0)  # both views at once
+        self._begun += 1
+        self._flying, self._waiting = (frame, self._clock.host_time(frame.stamp)), None
+        self._views, self._began_s = [None] * len(pictures), now_s
+
+    def _take(self) -> bool:
+        """Take in the views of the frame in hand; whether all are there, or one is lost."""
+        if self._flying is None:
+            return False
+        for side, worker in enumerate(self._workers[: len(self._views)]):
+            if self._views[side] is None:
+                self._views[side] = worker.result()
+        if any(view is None for view in self._views):
+            return False
+        (frame, t_s), self._flying = self._flying, None
+        views = [view[0] for view in self._views if view is not None]
+        self.took_s = host_now() - self._began_s
+        self._next_s = self._began_s + LEAVES * self.took_s
         self.newest = frame
+        self.processed += 1
+        left = views[0]
+        if left is None or any(view is None for view in views):
+            lost = next(worker for worker, view in zip(self._workers, views, strict=False) if view is None)
+            self.missing = lost.failure or "the picture's process was replaced"
+            return True
+        right = views[1] if len(views) > 1 else None
+        if self._begun % EVERYWHERE == 1:
+            self.whole = WholeFrame(t_s, frame, left, right)
+        fit = marker_from_views(left, right, self._marker)
         if isinstance(fit, NotFound):
             self.missing = fit.reason
-            return None
+            return True
         self.missing = ""
         self._fits.append(fit)
         if self._found % POOL_EVERY == 0:
             self._noise = pool_corner_noise(f.pose for f in self._fits)
         self._found += 1
-        pose = TimedPose(t_s, fit.camera_T_marker, marker_covariance(fit, self._noise))
-        return pose if self.poses.add(pose) else None
-
-    def _detect(self, frame: StereoFrame, t_s: float) -> MarkerFit | NotFound:
-        """As :func:`fgreg.detection.marker.detect_marker`, with both views in parallel if the worker is ready."""
-        right: ViewCorners | None = None
-        whole = self._frames % EVERYWHERE == 0  # both views at once
-        self._frames += 1
-        in_worker = (
-            frame.right is not None and self._right is not None and self._right_worker.submit(frame.right, whole=whole)
-        )
-        left = self._left.detect(frame.left, whole=whole)
-        if frame.right is not None and self._right is not None:
-            right = (self._right_worker.result() if in_worker else None) or self._right.detect(frame.right, whole=whole)
-        if whole:
-            self.whole = WholeFrame(t_s, frame, left, right)
-        return marker_from_views(left, right, self._marker)
+        self.poses.add(TimedPose(t_s, fit.camera_T_marker, marker_covariance(fit, self._noise)))
+        return True
 
     def close(self) -> None:
-        """End the right view's worker process."""
-        self._right_worker.close()
+        """End the worker processes."""
+        for worker in self._workers:
+            worker.close()

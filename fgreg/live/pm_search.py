@@ -21,7 +21,7 @@ ARRIVED_RAD = 0.004
 """The stage has arrived when it is this close to its goal."""
 QUIET_S = 0.03
 """A pulse counts once the stage has stood still for this long."""
-PATIENCE_S = 3.0
+PATIENCE_S = 8.0
 """The search ends if the stage does not arrive, or no laser pulse comes, within this time."""
 MOST_LOOKS = 4
 """Largest number of looks recorded for one PM."""

@@ -22,11 +22,11 @@ from fgreg.live.actions import LocatedPulse
 from fgreg.live.pa_worker import Locator
 from fgreg.model.measurements import OtherPosition
 from fgreg.model.session_model import SessionModel
-from fgreg.model.time_sync import DeviceClock, PairRefused, PoseHistory
+from fgreg.model.time_sync import HELD_GAP_S, DeviceClock, PairRefused, PoseHistory
 
-GIVE_UP_S = 0.5
+GIVE_UP_S = 1.0
 """Longest time that a pulse waits for the marker poses around it."""
-LOCATE_S = 2.0
+LOCATE_S = 6.0
 """Longest time that a pulse waits for the worker process."""
 UNREAD_S = 2.0
 """A frame that could not be processed is reported for this long."""
@@ -134,7 +134,7 @@ class PulseLocator:
     def _complete(self, pulse: _Waiting, poses: PoseHistory) -> LocatedPulse:
         complete = LocatedPulse(pulse.pulse_s, pulse.scan_rad)
         try:
-            complete = replace(complete, marker=poses.at(pulse.pulse_s))
+            complete = replace(complete, marker=poses.at(pulse.pulse_s, HELD_GAP_S))
         except PairRefused as error:
             complete = replace(complete, unpaired=str(error))
         if pulse.located is None:

@@ -99,6 +99,7 @@ class Status:
         pose, frame: newest. bmode: newest, None if its scanner is lost.
         invalid: why the registration is invalid, whatever its verdict was; empty if it is valid.
         heard: the last word in force and who said it. refused: the last refused one, with the reason.
+        slow: what is too slow on this machine, why, and what to lower; empty if nothing is.
     """
 
     now_s: float
@@ -117,6 +118,7 @@ class Status:
     invalid: str = ""
     heard: str = ""
     refused: str = ""
+    slow: str = ""
 
     @property
     def verdict(self) -> Verdict:
@@ -148,4 +150,4 @@ class Status:
     @property
     def reasons(self) -> tuple[str, ...]:
         """Reasons for the verdict."""
-        return tuple(filter(None, (self.invalid, *self.recorder.registration.reasons)))
+        return tuple(filter(None, (self.slow, self.invalid, *self.recorder.registration.reasons)))

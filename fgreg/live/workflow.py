@@ -51,6 +51,8 @@ CHECK_RAD = math.radians(2.0)
 """While the stage follows, a PM detected with the plane this close to the tracking result becomes a pair."""
 CHECK_S = 0.3
 """Time between two such detections."""
+UNSEEN_S = 2.0
+"""The marker is not seen once its newest pose is older; a slow machine has three frames a second."""
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
 """Wait after which the operator gets a message about what is missing."""
@@ -115,6 +117,7 @@ class Workflow:
 
     Attributes:
         stage: current stage of the session.
+        not_yet: why the stage may not be homed yet; empty if it may.
     """
 
     def __init__(self, model: SessionModel, settings: WorkflowSettings, next_pm: int = 0) -> None:
@@ -125,6 +128,7 @@ class Workflow:
         low, high = (model.stage.scan_from_device(angle) for angle in model.stage.limits_device_rad)
         self._field = (min(low, high), max(low, high))
         self.stage = Stage.AIMING if settings.aims else Stage.COLLECTING
+        self.not_yet = ""
         self._search: PmSearch | None = None
         self._done_at: FloatArray | None = None
         self._pms, self._epoch = 0, 0
@@ -190,6 +194,11 @@ class Workflow:
     def _may_turn(self, inputs: Inputs, stage: StageView, out: list[Action]) -> bool:
         """Whether the stage is homed and the operator has requested the next kind of motion; if not, ask for it."""
         if not stage.homed:
+            if self.not_yet:
+                if inputs.now_s - self._waits_s > PATIENCE_S:
+                    self._waits_s = inputs.now_s
+                    out.append(Tell(f"the stage is not homed: {self.not_yet}"))
+                return False
             self._want(CommandKind.HOME, "the stage has to find its zero position", inputs.now_s, out)
             return False
         if self._searching and stage.requested is not MotionKind.SEARCH:
@@ -220,6 +229,8 @@ class Workflow:
 
     def _obey(self, command: OperatorCommand, inputs: Inputs) -> list[Action]:
         match command.kind:
+            case CommandKind.HOME if self.not_yet:
+                return [Tell(f"not homed: {self.not_yet}")]
             case CommandKind.HOME:
                 return [Ask(MotionKind.HOME, command.peer)]
             case CommandKind.SEARCH:
@@ -338,7 +349,7 @@ class Workflow:
             return
         self._waits_s = inputs.now_s
         newest = inputs.poses.newest()
-        if newest is None or inputs.now_s - newest.t_s > 1.0:
+        if newest is None or inputs.now_s - newest.t_s > UNSEEN_S:
             out.append(Tell("the marker is not seen: hold the fibre elsewhere", done=True))
         elif held is None:
             out.append(Tell("hold the fibre still", done=False))
@@ -398,7 +409,7 @@ class Workflow:
     def _slipped(self, inputs: Inputs, search: PmSearch) -> str | None:
         """Why a search has to end; None if it goes on."""
         newest = inputs.poses.newest()
-        if newest is None or inputs.now_s - newest.t_s > 1.0:
+        if newest is None or inputs.now_s - newest.t_s > UNSEEN_S:
             return "the marker is not seen"
         pose = newest.parent_T_child
         if moved_mm(pose, search.held) > SLIP_MM or turned_rad(pose, search.held) > SLIP_RAD:

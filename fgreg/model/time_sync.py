@@ -25,6 +25,8 @@ MAX_GAP_S = 0.1
 UNSTEADY_MM_S2, UNSTEADY_RAD_S2 = 300.0, 3.0
 """Sigmas of the acceleration of a hand-held fibre between two poses: a tremor of 0.1 mm and 1 mrad at 9 Hz."""
 _LATENCY = Number(0.0, 1.0, unit="s")
+HELD_GAP_S = 0.5
+"""The same where the fibre is held still, with a machine too slow for more frames."""
 CLOCK_MEMORY = 256
 """Number of stamps over which a device's clock is compared with the host's."""
 
@@ -103,7 +105,8 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
     The rotation is interpolated along its geodesic, the origin along a straight line: a body of constant angular
     velocity whose origin has constant velocity. The covariance is propagated from both ends, taken as independent: half
     way between two equal ones it is half of either, as for the mean of two detections. An acceleration a between the
-    poses is added: it moves the body off the straight line by ``a gap^2 s (1 - s) / 2`` at share s.
+    poses is added: it moves the body off the straight line by ``a gap^2 s (1 - s) / 2`` at share s; beyond
+    ``MAX_GAP_S`` a tremor has no more room than within it, and what the hand does besides is of the order of the way.
 
     Args:
         poses: in time order.
@@ -121,8 +124,13 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
     gap = second.t_s - first.t_s
     transform, from_first, from_second = interpolate(first.parent_T_child, second.parent_T_child, share)
     covariance = from_first @ first.covariance @ from_first.T + from_second @ second.covariance @ from_second.T
-    off = 0.5 * gap * gap * share * (1.0 - share)
-    covariance += np.diag(np.repeat([(UNSTEADY_RAD_S2 * off) ** 2, (UNSTEADY_MM_S2 * off) ** 2], 3))
+    off, most = 0.5 * gap * gap * share * (1.0 - share), MAX_GAP_S**2 / 8.0
+    turn, way = (UNSTEADY_RAD_S2 * off, UNSTEADY_MM_S2 * off)
+    if gap > MAX_GAP_S:
+        a, b = first.parent_T_child, second.parent_T_child
+        turn = min(turn, UNSTEADY_RAD_S2 * most + float(np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3]))))
+        way = min(way, UNSTEADY_MM_S2 * most + float(np.linalg.norm(b[:3, 3] - a[:3, 3])))
+    covariance += np.diag(np.repeat([turn**2, way**2], 3))
     return TimedPose(t_s, transform, np.asarray(0.5 * (covariance + covariance.T)))
 
 

@@ -36,6 +36,7 @@ from fgreg.model.lens import project
 from fgreg.model.measurements import Check, Look, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
+from fgreg.online.hindrances import with_hindrances
 from fgreg.output.atomic_file import check_outputs
 from fgreg.pipeline.exclude import ShotNames, without_shots
 from fgreg.registration.checks import CHECKS_REFUSE, not_compared, with_checks
@@ -155,7 +156,7 @@ def solve_session(
         )
         extracted, found, solution, estimate = solve_extracted(session, extracted, config, request.detect_moves)
         used = settings_used(config, request.detect_moves, request.redetect)
-        estimate = replace(estimate, inputs=inputs, settings=used)
+        estimate = replace(with_hindrances(estimate, session.events), inputs=inputs, settings=used)
         errors = errors_where_known(estimate, truth, found.moves, session.model.targets_mm)
         show(viewer, session, extracted, estimate, truth, config.limit_mm)
         write_result(estimate, session.model, result_path, __version__)

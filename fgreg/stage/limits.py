@@ -37,7 +37,9 @@ class MotionLimits:
         stage: direction, zero, and the limits that no motion may leave (device angles).
         home_travel_rad: homing is stopped after this much travel; None for the span of the limits. The angle is unknown
             until the zero position is found; from inside the limits, homing takes no more than their span.
-        heartbeat_s: longest time between heartbeats of the main program; after that the stage stops.
+        heartbeat_s: longest time between heartbeats of the main program while the stage follows the beam; after that it
+            stops. step_heartbeat_s: the same while it homes, searches or stands: it then goes to one target that was
+            checked, and the heartbeat only shows that a stop would come through. A busy machine may take that long.
         command_age_s: an older command is refused, since it comes from before a stall.
         status_age_s: longest time between statuses of a moving stage.
         clock_gap_s: longest time between two clock readings of the watchdog; a longer gap means that it did not run.
@@ -79,6 +81,7 @@ class MotionLimits:
         float, Key("oldest marker that is followed, from its exposure", Number(0.0, 0.2, above=True, unit="s"))
     ] = 0.2
     heartbeat_s: float = 0.25
+    step_heartbeat_s: float = 1.0
     command_age_s: float = 0.2
     status_age_s: float = 0.3
     clock_gap_s: float = 0.5
@@ -101,7 +104,16 @@ class MotionLimits:
                 "marker_age_s",
                 "heartbeat_s",
             ),
-            *("command_age_s", "status_age_s", "clock_gap_s", "request_s", "tolerance_rad", "stop_s", "slack_s"),
+            *(
+                "step_heartbeat_s",
+                "command_age_s",
+                "status_age_s",
+                "clock_gap_s",
+                "request_s",
+                "tolerance_rad",
+                "stop_s",
+                "slack_s",
+            ),
             "deceleration_rad_s2",
         ):
             value = getattr(self, name)
@@ -146,6 +158,10 @@ class MotionLimits:
             MotionKind.TRACK: self.track_speed_rad_s,
         }
         return speeds[kind]
+
+    def heartbeat(self, kind: MotionKind | None) -> float:
+        """Longest time between heartbeats in a motion of a kind, or while it is requested; None: neither."""
+        return self.heartbeat_s if kind is MotionKind.TRACK else self.step_heartbeat_s
 
     def reach_rad(self, speed: float, age_s: float) -> float:
         """How far a stage can get from its reported angle, ``age_s`` old, before an order given now has reversed it.

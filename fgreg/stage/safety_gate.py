@@ -156,8 +156,8 @@ class Gate:
         self._halted_s, self._strayed_s = self._now, -math.inf
         return self._latch(reason)
 
-    def _alive(self, now: float) -> bool:
-        return self._beat is not None and now - self._beat.sent_s <= self.limits.heartbeat_s
+    def _alive(self, now: float, kind: MotionKind | None = None) -> bool:
+        return self._beat is not None and now - self._beat.sent_s <= self.limits.heartbeat(kind)
 
     def _fresh_status(self, now: float) -> StageStatus | None:
         status = self._status
@@ -169,7 +169,7 @@ class Gate:
         reason = self._stale(request.sent_s, now)
         if self.latched is not None:
             reason = f"latched: {self.latched}"
-        elif reason is None and not self._alive(now):
+        elif reason is None and not self._alive(now, request.kind):
             reason = "the main program's heartbeat is missing"
         if reason is not None:
             return [Refusal(f"request to {request.kind} refused: {reason}")]
@@ -250,7 +250,7 @@ class Gate:
             return f"the operator has not asked to {command.kind}"
         if now - self._request[1] > limits.request_s:
             return f"the operator's request is older than {limits.request_s:.0f} s"
-        if not self._alive(now):
+        if not self._alive(now, command.kind):
             return "the main program's heartbeat is missing"
         if (stale := self._stale(command.sent_s, now)) is not None:
             return stale
@@ -417,7 +417,7 @@ class Gate:
 
     def _supervise(self, now: float) -> list[Action]:
         """Stop a motion whose conditions no longer hold."""
-        if not self._alive(now) and (self._motion is not None or self._request is not None):
+        if not self._alive(now, self.moving or self.requested) and (self._motion or self._request):
             return self._halt("the main program's heartbeat is missing")
         if self._request is not None and now - self._request[1] > self.limits.request_s:
             self._request = None
