@@ -174,3 +174,18 @@ def test_message_held_up_on_its_way_moves_no_clock() -> None:
 def test_time_that_is_no_number_is_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         Stamp(math.nan, 1.0)
+
+
+def test_between_far_apart_frames_a_held_hand_is_as_steady_as_its_poses_and_a_moving_one_is_not() -> None:
+    still, moving = PoseHistory(), PoseHistory()
+    rng = np.random.default_rng(1)
+    for k in range(7):
+        for history, speed in ((still, 0.0), (moving, 40.0)):
+            pose = np.eye(4)
+            pose[:3, 3] = 0.05 * rng.standard_normal(3) + [speed * 0.3 * k, 0.0, 0.0]
+            history.add(TimedPose(0.3 * k, pose, 1e-4 * np.eye(6)))
+    held, moved = (np.sqrt(history.at(1.05, 0.5).covariance[3, 3]) for history in (still, moving))
+    assert 0.05 < held < 0.25
+    assert moved > 2.0
+    with pytest.raises(PairRefused, match="300 ms apart"):
+        still.at(1.05)

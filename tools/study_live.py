@@ -3,6 +3,9 @@
     python tools/study_live.py --seeds 1 2 --seconds 200            # rooms in real time, one after another
     python tools/study_live.py --made-up --seeds 1 2 3 4 5          # in simulated time: observations without pictures
     python tools/study_live.py --recorded FOLDER ...                # sessions of earlier runs: replay and solve only
+    python tools/study_live.py --quick --first-ok --made-up --bump-every inf --seeds $(seq 20) --seconds 400
+    python tools/study_live.py --quick --made-up --seeds $(seq 100) --seconds 300 [--reported]
+    python tools/study_live.py --quick --first-ok --load 1.5 --bump-every inf --seeds $(seq 10) --seconds 600
 
 Each room is run as by `fgreg live`, without the viewer. For every event: the estimate reported right after it, and that
 of replay: verdict, epoch, pairs, and the difference of the registrations in sigma of the live one, in degrees and in
@@ -10,6 +13,10 @@ mm. By design, live runs its full solves in worker processes, whose results come
 both are settled at the end; then epochs, verdict and rejected pairs have to be the same and the registrations within
 0.05 sigma. A solve is compared as well, and for each the true error at the targets with the
 predicted one. Every figure with a target is printed beside it.
+
+``--quick`` leaves replay and solve out, and prints what a user sees (tools/live_figures.py): the time to the first ok,
+each ok against the truth of the moment, each order to the stage against the true beam, stops of the stage. ``--load``
+keeps processors busy beside it, with loops of a niceness of their own.
 """
 
 from __future__ import annotations
@@ -48,6 +55,7 @@ from fgreg.session.yaml_loader import load_yaml
 from fgreg.simulation.documents import session_document
 from fgreg.simulation.room import Room, room_config
 from fgreg.tracking.query import track
+from live_figures import busy, conducted, rehearsed, totals
 from tests.rehearsal import Rehearsal
 
 SAME_SIGMA = 0.05
@@ -284,7 +292,7 @@ def report_truth(
 
 
 def main() -> int:
-    """Print each room; 1 where a target is missed."""
+    """Print each room; 1 where a target of the comparison is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--seconds", type=float, default=200.0)
@@ -295,7 +303,49 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("study-live"), help="folder of the sessions")
     parser.add_argument("--recorded", type=Path, nargs="+", help="sessions to compare instead")
     parser.add_argument("--every", action="store_true", help="print every event")
+    parser.add_argument("--quick", action="store_true", help="only what a user sees, without replay and solve")
+    parser.add_argument("--first-ok", action="store_true", help="with --quick: a room ends at its first ok")
+    parser.add_argument("--reported", action="store_true", help="with --quick --made-up: each bump is reported")
+    parser.add_argument("--load", type=float, default=0.0, help="processors kept busy beside it")
+    parser.add_argument("--load-nice", type=int, default=0, help="niceness of that load; below 0 needs root")
     options = parser.parse_args()
+    with busy(options.load, options.load_nice):
+        return quick(options) if options.quick else thorough(options)
+
+
+def quick(options: argparse.Namespace) -> int:
+    """Figures of each room and of all."""
+    rooms = []
+    for seed in options.seeds:
+        before = os.getloadavg()[0]
+        if options.made_up:
+            room = rehearsed(
+                seed,
+                options.aims,
+                options.bump_every,
+                options.seconds,
+                first=options.first_ok,
+                reports=options.reported,
+            )
+        else:
+            folder = options.out / f"seed-{seed}"
+            room = conducted(
+                folder,
+                seed,
+                options.width,
+                options.aims,
+                options.bump_every,
+                options.seconds,
+                first=options.first_ok,
+            )
+        rooms.append(room)
+        print(f"{room.line()}; load average {before:.1f} to {os.getloadavg()[0]:.1f}", flush=True)
+    print(totals(rooms))
+    return 0
+
+
+def thorough(options: argparse.Namespace) -> int:
+    """Replay, solve and truth of each room; 1 where a target is missed."""
     met = True
     for folder in options.recorded or ():
         print(folder)

@@ -110,7 +110,7 @@ class Pace:
             self.slow = f"{TOO_SLOW} to register: {text}: {LOWER}"
         elif p50 > MOST_LATENCY_S:
             self.slow = f"{TOO_SLOW} to follow the beam, but registers: {text}: {LOWER}"
-        elif used < min(GOOD_HZ, 0.9 * came):
+        elif used < GOOD_HZ:
             self.slow = f"this machine is slow, and registers with few frames: {text}: {LOWER}"
         else:
             self.slow = ""

@@ -27,6 +27,8 @@ UNSTEADY_MM_S2, UNSTEADY_RAD_S2 = 300.0, 3.0
 _LATENCY = Number(0.0, 1.0, unit="s")
 HELD_GAP_S = 0.5
 """The same where the fibre is held still, with a machine too slow for more frames."""
+NEAR_S, FEWEST_NEAR, SCATTERS = 1.0, 4, 2.0
+"""How near in time the poses are that show how steady the hand is, how many are needed, and how much they count."""
 CLOCK_MEMORY = 256
 """Number of stamps over which a device's clock is compared with the host's."""
 
@@ -105,8 +107,9 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
     The rotation is interpolated along its geodesic, the origin along a straight line: a body of constant angular
     velocity whose origin has constant velocity. The covariance is propagated from both ends, taken as independent: half
     way between two equal ones it is half of either, as for the mean of two detections. An acceleration a between the
-    poses is added: it moves the body off the straight line by ``a gap^2 s (1 - s) / 2`` at share s; beyond
-    ``MAX_GAP_S`` a tremor has no more room than within it, and what the hand does besides is of the order of the way.
+    poses is added: it moves the body off the straight line by ``a gap^2 s (1 - s) / 2`` at share s. Where that is more
+    than the poses of the time about it scatter, ``SCATTERS`` times their scatter is added: a hand that is held trembles
+    between the frames of a slow camera as it does from one to the next.
 
     Args:
         poses: in time order.
@@ -124,14 +127,23 @@ def pose_at(poses: Sequence[TimedPose], t_s: float, max_gap_s: float = MAX_GAP_S
     gap = second.t_s - first.t_s
     transform, from_first, from_second = interpolate(first.parent_T_child, second.parent_T_child, share)
     covariance = from_first @ first.covariance @ from_first.T + from_second @ second.covariance @ from_second.T
-    off, most = 0.5 * gap * gap * share * (1.0 - share), MAX_GAP_S**2 / 8.0
-    turn, way = (UNSTEADY_RAD_S2 * off, UNSTEADY_MM_S2 * off)
+    off = 0.5 * gap * gap * share * (1.0 - share)
+    turn, way = UNSTEADY_RAD_S2 * off, UNSTEADY_MM_S2 * off
     if gap > MAX_GAP_S:
-        a, b = first.parent_T_child, second.parent_T_child
-        turn = min(turn, UNSTEADY_RAD_S2 * most + float(np.linalg.norm(log_so3(a[:3, :3].T @ b[:3, :3]))))
-        way = min(way, UNSTEADY_MM_S2 * most + float(np.linalg.norm(b[:3, 3] - a[:3, 3])))
+        near = [pose.parent_T_child for pose in poses if abs(pose.t_s - t_s) < NEAR_S]
+        if len(near) >= FEWEST_NEAR:
+            scatter_rad, scatter_mm = _scatter(near)
+            turn, way = min(turn, SCATTERS * scatter_rad), min(way, SCATTERS * scatter_mm)
     covariance += np.diag(np.repeat([turn**2, way**2], 3))
     return TimedPose(t_s, transform, np.asarray(0.5 * (covariance + covariance.T)))
+
+
+def _scatter(poses: Sequence[FloatArray]) -> tuple[float, float]:
+    """Standard deviation per axis of poses (4, 4) about their mean: rotation, rad, and origin, mm."""
+    turns = np.stack([log_so3(poses[0][:3, :3].T @ pose[:3, :3]) for pose in poses])
+    origins = np.stack([pose[:3, 3] for pose in poses])
+    rad, mm = (np.sqrt(np.square(v - v.mean(axis=0)).sum() / (3.0 * (len(v) - 1))) for v in (turns, origins))
+    return float(rad), float(mm)
 
 
 def _bracket(times: Sequence[float], t_s: float, max_gap_s: float) -> tuple[int, int, float]:
