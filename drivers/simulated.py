@@ -50,8 +50,9 @@ if TYPE_CHECKING:
 
 AGAIN_S = 0.2
 """Time between attempts to connect."""
-SILENT_S = 1.0
-"""A device that sends by itself is lost after this long without data; a busy machine needs half a second."""
+SILENT_S, INTERVALS, MOST_SILENT_S = 0.5, 5.0, 3.0
+"""A device that sends by itself is lost after this long without data; where a busy machine delays them, after this many
+of its intervals, but at most the last."""
 START_S = 60.0
 TRUTH_S = 20.0
 """Longest time that a room may take to send the ground truth."""
@@ -135,6 +136,7 @@ class _Feed(Generic[Item]):
         self._connection: socket.socket | None = None
         self._end, self._lost, self._dropped = threading.Event(), "", 0
         self._received_s = self._since_s = -np.inf
+        self._interval_s = 0.0  # between data, smoothed
         self._index: int | None = None
         self._thread = threading.Thread(target=self._run, name=f"simulated {role}", daemon=True)
         self._thread.start()
@@ -149,7 +151,8 @@ class _Feed(Generic[Item]):
         """Whether the device is connected, and sends if it has to."""
         if self._connection is None:
             return False
-        return host_now() - self._received_s < SILENT_S if self._sends else self._steady()
+        silent_s = min(max(SILENT_S, INTERVALS * self._interval_s), MOST_SILENT_S)
+        return host_now() - self._received_s < silent_s if self._sends else self._steady()
 
     def _steady(self) -> bool:
         """Whether the room has kept the connection; it closes one to a device with a fault at once."""
@@ -215,7 +218,10 @@ class _Feed(Generic[Item]):
                 self._dropped += max(0, index - self._index - 1)
             self._index = index
         item = self._made(header, payload)
-        self._received_s = host_now()
+        now_s = host_now()
+        if now_s - self._received_s < MOST_SILENT_S:
+            self._interval_s += 0.2 * (now_s - self._received_s - self._interval_s)
+        self._received_s = now_s
         with self._lock:
             self._waiting.append(item)
             while len(self._waiting) > self._most:

@@ -37,7 +37,7 @@ PICTURE_RATE = 4.0
 FRAMES_WAITING, PULSES_WAITING = 2, 64
 """Largest number of unread frames and pulses; after that the oldest is dropped."""
 SLOW_S = 0.06
-"""Where a picture takes longer, the next one waits as long as it took: the machine has more to do than the room."""
+"""Where a picture takes longer, the next one waits half as long: the machine has more to do than the room."""
 SETTLE_S = 0.4
 """The surgeon sends an aim once the fibre has been still for this long."""
 SAY_AGAIN_S = 3.0
@@ -252,7 +252,7 @@ class RoomServer:
             else:
                 self._frame(due_frame, frame)
                 took = self.now_s() - now
-                free = now + 2.0 * took if took > SLOW_S else now  # what cannot be kept up with is skipped
+                free = now + 1.5 * took if took > SLOW_S else now  # what cannot be kept up with is skipped
                 frame = max(frame + 1, math.floor(free * self._frame_rate))
         self._listener.close()
         for client in list(self._clients):

@@ -56,7 +56,7 @@ class Figures:
         seconds_ok, seconds_wrong: seconds in which ok was shown, and in which it was off by more than twice its bound.
         orders_sigma: error of each order to follow in the sigmas that were said, by the beam at its marker's exposure.
         stops: reasons of the stage's stops, but for the operator's and those for lost tracking.
-        slow: what was said of the machine. lost: number of messages about lost parts.
+        spent: what the time went into. slow: what was said of the machine. lost: number of messages about lost parts.
     """
 
     seed: int
@@ -70,6 +70,7 @@ class Figures:
     slow: str = ""
     lost: list[str] = field(default_factory=list)
     homed: bool = True
+    spent: str = ""
 
     def line(self) -> str:
         """As text."""
@@ -81,6 +82,7 @@ class Figures:
             f"{wrong}; ok for {self.seconds_ok} s, wrong for {self.seconds_wrong} s; orders {len(self.orders_sigma)}, "
             f"off {off}; stops {len(self.stops)}, for want of a heartbeat {beats}; lost {len(self.lost)}"
             + ("" if self.homed else "; not homed: the machine is too slow")
+            + f"; {self.spent}"
         )
 
 
@@ -175,6 +177,7 @@ def rehearsed(seed: int, aims: int, bump_every_s: float, seconds: float, *, firs
     while watched.now_s < seconds and not (first and math.isfinite(watched.figures.first_ok_s)):
         watched.run(1.0)
     watched.figures.spots = watched.workflow._next_pm
+    watched.figures.spent = watched.workflow.spent.text()
     return watched.figures
 
 
@@ -220,7 +223,7 @@ def conducted(
 
             loop.run(going)
             figures.spots = figures.spots or session_pms()
-            figures.slow = loop.status().slow
+            figures.slow, figures.spent = loop.status().slow, loop._workflow.spent.text()
             used = loop.figures
             p50, p99 = np.percentile(np.array(used.latency_ms or [math.nan]), (50, 99))
             print(f"  {used.frames} frames, {used.skipped} skipped; latency p50 {p50:.0f}, p99 {p99:.0f} ms")

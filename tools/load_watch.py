@@ -162,11 +162,12 @@ class Watch:
         spent, figures = self._spent[name], self._session.loop.figures
 
         def timed(*arguments: Any) -> Any:
-            before, frames = Spent.now(), figures.frames
+            before, frames, found = Spent.now(), figures.frames, None
             try:
-                return call(*arguments)
+                found = call(*arguments)
+                return found
             finally:
-                if name != "turn" or figures.frames > frames:
+                if figures.frames > frames or (name == "look" and found) or name == "order":
                     spent.add(before)
 
         return timed

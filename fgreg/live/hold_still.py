@@ -13,7 +13,7 @@ STILL_MM, STILL_RAD = 0.8, 0.02
 """Largest distance and rotation from the median pose."""
 FEWEST = 4
 """Least number of poses."""
-SLOW_S = 1.5
+SLOW_S = 2.0
 """Where fewer than that come in ``STILL_S``, the last ones count up to this long: a slow machine has few frames."""
 
 

@@ -72,8 +72,8 @@ from fgreg.schema.problems import numbers_text
 from fgreg.tracking.query import track
 from fgreg.tracking.snapshot import Snapshot
 
-IDLE_S = 0.002
-"""Time between two polls for a frame."""
+IDLE_S, SLOW_IDLE_S = 0.002, 0.01
+"""Time between two polls for a frame, and on a slow machine: each poll competes with the threads of devices."""
 STEP_S = 0.02
 """Time between two steps of the loop while no frames come."""
 SEND_S = 0.2
@@ -154,7 +154,7 @@ class LiveLoop:
         """Step while ``going`` returns True."""
         while going():
             if not self.turn():
-                time.sleep(IDLE_S)
+                time.sleep(SLOW_IDLE_S if self._pace.slow else IDLE_S)
             elif on_status is not None:
                 on_status(self.status())
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fgreg.online.hindrances import TOO_SLOW
 
-MEASURE_S, OVER_S = 2.0, 5.0
+MEASURE_S, OVER_S = 3.0, 5.0
 """Time from the first processed frame until the first message; what is measured later is over the last ``OVER_S``."""
 SAY_S = 30.0
 """Time between two messages about a change."""
@@ -21,10 +21,12 @@ MOST = 1000
 """Entries kept of each figure."""
 NO_CAMERA_S = 20.0
 """Without a frame for this long the stage may be homed: that the camera is lost is another message."""
-LEAST_HZ, GOOD_HZ = 3.0, 8.0
+LEAST_HZ, GOOD_HZ = 2.0, 8.0
 """Least number of frames processed a second, with which a fibre that is held still shows; and a fair one."""
 MOST_GAP_S = 0.8
 """Longest time between two steps of the loop: after a second without a heartbeat the stage stops."""
+BEGIN_HZ, BEGIN_GAP_S = 3.0, 0.4
+"""The same before the stage is homed, and after the machine was too slow: with some room for what comes."""
 MOST_LATENCY_S = 0.2
 """A marker that is older is not followed."""
 LOWER = "lower the camera's picture size or frame rate, end other programs, or use --no-viewer"
@@ -69,8 +71,8 @@ class Pace:
     def not_yet(self, now_s: float) -> str:
         """Why the stage may not be homed yet; empty if it may."""
         if self._said is None:
-            waits = math.isinf(self._first_s) and now_s - self._began_s > NO_CAMERA_S
-            return "" if waits else "what this machine can do is being measured"
+            no_camera = not self._arrived and now_s - self._began_s > NO_CAMERA_S
+            return "" if no_camera else "what this machine can do is being measured"
         return "" if self.enough else self.slow
 
     def news(self, now_s: float) -> list[str]:
@@ -105,7 +107,8 @@ class Pace:
             f"{used:.0f} of {came:.0f} frames/s used, {1e3 * p50:.0f} ms from frame to angle (99 %: {1e3 * p99:.0f} "
             f"ms), longest step {1e3 * gap_s:.0f} ms"
         )
-        self.enough = used >= LEAST_HZ and gap_s <= MOST_GAP_S
+        least_hz, most_s = (LEAST_HZ, MOST_GAP_S) if self.enough else (BEGIN_HZ, BEGIN_GAP_S)
+        self.enough = used >= least_hz and gap_s <= most_s
         if not self.enough:
             self.slow = f"{TOO_SLOW} to register: {text}: {LOWER}"
         elif p50 > MOST_LATENCY_S:

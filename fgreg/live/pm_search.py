@@ -85,15 +85,15 @@ class PmSearch:
                 self.planner.add_look(pulse.scan_rad, amplitude)
                 if loud:
                     self.looks.append(pulse)
-            self._goal = None
+            self._goal, self.wants_pulses = None, False
         step = self._next(stage.scan_rad)
         if isinstance(step, Turn):
             self._goal, self._waits_s, self._stood_s, self.wants_pulses = step, now_s, None, False
         return step
 
-    def _next(self, stands_rad: float) -> Turn | Found | NotFound:
+    def _next(self, stands_rad: float) -> Turn | Found | NotFound | None:
         if self.found is None:
-            step = self.planner.next()
+            step = self.planner.advance()
             if not isinstance(step, Found):
                 return step
             self.found = step

@@ -12,6 +12,7 @@ from typing import Annotated
 from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.drivers.operator_words import spelt
 from fgreg.geometry.transforms import FloatArray
+from fgreg.live import time_spent
 from fgreg.live.actions import (
     Action,
     Ask,
@@ -32,6 +33,7 @@ from fgreg.live.actions import (
 )
 from fgreg.live.hold_still import held_pose, moved_mm, turned_rad
 from fgreg.live.pm_search import PmSearch
+from fgreg.live.time_spent import TimeSpent
 from fgreg.model.estimate import Verdict
 from fgreg.model.session_model import SessionModel
 from fgreg.schema.kinds import Integer, Number
@@ -43,6 +45,8 @@ from fgreg.stage.limits import MotionKind
 
 SLIP_MM, SLIP_RAD = 1.2, 0.03
 """A fibre that leaves its pose by more than this during a search has moved: its pulses belong to no single spot."""
+LIKELY_PMS = 2
+"""Found PMs after which a search begins where they were."""
 ANOTHER_MM, ANOTHER_RAD = 3.0, 0.06
 """A new PM needs the fibre to be at least this far from the pose of the last PM."""
 WORTH_PREDICTING_RAD = math.radians(8.0)
@@ -52,7 +56,7 @@ CHECK_RAD = math.radians(2.0)
 CHECK_S = 0.3
 """Time between two such detections."""
 UNSEEN_S = 2.0
-"""The marker is not seen once its newest pose is older; a slow machine has three frames a second."""
+"""The marker is not seen once its newest pose is older; a slow machine has two frames a second."""
 ASK_AGAIN_S = 10.0
 PATIENCE_S = 6.0
 """Wait after which the operator gets a message about what is missing."""
@@ -118,6 +122,7 @@ class Workflow:
     Attributes:
         stage: current stage of the session.
         not_yet: why the stage may not be homed yet; empty if it may.
+        spent: what the time went into.
     """
 
     def __init__(self, model: SessionModel, settings: WorkflowSettings, next_pm: int = 0) -> None:
@@ -129,9 +134,12 @@ class Workflow:
         self._field = (min(low, high), max(low, high))
         self.stage = Stage.AIMING if settings.aims else Stage.COLLECTING
         self.not_yet = ""
+        self.spent = TimeSpent()
         self._search: PmSearch | None = None
         self._done_at: FloatArray | None = None
         self._pms, self._epoch = 0, 0
+        self._found_rad: list[float] = []  # plane angles of the PMs found
+        self._ahead = False  # whether the stage was sent to where the next search begins
         self._refused_pms = 0
         self._missed = 0
         self._wanted: CommandKind | None = None
@@ -152,6 +160,7 @@ class Workflow:
         """The actions for these inputs."""
         out: list[Action] = []
         self._checks = False
+        self.spent.add(inputs.now_s, self._purpose(inputs.stage))
         for command in inputs.commands:
             out += self._obey(command, inputs)
         latched = inputs.stage is not None and self._is_latched(inputs.stage, inputs.now_s, out)
@@ -179,6 +188,15 @@ class Workflow:
         else:
             self._search = None
         return tuple(out)
+
+    def _purpose(self, stage: StageView | None) -> str:
+        """What the time since the last step went into."""
+        if self._search is not None:
+            return time_spent.SEARCHING if self._search.found is None else time_spent.BOTH_SIDES
+        if self.stage is Stage.COLLECTING:
+            ready = stage is not None and stage.homed and stage.requested is MotionKind.SEARCH
+            return time_spent.GOING if ready else time_spent.WAITING
+        return time_spent.CALIBRATING if self.stage is Stage.AIMING else time_spent.FOLLOWING
 
     def _is_latched(self, stage: StageView, now_s: float, out: list[Action]) -> bool:
         """Whether the stage is latched; then ask the operator for a reset."""
@@ -305,7 +323,7 @@ class Workflow:
             enough = self._settings.pms if registration.verdict is Verdict.OK else self._settings.most_pms
             if self._pms >= enough and self._search is None:
                 self.stage = Stage.FOLLOWING
-                out.append(Tell("registered", done=True))
+                out.append(Tell(f"registered; where the time went: {self.spent.text()}", done=True))
         elif self.stage is Stage.COLLECTING and self._pms >= self._refused_pms + self._settings.most_pms:
             self._refused_pms = self._pms
             why = _why(registration)
@@ -322,8 +340,10 @@ class Workflow:
         held = held_pose(inputs.poses, inputs.now_s)
         if self._search is None:
             if held is None or not self._is_another(held):
+                self._go_ahead(inputs, stage, out)
                 self._wait(inputs, held, out)
                 return
+            self._ahead = False
             self._waits_s = inputs.now_s
             self._search = self._begin(inputs, stage, held, cold=False)
         elif (slipped := self._slipped(inputs, self._search)) is not None:
@@ -365,7 +385,7 @@ class Workflow:
             if low <= at <= high and sigma <= WORTH_PREDICTING_RAD and not refused:
                 prediction = Prediction(at, sigma)
         stands = min(max(stage.scan_rad, low), high)
-        planner = SearchPlanner(self._detection_model, low, high, stands, prediction)
+        planner = SearchPlanner(self._detection_model, low, high, stands, prediction, likely_rad=self._likely())
         return PmSearch(
             planner,
             held,
@@ -377,8 +397,25 @@ class Workflow:
             self._settings.both_sides,
         )
 
+    def _likely(self) -> tuple[float, float] | None:
+        """Lowest and highest angle of the PMs found up to now: tissue is there, wherever the camera is."""
+        return (min(self._found_rad), max(self._found_rad)) if len(self._found_rad) >= LIKELY_PMS else None
+
+    def _go_ahead(self, inputs: Inputs, stage: StageView, out: list[Action]) -> None:
+        """While the fibre goes on to the next spot, turn the stage to where the search there will begin."""
+        known = inputs.registration.registered and inputs.registration.verdict is not Verdict.REFUSED
+        if self._ahead or self._done_at is None or stage.moving or known:
+            return
+        self._ahead = True
+        low, high = self._field
+        stands = min(max(stage.scan_rad, low), high)
+        step = SearchPlanner(self._detection_model, low, high, stands, likely_rad=self._likely()).next()
+        if isinstance(step, Turn):
+            out.append(Sweep(step.scan_rad, "to where the next search begins"))
+
     def _found(self, now_s: float, search: PmSearch, found: Found, out: list[Action]) -> None:
         self._search, self._done_at, self._waits_s = None, search.held, now_s
+        self._found_rad.append(found.scan_rad)
         looks = tuple(look for look in search.best_looks(found) if look.marker is not None)
         if not looks:
             off_window = "the looks were outside the sensitivity window"

@@ -25,9 +25,9 @@ MAX_GAP_S = 0.1
 UNSTEADY_MM_S2, UNSTEADY_RAD_S2 = 300.0, 3.0
 """Sigmas of the acceleration of a hand-held fibre between two poses: a tremor of 0.1 mm and 1 mrad at 9 Hz."""
 _LATENCY = Number(0.0, 1.0, unit="s")
-HELD_GAP_S = 0.5
+HELD_GAP_S = 0.7
 """The same where the fibre is held still, with a machine too slow for more frames."""
-NEAR_S, FEWEST_NEAR, SCATTERS = 1.0, 4, 2.0
+NEAR_S, FEWEST_NEAR, SCATTERS = 1.5, 4, 2.0
 """How near in time the poses are that show how steady the hand is, how many are needed, and how much they count."""
 CLOCK_MEMORY = 256
 """Number of stamps over which a device's clock is compared with the host's."""
@@ -206,7 +206,7 @@ def _right_jacobian(w: FloatArray) -> FloatArray:
 class PoseHistory:
     """The recent poses of one body, oldest first, for :func:`pose_at`; ``keep_s`` bounds their age."""
 
-    keep_s: float = 2.0
+    keep_s: float = 3.0
     _poses: deque[TimedPose] = field(default_factory=deque)
 
     def add(self, pose: TimedPose) -> bool:

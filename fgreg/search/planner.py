@@ -25,6 +25,8 @@ CANDIDATE_RAD = math.radians(0.5)
 """Spacing of the positions among which the next one is chosen."""
 AS_GOOD = 0.08
 """Positions count as equal if their expected sigma is larger than the best by at most this share."""
+AT_ONCE = 16
+"""Positions weighed in one part of :meth:`SearchPlanner.advance`, about 1 ms each."""
 PREDICTION_REACH = 3.5
 """A search from a prediction stays within this many of its sigmas plus a sensitivity window."""
 PREDICTION_WRONG = 0.05
@@ -109,6 +111,7 @@ class SearchPlanner:
         low_rad, high_rad: the field: plane angles between which the stage may search.
         stands_rad: current plane angle of the stage.
         prediction: of the registration; None for a cold search.
+        likely_rad: where other PMs were found, lowest and highest; a cold search begins with these positions.
 
     Raises:
         ValueError: an empty field, or a prediction outside of it.
@@ -122,6 +125,7 @@ class SearchPlanner:
         stands_rad: float,
         prediction: Prediction | None = None,
         settings: SearchSettings | None = None,
+        likely_rad: tuple[float, float] | None = None,
     ) -> None:
         if not low_rad < high_rad:
             raise ValueError(f"the field reaches from {low_rad} to {high_rad} rad, expected an increasing range")
@@ -129,9 +133,12 @@ class SearchPlanner:
         self._model, self._stands, self._prediction = model, stands_rad, prediction
         self._low, self._high = low_rad, high_rad
         self._looks: list[tuple[float, float | None]] = []
+        self._weighed: tuple[FloatArray, list[float]] | None = None  # candidates, expected sigmas of the first of them
         if prediction is None:
             self._belief = Belief.flat(model, low_rad, high_rad)
             self._queue = sweep_positions(low_rad, high_rad, model.reach_rad, stands_rad, self.settings.passes)
+            if likely_rad is not None:
+                self._queue = _likely_first(self._queue, likely_rad, model.reach_rad, stands_rad, self.settings.passes)
             return
         if not low_rad <= prediction.scan_rad <= high_rad:
             raise ValueError(
@@ -158,11 +165,18 @@ class SearchPlanner:
             raise ValueError(f"the stage's angle is {scan_rad}, expected a number")
         self._belief = self._belief.after(scan_rad, amplitude)
         self._looks.append((scan_rad, amplitude))
+        self._weighed = None
         self._stands = scan_rad
         self._queue = [position for position in self._queue if abs(position - scan_rad) > 0.5 * CANDIDATE_RAD]
 
     def next(self) -> Step:
         """The next step; the same as before if no look came in between."""
+        while True:
+            if (step := self.advance()) is not None:
+                return step
+
+    def advance(self) -> Step | None:
+        """As :meth:`next`, in parts of some hundredths of a second: None until the last, and a loop goes on between."""
         count = len(self._looks)
         sigma = self._belief.sigma_rad()
         if self.detected and sigma <= self.settings.stop_sigma_rad:
@@ -200,12 +214,19 @@ class SearchPlanner:
             return f"nothing detected about the predicted angle, between {low:.1f} and {high:.1f} deg: search the field"
         return f"nothing detected between {low:.1f} and {high:.1f} deg in {self.settings.passes} sweeps"
 
-    def _refine(self, sigma: float) -> Turn:
-        reach = 2.0 * self._model.reach_rad
-        low = max(self._low, self._belief.quantile(0.02) - reach)
-        high = min(self._high, self._belief.quantile(0.98) + reach)
-        candidates = np.linspace(low, high, max(2, math.ceil((high - low) / CANDIDATE_RAD) + 1))
-        position = best_position(candidates, self._belief.expected_sigma(candidates), self._stands)
+    def _refine(self, sigma: float) -> Turn | None:
+        if self._weighed is None:
+            reach = 2.0 * self._model.reach_rad
+            low = max(self._low, self._belief.quantile(0.02) - reach)
+            high = min(self._high, self._belief.quantile(0.98) + reach)
+            self._weighed = np.linspace(low, high, max(2, math.ceil((high - low) / CANDIDATE_RAD) + 1)), []
+        candidates, expected = self._weighed
+        done = len(expected)
+        if done < len(candidates):
+            expected += self._belief.expected_sigma(candidates[done : done + AT_ONCE]).tolist()
+        if len(expected) < len(candidates):
+            return None
+        position = best_position(candidates, np.array(expected), self._stands)
         return Turn(position, Phase.REFINE, f"known to {math.degrees(sigma):.2f} deg (1 sigma): refine")
 
 
@@ -235,6 +256,18 @@ def sweep_positions(
         leg = (first, between)[number % 2]
         positions += leg if number % 2 == 0 else leg[::-1]
     return positions
+
+
+def _likely_first(
+    positions: list[float], likely_rad: tuple[float, float], reach_rad: float, stands_rad: float, passes: int
+) -> list[float]:
+    """The positions with those of the first pass in front that cover a range, from its end nearer to the stage."""
+    low, high = likely_rad[0] - reach_rad, likely_rad[1] + reach_rad
+    first = positions[: math.ceil((len(positions) - passes // 2) / passes)]
+    inside = sorted(position for position in first if low <= position <= high)
+    if inside and abs(stands_rad - inside[-1]) < abs(stands_rad - inside[0]):
+        inside.reverse()
+    return inside + [position for position in positions if position not in inside]
 
 
 def _around(prediction: Prediction, reach_rad: float, low_rad: float, high_rad: float) -> list[float]:

@@ -1,0 +1,66 @@
+"""What a machine can do is measured before anything moves; too slow a one is named as the cause, with what to lower."""
+
+from __future__ import annotations
+
+import pytest
+
+from fgreg.live.pace import MEASURE_S, NO_CAMERA_S, SAY_S, Pace
+
+
+def run(
+    pace: Pace, begin_s: float, seconds: float, hz: float, latency_s: float = 0.03, step_s: float = 0.02
+) -> list[str]:
+    """Let a camera send 30 frames a second, of which ``hz`` are processed; all messages."""
+    said, next_frame = [], begin_s
+    for k in range(round(seconds / step_s)):
+        now = begin_s + step_s * k
+        pace.arrived(now, 1)
+        if now >= next_frame:
+            next_frame += 1.0 / hz
+            pace.frame(now, latency_s)
+        pace.step(now)
+        said += pace.news(now)
+    return said
+
+
+def test_a_fast_machine_is_said_once_and_may_home_after_the_measurement() -> None:
+    pace = Pace(0.0)
+    assert run(pace, 0.0, MEASURE_S - 0.1, 30.0) == []
+    assert "being measured" in pace.not_yet(MEASURE_S - 0.1)
+    (text,) = run(pace, MEASURE_S - 0.1, 20.0, 30.0)
+    assert text.startswith("this machine: 30 of 50 frames/s used, 30 ms from frame to angle")
+    assert (pace.not_yet(30.0), pace.slow) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("hz", "latency_s", "step_s", "says", "homes"),
+    [
+        (2.0, 0.3, 0.02, "this machine is too slow to register: 2 of 50 frames/s used", False),
+        (10.0, 0.1, 0.5, "this machine is too slow to register", False),  # the loop stalls
+        (10.0, 0.3, 0.02, "this machine is too slow to follow the beam, but registers", True),
+        (5.0, 0.1, 0.02, "this machine is slow, and registers with few frames", True),
+    ],
+)
+def test_a_slow_machine_is_the_cause_and_may_home_where_it_registers(
+    hz: float, latency_s: float, step_s: float, says: str, homes: bool
+) -> None:
+    pace = Pace(0.0)
+    (text,) = run(pace, 0.0, 20.0, hz, latency_s, step_s)
+    assert text.startswith(says)
+    assert "lower the camera's picture size" in text
+    assert pace.slow.startswith(says)
+    assert (pace.not_yet(20.0) == "") is homes
+
+
+def test_once_the_load_is_gone_it_homes_and_says_so() -> None:
+    pace = Pace(0.0)
+    run(pace, 0.0, 10.0, 2.0)
+    assert pace.not_yet(10.0)
+    assert any("fast enough again" in text for text in run(pace, 10.0, SAY_S + 10.0, 30.0))
+    assert pace.not_yet(SAY_S + 20.0) == ""
+
+
+def test_without_a_camera_the_stage_may_be_homed_in_the_end() -> None:
+    pace = Pace(0.0)
+    assert pace.not_yet(1.0)
+    assert pace.not_yet(NO_CAMERA_S + 0.1) == ""
