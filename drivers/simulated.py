@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 AGAIN_S = 0.2
 """Time between attempts to connect."""
-SILENT_S, INTERVALS, MOST_SILENT_S = 0.5, 5.0, 3.0
+SILENT_S, INTERVALS, MOST_SILENT_S = 1.0, 5.0, 3.0
 """A device that sends by itself is lost after this long without data; where a busy machine delays them, after this many
 of its intervals, but at most the last."""
 START_S = 60.0

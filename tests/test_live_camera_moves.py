@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -344,3 +345,27 @@ def test_latencies_move_pulses_and_pictures_apart(stand: Stand) -> None:
     finally:
         marker_tracker.close()
     assert poses == [pytest.approx(now - 0.08)]
+
+
+def test_an_aim_is_taken_from_a_picture_exposed_after_the_word(stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[object] = []
+
+    def run(_work: object, left: object, *_arguments: object) -> Future[object]:
+        taken.append(left)
+        return Future()
+
+    monkeypatch.setattr(stand.loop.pulse_locator.locator, "run", run)
+    tracker, now = stand.loop.marker_tracker, host_now()
+
+    def show(t_s: float) -> StereoFrame:
+        tracker.newest = StereoFrame(Stamp(t_s, t_s), np.zeros((2, 2), np.uint8), None, 0)
+        tracker.poses.add(TimedPose(t_s, stand.marker, 1e-6 * np.eye(6)))
+        stand.loop._take_aim()
+        return tracker.newest
+
+    show(now - 0.3)  # processed late on a slow machine: the fibre may have been on its way
+    stand.loop._aim((1, 1))
+    stand.loop._take_aim()
+    assert taken == []
+    newest = show(host_now() + 0.01)
+    assert taken == [newest.left]

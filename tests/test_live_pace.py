@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
+from fgreg.drivers.base import CommandKind, OperatorCommand
+from fgreg.live.actions import Action, Ask, Inputs, RegistrationState, StageView, Tell
 from fgreg.live.pace import MEASURE_S, NO_CAMERA_S, SAY_S, Pace
+from fgreg.live.workflow import Workflow, WorkflowSettings
+from fgreg.model.time_sync import PoseHistory
+from fgreg.session.setup_reader import read_setup
+from fgreg.simulation.documents import session_document
+from fgreg.simulation.room import room_config
+from fgreg.stage.limits import MotionKind
 
 
 def run(
@@ -64,3 +72,24 @@ def test_without_a_camera_the_stage_may_be_homed_in_the_end() -> None:
     pace = Pace(0.0)
     assert pace.not_yet(1.0)
     assert pace.not_yet(NO_CAMERA_S + 0.1) == ""
+
+
+def test_the_stage_is_not_homed_before_the_machine_may_and_the_operator_is_told_why() -> None:
+    model = read_setup(session_document(room_config(1).scene), "session.yaml", "room", []).model
+    assert model is not None
+    workflow = Workflow(model, WorkflowSettings(hearing_threshold=1.0))
+
+    def step(now_s: float, *words: CommandKind) -> tuple[Action, ...]:
+        commands = tuple(OperatorCommand(word) for word in words)
+        stage = StageView(0.0, False, False, now_s)
+        return workflow.step(Inputs(now_s, PoseHistory(), stage, (), commands, RegistrationState(), None, 0))
+
+    workflow.not_yet = "this machine is too slow to register: 1 of 30 frames/s used"
+    assert step(1.0) == (Tell(f"the stage is not homed: {workflow.not_yet}"),)
+    assert step(2.0) == ()  # said once in a while
+    assert step(3.0, CommandKind.HOME) == (Tell(f"not homed: {workflow.not_yet}"),)
+    workflow.not_yet = ""
+    (asked,) = step(4.0)
+    assert isinstance(asked, Tell)
+    assert asked.wants is CommandKind.HOME
+    assert step(5.0, CommandKind.HOME) == (Ask(MotionKind.HOME),)

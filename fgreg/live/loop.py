@@ -81,6 +81,8 @@ SEND_S = 0.2
 STALE_S = 3.0
 """An engine that has been silent for this long hangs, and camera moves would go undetected. The first pairs of an epoch
 may take a second on a busy machine."""
+AIM_S, NO_FRAME_S = 0.3, 3.0
+"""An aim is given up once a picture that came this long after it shows no marker, or none came for the second."""
 SENDERS = ("camera", "probe", "motion", "bmode")
 """Roles of devices that send without being asked."""
 
@@ -148,6 +150,7 @@ class LiveLoop:
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
         self._tracking: TrackEstimate | None = None
+        self._aim_wanted: tuple[tuple[int, int], float] | None = None  # the corner, and when it was asked for
         self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
 
     def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
@@ -407,25 +410,33 @@ class LiveLoop:
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
 
     def _aim(self, corner: tuple[int, int]) -> None:
-        """A calibration shot from the newest frame: marker and board in the same picture."""
-        frame, pose, rig, board = (
-            self.marker_tracker.newest,
-            self.marker_tracker.poses.newest(),
-            self._model.camera,
-            self._model.board,
-        )
-        if frame is None or pose is None or self.marker_tracker.missing:
-            self._tell(Tell(f"no aim: the marker is not seen ({self.marker_tracker.missing or 'no frame'})"))
-            return
-        if rig is None or board is None:
+        """Want a calibration shot: marker and board in one picture, from after the word.
+
+        The newest picture that was processed may show the fibre on its way, where the machine is slow.
+        """
+        if self._model.camera is None or self._model.board is None:
             self._tell(Tell("no aim: session.yaml has no board"))
+        elif self._aiming is None and self._aim_wanted is None:  # else one is under way
+            self._aim_wanted = (corner, host_now())
+
+    def _begin_aim(self) -> None:
+        """Look for the board in the first picture with the marker that was exposed after the aim was asked for."""
+        if self._aim_wanted is None:
             return
-        if self._aiming is None:  # else a detection is under way
+        (corner, asked_s), tracker, now = self._aim_wanted, self.marker_tracker, host_now()
+        frame, pose, rig, board = tracker.newest, tracker.poses.newest(), self._model.camera, self._model.board
+        shown = frame is not None and not tracker.missing and pose is not None and pose.t_s >= asked_s
+        if shown and frame is not None and pose is not None and rig is not None and board is not None:
             found = self.pulse_locator.locator.run(detect_board, frame.left, frame.right, rig, board)
-            self._aiming = (corner, pose, found)
+            self._aiming, self._aim_wanted = (corner, pose, found), None
+        elif (missing := frame is not None and frame.stamp.host_s > asked_s + AIM_S) or now - asked_s > NO_FRAME_S:
+            self._aim_wanted = None
+            why = tracker.missing if missing and tracker.missing else "no frame"
+            self._tell(Tell(f"no aim: the marker is not seen ({why})"))
 
     def _take_aim(self) -> None:
         """Record the pending calibration shot once its board has been detected."""
+        self._begin_aim()
         if self._aiming is None or not self._aiming[2].done():
             return
         (corner, pose, found), self._aiming = self._aiming, None

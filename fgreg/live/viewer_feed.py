@@ -30,8 +30,8 @@ from fgreg.viewer.status_line import Now
 if TYPE_CHECKING:
     from fgreg.viewer.recording import Viewer
 
-LOOK_S = 0.5
-"""Time between two drawings of the tracking state; drawing takes processor time from the loop."""
+LOOK_S, SLOW_LOOK_S = 0.5, 2.0
+"""Time between two drawings of the tracking state, and on a slow machine: drawing takes time from the loop."""
 FRESH_S = 0.5
 """An older marker pose is not drawn."""
 WAITING = 64
@@ -108,9 +108,9 @@ class RerunFeed(ViewerFeed):
         self._put(_Drawing(event.t, shot, note, estimate, _frame(status), status))
 
     def status(self, status: Status) -> None:
-        """Store the newest status; draw it every ``LOOK_S``."""
+        """Store the newest status; draw it every ``LOOK_S``, or ``SLOW_LOOK_S`` while the machine is slow."""
         self._status = status
-        if status.now_s - self._looked_s < LOOK_S:
+        if status.now_s - self._looked_s < (SLOW_LOOK_S if status.slow else LOOK_S):
             return
         self._looked_s = status.now_s
         self._put(self._look(status))
