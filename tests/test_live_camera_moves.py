@@ -360,12 +360,12 @@ def test_an_aim_is_taken_from_a_picture_exposed_after_the_word(stand: Stand, mon
     def show(t_s: float) -> StereoFrame:
         tracker.newest = StereoFrame(Stamp(t_s, t_s), np.zeros((2, 2), np.uint8), None, 0)
         tracker.poses.add(TimedPose(t_s, stand.marker, 1e-6 * np.eye(6)))
-        stand.loop._take_aim()
+        stand.loop._aims.step()
         return tracker.newest
 
     show(now - 0.3)  # processed late on a slow machine: the fibre may have been on its way
-    stand.loop._aim((1, 1))
-    stand.loop._take_aim()
+    stand.loop._aims.aim((1, 1))
+    stand.loop._aims.step()
     assert taken == []
     newest = show(host_now() + 0.01)
     assert taken == [newest.left]

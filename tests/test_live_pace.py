@@ -77,7 +77,7 @@ def test_without_a_camera_the_stage_may_be_homed_in_the_end() -> None:
 def test_the_stage_is_not_homed_before_the_machine_may_and_the_operator_is_told_why() -> None:
     model = read_setup(session_document(room_config(1).scene), "session.yaml", "room", []).model
     assert model is not None
-    workflow = Workflow(model, WorkflowSettings(hearing_threshold=1.0))
+    workflow = Workflow(model, WorkflowSettings(aims=0, hearing_threshold=1.0))
 
     def step(now_s: float, *words: CommandKind) -> tuple[Action, ...]:
         commands = tuple(OperatorCommand(word) for word in words)
@@ -87,7 +87,7 @@ def test_the_stage_is_not_homed_before_the_machine_may_and_the_operator_is_told_
     workflow.not_yet = "this machine is too slow to register: 1 of 30 frames/s used"
     assert step(1.0) == (Tell(f"the stage is not homed: {workflow.not_yet}"),)
     assert step(2.0) == ()  # said once in a while
-    assert step(3.0, CommandKind.HOME) == (Tell(f"not homed: {workflow.not_yet}"),)
+    assert step(3.0, CommandKind.HOME) == (Tell(f"not homed: {workflow.not_yet}", answer=True),)
     workflow.not_yet = ""
     (asked,) = step(4.0)
     assert isinstance(asked, Tell)

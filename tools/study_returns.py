@@ -40,9 +40,9 @@ from fgreg.errors import EstimationError
 from fgreg.geometry.target_error import tre_mm
 from fgreg.geometry.transforms import FloatArray, exp_so3, inverse, make_transform
 from fgreg.live.marker_tracker import WholeFrame
-from fgreg.live.right_view_worker import right_roi
 from fgreg.live.scope_holder import HolderMove
 from fgreg.live.static_tags import StaticTags
+from fgreg.live.view_worker import view_roi
 from fgreg.model.measurements import EpochStart, Measurements
 from fgreg.model.session_model import SessionModel
 from fgreg.model.time_sync import Stamp
@@ -209,7 +209,7 @@ class TaggedRun:
         assert model.marker is not None
         self.room, self.model = TaggedRoom(config), model
         self.left = MarkerRoi(model.camera.left, 0, np.eye(4), model.marker)
-        self.right = right_roi(model.camera, model.marker)
+        self.right = view_roi(model.camera, model.marker, 1)
         self.tags = StaticTags(model, AtOnce())  # type: ignore[arg-type]
         self.now_s, self.index, self.news = 0.0, 0, list[str]()
 

@@ -11,16 +11,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from dataclasses import replace
 from typing import Protocol
 
-import numpy as np
-
 from fgreg.camera_moves.validity import Validity
-from fgreg.detection.board import detect_board
-from fgreg.detection.corner_noise import pool_corner_noise
-from fgreg.detection.results import BoardFit, NotFound, board_corner
 from fgreg.drivers.base import BmodeFrame, CommandKind, DeviceLost, Registration, host_now
 from fgreg.drivers.operator_words import asked
 from fgreg.live.actions import (
@@ -40,6 +34,7 @@ from fgreg.live.actions import (
     TakeVerify,
     Tell,
 )
+from fgreg.live.aims import AimTaker
 from fgreg.live.device_health import Health, Pictures, Source
 from fgreg.live.heard_words import HeardWords
 from fgreg.live.marker_tracker import MarkerTracker
@@ -57,11 +52,9 @@ from fgreg.live.verification import LiveVerification
 from fgreg.live.workflow import Stage, Workflow
 from fgreg.model.estimate import TrackEstimate, Verdict
 from fgreg.model.events import (
-    AimEvent,
     CameraMovedEvent,
     ExcludeEvent,
     IncludeEvent,
-    MarkerRecord,
     NoteEvent,
 )
 from fgreg.model.measurements import MarkerObservation, Track
@@ -81,8 +74,6 @@ SEND_S = 0.2
 STALE_S = 3.0
 """An engine that has been silent for this long hangs, and camera moves would go undetected. The first pairs of an epoch
 may take a second on a busy machine."""
-AIM_S, NO_FRAME_S = 0.3, 3.0
-"""An aim is given up once a picture that came this long after it shows no marker, or none came for the second."""
 SENDERS = ("camera", "probe", "motion", "bmode")
 """Roles of devices that send without being asked."""
 
@@ -142,6 +133,9 @@ class LiveLoop:
         self._steering = Steering(devices.stage, self._health, lambda text: self._news(Tell(text)), self._began_s)
         self._words = HeardWords()
         self._verification = LiveVerification(model, self.pulse_locator.locator)
+        self._aims = AimTaker(
+            model, self.marker_tracker, self.pulse_locator.locator, self._tell, recorder.hand_over, self._t
+        )
         self._text, self._task, self._number = "", "", 0
         self._pace = Pace(self._began_s)
         self._unused = 0  # frames that were older than another, or repeated
@@ -150,8 +144,6 @@ class LiveLoop:
         self._sent_s, self._stepped_s = -math.inf, -math.inf
         self._snapshot: Snapshot | None = None
         self._tracking: TrackEstimate | None = None
-        self._aim_wanted: tuple[tuple[int, int], float] | None = None  # the corner, and when it was asked for
-        self._aiming: tuple[tuple[int, int], TimedPose, Future[BoardFit | NotFound]] | None = None
 
     def run(self, going: Callable[[], bool], on_status: Callable[[Status], None] | None = None) -> None:
         """Step while ``going`` returns True."""
@@ -182,7 +174,7 @@ class LiveLoop:
         self._steering.beat(None if newest is None else newest.t_s, None if verdict is None else verdict.value)
         for action in self._workflow.step(self._inputs(now)):
             self._do(action)
-        self._take_aim()
+        self._aims.step()
         self._take_verification()
         if processed and self.marker_tracker.newest is not None:
             latency_s = host_now() - self.marker_tracker.newest.stamp.host_s
@@ -381,7 +373,7 @@ class LiveLoop:
             case Ask() | Sweep() | Follow() | Halt() | Release():
                 self.figures.orders += self._steering.order(action)
             case TakeAim(corner):
-                self._aim(corner)
+                self._aims.aim(corner)
             case TakeCheck(point, scan_rad):
                 self._check_point(point, scan_rad)
             case TakePairs(pm, looks):
@@ -408,56 +400,6 @@ class LiveLoop:
         """A message that asks nothing of the operator; the last task stays in force."""
         self._text = asked(tell.text, tell.wants)
         self._devices.operator.tell(tell.text, done=tell.done, wants=tell.wants)
-
-    def _aim(self, corner: tuple[int, int]) -> None:
-        """Want a calibration shot: marker and board in one picture, from after the word.
-
-        The newest picture that was processed may show the fibre on its way, where the machine is slow.
-        """
-        if self._model.camera is None or self._model.board is None:
-            self._tell(Tell("no aim: session.yaml has no board"))
-        elif self._aiming is None and self._aim_wanted is None:  # else one is under way
-            self._aim_wanted = (corner, host_now())
-
-    def _begin_aim(self) -> None:
-        """Look for the board in the first picture with the marker that was exposed after the aim was asked for."""
-        if self._aim_wanted is None:
-            return
-        (corner, asked_s), tracker, now = self._aim_wanted, self.marker_tracker, host_now()
-        frame, pose, rig, board = tracker.newest, tracker.poses.newest(), self._model.camera, self._model.board
-        shown = frame is not None and not tracker.missing and pose is not None and pose.t_s >= asked_s
-        if shown and frame is not None and pose is not None and rig is not None and board is not None:
-            found = self.pulse_locator.locator.run(detect_board, frame.left, frame.right, rig, board)
-            self._aiming, self._aim_wanted = (corner, pose, found), None
-        elif (missing := frame is not None and frame.stamp.host_s > asked_s + AIM_S) or now - asked_s > NO_FRAME_S:
-            self._aim_wanted = None
-            why = tracker.missing if missing and tracker.missing else "no frame"
-            self._tell(Tell(f"no aim: the marker is not seen ({why})"))
-
-    def _take_aim(self) -> None:
-        """Record the pending calibration shot once its board has been detected."""
-        self._begin_aim()
-        if self._aiming is None or not self._aiming[2].done():
-            return
-        (corner, pose, found), self._aiming = self._aiming, None
-        board = self._model.board
-        try:
-            fit = found.result()
-        except Exception as error:  # a fault of one picture; the next may be good
-            self._tell(Tell(f"no aim: {error}"))
-            return
-        if board is None or not (0 <= corner[0] < board.columns and 0 <= corner[1] < board.rows):
-            self._tell(Tell(f"no aim: the board has no inner corner {corner[0]}, {corner[1]}"))
-            return
-        if not isinstance(fit, BoardFit):
-            self._tell(Tell(f"no aim: {fit.reason}"))
-            return
-        spot, covariance = board_corner(fit, corner[0], corner[1], pool_corner_noise([fit.pose]))
-        turn = fit.camera_T_board[:3, :3]
-        covariance = covariance + turn @ np.diag(np.square(self._model.noise.aim_mm)) @ turn.T
-        marker = MarkerRecord(pose.parent_T_child, pose.covariance)
-        self._recorder.hand_over(AimEvent(self._t(pose.t_s), 0, marker, spot, covariance))
-        self._tell(Tell(f"aim at corner {corner[0]}, {corner[1]} taken", done=True))
 
     def _check_point(self, point: tuple[float, ...], scan_rad: float) -> None:
         """Record a check."""

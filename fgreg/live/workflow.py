@@ -248,7 +248,7 @@ class Workflow:
     def _obey(self, command: OperatorCommand, inputs: Inputs) -> list[Action]:
         match command.kind:
             case CommandKind.HOME if self.not_yet:
-                return [Tell(f"not homed: {self.not_yet}")]
+                return [Tell(f"not homed: {self.not_yet}", answer=True)]
             case CommandKind.HOME:
                 return [Ask(MotionKind.HOME, command.peer)]
             case CommandKind.SEARCH:
