@@ -22,6 +22,7 @@ import numpy as np
 
 from fgreg.drivers.base import CommandKind, OperatorCommand
 from fgreg.drivers.simulated import RoomProcess, ask_truth
+from fgreg.errors import EventRefused
 from fgreg.geometry.transforms import FloatArray
 from fgreg.live.actions import Action, Follow, TakeMove
 from fgreg.live.launch import running
@@ -56,7 +57,8 @@ class Figures:
         seconds_ok, seconds_wrong: seconds in which ok was shown, and in which it was off by more than twice its bound.
         orders_sigma: error of each order to follow in the sigmas that were said, by the beam at its marker's exposure.
         stops: reasons of the stage's stops, but for the operator's and those for lost tracking.
-        spent: what the time went into. slow: what was said of the machine. lost: number of messages about lost parts.
+        spent: what the time went into. slow: what was said of the machine. lost: messages about lost parts.
+        refused: why pairs were refused, in made-up time.
     """
 
     seed: int
@@ -69,6 +71,7 @@ class Figures:
     stops: list[str] = field(default_factory=list)
     slow: str = ""
     lost: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
     homed: bool = True
     spent: str = ""
 
@@ -80,7 +83,8 @@ class Figures:
         return (
             f"seed {self.seed}: first ok {self.first_ok_s:.0f} s, {self.spots} PMs; oks said {len(self.oks)}, wrong "
             f"{wrong}; ok for {self.seconds_ok} s, wrong for {self.seconds_wrong} s; orders {len(self.orders_sigma)}, "
-            f"off {off}; stops {len(self.stops)}, for want of a heartbeat {beats}; lost {len(self.lost)}"
+            f"off {off}; stops {len(self.stops)}, for want of a heartbeat {beats}; lost {len(self.lost)}, pairs "
+            f"refused {len(self.refused)}"
             + ("" if self.homed else "; not homed: the machine is too slow")
             + f"; {self.spent}"
         )
@@ -156,6 +160,12 @@ class _Watched(Rehearsal):
             self._sampled_s = self.now_s
             figures.seconds_ok += 1
             figures.seconds_wrong += found > 2.0 * bound
+
+    def _pair(self, *arguments: Any) -> None:
+        try:
+            super()._pair(*arguments)
+        except EventRefused as error:  # recorded as refused, as in a live session
+            self.figures.refused.append(str(error))
 
     def _do(self, action: Action) -> None:
         if isinstance(action, TakeMove):
