@@ -252,13 +252,12 @@ def test_the_loop_shows_its_frames_and_tells_when_a_display_is_lost(room: RoomSt
     loop = LiveLoop(room.model, devices, cast("Any", told), told, workflow, 0.0, overlay=feed)
     try:
         camera.frames.append(room.frame)
-        loop.turn()
-        wait_for(lambda: screen.shown)
+        wait_for(lambda: (loop.turn(), screen.shown)[1], 60.0)  # the workers of the marker's detection start
         assert screen.shown[0].stamp == room.frame.stamp
         screen.fails, screen.connected = True, False
         now = host_now()
         camera.frames.append(StereoFrame(Stamp(now, now), room.frame.left[:, ::-1], None, 1))
-        wait_for(lambda: loop.turn() and "overlay 1" in loop.lost)
+        wait_for(lambda: loop.turn() and "overlay 1" in loop.lost, 60.0)
         assert loop.lost["overlay 1"] == "unplugged"
         assert "overlay 1 lost: unplugged" in told.notes
     finally:
