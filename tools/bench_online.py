@@ -2,11 +2,11 @@
 
     python tools/bench_online.py                       # 2,000 pairs in 7 epochs
     python tools/bench_online.py --pairs 300 --epochs 1
-    python tools/bench_online.py --native 300          # updates of iSAM2 alone, with GTSAM's own factors
 
 The run is in one process; the full solve is timed separately. ``add`` without it is the time of an event where the full
 solve has a worker process, with the update by its results. ``add`` with it, over the first 10 pairs of each epoch, is
 the time in replay and tests. Also ``track``, and the time to open the session's first 1,000 pairs again.
+``python -m tools.bench online`` compares one event with other ways of keeping the estimate.
 
 Printed are wall time and processor time of the thread. On a machine that does other work as well, only the processor
 time is the engine's own, so the limits apply to it. The exit status is 1 where one is missed.
@@ -19,22 +19,17 @@ import sys
 import time
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fgreg.geometry.rig import COUNT
-from fgreg.graph.columns import make_columns
-from fgreg.graph.packing import least_sigmas
 from fgreg.model.measurements import Measurements, Pair, Track
 from fgreg.model.session_model import SessionModel
 from fgreg.model.solve_config import SolveConfig
 from fgreg.online.engine import OnlineRegistration
 from fgreg.online.full_solve import FullSolveCase
 from fgreg.online.solver import InProcessSolver
-from fgreg.smoother.isam_window import empty_isam
-from fgreg.smoother.updates import FIRST_PAIRS, LEAVE, MOST
+from fgreg.smoother.updates import FIRST_PAIRS
 from tests.forward import make_measurements
 from tests.online_streams import events, first, restored
 
@@ -132,69 +127,6 @@ def bench_opening(model: SessionModel, measurements: Measurements, *, worker: bo
     return count != OPEN_PAIRS or processor <= 1e3 * OPEN_S
 
 
-def _linear(rng: np.random.Generator, values: gtsam.Values, rows: list[list[tuple[int, int]]]) -> gtsam.NonlinearFactor:
-    """A native factor on keys of these dimensions, with at most three keys in a row, as the wrapper allows."""
-    graph = gtsam.GaussianFactorGraph()
-    for row_keys in rows:
-        blocks = [x for key, size in row_keys for x in (key, rng.normal(size=(1, size)))]
-        graph.add(gtsam.JacobianFactor(*blocks, np.zeros(1), gtsam.noiseModel.Unit.Create(1)))  # type: ignore[call-overload]
-    return gtsam.LinearContainerFactor(gtsam.JacobianFactor(graph), values)
-
-
-def bench_native(pairs: int) -> None:
-    """The same updates of iSAM2 with native factors: what ``add`` would take if GTSAM did everything.
-
-    Each pair's factors are on the same keys, with the same dimensions, as in fgreg.smoother.isam_window: a prior of the
-    marker pose (6), point on line (3) on registration, marker pose, beam, lambda and PM, point on arc (3) on PM and
-    theta, sensitivity (1) on theta and the window's edge. As many pairs stay in the active window. Not matched: the two
-    of 3 rows are linear (the wrapper has no native factor on those keys), there is no marginal prior, and no pair is
-    prepared, tested or reported.
-    """
-    rng, isam = np.random.default_rng(0), empty_isam(make_columns(1, least_sigmas(np.zeros(COUNT))))
-    pose, beam, edge = gtsam.symbol("T", 0), gtsam.symbol("B", 0), gtsam.symbol("W", 0)
-    unit = {n: gtsam.noiseModel.Unit.Create(n) for n in (1, 4, 6)}
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(gtsam.PriorFactorPose3(pose, gtsam.Pose3(), unit[6]))
-    graph.add(gtsam.PriorFactorVector(beam, np.zeros(4), unit[4]))
-    graph.add(gtsam.PriorFactorDouble(edge, 0.0, unit[1]))
-    values.insert(pose, gtsam.Pose3())
-    values.insert(beam, np.zeros(4))
-    values.insert(edge, 0.0)
-    isam.update(graph, values)
-    shared, slots, times = gtsam.Values(values), list[list[int]](), list[Times]()
-    for i in range(pairs):
-        marker, point, lam, arc = (gtsam.symbol(name, i) for name in "MPLH")
-        values = gtsam.Values()
-        values.insert(marker, gtsam.Pose3())
-        values.insert(point, np.zeros(3))
-        values.insert(lam, 0.0)
-        values.insert(arc, 0.0)
-        every = gtsam.Values(shared)
-        every.insert(values)
-        line = [
-            [(pose, 6), (marker, 6), (point, 3)],
-            [(beam, 4), (lam, 1), (point, 3)],
-            [(pose, 6), (beam, 4), (lam, 1)],
-        ]
-        graph = gtsam.NonlinearFactorGraph()
-        graph.add(gtsam.PriorFactorPose3(marker, gtsam.Pose3(), unit[6]))
-        graph.add(_linear(rng, every, line))
-        graph.add(_linear(rng, every, [[(point, 3), (arc, 1)]] * 3))
-        graph.add(gtsam.BetweenFactorDouble(edge, arc, 0.0, unit[1]))
-        oldest = slots[:LEAVE] if len(slots) == MOST else []
-        slots = slots[len(oldest) :]
-        start = now()
-        isam = gtsam.ISAM2(isam)
-        theta = isam.getLinearizationPoint()  # has to outlive the update
-        result = isam.update(graph, values, [slot for group in oldest for slot in group])
-        isam.calculateEstimatePose3(pose)
-        isam.jointMarginalCovariance([pose, beam, edge])
-        times.append(since(start))
-        slots.append(list(result.getNewFactorsIndices()))
-        del theta
-    row("iSAM2 alone, native factors", times[MOST:], {})
-
-
 def main() -> int:
     """Parse and run; 1 where a limit is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -202,11 +134,7 @@ def main() -> int:
     parser.add_argument("--epochs", type=int, default=7)
     parser.add_argument("--known-motion", action="store_true", help="the motions between the epochs are measured")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--native", type=int, default=None, help="only this many updates with native factors")
     arguments = parser.parse_args()
-    if arguments.native is not None:
-        bench_native(arguments.native)
-        return 0
     model, measurements, _ = make_measurements(
         np.random.default_rng(arguments.seed),
         pairs=arguments.pairs,

@@ -6,7 +6,7 @@ take turns, one solve at a time. Printed: the median processor time (user and sy
 the other checkout, the longest solve, and the differences of the two results: verdict, outliers, and the registration
 in standard deviations.
 
-    python tools/bench_full_solve.py --against ../fgreg-before
+    python tools/bench/checkouts.py --against ../fgreg-before
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-HERE = Path(__file__).resolve().parent.parent
+HERE = Path(__file__).resolve().parents[2]
 PAIRS = (3, 4, 5, 6, 8, 10, 15)
 OUTLIER_SHARE, OUTLIER_PAIRS = 0.2, 25
 MODULES = {

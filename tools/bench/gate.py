@@ -1,0 +1,72 @@
+"""Stored ratios, and what was lost against them."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from bench.compare import Row
+
+RATIOS = Path(__file__).resolve().parent / "ratios.json"
+LOSS = 1.25
+"""A ratio that fell by more than this factor counts as lost."""
+VERSIONS = ("gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "pyceres", "symforce", "pyapriltags", "pymust")
+
+
+def stored(rows: Sequence[Row]) -> dict[str, float]:
+    """The ratios that are kept: of contenders that were run several times, not of what they are compared with."""
+    return {
+        row.key: float(f"{row.ratio:.4g}")
+        for row in rows
+        if row.ratio is not None and row.runs > 1 and not is_base(row)
+    }
+
+
+def is_base(row: Row) -> bool:
+    return row.ratio == row.low == row.high == 1.0
+
+
+def store(rows: Sequence[Row], path: Path) -> None:
+    """Write the ratios; those of parts that were not run stay."""
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    path.write_text(json.dumps(dict(sorted((known | stored(rows)).items())), indent=1) + "\n")
+
+
+def losses(rows: Sequence[Row], path: Path) -> list[str]:
+    """A line for each ratio that is worse than the stored one by over 25 %.
+
+    Raises:
+        FileNotFoundError: nothing is stored.
+    """
+    before = json.loads(path.read_text())
+    lost = []
+    for row in rows:
+        if row.key not in before or row.ratio is None or is_base(row):
+            continue
+        # The full solve's rows are compared with native factors the other way round.
+        worse = row.ratio / before[row.key] if row.section == "full solve" else before[row.key] / row.ratio
+        if worse > LOSS:
+            lost.append(f"{row.key}: {row.ratio:.3g}, stored {before[row.key]:.3g}")
+    return lost
+
+
+def machine() -> str:
+    """Cores, kind of processor, load, and versions: a line each."""
+    kind = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        kind = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
+    found = []
+    for name in VERSIONS:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            found.append(f"{name} not installed")
+    return f"{os.cpu_count()} cores, {kind}, load {load}\nPython {platform.python_version()}, {', '.join(found)}"
