@@ -75,6 +75,8 @@ MEDIAN_SIGMAS = 0.6745
 """Median of the size of a normally distributed residual, in standard deviations."""
 BINS, CLEAN_SHARE = 40, 0.75
 """Parts along an edge, and the mean weight of a part's pixels below which all of them are left out."""
+RESPONSE_STEPS = 3
+"""Iterations of the fit with video's response: a sigma needs no more, and later ones change o by 0.003 px."""
 REWEIGH_AT = 4
 """First iteration that down-weights outlier pixels."""
 
@@ -108,51 +110,85 @@ def _step_model(band: EdgePixels, x: FloatArray) -> tuple[FloatArray, FloatArray
     e = band.d - x[:, :1] - x[:, 1:2] * u
     t = e / blur
     t2 = t * t
-    phi = np.exp(-0.5 * t2) * (1.0 / np.sqrt(2.0 * np.pi))
-    he3_phi = t * (t2 - 3.0) * phi
+    phi = np.exp(-0.5 * t2)
+    phi *= 1.0 / np.sqrt(2.0 * np.pi)
+    t_phi = t * phi
+    he3_phi = (t2 - 3.0) * t_phi
     profile = ndtr(t) - kurtosis * he3_phi
-    slope = phi * (1.0 + kurtosis * (t2 * (t2 - 6.0) + 3.0))  # of the profile
-    light = 1.0 + fall * e
-    # Shares of the two levels: they add up to the light that falls on the pixel.
-    high = light * profile + fall * blur * phi
-    low = light - high
-    dark = x[:, 3:4] + x[:, 4:5] * u
-    step = x[:, 5:6] + x[:, 6:7] * u - dark
+    slope = (t2 * (t2 - 6.0) + 3.0) * kurtosis  # of the profile
+    slope += 1.0
+    slope *= phi
+    light = fall * e
+    light += 1.0
+    blur_phi = blur * phi
+    dark = x[:, 4:5] * u + x[:, 3:4]
+    step = (x[:, 6:7] - x[:, 4:5]) * u + (x[:, 5:6] - x[:, 3:4])
     jacobian = np.empty((len(u), PARAMETERS, u.shape[1]))
-    # d high / d e = fall P + light P' / s - fall t phi;  d high / d log s = -P' t light + fall s phi (1 + t^2)
-    by_e = fall * dark + step * (fall * profile + slope * light / blur - fall * t * phi)
-    jacobian[:, 0] = -by_e
-    jacobian[:, 1] = -by_e * u
-    jacobian[:, 2] = step * (fall * blur * phi * (1.0 + t2) - light * t * slope)
-    jacobian[:, 3] = low
-    jacobian[:, 4] = low * u
-    jacobian[:, 5] = high
-    jacobian[:, 6] = high * u
-    jacobian[:, 7] = e * dark + step * (e * profile + blur * phi)
-    jacobian[:, 8] = -step * light * he3_phi
+    by_offset, by_slope, by_blur, low, low_u, high, high_u, by_fall, by_kurtosis = jacobian.swapaxes(0, 1)
+    # Shares of the two levels: they add up to the light that falls on the pixel.
+    np.multiply(light, profile, out=high)
+    high += fall * blur_phi
+    np.subtract(light, high, out=low)
+    np.multiply(low, u, out=low_u)
+    np.multiply(high, u, out=high_u)
+    # d high / d e = fall (P - t phi) + light P' / s;  d high / d log s = -P' t light + fall s phi (1 + t^2)
+    slope *= light
+    np.subtract(t_phi, profile, out=by_offset)
+    by_offset *= fall
+    by_offset -= slope / blur
+    by_offset *= step
+    by_offset -= fall * dark
+    np.multiply(by_offset, u, out=by_slope)
+    t2 += 1.0
+    t2 *= blur_phi
+    t2 *= fall
+    np.multiply(slope, t, out=by_blur)
+    np.subtract(t2, by_blur, out=by_blur)
+    by_blur *= step
+    np.multiply(e, profile, out=by_fall)
+    by_fall += blur_phi
+    by_fall *= step
+    by_fall += e * dark
+    np.multiply(light, he3_phi, out=by_kurtosis)
+    by_kurtosis *= -step
     return dark * light + step * high, jacobian
 
 
 def _seen(light: FloatArray, by_light: FloatArray, exponent: float) -> tuple[FloatArray, FloatArray]:
-    """Grey levels (n, p) of light (n, p), 255 (light / 255)^exponent; and their Jacobian (n, k, p) from the light's."""
+    """Grey levels (n, p) of light (n, p), 255 (light / 255)^exponent; and their Jacobian (n, k, p), by the light's,
+    which is overwritten."""
     if exponent == 1.0:
         return light, by_light
     share = np.maximum(light, 0.5) / WHITE
-    return WHITE * share**exponent, by_light * (exponent * share ** (exponent - 1.0))[:, None]
+    grey = WHITE * share**exponent
+    by_light *= (exponent / WHITE * grey / share)[:, None]
+    return grey, by_light
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Optimum:
+    """Parameters (n, 9) at the optimum, with grey levels, residuals, weights (n, p) and Jacobian (n, 9, p) there, and
+    the inverse variances (n, 9) of the priors."""
+
+    x: FloatArray
+    grey: FloatArray
+    residual: FloatArray
+    weight: FloatArray
+    jacobian: FloatArray
+    prior: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandFit:
     """Parameters (n, 9), inverse normal matrix (n, 9, 9), pixel noise sigma (n,); by the response's exponent: what one
-    Gauss-Newton step would change of it (n,), its information (n,), and the derivative of o (n,); and how far apart
-    odd and even lines have the edge (n,) px, 0 where that may be noise."""
+    Gauss-Newton step would change of it (n,), and its information (n,); and how far apart odd and even lines have the
+    edge (n,) px, 0 where that may be noise."""
 
     x: FloatArray
     inverse_normal: FloatArray
     sigma: FloatArray
     exponent_step: FloatArray
     exponent_information: FloatArray
-    offset_by_exponent: FloatArray
     between_fields: FloatArray
 
 
@@ -164,7 +200,7 @@ def _fit_band(
     fall_off_sigma: float,
     near: bool,
     exponent: float = 1.0,
-) -> _BandFit:
+) -> _Optimum:
     """The edges by Levenberg-Marquardt, for a camera with this response."""
     x = start.copy()
     contrast = np.maximum(np.abs(x[:, 5] - x[:, 3]), MIN_CONTRAST)
@@ -174,7 +210,8 @@ def _fit_band(
     prior[:, 4] = prior[:, 6] = (LEVEL_SLOPE_SIGMA * contrast) ** -2.0
     prior[:, 7] = fall_off_sigma**-2
     prior[:, 8] = KURTOSIS_SIGMA**-2
-    centre = np.where(np.isin(np.arange(PARAMETERS), (2, 7)), x, 0.0)
+    centre = np.zeros_like(x)
+    centre[:, [2, 7]] = x[:, [2, 7]]
     diagonal = np.arange(PARAMETERS)
 
     bins = np.clip((0.5 * BINS * (band.u + 1.0)).astype(np.intp), 0, BINS - 1) + BINS * np.arange(len(x))[:, None]
@@ -219,26 +256,30 @@ def _fit_band(
             grey[better] = new_grey[better]
         if iteration > (0 if near else REWEIGH_AT) and np.abs(step[:, :2]).max() < tolerance_px:
             break
+    return _Optimum(x, grey, residual, weight, jacobian, prior)
+
+
+def _fit_at(band: EdgePixels, at: _Optimum) -> _BandFit:
+    """The fit at an optimum for a camera that is linear."""
+    residual, weight, jacobian, diagonal = at.residual, at.weight, at.jacobian, np.arange(PARAMETERS)
     sigma = _spread(residual, weight, weight)
     normal = (jacobian * (weight / sigma[:, None] ** 2)[:, None]) @ np.swapaxes(jacobian, 1, 2)
-    normal[:, diagonal, diagonal] += prior + 1e-9
+    normal[:, diagonal, diagonal] += at.prior + 1e-9
     inverse_normal = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     # The exponent as one more parameter of each edge: the Schur complement of the others.
-    share = np.clip(grey / WHITE, 1e-3, 1.0)
-    by_exponent = grey * np.log(share) / exponent
+    by_exponent = at.grey * np.log(np.clip(at.grey / WHITE, 1e-3, 1.0))
     weighed = by_exponent * weight / sigma[:, None] ** 2
-    others = np.einsum("nij,njp,np->ni", inverse_normal, jacobian, weighed)
-    left = by_exponent - np.einsum("nip,ni->np", jacobian, others)
+    others = (inverse_normal @ (jacobian @ weighed[..., None]))[..., 0]
+    left = by_exponent - (others[:, None] @ jacobian)[:, 0]
     information = np.sum(weighed * left, axis=1)
     gradient = np.sum(left * weight / sigma[:, None] ** 2 * residual, axis=1)
     step = gradient / np.maximum(information, 1e-9)
     return _BandFit(
-        x,
+        at.x,
         inverse_normal,
         sigma,
         step,
         information,
-        -others[:, 0],
         _between_fields(band, residual, jacobian[:, 0], weight),
     )
 
@@ -292,7 +333,7 @@ def _by_response(band: EdgePixels, linear: _BandFit, near: BoolArray) -> FloatAr
     start = linear.x.copy()
     start[:, [3, 5]] = WHITE * (np.clip(linear.x[:, [3, 5]], 0.5, WHITE) / WHITE) ** (1.0 / VIDEO)
     start[:, [4, 6]] = 0.0
-    video = _fit_band(band, start, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True, exponent=VIDEO)
+    video = _fit_band(band, start, RESPONSE_STEPS, 1e-3, FALL_OFF_COMMON_SIGMA, near=True, exponent=VIDEO)
     return np.asarray(np.sqrt(video_odds) * np.abs(video.x[:, 0] - linear.x[:, 0]))
 
 
@@ -307,8 +348,20 @@ def _typical(residual: FloatArray, used: BoolArray, by_offset: FloatArray) -> Fl
     """Standard deviation (n,) of the pixels about the model where it falls or rises, half of which may be outliers."""
     size = np.abs(by_offset)
     chosen = used & (size > STEEP * (size * used).max(axis=1, keepdims=True))
-    out = [np.median(np.abs(row[steep])) if steep.any() else 0.0 for row, steep in zip(residual, chosen, strict=True)]
+    out = [_median(np.abs(row[steep])) for row, steep in zip(residual, chosen, strict=True)]
     return np.maximum(np.array(out) / MEDIAN_SIGMAS, 0.3)
+
+
+def _median(values: FloatArray) -> float:
+    """As ``numpy.median`` of finite values, at a third of its time; 0 of none."""
+    count = len(values)
+    if not count:
+        return 0.0
+    middle = count // 2
+    if count % 2:
+        return float(np.partition(values, middle)[middle])
+    parted = np.partition(values, (middle - 1, middle))
+    return float(0.5 * (parted[middle - 1] + parted[middle]))
 
 
 def _spread(residual: FloatArray, weight: FloatArray, counted: FloatArray) -> FloatArray:
@@ -337,9 +390,7 @@ def _first_guess(band: EdgePixels, half_width: FloatArray, blur_px: FloatArray) 
     x[:, 2] = np.log(blur_px)
     for k, side in ((3, -1.0), (5, 1.0)):
         share = band.used & (side * band.d > 0.5 * half_width[:, None])
-        x[:, k] = [
-            np.median(grey[chosen]) if chosen.any() else 0.0 for grey, chosen in zip(band.grey, share, strict=True)
-        ]
+        x[:, k] = [_median(grey[chosen]) for grey, chosen in zip(band.grey, share, strict=True)]
     return x
 
 
@@ -392,7 +443,7 @@ def fit_edges(
     x[:, 7] = 0.5 * (x[:, 7] - x[:, 7].reshape(-1, 2, 2)[:, ::-1].ravel())
     x[:, [0, 1, 8]] = 0.0
     x[:, 2] = np.log(np.clip(blur, 0.4, MAX_BLUR_PX))
-    fit = _fit_band(band, x, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True)
+    fit = _fit_at(band, _fit_band(band, x, 8, 1e-3, FALL_OFF_COMMON_SIGMA, near=True))
     by_response = _by_response(band, fit, near)
     cut = np.sum(band.used & (band.grey >= CUT_OFF), axis=1) > CUT_SHARE * np.sum(band.used, axis=1)
     by_response = np.hypot(by_response, OVEREXPOSED * cut * np.exp(fit.x[:, 2]))
