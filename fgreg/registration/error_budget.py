@@ -289,10 +289,11 @@ def _seen(registration: Registration, place: int, jacobian: FloatArray, targets_
     pose, cross, own = _parts(registration, place)
     covariance = np.block([[pose, cross], [cross.T, own]])
     mean = -shown @ state.constants[0, columns.constants]
-    spread = np.einsum("nij,jk,nlk->nil", gain, covariance, gain)
+    spread = gain @ covariance @ gain.swapaxes(1, 2)
     root = np.linalg.cholesky(spread + 1e-12 * np.eye(3))
     draws = np.random.default_rng(0).standard_normal((DRAWS, 3))
-    length = np.linalg.norm(np.einsum("nij,sj->sni", root, draws) + mean, axis=-1)
-    quantiles = np.quantile(length, QUANTILE, axis=0)
+    moved = draws @ root.swapaxes(1, 2) + mean[:, None]
+    length = np.sqrt(np.square(moved[..., 0]) + np.square(moved[..., 1]) + np.square(moved[..., 2]))
+    quantiles = np.quantile(length, QUANTILE, axis=1)
     square = np.trace(spread, axis1=1, axis2=2) + np.sum(mean**2, axis=1)
     return PredictedPart(float(np.sqrt(square).mean()), float(quantiles.mean()), float(quantiles.max()))
