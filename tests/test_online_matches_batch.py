@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -20,6 +21,7 @@ from fgreg.online.estimate import gaussian_tre
 from fgreg.online.events import CameraMoved
 from fgreg.online.full_solve import FullSolveCase, result_of
 from fgreg.online.reported_estimate import NOT_SOLVED
+from fgreg.online.solver import InProcessSolver
 from fgreg.registration.register import register
 from fgreg.registration.solve import solve
 from fgreg.smoother.isam_window import free_number
@@ -156,6 +158,39 @@ def test_between_full_solves_the_report_keeps_the_posteriors_shift_and_width() -
     mean = np.asarray(last.optimum_trus_T_camera) @ gtsam.Pose3.Expmap(shift).matrix()
     np.testing.assert_allclose(np.asarray(last.trus_T_camera), mean, atol=1e-3)
     assert np.abs(shift).max() > 1e-4
+
+
+class _Recording(InProcessSolver):
+    """``full``: no case is a draft. ``results``: of all cases since they were last cleared."""
+
+    full = False
+
+    def submit(self, case: FullSolveCase) -> None:
+        super().submit(replace(case, draft=False, searched=None) if self.full else case)
+        found, self.results = self._found, getattr(self, "results", [])
+        if found is not None:
+            self.results.append(found)
+
+
+def test_a_draft_leaves_out_what_would_be_done_twice() -> None:
+    model, measurements, _ = make_measurements(np.random.default_rng(0), pairs=10, epochs=2)
+    engines = []
+    for full in (False, True):
+        engine = OnlineRegistration(model, find_moves=False)
+        engine._solver = solver = _Recording(model, SolveConfig(), verdicts=True)
+        solver.full = full
+        restored(engine, first(measurements, 5))
+        for event in list(events(measurements))[-6:-1]:  # the move, and four pairs
+            solver.results = []
+            engine.add(event)
+        engines.append((engine.estimate, solver.results))
+    (drafted, results), (whole, all_results) = engines
+    assert [result.report is None for result in results] == [True, False]
+    assert [result.report is None for result in all_results] == [False, False]
+    assert drafted.settled
+    assert drafted.reasons == whole.reasons
+    np.testing.assert_array_equal(np.asarray(drafted.trus_T_camera), np.asarray(whole.trus_T_camera))
+    np.testing.assert_array_equal(np.asarray(drafted.covariance), np.asarray(whole.covariance))
 
 
 def test_the_schedule_of_full_solves_thins_out() -> None:

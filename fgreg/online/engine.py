@@ -38,6 +38,7 @@ from fgreg.online.reported_estimate import reported
 from fgreg.online.solver import Where, make_solver
 from fgreg.online.tracking_snapshot import online_snapshot
 from fgreg.registration.epochs import FinishedEpochs, has_registration, last_epoch
+from fgreg.registration.multistart import EpochSearch
 from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import initialised
 from fgreg.smoother.innovation import misplaced_pms
@@ -99,6 +100,7 @@ class OnlineRegistration:
         self._reports: tuple[EpochReport, ...] = ()  # of these epochs
         self._misfit = 0  # the current epoch, where its PMs did not all fit with the earlier epochs as a prior
         self._finished_prior: Quadratic | None = None  # from the earlier epochs, in the full solve of the current one
+        self._draft: tuple[int, EpochSearch] | None = None  # of a full solve that has to follow: serial, minima
         self._solve_wanted = self._move_wanted = self._move_untested = False
         self._misplaced: frozenset[int] = frozenset()
         self._restoring = False
@@ -322,6 +324,8 @@ class OnlineRegistration:
             before=self._reports[: state.epoch],
             first=state.now.first,
             move=move,
+            draft=self._draft is None,
+            searched=self._draft[1] if self._draft is not None and self._draft[0] == self._serial else None,
         )
 
     def _finished(self) -> FinishedEpochs | None:
@@ -346,6 +350,7 @@ class OnlineRegistration:
         if self._report is not None and found.serial < self._report.serial:
             return  # a later one has been taken over
         before = self._state, self._misplaced, self._report, self._surface
+        self._draft = None if found.draft is None else (found.serial, found.draft)
         try:
             if found.report is not None:
                 self._report = found.report
@@ -355,13 +360,15 @@ class OnlineRegistration:
                 # Pairs that came before the first registration have not been tested for a move yet.
                 self._move_wanted, self._move_untested = self._move_wanted or self._move_untested, False
                 self._misplaced = misplaced_pms(self._state, self._setting)
-                self._solved, self._reports = found.epoch + 1, () if found.report is None else found.report.epochs
+                if self._draft is None:
+                    self._solved, self._reports = found.epoch + 1, () if found.report is None else found.report.epochs
                 prior, here = self._finished_prior, self._state.active_window
                 if not found.initial.first:
                     self._finished_prior = None  # the earlier epochs were solved, too
-                elif prior and here and has_moved(prior, here.state, self._setting.empty):
+                elif prior and here and (self._draft or has_moved(prior, here.state, self._setting.empty)):
                     self._finished_prior = finished_prior(self._state, here.state, self._setting).finished
                     self._solve_wanted = True
+                self._solve_wanted |= self._draft is not None
             elif found.why_none:
                 self._state = replace(self._state, active_window=None, why_none=found.why_none)
             self._estimate = self._estimated(self._state, self._estimate.t)

@@ -28,6 +28,7 @@ from fgreg.registration.posterior import pose_tangent
 from fgreg.registration.register import Registration, register
 from fgreg.registration.solve import EpochReport, Solution, solve
 from fgreg.smoother.initialise import Initial, initial_of
+from fgreg.smoother.marginal_prior import has_moved
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,9 @@ class FullSolveCase:
         first: place of the first of the pairs in the session's order.
         move: for the camera-move test; None where none is looked for.
         detected: whether the current epoch began with a move that was detected: it may have begun at another pair.
+        draft: whether to leave posterior and verdict out where the registration moved away from where ``finished`` was
+            linearised: that is linearised and the case solved again.
+        searched: minima of the current epoch from a draft on the same measurements; they do not depend on ``finished``.
     """
 
     serial: int
@@ -54,6 +58,8 @@ class FullSolveCase:
     first: int = 0
     move: MoveCase | None = None
     detected: bool = False
+    draft: bool = False
+    searched: EpochSearch | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +111,8 @@ class FullSolveResult:
         move: an unreported camera move, or a loop closure; nothing else was computed then.
         begins: place of the pair with which the current epoch begins, where it is another one; likewise.
         initial: the registration; None where there is none, for the reason ``why_none``, or none was wanted.
-        report: None where none was wanted.
+        report: None where none was wanted, or the case has to be solved again.
+        draft: minima of the current epoch, where the case has to be solved again with ``finished`` linearised anew.
         move_failure: why the camera-move test failed, empty where it did not; None where no test was wanted.
     """
 
@@ -116,6 +123,7 @@ class FullSolveResult:
     initial: Initial | None = None
     why_none: str = ""
     report: Report | None = None
+    draft: EpochSearch | None = None
     move_failure: str | None = None
 
 
@@ -153,8 +161,9 @@ def _solved(
     if case.measurements is None:
         return FullSolveResult(case.serial, case.epoch)
     found: Registration | None = None
+    known = case.known if case.searched is None else {case.epoch: case.searched}
     try:
-        found = register(case.measurements, model, config, case.known, case.finished)
+        found = register(case.measurements, model, config, known, case.finished)
     except EstimationError as error:
         if not verdicts:
             return FullSolveResult(case.serial, case.epoch, why_none=str(error))
@@ -164,17 +173,32 @@ def _solved(
             return FullSolveResult(case.serial, case.epoch, begins=begins)
         if not verdicts:
             return _registered(case, case.measurements, found, None)
+        again = _to_be_solved_again(case, case.measurements, found)
+        if again is not None:
+            return again
     solution = solve(
         case.measurements,
         [],
         model,
         config,
-        known=case.known,
+        known=known,
         finished=case.finished,
         before=case.before,
         registration=found,
     )
     return result_of(case, case.measurements, solution)
+
+
+def _to_be_solved_again(case: FullSolveCase, measurements: Measurements, found: Registration) -> FullSolveResult | None:
+    """The registration alone where posterior and verdict would be of no use, because the case is solved again."""
+    if case.finished is None:
+        return None
+    result = _registered(case, measurements, found, None)
+    if result.initial is not None and result.initial.first and not result.initial.fits:
+        return result
+    if case.draft and has_moved(case.finished.prior, found.optimum.state, found.problem):
+        return replace(result, draft=found.searches[case.epoch])
+    return None
 
 
 def other_start(
