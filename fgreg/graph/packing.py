@@ -154,6 +154,8 @@ class PackedProblem:
 
 
 _CAMERA_COUNT = CAMERA.stop - CAMERA.start
+BIAS = slice(Constant.MARKER_BIAS_X - CAMERA.start, Constant.MARKER_BIAS_Z + 1 - CAMERA.start)
+"""The marker's bias among the camera's constants."""
 
 
 def marker_gain(marker: MarkerObservation) -> FloatArray:
@@ -186,7 +188,9 @@ def _beam_arrays(markers: Sequence[MarkerObservation], offset_mm: FloatArray) ->
     covariance = usable_covariance(np.stack([marker.covariance for marker in markers]), POSE_FLOOR)
     rotation = np.ascontiguousarray(transforms[:, :3, :3])
     for i, marker in enumerate(markers):
-        gain[i] = marker_gain(marker)[:, CAMERA]
+        if marker.dependence is not None:
+            gain[i] = marker.dependence.gain
+    gain[:, 3:, BIAS] = -np.eye(3)  # as marker_gain, for all at once
     spread = parent_from_right_covariance(rotation, covariance)
     return BeamArrays(rotation, transforms[:, :3, 3].copy(), spread, gain, offset_mm)
 
