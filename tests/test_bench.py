@@ -44,14 +44,20 @@ def test_ratios_are_of_the_same_round() -> None:
     rows = rows_of("section", "case", times, {})
     assert [row.ratio for row in rows] == [1.0, 2.5]  # rounds of 2 and 3
     assert [row.ms for row in rows] == [2500.0, 7000.0]
+    assert [row.worse for row in rows] == [0, -1]
+    assert [row.worse for row in rows_of("section", "case", times, {}, own=["other"])] == [0, 1]
 
 
 def test_gate_fails_on_a_loss_of_over_a_quarter(tmp_path: Path) -> None:
     path = tmp_path / "ratios.json"
     base, other = Row("solve", "10 pairs", "this package", 1.0, 1.0, 1.0, 1.0, 9), "scipy least_squares"
-    store([base, Row("solve", "10 pairs", other, 5.0, 5.0, 4.9, 5.1, 9)], path)
-    assert json.loads(path.read_text()) == {f"solve | 10 pairs | {other}": 5.0}
-    assert not losses([base, Row("solve", "10 pairs", other, 4.1, 4.1, 4.0, 4.2, 9)], path)
-    assert losses([base, Row("solve", "10 pairs", other, 3.9, 3.9, 3.8, 4.0, 9)], path) == [
-        f"solve | 10 pairs | {other}: 3.9, stored 5"
-    ]
+
+    def rows(of_other: float, of_own: float) -> list[Row]:
+        own = Row("marker", "frame", "this package", of_own, of_own, of_own, of_own, 9, worse=1)
+        return [base, Row("solve", "10 pairs", other, of_other, of_other, of_other, of_other, 9, worse=-1), own]
+
+    store(rows(5.0, 2.0), path)
+    assert json.loads(path.read_text()) == {"marker | frame | this package": 2.0, f"solve | 10 pairs | {other}": 5.0}
+    assert not losses(rows(4.1, 2.4), path)
+    assert losses(rows(3.9, 2.4), path) == [f"solve | 10 pairs | {other}: 3.9, stored 5"]
+    assert losses(rows(7.0, 2.6), path) == ["marker | frame | this package: 2.6, stored 2"]

@@ -3,11 +3,11 @@
     python -m tools.bench                          # all parts
     python -m tools.bench solve marker             # these parts
     python -m tools.bench --gate                   # exit status 1 where a ratio fell by over 25 %
-    python -m tools.bench --store                  # write the ratios that --gate compares with
+    python -m tools.bench --store --docs           # keep the ratios for --gate; write docs/performance.md
 
 Contenders of a part run in turn in one process, at least 9 times, so that other load on the machine meets all alike.
-Times are processor time of the process. A ratio is a contender's time over that of this package (the first line) in
-the same round: above 1 this package is faster. The parts:
+Times are processor time of the process. A ratio is a contender's time over that of the first line in the same round.
+The parts:
 
   solve         one epoch, 12 aims and 10 to 1,000 pairs: optimisers from one start to the same cost
   full-solve    search, posterior and verdict of 15 pairs, and the first pairs of two epochs, beside native factors
@@ -27,6 +27,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 sys.path.insert(0, os.fspath(Path(__file__).resolve().parents[2]))
@@ -34,6 +35,7 @@ sys.path.insert(0, os.fspath(Path(__file__).resolve().parents[1]))
 
 from bench.compare import BUDGET_S, Row, Section, Target, print_rows, print_targets
 from bench.gate import RATIOS, losses, machine, store
+from bench.page import PAGE, write_tables
 from fgreg.workers.threads import one_thread_each
 
 LEAST_REPEATS = 9
@@ -92,15 +94,23 @@ def main() -> int:
     parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds; a longer run is not repeated")
     parser.add_argument("--gate", action="store_true", help="compare with the stored ratios")
     parser.add_argument("--store", action="store_true", help="write the ratios of this run")
-    parser.add_argument("--json", type=Path, help="write all rows")
+    parser.add_argument("--docs", action="store_true", help="write the tables of docs/performance.md, of all parts")
+    parser.add_argument("--json", type=Path, help="write all rows and targets")
     args = parser.parse_args()
     if args.repeats < LEAST_REPEATS:
         parser.error(f"--repeats {args.repeats}, expected at least {LEAST_REPEATS}")
     parts = _parts(args)
+    if min(args.pairs) < 6:
+        parser.error(f"--pairs {min(args.pairs)}, expected at least 6")
+    if args.gate and not RATIOS.is_file():
+        parser.error(f"{RATIOS} is absent: run with --store first")
+    if args.docs and args.parts:
+        parser.error("--docs needs all parts")
     if unknown := [name for name in args.parts if name not in parts]:
         parser.error(f"no part {unknown[0]}; there are {', '.join(parts)}")
     rows, targets = list[Row](), list[Target]()
-    print(machine(), flush=True)
+    begun = machine()
+    print(begun, flush=True)
     for name in args.parts or parts:
         with one_thread_each():
             found = parts[name]()
@@ -108,15 +118,18 @@ def main() -> int:
         sys.stdout.flush()
         rows += found.rows
         targets += found.targets
-    print_targets(targets)
+    if targets:
+        print_targets(targets)
     if args.json is not None:
-        args.json.write_text(json.dumps([{k: getattr(row, k) for k in Row.__slots__} for row in rows], indent=1))
+        whole = {"machine": begun, "rows": [asdict(row) for row in rows], "targets": [asdict(t) for t in targets]}
+        args.json.write_text(json.dumps(whole, indent=1) + "\n")
+    if args.docs:
+        write_tables(PAGE, begun, rows, targets)
     if args.store:
         store(rows, RATIOS)
     if args.gate:
         lost = losses(rows, RATIOS)
-        print(f"\nGate: {len(lost)} ratios lost over 25 %")
-        print(*(f"  {text}" for text in lost), sep="\n")
+        print("\n".join([f"\nGate: {len(lost)} ratios lost over 25 %", *(f"  {text}" for text in lost)]))
         return int(bool(lost))
     return 0
 

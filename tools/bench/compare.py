@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ class Row:
         ms: median time, ms. None where it was not run.
         ratio, low, high: median and quartiles over the rounds of its time over that of the first contender's.
         runs: number of runs. note: what a reader has to know.
+        worse: 1 where a larger ratio is a loss of this package, -1 where a smaller one is, 0 where it says nothing.
     """
 
     section: str
@@ -34,6 +35,7 @@ class Row:
     high: float | None = None
     runs: int = 0
     note: str = ""
+    worse: int = 0
 
     @property
     def key(self) -> str:
@@ -90,27 +92,41 @@ def in_turn(
 
 
 def rows_of(
-    section: str, case: str, times: Mapping[str, list[float]], notes: Mapping[str, str], *, ms_of: float = 1.0
+    section: str,
+    case: str,
+    times: Mapping[str, list[float]],
+    notes: Mapping[str, str],
+    *,
+    ms_of: float = 1.0,
+    own: Collection[str] | None = None,
 ) -> list[Row]:
-    """Rows from times in turn; ratios to the first contender, of the same round. ``ms_of``: runs timed together."""
-    first = next(iter(times.values()))
+    """Rows from times in turn; ratios to the first contender, of the same round.
+
+    Args:
+        section, case, notes: of the rows.
+        times: seconds of each.
+        ms_of: runs that were timed together.
+        own: names that are this package; None: the first.
+    """
+    base, first = next(iter(times.items()))
+    ours = {base} if own is None else set(own)
     rows = []
-    for name, own in times.items():
-        same_rounds = len(own) == len(first)
-        base = first if same_rounds else [statistics.median(first)] * len(own)
-        ratios = [mine / other for mine, other in zip(own, base, strict=True)]
+    for name, taken in times.items():
+        beside = first if len(taken) == len(first) else [statistics.median(first)] * len(taken)
+        ratios = [mine / other for mine, other in zip(taken, beside, strict=True)]
         low, _, high = statistics.quantiles(ratios, n=4) if len(ratios) > 1 else ratios * 3
         rows.append(
             Row(
                 section,
                 case,
                 name,
-                1e3 * statistics.median(own) / ms_of,
+                1e3 * statistics.median(taken) / ms_of,
                 statistics.median(ratios),
                 low,
                 high,
-                len(own),
+                len(taken),
                 notes.get(name, ""),
+                0 if name == base else 1 if name in ours else -1 if base in ours else 0,
             )
         )
     return rows

@@ -18,16 +18,8 @@ VERSIONS = ("gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "pycere
 
 
 def stored(rows: Sequence[Row]) -> dict[str, float]:
-    """The ratios that are kept: of contenders that were run several times, not of what they are compared with."""
-    return {
-        row.key: float(f"{row.ratio:.4g}")
-        for row in rows
-        if row.ratio is not None and row.runs > 1 and not is_base(row)
-    }
-
-
-def is_base(row: Row) -> bool:
-    return row.ratio == row.low == row.high == 1.0
+    """The ratios that are kept: those that tell a loss, of contenders that were run several times."""
+    return {row.key: float(f"{row.ratio:.4g}") for row in rows if row.ratio is not None and row.runs > 1 and row.worse}
 
 
 def store(rows: Sequence[Row], path: Path) -> None:
@@ -45,11 +37,9 @@ def losses(rows: Sequence[Row], path: Path) -> list[str]:
     before = json.loads(path.read_text())
     lost = []
     for row in rows:
-        if row.key not in before or row.ratio is None or is_base(row):
+        if row.key not in before or row.ratio is None or not row.worse:
             continue
-        # The full solve's rows are compared with native factors the other way round.
-        worse = row.ratio / before[row.key] if row.section == "full solve" else before[row.key] / row.ratio
-        if worse > LOSS:
+        if (row.ratio / before[row.key]) ** row.worse > LOSS:
             lost.append(f"{row.key}: {row.ratio:.3g}, stored {before[row.key]:.3g}")
     return lost
 
