@@ -14,12 +14,20 @@ from bench.compare import Row
 RATIOS = Path(__file__).resolve().parent / "ratios.json"
 LOSS = 1.25
 """A ratio that fell by more than this factor counts as lost."""
+SCATTER = 1.6
+"""Upper over lower quartile beyond which a ratio is not kept."""
 VERSIONS = ("gtsam", "numpy", "scipy", "opencv-contrib-python-headless", "pyceres", "symforce", "pyapriltags", "pymust")
 
 
 def stored(rows: Sequence[Row]) -> dict[str, float]:
-    """The ratios that are kept: those that tell a loss, of contenders that were run several times."""
-    return {row.key: float(f"{row.ratio:.4g}") for row in rows if row.ratio is not None and row.runs > 1 and row.worse}
+    """The ratios that are kept: those that tell a loss, of several runs that do not scatter too much to show it."""
+    kept = {}
+    for row in rows:
+        if row.ratio is None or row.low is None or row.high is None or row.runs < 2 or not row.worse:
+            continue
+        if row.high <= SCATTER * row.low:
+            kept[row.key] = float(f"{row.ratio:.4g}")
+    return kept
 
 
 def store(rows: Sequence[Row], path: Path) -> None:
