@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import fftconvolve, hilbert
 
-from bench.compare import Row, Section, in_turn, rows_of, say
+from bench.compare import Row, Section, Target, in_turn, rows_of, say
 from fgreg.detection.photoacoustic import locate_in_channels
 from fgreg.detection.results import PaFind
 from fgreg.geometry.transforms import FloatArray
@@ -114,4 +114,8 @@ def bench_photoacoustic(repeats: int, seed: int) -> Section:
         notes[name] = f"{within} of {FRAMES} within 1 mm, RMS of these x {rms[0]:.3f}, range {rms[1]:.3f} mm"
     runs = {name: (lambda f=locate: [f(data) for data, _ in frames]) for name, locate in locators.items()}
     rows = rows_of("photoacoustic", case, in_turn(runs, repeats), notes, ms_of=FRAMES)
-    return Section((*rows, *absent))
+    others = [row.ratio for row in rows[1:] if row.ratio is not None]
+    targets = (
+        [Target("a photoacoustic source over the fastest of the others", 1.0 / min(others), 1.0)] if others else []
+    )
+    return Section((*rows, *absent), tuple(targets))
